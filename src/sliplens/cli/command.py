@@ -25,6 +25,8 @@ Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", h
 TableFile = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE.parquet", help="File to write.")]
 _FRICTION = "Coefficient of friction of the object, where it is known: 0.62, or a range such as 0.5..0.8."
 Friction = Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH", help=_FRICTION)]
+_SEQUENCE = "Read frames in order: what those before tell counts too; for a network of the recipe sequence."
+InOrder = Annotated[bool, tyro.conf.arg(help=_SEQUENCE)]
 On = Annotated[str, tyro.conf.arg(metavar="serial|processes[=N]|ray[=ADDRESS]", help="Where the work is done.")]
 RetryFailed = Annotated[bool, tyro.conf.arg(help="Try again what failed three times before.")]
 Device = Annotated[str, tyro.conf.arg(help="Where the network runs: cpu, cuda or cuda:1.")]

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.command import Command, Data, Device, Network, Output
+from sliplens.cli.command import Command, Data, Device, InOrder, Network, Output
 from sliplens.cli.console import print_table, say
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ class Evaluate(Command):
     friction: Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH|each")] = None
     """Coefficient of friction that the network is told: 0.62, a range such as 0.5..0.8, or each for that of every
     trial."""
+    sequence: InOrder = False
     baselines: tuple[str, ...] = ()
     """Estimators to put beside it, by name or all: they read the motion of the markers, fitted on training trials."""
     baseline_trials: int = 40
@@ -66,6 +67,8 @@ def _print_scores(evaluation: "Evaluation") -> None:
     )
     if evaluation.friction:
         say(f"friction: {evaluation.friction}")
+    if evaluation.sequence:
+        say("several frames: each margin is read from those of its contact so far")
     if evaluation.ratio_r2:
         told = (f"{name} {'none' if r2 is None else f'{r2:.3f}'}" for name, r2 in evaluation.ratio_r2.items())
         say(f"F_t / F_n is read with R2 {', '.join(told)}")

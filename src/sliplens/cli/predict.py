@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.command import NETWORK_HELP, SOURCE_HELP, Device, Friction, On, RetryFailed, SourceCommand
+from sliplens.cli.command import NETWORK_HELP, SOURCE_HELP, Device, Friction, InOrder, On, RetryFailed, SourceCommand
 from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
 from sliplens.files import require_new_file
@@ -44,6 +44,7 @@ class Predict(SourceCommand):
     onnx: Annotated[Path | None, tyro.conf.arg(metavar="FILE.onnx")] = None
     """The network as `sliplens export` wrote it; without it onnxruntime and openvino convert the network first."""
     friction: Friction = None
+    sequence: InOrder = False
     batch_size: int = 8
     """Frames predicted together; on a CPU more are slower, as they no longer fit its cache."""
     device: Device = "cpu"

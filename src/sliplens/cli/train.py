@@ -21,7 +21,8 @@ class Train(Command):
     recipe: str = "default"
     """default: a distribution over the margin, AdamW. thesis: as the thesis trained, one output and Ranger21.
     adapt: teaches the network of --start-from a sensor of your own, from some ten trials, in minutes. ratio: teaches it
-    F_t / F_n, for where friction is told; its margins stay. The options below change it."""
+    F_t / F_n, for where friction is told; its margins stay. sequence: teaches it to read several frames, beside one.
+    The options below change it."""
     input: str | None = None
     """What the network sees of a frame T_n and of the untouched sensor T_0. difference, unless --start-from sees
     something else: |T_n - T_0|, each image divided by its own maximum. raw: T_n. signed: T_n - T_0. amplitude:

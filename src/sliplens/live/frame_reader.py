@@ -122,6 +122,7 @@ class FrameReader:
         network: Run | None,
         *,
         friction: FrictionLike | None,
+        sequence: bool,
         smoothing_s: float,
         health: Callable[[Frame, Run | None], HealthWatch] | None,
         slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None,
@@ -140,6 +141,9 @@ class FrameReader:
             if network is None:
                 raise InputError("--friction makes a margin of what a network reads; name one with --network")
             network.require_ratio()
+        if sequence and network is None:
+            raise InputError("--sequence reads what a network says of several frames; name one with --network")
+        self._follower = network.follow(friction=friction) if network is not None and sequence else None
         self._smooth = LowPass(time_constant_s=smoothing_s)
         self._make_health, self._make_slip = health, slip
         self._health: HealthWatch | None = None
@@ -228,6 +232,8 @@ class FrameReader:
         if untouched or (markers is not None and markers.contact is False):
             reading = replace(reading, contact_state=ContactState.NO_CONTACT)
             withheld = withheld or (None if self.network is None else _NO_CONTACT)
+        if self._follower is not None and reading.contact_state == ContactState.NO_CONTACT:
+            self._follower.forget()
         if self._friction is not None:
             slipping_s = None if markers is None else markers.slipping_s
             touches = reading.contact_state != ContactState.NO_CONTACT
@@ -264,6 +270,8 @@ class FrameReader:
         assert self.network is not None
         friction = None if self._friction is None else self._friction.friction
         estimate = self.network.to_estimate(*answers.parts, friction=friction)
+        if self._follower is not None:
+            estimate = self._follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
         if self._friction is not None and ratio is not None and estimate.ratio is not None:
             self._friction.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
@@ -309,6 +317,8 @@ class FrameReader:
     def _begin_anew(self) -> None:
         """Forget what came before, where frames no longer follow each other."""
         self._smooth.forget()
+        if self._follower is not None:
+            self._follower.forget()
         self.markers_px = None
         if self._make_slip is not None and self.reference is not None:
             try:

@@ -119,6 +119,8 @@ class LiveReader:
     friction
         What is known of the coefficient of friction, as `predict` takes it, for a network that tells F_t / F_n. Slips
         that the markers tell narrow a range down; `Reading.friction` says what was assumed.
+    sequence
+        Whether what the frames of a contact so far tell counts too, as `predict` takes it.
     engine
         Row of `ENGINES`; `auto` for the fastest at hand that pays for `seconds`, or for hours where that is None, and
         that may take seconds to be made.
@@ -165,6 +167,7 @@ class LiveReader:
         options: SourceOptions | None = None,
         sensor: SensorProfile | Path | str | None = None,
         friction: FrictionLike | None = None,
+        sequence: bool = False,
         engine: str = "auto",
         device: str = "cpu",
         smoothing_s: float = 0.0,
@@ -204,6 +207,7 @@ class LiveReader:
             self.source,
             self.network,
             friction=friction,
+            sequence=sequence,
             smoothing_s=smoothing_s,
             health=health,
             slip=slip,

@@ -5,8 +5,9 @@ from sliplens.models.checkpoint import Estimate, Manifest, Ratio, Run, load, loa
 from sliplens.models.engines import ENGINES, Engine, make_engine, prepare
 from sliplens.models.onnx import export_onnx
 from sliplens.models.predictions import Predictions, predict
+from sliplens.models.sequence import Follower
 
 __all__ = [
-    "ENGINES", "Engine", "Estimate", "Manifest", "Predictions", "Ratio", "Run", "build_model", "export_onnx", "load",
+    "ENGINES", "Engine", "Estimate", "Follower", "Manifest", "Predictions", "Ratio", "Run", "build_model", "export_onnx", "load",
     "load_checkpoint", "make_engine", "predict", "prepare", "save_checkpoint",
 ]  # fmt: skip

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sliplens.errors import ModelError
 from sliplens.friction import Friction
+from sliplens.models.backbones import histogram_targets
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Shares of the frames for which an interval is to hold."""
@@ -132,6 +133,46 @@ def conformal_offset(
     missed = np.sort(np.maximum(low - margins, margins - high))
     rank = int(np.ceil(level * (len(missed) + 1)))
     return float(missed[min(rank, len(missed)) - 1])
+
+
+def calibrate_histogram(
+    logits: Float[Tensor, "frames bins"],
+    edges: Tensor,
+    temperature: Tensor,
+    labels: Float[Tensor, " frames"],
+    *,
+    kept: Calibration | None = None,
+) -> tuple[Calibration, Float[np.ndarray, "frames bins"]]:
+    """Fit and set the temperature of a histogram, unless it is kept; its calibration, and its probabilities then.
+
+    `logits`, `labels`: of validation frames; `temperature` is changed in place.
+    """
+    if kept is None:
+        temperature.fill_(fit_temperature(logits, histogram_targets(labels, edges.cpu())))
+    probabilities = torch.softmax(logits / temperature.cpu(), dim=-1).double().numpy()
+    numbers = edges.double().cpu().numpy()
+    values = probabilities @ ((numbers[1:] + numbers[:-1]) / 2)
+    kept = kept or conformal_calibration(values, probabilities, numbers, labels, temperature=float(temperature))
+    return kept, probabilities
+
+
+def conformal_calibration(
+    values: Float[np.ndarray, " frames"],
+    probabilities: Float[np.ndarray, "frames bins"] | None,
+    edges: Float[np.ndarray, " edges"] | None,
+    labels: Float[Tensor, " frames"],
+    *,
+    temperature: float,
+) -> Calibration:
+    """Intervals that hold as often as they say on validation frames with these labels."""
+    truth = labels.double().numpy()
+    ends = {level: raw_interval(values, probabilities, edges, level) for level in LEVELS}
+    return Calibration(
+        temperature=temperature,
+        offsets={str(level): conformal_offset(*ends[level], truth, level=level) for level in LEVELS},
+        frames=len(truth),
+        mse=float(np.mean((values - truth) ** 2)),
+    )
 
 
 _DOUBT = 0.1

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
@@ -19,13 +19,14 @@ from sliplens.extras import require_device
 from sliplens.files import MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import MOST_PIXELS
-from sliplens.models.backbones import Answers, bin_edges, build_model, ratio_edges
+from sliplens.models.backbones import Answers, HistogramRegressor, bin_edges, build_model, ratio_edges
 from sliplens.models.calibration import Calibration, Traction, raw_interval, spread, told_probabilities
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty, watch_features
+from sliplens.models.sequence import Follower, SequenceHead, SequenceManifest
 from sliplens.results.evaluation import Training
 
-WEIGHTS_FILE = "model.safetensors"
+WEIGHTS_FILE, SEQUENCE_FILE = "model.safetensors", "sequence.safetensors"
 SCHEMA_VERSION = 1
 LARGEST_INPUT = 4096  # pixels along a side, several times what any backbone was made for
 
@@ -51,6 +52,8 @@ class Manifest:
     """Of the second answer, F_t / F_n; None for a network that answers with the margin alone."""
     novelty: Novelty | None = None
     """Where its training frames lie in its features; None where that was never fitted."""
+    sequence: SequenceManifest | None = None
+    """Of the margins that it reads from several frames; None where it reads each frame by itself alone."""
     versions: dict[str, str] = field(default_factory=dict)
     trained_on: tuple[str, ...] = ()
     """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""
@@ -81,6 +84,8 @@ class Run:
     manifest: Manifest
     training: Training | None = None
     """How it was trained, with its learning curve; None where its folder does not tell."""
+    sequence: SequenceHead | None = None
+    """What makes one margin of several frames, see `follow`; None where each frame is read by itself alone."""
 
     def __repr__(self) -> str:
         """What it is, in a few lines: the layers are in `model`."""
@@ -250,6 +255,23 @@ class Run:
             as_friction(friction), trained_friction=np.array(traction.friction), calibration=traction.told
         )
 
+    def follow(self, *, friction: object = None) -> Follower:
+        """What reads the frames of a sensor in order.
+
+        `InputError` for a network that was never taught to, and where `friction` is told, which is what it looks for.
+        """
+        kept = self.manifest.sequence
+        if friction is not None:
+            raise InputError(
+                "--sequence finds out what friction may be, and --friction tells it; leave out one of them"
+            )
+        if self.sequence is None or kept is None:
+            raise InputError(
+                "this network reads each frame by itself; leave out --sequence, or teach it with `sliplens train DATA "
+                "-o RUN --start-from NETWORK --recipe sequence`"
+            )
+        return Follower(self.sequence, kept)
+
     def require_ratio(self) -> Traction:
         """What the second answer is; `InputError` for a network that answers with the margin alone."""
         if self.manifest.traction is None:
@@ -309,6 +331,13 @@ class Estimate:
 
     An unknown friction is nothing strange: a network that was trained on frictions from 0.15 to 1.2 takes wet for one
     more of them, and no value of this warns of it."""
+
+    def at(self, rows: Int[np.ndarray, " rows"] | Bool[np.ndarray, " frames"]) -> "Estimate":
+        """Some of the frames."""
+        ratio = self.ratio and replace(self.ratio, probabilities=self.ratio.probabilities[rows])
+        parts = {name: getattr(self, name) for name in ("probabilities", "known")}
+        parts = {name: None if values is None else values[rows] for name, values in parts.items()}
+        return replace(self, margin=self.margin[rows], ratio=ratio, **parts)
 
     @property
     def sigma(self) -> Float[np.ndarray, " frames"] | None:
@@ -375,26 +404,34 @@ def tell_each(
 ) -> Estimate:
     """Tell each frame the friction of its own trial, exactly."""
     assert estimate.probabilities is not None
-    assert estimate.ratio is not None
     margin, probabilities = np.empty_like(estimate.margin), np.empty_like(estimate.probabilities)
     for value in np.unique(friction):
         rows = friction == value
-        ratio = replace(estimate.ratio, probabilities=estimate.ratio.probabilities[rows])
-        own = {"margin": estimate.margin[rows], "probabilities": estimate.probabilities[rows]}
-        some = replace(estimate, **own, ratio=ratio)
-        told = some.told(Friction(float(value)), trained_friction=trained_friction)
+        told = estimate.at(rows).told(Friction(float(value)), trained_friction=trained_friction)
         assert told.probabilities is not None
         margin[rows], probabilities[rows] = told.margin, told.probabilities
     return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration)
 
 
-def save_checkpoint(folder: Path, model: nn.Module, manifest: Manifest) -> None:
-    """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last."""
-    weights = folder / WEIGHTS_FILE
+def save_checkpoint(
+    folder: Path, model: nn.Module, manifest: Manifest, *, sequence: SequenceHead | None = None
+) -> None:
+    """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last.
+
+    `sequence`: the head that reads several frames, of a manifest that tells of one.
+    """
+    if manifest.sequence is not None and sequence is not None:
+        hashed = _save_weights(folder / SEQUENCE_FILE, sequence)
+        manifest = replace(manifest, sequence=replace(manifest.sequence, weights_sha256=hashed))
+    hashed = _save_weights(folder / WEIGHTS_FILE, model)
+    save_record(replace(manifest, weights_sha256=hashed), folder / MANIFEST_FILE)
+
+
+def _save_weights(path: Path, model: nn.Module) -> str:
     values = save({name: value.detach().cpu().contiguous() for name, value in model.state_dict().items()})
-    with whole_file(weights) as part:
+    with whole_file(path) as part:
         part.write_bytes(values)
-    save_record(replace(manifest, weights_sha256=hash_file(weights)), folder / MANIFEST_FILE)
+    return hash_file(path)
 
 
 def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
@@ -404,33 +441,44 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
     weights were changed or damaged, or they do not fit the backbone.
     """
     require_folder(folder, what="the run")
-    weights, manifest = folder / WEIGHTS_FILE, read_manifest(folder)
-    if not weights.is_file():
-        raise CheckpointError(f"{weights} is missing; train the network again or copy the whole folder")
-    if hash_file(weights) != manifest.weights_sha256:
-        raise CheckpointError(f"{weights} is not the file its manifest describes; copy the whole folder again")
+    manifest = read_manifest(folder)
     model = build_model(manifest.backbone, head=manifest.head, colours=ENCODINGS.pick(manifest.input).colours)
-    try:
-        values, own = load_file(weights, device="cpu"), model.state_dict()
-        model.load_state_dict(values)
-    except (SafetensorError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
-        raise CheckpointError(
-            f"{weights} does not hold a {manifest.backbone} with a {manifest.head} head ({reason})"
-        ) from None
-    # halves are widened: networks of the package are stored as such
-    kept = {name: {tensor.dtype, torch.float16} for name, tensor in own.items()}
-    strange = [name for name in own if values[name].dtype not in kept[name] or not values[name].isfinite().all()]
-    if strange:
-        raise CheckpointError(f"{weights} holds what is no number in {strange[0]}; train the network again")
+    what = f"a {manifest.backbone} with a {manifest.head} head"
+    _load_weights(folder / WEIGHTS_FILE, model, what=what, sha256=manifest.weights_sha256)
     if manifest.novelty is not None and manifest.novelty.layer not in dict(model.named_modules()):
         raise CheckpointError(f"{folder / MANIFEST_FILE} names a layer that the network has not; copy the folder again")
+    sequence = None
+    if manifest.sequence is not None:
+        if not isinstance(model, HistogramRegressor) or model.ratio_edges is None:
+            raise CheckpointError(f"{folder / MANIFEST_FILE} tells of several frames, whose head reads F_t / F_n too")
+        sequence = SequenceHead(model.edges, model.ratio_edges)
+        hashed = manifest.sequence.weights_sha256
+        _load_weights(folder / SEQUENCE_FILE, sequence, what="a head of several frames", sha256=hashed)
+        sequence = sequence.to(device).eval()
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
     # the networks of the package come without their learning curve
     told = (folder / "curve.parquet").is_file()
     training = load_result(folder, Training, command="sliplens train") if told else None
-    return Run(model=model, manifest=manifest, training=training)
+    return Run(model=model, manifest=manifest, training=training, sequence=sequence)
+
+
+def _load_weights(path: Path, model: nn.Module, *, what: str, sha256: str) -> None:
+    """Fill a network with the weights of a file that is the one its manifest names, and holds numbers alone."""
+    if not path.is_file():
+        raise CheckpointError(f"{path} is missing; train the network again or copy the whole folder")
+    if hash_file(path) != sha256:
+        raise CheckpointError(f"{path} is not the file its manifest describes; copy the whole folder again")
+    try:
+        values, own = load_file(path, device="cpu"), model.state_dict()
+        model.load_state_dict(values)
+    except (SafetensorError, RuntimeError) as error:
+        raise CheckpointError(f"{path} does not hold {what} ({str(error).splitlines()[0]})") from None
+    # halves are widened: networks of the package are stored as such
+    kept = {name: {tensor.dtype, torch.float16} for name, tensor in own.items()}
+    strange = [name for name in own if values[name].dtype not in kept[name] or not values[name].isfinite().all()]
+    if strange:
+        raise CheckpointError(f"{path} holds what is no number in {strange[0]}; train the network again")
 
 
 def read_manifest(run: str | Path) -> Manifest:

@@ -29,7 +29,7 @@ from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, Frames, Trials, open_trials
 from sliplens.recordings.trial import ContactState
-from sliplens.shards import MakePart, Work, make_table
+from sliplens.shards import LONGEST, MakePart, Work, make_table
 
 LEVEL = 0.9
 """Confidence of the intervals."""
@@ -172,6 +172,7 @@ def predict(
     format: str | None = None,
     options: ReadOptions | None = None,
     friction: FrictionLike | None = None,
+    sequence: bool = False,
     sensor: SensorProfile | Path | str | None = None,
     engine: str = "auto",
     onnx_file: Path | None = None,
@@ -201,6 +202,9 @@ def predict(
     friction
         What is known of the object's coefficient of friction, for a network that tells F_t / F_n: a number, (low,
         high), or a `Friction`, such as one learnt from slips. If None, it may be any that the training had.
+    sequence
+        Read each trial in order: what the frames of a contact so far tell of its friction and of sliding counts too
+        (`Follower`). The times of the frames must be known, and friction is not told then.
     engine
         Row of `ENGINES`; `auto` for the fastest at hand that pays.
     onnx_file
@@ -255,6 +259,8 @@ def predict(
     known = None if friction is None else as_friction(friction)
     if known is not None:
         trained.require_ratio()
+    if sequence:
+        trained.follow(friction=known)
     with stage(on_progress, "Opening the source"):
         trials = open_trials(
             source,
@@ -284,9 +290,10 @@ def predict(
     make = partial(make_engine, engine, trained, **run_with)
     recipe = run_with | {"onnx_file": onnx_file and hash_file(onnx_file), "engine": engine, **metadata}
     recipe |= {"columns": schema.names, "device": str(trained.device), "source": trials.recipe}
+    recipe |= {"sequence": True} if sequence else {}
     written, rows = make_table(
-        _Reading(trained=trained, trials=trials, schema=schema, friction=known, make_engine=make),
-        partial(trials.shards, recipe),
+        _Reading(trained=trained, trials=trials, schema=schema, friction=known, sequence=sequence, make_engine=make),
+        partial(trials.shards, recipe, longest=None if sequence else LONGEST),
         path,
         title=f"Predicting frames ({trained.manifest.input})",
         recipe=recipe,
@@ -392,6 +399,7 @@ class _Reading(Work):
     trials: Trials
     schema: pa.Schema
     friction: Friction | None
+    sequence: bool
     make_engine: Callable[[], Engine]
 
     @property
@@ -425,6 +433,7 @@ class _Reading(Work):
         # batches are encoded while the ones before are under way; first frame of each, which touch, and features
         encoded: deque[tuple[int, list[bool], np.ndarray | None]] = deque()
         novelty = self.trained.novelty
+        follower = self.trained.follow() if self.sequence else None
 
         def encode() -> Iterator[Tensor]:
             while batch := list(islice(frames, engine.batch_size)):
@@ -444,6 +453,11 @@ class _Reading(Work):
         for answers in engine.answers(encode()):
             first, touches, features = encoded.popleft()
             estimate = self.trained.to_estimate(*answers, friction=self.friction, features=features)
+            if follower is not None:
+                if capture.time_s is None:
+                    raise InputError("--sequence reads frames by their times, and nobody tells them here; leave it out")
+                times = capture.time_s[first : first + len(touches)]
+                estimate = follower.update(estimate, times, np.array(touches))
             for name, values in (_columns(estimate, capture, first) | {"touches": touches}).items():
                 if name in rows:
                     rows[name].extend(values)

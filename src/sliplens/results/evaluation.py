@@ -281,6 +281,8 @@ class Evaluation:
     predictions: Predictions
     friction: str = ""
     """What the network was told of the coefficient of friction; empty where nothing was."""
+    sequence: bool = False
+    """Whether each margin was read from the frames of its contact so far, not from one alone."""
     ratio_r2: dict[str, float | None] = field(default_factory=dict)
     """R2 of the traction ratio F_t / F_n by condition; empty for a network that answers with the margin alone, None
     where the ratio does not vary or no force is known."""

@@ -41,10 +41,11 @@ class TrainConfig:
     augmentation: str = "default"
     untouched_share: float = 0.05
     """Images of the untouched sensor, as full stick, for each labelled frame."""
-    learns: Literal["all", "weights", "ratio"] = "all"
+    learns: Literal["all", "weights", "ratio", "sequence"] = "all"
     """What changes. all: weights, and the statistics of batch normalisation. weights: these statistics stay.
     ratio: the rows of the last layer that answer with F_t / F_n, so that margins stay to the
-    bit; what that layer sees is computed once, without augmentation."""
+    bit; what that layer sees is computed once, without augmentation. sequence: a head beside the network, which makes
+    one margin of its answers to several frames; a batch is so many trials."""
     epoch_frames: int | None = None
     """Images of an epoch, drawn from all: few trials come again, of long ones some; each frame once if None."""
     patience: int | None = None
@@ -72,6 +73,8 @@ class TrainConfig:
                 "a network whose margins stay learns F_t / F_n alone, by AdamW without weight decay and augmentation; "
                 "leave out --head, --optimizer and --augmentation"
             )
+        if self.learns == "sequence" and (self.max_minutes is not None or self.optimizer != "adamw"):
+            raise InputError("a head of several frames is trained by AdamW; leave out --max-minutes and --optimizer")
         head_outputs(self.head)
         get_augmentation(self.augmentation)
 
@@ -90,6 +93,15 @@ _RECIPES = {
     "ratio": TrainConfig(
         recipe="ratio", head="margin-and-ratio", epochs=20, weight_decay=0.0, augmentation="none", learns="ratio"
     ),
+    "sequence": TrainConfig(
+        recipe="sequence",
+        head="margin-and-ratio",
+        epochs=60,
+        batch_size=32,
+        learning_rate=3e-3,
+        augmentation="none",
+        learns="sequence",
+    ),
     "adapt": TrainConfig(
         recipe="adapt",
         head="histogram",
@@ -105,8 +117,8 @@ RECIPES = Table("recipe", "sliplens.recipes", _RECIPES)
 """`thesis` is that of Polak, section 4: ShuffleNetV2 x1.0 from scratch, one output, Ranger21 with its defaults, mean
 squared error, 25 epochs, batches of 124, 224 x 224 pixels, a learning rate of 8e-4, mixed precision, the best
 checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md tells why. `ratio` teaches a
-network that is there its second answer, F_t / F_n, and `adapt` a sensor of your own from few trials, both in
-minutes."""
+network that is there its second answer, F_t / F_n, `sequence` to read several frames, and `adapt` a sensor of your own
+from few trials, all in minutes."""
 
 
 def get_recipe(name: str) -> TrainConfig:

@@ -166,6 +166,7 @@ def evaluate(
     *,
     split: str = "test",
     friction: FrictionLike | None = None,
+    sequence: bool = False,
     baselines: Sequence[str] = (),
     baseline_trials: int = 40,
     markers: str | None = None,
@@ -187,6 +188,8 @@ def evaluate(
     friction
         What the network is told of the coefficient of friction, as `predict` takes it; `each` tells it that of every
         trial, exactly, as its labels have it. A network without the answer F_t / F_n cannot be told.
+    sequence
+        Read each trial in order, as `predict` takes it; frames without a label are left out.
     baselines, baseline_trials
         Estimators to put beside the network, rows of `markers.estimators.ESTIMATORS` or `all`, and how many training
         trials they are fitted on, spread evenly over those of the data set.
@@ -206,6 +209,8 @@ def evaluate(
     told = friction if friction is None or friction == EACH else as_friction(friction)
     if told is not None:
         run.require_ratio()
+    if sequence:
+        run.follow(friction=told)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     trials = data.select(split=split)
     for trial in trials:
@@ -214,14 +219,17 @@ def evaluate(
         if words is not None:
             note(on_progress, words)
     plan = _plan_baselines(baselines, data, trials, count=baseline_trials, markers=markers) if baselines else None
+    asked: dict[str, Any] = {"split": split, "friction": told, "sequence": sequence}
     if out is None:
         with scratch_folder() as folder:
-            return _evaluate(run, data, trials, plan, folder, split=split, friction=told, on_progress=on_progress)
+            return _evaluate(run, data, trials, plan, folder, **asked, on_progress=on_progress)
     kept = run.manifest
     recipe: dict[str, Any] = {"weights_sha256": kept.weights_sha256, "data_hash": data.hash, "input": kept.input}
     recipe["split"] = split
     if told is not None:
         recipe["friction"] = str(told)
+    if sequence:
+        recipe["sequence"] = kept.sequence
     if plan is not None:
         trained_on = [trial.trial for trial in plan.training]
         recipe["baselines"] = {"estimators": plan.estimators, "markers": plan.markers, "trials": trained_on}
@@ -229,9 +237,7 @@ def evaluate(
         if output.complete:
             evaluation = load_result(output.folder, Evaluation, command="sliplens evaluate")
         else:
-            evaluation = _evaluate(
-                run, data, trials, plan, output.folder, split=split, friction=told, on_progress=on_progress
-            )
+            evaluation = _evaluate(run, data, trials, plan, output.folder, **asked, on_progress=on_progress)
             save_result(evaluation, output.folder)
     wrote(on_progress, Path(out), "scores and predictions", kept=output.complete)
     return evaluation
@@ -246,13 +252,15 @@ def _evaluate(
     *,
     split: str,
     friction: FrictionLike | None,
+    sequence: bool,
     on_progress: OnProgress | None,
 ) -> Evaluation:
     size = run.manifest.image_size
     with stage(on_progress, f"Reading {split} trials ({run.manifest.input})") as count:
         frames = load_frames(data, trials, encoding=run.encoding, image_size=size, on_progress=count)
     with stage(on_progress, "Predicting frames") as count:
-        evaluation = evaluate_frames(run, frames, split=split, friction=friction, on_progress=count)
+        asked: dict[str, Any] = {"split": split, "friction": friction, "sequence": sequence}
+        evaluation = evaluate_frames(run, frames, **asked, on_progress=count)
     evaluation = replace(evaluation, known_trials=len(find_known(trials, run)))
     if plan is None:
         return evaluation
@@ -294,6 +302,7 @@ def evaluate_frames(
     *,
     split: str = "test",
     friction: FrictionLike | None = None,
+    sequence: bool = False,
     batch_size: int = 64,
     on_progress: OnProgress | None = None,
 ) -> Evaluation:
@@ -305,8 +314,8 @@ def evaluate_frames(
         Labelled frames in the network's encoding and size, as `load_frames` gives them.
     split
         What they are called in the result.
-    friction
-        Coefficient of friction that is told, as `evaluate` takes it.
+    friction, sequence
+        As `evaluate` takes them.
 
     Raises
     ------
@@ -316,6 +325,8 @@ def evaluate_frames(
     if not len(frames):
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
     estimate = _estimate(run, frames.batches(batch_size, on_progress), frames.friction, told=friction)
+    if sequence:
+        estimate = _follow_trials(run, estimate, frames.trial, frames.time_s)
     levels = estimate.calibration.offsets if estimate.calibration else ()
     intervals = {level: ends for level in levels if (ends := estimate.interval(float(level)))}
     unknown, sigma = np.full(len(frames), np.nan), estimate.sigma
@@ -365,6 +376,7 @@ def evaluate_frames(
             np.abs(predictions.prediction - predictions.safety_margin),
             {"known": estimate.known, "spread": None if sigma is None else -sigma},
         ),
+        sequence=sequence,
         friction="that of each trial, told exactly" if friction == EACH else str(estimate.friction or ""),
         ratio_r2={} if estimate.ratio is None else _ratio_r2(estimate.ratio.mean, frames),
     )
@@ -381,6 +393,22 @@ def _estimate(
         raise RecordingError("not every trial has a coefficient of friction to tell; name one, or leave it out")
     estimate = run.estimate_batches(batches)
     return tell_each(estimate, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
+
+
+def _follow_trials(
+    run: Run, estimate: Estimate, trial: Sequence[str], time_s: Float[np.ndarray, " frames"]
+) -> Estimate:
+    """Read the frames of each trial in the order of their times (`Follower`); all of them touch."""
+    assert estimate.probabilities is not None
+    margin, probabilities = np.empty_like(estimate.margin), np.empty_like(estimate.probabilities)
+    names, calibration = np.array(trial), None
+    for name in dict.fromkeys(trial):
+        rows = np.flatnonzero(names == name)
+        rows = rows[np.argsort(time_s[rows], kind="stable")]
+        read = run.follow().update(estimate.at(rows), time_s[rows], np.ones(len(rows), dtype=bool))
+        assert read.probabilities is not None
+        margin[rows], probabilities[rows], calibration = read.margin, read.probabilities, read.calibration
+    return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration)
 
 
 def _ratio_r2(ratio: Float[np.ndarray, " frames"], frames: FrameSet) -> dict[str, float | None]:

@@ -25,12 +25,11 @@ from sliplens.models.backbones import (
     REFERENCE_SIGNS,
     HistogramRegressor,
     bin_edges,
-    histogram_targets,
     last_layer,
     with_ratio,
     with_reference,
 )
-from sliplens.models.calibration import LEVELS, Calibration, Traction, conformal_offset, fit_temperature, raw_interval
+from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
 from sliplens.models.checkpoint import Estimate, Ratio, load, tell_each
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty, fit_novelty
@@ -41,6 +40,7 @@ from sliplens.results.evaluation import Training
 from sliplens.training.config import TrainConfig, get_recipe, open_logger
 from sliplens.training.data import EpochShuffle, FrameSet, extract_features, get_augmentation, load_frames, make_loaders
 from sliplens.training.module import Clock, DivergedError, Regressor, make_trainer, run_trainer, share_of_batch
+from sliplens.training.sequence import fit_sequence
 
 _ENOUGH_TRIALS, _FEW_TRIALS = 10, 30
 """Labelled trials with which adapting has nine tenths of the R2 of a hundred, and up to which it beat a network that
@@ -49,6 +49,7 @@ _KIND = {
     "all": ("backbone", "head"),
     "weights": ("backbone", "head", "image_size"),
     "ratio": ("backbone", "image_size"),
+    "sequence": ("backbone", "head", "image_size"),
 }
 """What a network to start from keeps, by what is learnt."""
 _NOVELTY_FRAMES = 2000
@@ -114,6 +115,8 @@ def train(
     share_of_batch(config.batch_size, trainer.world_size)
     if start is not None:
         require_same_kind(start, config, input)
+    if config.learns == "sequence" and trainer.world_size > 1:
+        raise InputError("a head of several frames is trained by one process; leave out --devices and --num-nodes")
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = ENCODINGS.pick(input), _choose_trials(data, condition)
     _require_varied_labels(data, trials[0])
@@ -128,6 +131,11 @@ def train(
         folder: Path, *, scratch: Path, logger: Logger | None = None, on_progress: OnProgress | None = None
     ) -> Training:
         """Read the frames and fit: what every process does alike."""
+        if config.learns == "sequence":
+            assert start is not None
+            return replace(
+                fit_sequence(config, start, data, trials, folder, on_progress=on_progress), condition=condition
+            )
         read = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=scratch)
         frames = []
         for what, some, share in zip(("training", "validation"), trials, (config.untouched_share, 0.0), strict=True):
@@ -256,14 +264,14 @@ def calibrate(
     labels = validation.safety_margin
     if not isinstance(model, HistogramRegressor):
         margins = outputs.reshape(-1).double().numpy()
-        return _offsets(margins, None, None, labels, temperature=1.0), None
+        return conformal_calibration(margins, None, None, labels, temperature=1.0), None
     logits, ratio_logits = outputs[:, : len(model.edges) - 1], outputs[:, len(model.edges) - 1 :]
-    calibration, probabilities = _calibrate_histogram(logits, model.edges, model.temperature, labels, kept=kept)
+    calibration, probabilities = calibrate_histogram(logits, model.edges, model.temperature, labels, kept=kept)
     if model.ratio_edges is None or model.ratio_temperature is None or trained_friction is None:
         return calibration, None
     known = torch.isfinite(validation.traction_ratio) & torch.from_numpy(np.isfinite(validation.friction))
     ratios = validation.traction_ratio[known]
-    of_ratio, ratio_probabilities = _calibrate_histogram(
+    of_ratio, ratio_probabilities = calibrate_histogram(
         ratio_logits[known], model.ratio_edges, model.ratio_temperature, ratios
     )
     quantiles = np.quantile(trained_friction[np.isfinite(trained_friction)], np.linspace(0, 1, 11))
@@ -276,45 +284,10 @@ def calibrate(
         ratio=Ratio(probabilities=ratio_probabilities, edges=model.ratio_edges.double().cpu().numpy()),
     )
     told = tell_each(untold, validation.friction[known.numpy()], trained_friction=quantiles)
-    told_calibration = _offsets(
+    told_calibration = conformal_calibration(
         told.margin, told.probabilities, edges, labels[known], temperature=calibration.temperature
     )
     return calibration, Traction(calibration=of_ratio, told=told_calibration, friction=tuple(quantiles.tolist()))
-
-
-def _calibrate_histogram(
-    logits: Float[Tensor, "frames bins"],
-    edges: Tensor,
-    temperature: Tensor,
-    labels: Float[Tensor, " frames"],
-    *,
-    kept: Calibration | None = None,
-) -> tuple[Calibration, Float[np.ndarray, "frames bins"]]:
-    """Fit and set the temperature of a histogram, unless it is kept; its calibration, and its probabilities then."""
-    if kept is None:
-        temperature.fill_(fit_temperature(logits, histogram_targets(labels, edges.cpu())))
-    probabilities = torch.softmax(logits / temperature.cpu(), dim=-1).double().numpy()
-    numbers = edges.double().cpu().numpy()
-    values = probabilities @ ((numbers[1:] + numbers[:-1]) / 2)
-    return kept or _offsets(values, probabilities, numbers, labels, temperature=float(temperature)), probabilities
-
-
-def _offsets(
-    values: Float[np.ndarray, " frames"],
-    probabilities: Float[np.ndarray, "frames bins"] | None,
-    edges: Float[np.ndarray, " edges"] | None,
-    labels: Float[Tensor, " frames"],
-    *,
-    temperature: float,
-) -> Calibration:
-    truth = labels.double().numpy()
-    ends = {level: raw_interval(values, probabilities, edges, level) for level in LEVELS}
-    return Calibration(
-        temperature=temperature,
-        offsets={str(level): conformal_offset(*ends[level], truth, level=level) for level in LEVELS},
-        frames=len(truth),
-        mse=float(np.mean((values - truth) ** 2)),
-    )
 
 
 def _spread_batches(frames: FrameSet, *, batch_size: int) -> Iterator[Tensor]:

@@ -234,7 +234,11 @@ class Clock(Callback):
                 f"the validation error is {validation} after epoch {trainer.current_epoch + 1}; "
                 "lower the learning rate and try again"
             )
-        self.rows.append([epoch, train, validation, self.seconds / 60])
+        self.add_row(epoch, train, validation)
+
+    def add_row(self, epoch: float, train_mse: float, validation_mse: float) -> None:
+        """Add an epoch to the learning curve, and write it."""
+        self.rows.append([epoch, train_mse, validation_mse, self.seconds / 60])
         if self.metrics_file is not None:
             lines = ["epoch,train_mse,validation_mse,minutes"]
             lines += [f"{r[0]:.3f},{r[1]:.6g},{r[2]:.6g},{r[3]:.4f}" for r in self.rows]

@@ -1,0 +1,160 @@
+"""Several frames: laws of the head that reads them, and of what is kept of it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small import save_untrained
+
+import sliplens as sl
+from sliplens.errors import CheckpointError, InputError
+from sliplens.models import Run, load_checkpoint, save_checkpoint
+from sliplens.models.calibration import Calibration, Traction
+from sliplens.models.checkpoint import Estimate
+from sliplens.models.sequence import SequenceHead, SequenceManifest
+from sliplens.recordings import Dataset
+from sliplens.recordings.trial import ContactState
+
+EDGES, RATIO_EDGES = torch.linspace(-0.1, 1.1, 61), torch.linspace(-0.1, 1.5, 81)
+SURE = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A network with two answers and a head for several frames, all of random weights."""
+    traction = Traction(calibration=SURE, told=SURE, friction=(0.2, 0.7, 1.2))
+    folder = save_untrained(tmp_path_factory.mktemp("sequence") / "run", traction=traction)
+    alone = load_checkpoint(folder)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(3)
+        head = SequenceHead(EDGES, RATIO_EDGES)
+        torch.nn.init.normal_(head.correction.weight)
+    save_checkpoint(
+        folder,
+        alone.model,
+        replace(alone.manifest, sequence=SequenceManifest(calibration=SURE, mse_one=0.02)),
+        sequence=head,
+    )
+    return load_checkpoint(folder)
+
+
+def answers(frames: int, *, seed: int = 0) -> Estimate:
+    """What a network might say of frames: distributions drawn at random."""
+    rng = np.random.default_rng(seed)
+    edges, ratio_edges = EDGES.double().numpy(), RATIO_EDGES.double().numpy()
+    margin = rng.dirichlet(np.full(60, 0.3), frames)
+    ratio = sl.models.Ratio(probabilities=rng.dirichlet(np.full(80, 0.3), frames), edges=ratio_edges)
+    mean = margin @ ((edges[1:] + edges[:-1]) / 2)
+    return Estimate(margin=mean, calibration=SURE, probabilities=margin, edges=edges, ratio=ratio)
+
+
+def follow(run: Run, estimate: Estimate, *, pieces: int = 1, touches: np.ndarray | None = None) -> np.ndarray:
+    """Margins that are read from the frames in order, so many pieces of them at once; 30 frames a second."""
+    follower, rows = run.follow(), np.arange(len(estimate.margin))
+    touches = np.ones(len(rows), dtype=bool) if touches is None else touches
+    parts = [follower.update(estimate.at(some), some / 30, touches[some]) for some in np.array_split(rows, pieces)]
+    return np.concatenate([part.margin for part in parts])
+
+
+def test_frames_one_by_one_are_read_as_all_at_once(run: Run):
+    estimate = answers(17)
+    assert np.array_equal(follow(run, estimate), follow(run, estimate, pieces=17))
+    assert np.array_equal(follow(run, estimate), follow(run, estimate, pieces=4))
+
+
+def test_an_answer_depends_on_the_frames_so_far_alone(run: Run):
+    first, other = answers(12), answers(12, seed=1)
+    assert first.probabilities is not None
+    assert other.probabilities is not None
+    mixed = replace(first, probabilities=np.concatenate([first.probabilities[:7], other.probabilities[7:]]))
+    assert np.array_equal(follow(run, first)[:7], follow(run, mixed)[:7])
+    assert not np.isclose(follow(run, first)[7:], follow(run, mixed)[7:]).any()
+
+
+def test_memory_counts_and_ends_with_the_contact(run: Run):
+    estimate = answers(6)
+    twice = estimate.at(np.r_[0:6, 0:6])
+    again = follow(run, twice)
+    assert not np.isclose(again[6:], again[:6]).any()
+    touches = np.ones(13, dtype=bool)
+    touches[6] = False
+    lifted = follow(run, estimate.at(np.r_[0:6, 0, 0:6]), touches=touches)
+    # times differ by a shift, whose differences round
+    np.testing.assert_allclose(lifted[7:], lifted[:6], atol=1e-6)
+    assert lifted[6] == estimate.margin[0]
+
+
+def test_a_head_that_learnt_nothing_leaves_answers_as_they_are(run: Run):
+    untaught = replace(run, sequence=SequenceHead(EDGES, RATIO_EDGES).eval())
+    estimate = answers(5)
+    # bins of less than 1e-6 are lifted to it, 60 of them at most, and floats have 24 bits
+    np.testing.assert_allclose(follow(untaught, estimate), estimate.margin, atol=1e-4)
+
+
+def test_the_gradient_of_a_fresh_head_points_from_the_answer_to_the_label():
+    head = SequenceHead(EDGES, RATIO_EDGES, dropout=0.0)
+    estimate = answers(8)
+    assert estimate.ratio is not None
+    margin, ratio = (torch.from_numpy(one.probabilities).float()[None] for one in (estimate, estimate.ratio))
+    label = torch.full((8,), 20)
+    logits, _ = head(margin, ratio, torch.full((1, 8), 0.1))
+    torch.nn.functional.cross_entropy(logits[0], label).backward()
+    expected = margin[0].clamp_min(1e-6)
+    expected = (expected / expected.sum(-1, keepdim=True)).mean(0) - torch.eye(60)[20]
+    torch.testing.assert_close(head.correction.bias.grad, expected, atol=1e-6, rtol=1e-4)
+
+
+def test_one_frame_is_read_as_before(run: Run, small_dataset: Dataset):
+    trial = small_dataset.load(small_dataset.trials[0])
+    alone = sl.predict(replace(run, sequence=None), trial.frames, reference=trial.reference)
+    assert sl.predict(run, trial.frames, reference=trial.reference).frame().equals(alone.frame())
+
+
+def test_a_recording_is_read_as_the_follower_reads_it(run: Run, small_dataset: Dataset, tmp_path: Path):
+    info = small_dataset.trials[0]
+    table = sl.predict(run, small_dataset, split="train", sequence=True).frame()
+    rows = table.filter(np.array([name == info.trial for name in table["trial"].to_pylist()]))
+    trial = small_dataset.load(info)
+    estimate = run.estimate(run.encode(trial.frames, trial.reference))
+    touches = np.array([state != ContactState.NO_CONTACT for state in trial.contact_state])
+    expected = run.follow().update(estimate, trial.time_s, touches)
+    np.testing.assert_allclose(rows["prediction"].to_numpy(), expected.margin, atol=1e-5)
+    low, _ = expected.interval(0.9) or pytest.fail("a taught head has intervals")
+    np.testing.assert_allclose(rows["low_90"].to_numpy(), low, atol=1e-5)
+    written = sl.predict(run, small_dataset, split="train", sequence=True, out=tmp_path / "margins").frame()
+    assert written["prediction"].equals(table["prediction"])
+
+
+def test_evaluation_reads_labelled_frames_in_order(run: Run, small_dataset: Dataset):
+    evaluation = sl.evaluate(run, small_dataset, sequence=True)
+    assert evaluation.sequence
+    found = evaluation.predictions
+    for name in np.unique(found.trial):
+        trial = small_dataset.load(next(one for one in small_dataset.trials if one.trial == name))
+        rows = trial.labelled
+        estimate = run.estimate(run.encode(trial.frames[rows], trial.reference))
+        expected = run.follow().update(estimate, trial.time_s[rows], np.ones(rows.sum(), dtype=bool))
+        np.testing.assert_allclose(found.prediction[found.trial == name], expected.margin, atol=1e-5)
+
+
+def test_what_cannot_be_followed_is_refused(run: Run, small_dataset: Dataset):
+    with pytest.raises(InputError, match="--recipe sequence"):
+        sl.predict("chromatouch-raw", small_dataset, sequence=True)
+    with pytest.raises(InputError, match="leave out one of them"):
+        sl.predict(run, small_dataset, sequence=True, friction=0.6)
+    with pytest.raises(InputError, match="times"):
+        sl.predict(run, small_dataset.load(small_dataset.trials[0]).frames, sequence=True)
+
+
+def test_a_damaged_head_is_refused(run: Run, tmp_path: Path):
+    save_checkpoint(tmp_path, run.model, run.manifest, sequence=run.sequence)
+    weights = tmp_path / "sequence.safetensors"
+    kept = weights.read_bytes()
+    weights.write_bytes(kept[:-1] + bytes([kept[-1] ^ 1]))
+    with pytest.raises(CheckpointError, match="not the file its manifest describes"):
+        load_checkpoint(tmp_path)
+    weights.unlink()
+    with pytest.raises(CheckpointError, match=r"sequence\.safetensors is missing"):
+        load_checkpoint(tmp_path)

@@ -1,0 +1,93 @@
+"""Teaching a network to read several frames."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small import save_untrained
+
+from sliplens.errors import InputError, ModelError
+from sliplens.models import load_checkpoint
+from sliplens.models.calibration import Calibration, Traction
+from sliplens.recordings import Dataset
+from sliplens.training import sequence as sequences
+from sliplens.training import train
+
+
+@pytest.fixture(scope="module")
+def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    calibration = Calibration(temperature=1.0, offsets={"0.9": 0.05}, frames=100, mse=0.01)
+    traction = Traction(calibration=calibration, told=calibration, friction=(0.2, 0.7, 1.2))
+    return save_untrained(tmp_path_factory.mktemp("start") / "run", traction=traction)
+
+
+def teach(data: Dataset, start: Path, out: Path | None = None, **changes):
+    return train(data, out, recipe="sequence", start_from=start, **{"epochs": 150, "learning_rate": 1e-2} | changes)
+
+
+def test_several_frames_tell_what_one_does_not(small_dataset: Dataset, start: Path, tmp_path: Path):
+    """The margin of these trials falls with time: a network of random weights does not see it, its head counts."""
+    run = teach(small_dataset, start, tmp_path / "run")
+    kept, before, training = run.manifest.sequence, load_checkpoint(start), run.training
+    assert kept is not None
+    assert training is not None
+    assert kept.calibration.mse < 0.7 * kept.mse_one
+    for name, values in run.model.state_dict().items():
+        assert torch.equal(values, before.model.state_dict()[name])
+    assert run.manifest.calibration == before.manifest.calibration
+    assert training.curve.validation_mse.min() == pytest.approx(training.best_validation_mse)
+    assert not (tmp_path / "run" / "answers").exists()
+    assert {one.sha256[:12] for one in small_dataset.trials if one.split != "test"} == set(run.manifest.trained_on)
+
+
+def test_interrupted_it_reads_no_trial_twice_and_ends_the_same(
+    small_dataset: Dataset, start: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    whole = teach(small_dataset, start, tmp_path / "whole", epochs=2)
+    read = []
+    load = Dataset.load
+
+    def counting(self, info, **named):
+        read.append(info.trial)
+        if len(read) == 4:
+            raise KeyboardInterrupt
+        return load(self, info, **named)
+
+    monkeypatch.setattr(Dataset, "load", counting)
+    with pytest.raises(KeyboardInterrupt):
+        teach(small_dataset, start, tmp_path / "cut", epochs=2)
+    again = teach(small_dataset, start, tmp_path / "cut", epochs=2)
+    assert len(read) == 4 + 3  # of six trials three were answered
+    for name in ("sequence.safetensors", "model.safetensors"):
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    assert again.manifest.sequence == whole.manifest.sequence
+
+
+def test_neither_rate_nor_number_of_frames_tells_how_long_a_trial_is(rng: np.random.Generator):
+    """Trials of equally many frames: their own rates differ fivefold, those that teach do not depend on the trial."""
+    rates = {}
+    for duration_s in (1.5, 7.5):
+        time_s = np.linspace(0, duration_s, 76)
+        trial = sequences.AnsweredTrial(
+            margin=np.zeros((76, 1), "f4"), ratio=np.zeros((76, 1), "f4"), label=time_s, time_s=time_s
+        )
+        some = [trial.some(rng) for _ in range(400)]
+        assert all(one.time_s[0] <= duration_s / 2 + 0.1 for one in some)
+        assert all(np.array_equal(one.label, one.time_s) for one in some)
+        rates[duration_s] = np.concatenate([np.diff(one.time_s)[:1] for one in some])
+        assert rates[duration_s].min() >= 0.1 - 1e-6
+    # the step is a multiple of the time between frames, 0.02 or 0.1 s, which rounds it up by half of that on average
+    assert rates[7.5].mean() - rates[1.5].mean() == pytest.approx(0.04, abs=0.03)
+
+
+def test_what_cannot_be_taught_is_refused(small_dataset: Dataset, start: Path, difference_run: Path):
+    with pytest.raises(InputError, match="--start-from"):
+        train(small_dataset, recipe="sequence")
+    with pytest.raises((InputError, ModelError), match="ratio"):
+        teach(small_dataset, difference_run)
+    with pytest.raises(InputError, match="--max-minutes"):
+        teach(small_dataset, start, max_minutes=1.0)
+    with pytest.raises(InputError, match="--devices"):
+        teach(replace(small_dataset), start, devices=2)
