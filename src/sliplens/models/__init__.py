@@ -8,6 +8,6 @@ from sliplens.models.predictions import Predictions, predict
 from sliplens.models.sequence import Follower
 
 __all__ = [
-    "ENGINES", "Engine", "Estimate", "Follower", "Manifest", "Predictions", "Ratio", "Run", "build_model", "export_onnx", "load",
-    "load_checkpoint", "make_engine", "predict", "prepare", "save_checkpoint",
+    "ENGINES", "Engine", "Estimate", "Follower", "Manifest", "Predictions", "Ratio", "Run", "build_model",
+    "export_onnx", "load", "load_checkpoint", "make_engine", "predict", "prepare", "save_checkpoint",
 ]  # fmt: skip
