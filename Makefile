@@ -66,6 +66,11 @@ weights: $(INSTALLED) ## train the networks that come with the package: some fiv
 	$(BIN)/sliplens simulate runs/weights/other --preset varied --dry-trials 1230 --days 410 --seed 2
 	$(BIN)/sliplens train runs/weights/other -o runs/weights/told-difference --recipe ratio \
 		--start-from runs/weights/more-difference
+# a head beside it that reads several frames, on pulls of which no two are alike; what it says of one frame stays
+	$(BIN)/sliplens simulate runs/weights/pulled --preset varied --pulls varied --dry-trials 1020 --days 340 \
+		--test-days 10 --wet-trials 30 --frames-per-trial 60 --seed 4
+	$(BIN)/sliplens train runs/weights/pulled -o runs/weights/sequence-difference --recipe sequence \
+		--start-from runs/weights/told-difference
 # the networks of the thesis: its days and trials on one sensor, its recipe, as far as two cores reach
 	$(BIN)/sliplens simulate runs/weights/thesis --preset thesis --frames-per-trial 200
 	@set -e; for input in difference raw; do \
@@ -73,7 +78,7 @@ weights: $(INSTALLED) ## train the networks that come with the package: some fiv
 			--recipe thesis --image-size 112 --epochs 4; \
 	done
 # rounded, so that the package stays under 15 MB; answers move by less than 0.001
-	@set -e; for kept in told-difference:chromatouch:10 large-raw:chromatouch:10 thesis-difference:thesis:14 thesis-raw:thesis:14; do \
+	@set -e; for kept in sequence-difference:chromatouch:10 large-raw:chromatouch:10 thesis-difference:thesis:14 thesis-raw:thesis:14; do \
 		set -- $$(echo $$kept | tr : ' '); \
 		$(BIN)/python .ci/ship.py runs/weights/$$1 src/sliplens/weights/$$2-$${1##*-} --bits $$3; \
 	done

@@ -61,7 +61,7 @@ def ship(run: Path, folder: Path, *, bits: int) -> float:
         if run.resolve() != folder.resolve():
             shutil.copyfile(run / name, folder / name)
     network.model.load_state_dict(kept, assign=True)
-    save_checkpoint(folder, network.model, network.manifest)
+    save_checkpoint(folder, network.model, network.manifest, sequence=network.sequence)
     if (folder / "readings").is_dir():
         table = load_result(folder / "readings", ReadingTable, command="make weights")
         # of the very network that was rounded: what it reads moves by less than the table resolves

@@ -8,8 +8,11 @@ test is for the one that was chosen.
 What is told: nothing; the static friction of each trial, exactly; a number that is wrong by up to 10 %, as a range of
 10 % either way; or what one earlier slip of the same object has taught. For that the object is grasped once before, at
 a place, force and stretch of its own, with a friction that differs as those of the trials of a day do; the network
-reads F_t / F_n in five frames of the last 0.2 s before the slip, whose time is taken as known. Intervals hold 95 % over
-days.
+reads F_t / F_n in five frames of the last 0.2 s before the slip, whose time is taken as known.
+
+`several`, of a network that was taught to: all frames of a trial are read in order. Its pulls are varied (0.8 to 8 s,
+with rests, jerks and lettings back), so that no sequence reads the clock, and `one_of_several` has the same frames one
+by one. Intervals hold 95 % over days.
 """
 
 import argparse
@@ -30,7 +33,7 @@ from sliplens.models.checkpoint import load
 from sliplens.simulation import PRESETS, SimulationRecipe
 from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import Loading
-from sliplens.simulation.plan import TrialPlan, plan_trials
+from sliplens.simulation.plan import PULLS, TrialPlan, plan_trials
 from sliplens.simulation.trials import prepare_trial
 
 DAYS, TRIALS, FRAMES, DRAWN = 40, 3, 40, 10
@@ -78,6 +81,17 @@ def require_disjoint(plans: list[TrialPlan]) -> None:
         varied,
         replace(varied, seed=1, dry_trials=3060, days=1020),
         replace(varied, seed=2, dry_trials=1230, days=410),
+        replace(varied, seed=3, dry_trials=1230, days=410, frames_per_trial=20),
+        replace(
+            varied,
+            seed=4,
+            dry_trials=1020,
+            days=340,
+            test_days=10,
+            wet_trials=30,
+            frames_per_trial=60,
+            pulls=PULLS["varied"],
+        ),
         PRESETS["thesis"],
         PRESETS["small"],
     ]
@@ -216,19 +230,59 @@ def measure(run: Run, *, selection: bool, trials: int | None = None) -> dict[str
     return found
 
 
+def measure_sequences(run: Run, *, selection: bool, trials: int | None = None) -> dict[str, Any]:
+    """R2 of the margin from one frame, and where all frames of a trial are read in order, with intervals."""
+    recipe = test_recipe(selection=selection)
+    require_disjoint([plan for plan in plan_trials(recipe) if plan.split == "test"])
+    plans = [plan for plan in plan_trials(replace(recipe, pulls=PULLS["varied"])) if plan.split == "test"]
+    plans = plans[:: max(1, len(plans) // trials)] if trials else plans
+    parts: list[np.ndarray] = []
+    for plan in plans:
+        loading, film = prepare_trial(plan)
+        contact = np.flatnonzero(np.isfinite(loading.safety_margin))
+        frames = film.draw(slice(int(contact[0]), int(contact[-1]) + 1)).numpy()
+        one = run.to_estimate(*run.answers(run.encode(frames, film.draw_reference().numpy()).split(8)))
+        several = run.follow().update(one, loading.time_s[contact], np.ones(len(contact), dtype=bool))
+        margin = loading.safety_margin[contact]
+        low, high = several.interval(0.9) or (margin, margin)
+        facts = (np.full(len(margin), fact) for fact in (plan.day, plan.condition == "wet"))
+        slipped = np.cumsum(margin == 0) > 0
+        parts.append(
+            np.stack([margin, one.margin, several.margin, slipped, (margin >= low) & (margin <= high), *facts])
+        )
+    margin, one, several, slipped, held, day, wet = np.concatenate(parts, axis=1)
+    found: dict[str, Any] = {"sequence_frames": len(margin)}
+    for condition, rows in (("dry", wet == 0), ("wet", wet == 1)):
+        for name, answer in (("one_of_several", one), ("several", several)):
+            key = f"{name}_r2_{condition}"
+            found[key], found[f"{key}_low"], found[f"{key}_high"] = with_interval(
+                margin[rows], answer[rows], day[rows], rng=np.random.default_rng(0)
+            )
+            pulled = rows & (margin < 1) & (slipped == 0)
+            found[f"{key}_before_slip"] = r2(margin[pulled], answer[pulled])
+            for when, some in (("before", rows & (slipped == 0)), ("after", rows & (slipped == 1))):
+                found[f"{name}_rmse_{condition}_{when}_slip"] = float(np.sqrt(np.mean((answer - margin)[some] ** 2)))
+        found[f"several_in_90_{condition}"] = float(held[rows].mean())
+    return found
+
+
 def main() -> None:
     """Print what was measured, as a table or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path("chromatouch-difference"), help="a trained network")
     parser.add_argument("--selection", action="store_true", help="the days on which variants are compared")
     parser.add_argument("--trials", type=int, help="about so many trials, for a quick look")
+    parser.add_argument("--sequences", action="store_true", help="only what several frames tell")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     try:
         run = load(options.run)
     except SliplensError as error:
         sys.exit(f"{Path(__file__).name}: {error}")
-    found = measure(run, selection=options.selection, trials=options.trials)
+    chosen = {"selection": options.selection, "trials": options.trials}
+    found = {} if options.sequences else measure(run, **chosen)
+    if run.sequence is not None:
+        found |= measure_sequences(run, **chosen)
     if options.json:
         print(json.dumps(found))
         return

@@ -120,6 +120,17 @@ class Follower:
     Frames go through one by one, however many are given at once, so that a recording and a running camera have the
     same answers. Memory takes a step each `STEP_S`, at whatever rate they come; frames between are read by it and
     leave nothing.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sliplens as sl
+    >>> network = sl.load("chromatouch-difference")
+    >>> follower = network.follow()
+    >>> touch = np.zeros((2, 224, 224, 3), dtype=np.uint8)  # difference images: nothing has moved
+    >>> one_by_one = network.estimate(network.encode(touch, None))
+    >>> follower.update(one_by_one, np.array([0.0, 0.1]), np.array([True, True])).margin.shape
+    (2,)
     """
 
     def __init__(self, head: SequenceHead, sequence: SequenceManifest) -> None:

@@ -314,8 +314,10 @@ def evaluate_frames(
         Labelled frames in the network's encoding and size, as `load_frames` gives them.
     split
         What they are called in the result.
-    friction, sequence
-        As `evaluate` takes them.
+    friction
+        Coefficient of friction that is told, as `evaluate` takes it.
+    sequence
+        Read the frames of each trial in order, as `evaluate` takes it.
 
     Raises
     ------
