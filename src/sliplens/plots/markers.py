@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -15,9 +16,11 @@ from matplotlib.patheffects import Normal, Stroke
 
 from sliplens.errors import InputError
 from sliplens.markers import DisplacementField
-from sliplens.markers.gel import SensorProposal
 from sliplens.plots.saliency import overlay_saliency, plot_colour_bar, stretch_saliency
 from sliplens.plots.style import BLACK, BLUE, GREY, VERMILLION, drawing_style, written_whole
+
+if TYPE_CHECKING:
+    from sliplens.markers.gel import SensorProposal
 
 # light is far: read alike under every common colour blindness
 FIELD_COLOURS = "cividis"
@@ -126,7 +129,7 @@ def _ends(places: Float[np.ndarray, " places"]) -> tuple[float, float]:
     return float(places[0] - half), float(places[-1] + half)
 
 
-def draw_proposal(proposal: SensorProposal) -> Figure:
+def draw_proposal(proposal: "SensorProposal") -> Figure:
     """Draw the camera's frame with gel, crop and markers, and beside it the frame as networks and trackers read it."""
     profile, frame = proposal.profile, proposal.frame
     with drawing_style():
@@ -161,7 +164,7 @@ def draw_proposal(proposal: SensorProposal) -> Figure:
     return figure
 
 
-def write_proposal(proposal: SensorProposal, path: Path) -> None:
+def write_proposal(proposal: "SensorProposal", path: Path) -> None:
     """Write the picture as PNG, whole or not at all."""
     with written_whole(path) as part:
         draw_proposal(proposal).savefig(part, dpi=120, format="png")
