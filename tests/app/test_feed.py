@@ -139,6 +139,21 @@ def test_a_viewer_that_comes_back_before_its_old_connection_is_given_up_goes_on(
     with_viewer(act)
 
 
+def test_a_viewer_that_sending_found_gone_leaves_without_a_word():
+    class Gone(Wire):
+        async def receive_text(self) -> str:
+            await self.answers.get()
+            raise RuntimeError('WebSocket is not connected. Need to call "accept" first.')
+
+    async def run() -> None:
+        feed, wire = Feed(sl.LiveReader("simulated")), Gone()
+        await wire.answers.put(None)
+        await Viewer(feed).serve(cast("Any", wire))
+        assert not feed.viewers
+
+    asyncio.run(run())
+
+
 def test_its_threads_have_ended_when_it_is_closed():
     class Looks:
         wants_picture = shows_map = ready = True

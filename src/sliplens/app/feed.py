@@ -472,8 +472,8 @@ class Viewer:
                     self._drawn_ms = 1e3 * (now_s - captured_s)
                     self.takes_s += 0.2 * (now_s - sent_s - self.takes_s)
                 self._changed.set()
-        except (WebSocketDisconnect, msgspec.MsgspecError, KeyError):
-            pass  # it has gone, or speaks another language
+        except (WebSocketDisconnect, RuntimeError, msgspec.MsgspecError, KeyError):
+            pass  # it has gone, which starlette calls a RuntimeError where sending saw it first, or is of another kind
         finally:
             sending.cancel()
             if self._sending is sending:
