@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.files import hash_json, output_folder, read_json, scratch_folder, to_builtins, whole_file, write_json
+from sliplens.files import (
+    hash_json,
+    output_folder,
+    read_json,
+    remove,
+    scratch_folder,
+    to_builtins,
+    whole_file,
+    write_json,
+)
 
 
 def make(target: Path, config: dict, *, text: str = "x", overwrite: bool = False) -> bool:
@@ -201,3 +210,21 @@ def test_whatever_change_a_process_was_killed_before_the_next_one_makes_the_same
     tried = json.loads(told.stdout)
     assert {name for name, _ in tried} == {"make", "replace", "file", "scratch", "split"}
     assert len(tried) > 40
+
+
+def test_a_folder_that_is_removed_is_there_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "part"
+    folder.mkdir()
+    (folder / "result.json").write_text("{}")
+
+    def killed(path: Path, **_: object) -> None:
+        if path.exists():
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.rmtree", killed)
+        with pytest.raises(KeyboardInterrupt):
+            remove(folder)
+    assert not folder.exists()
+    remove(folder)
+    assert not list(tmp_path.iterdir())

@@ -415,7 +415,8 @@ def read_written(path: Path, schema: pa.Schema) -> pa.Table:
     if path.is_dir():
         return pa.concat_tables([open_table(part).read() for part in sorted(path.glob("*=*/*.parquet"))])
     if path.suffix == ".csv":
-        with path.open("rb") as stream:
+        # none of Python's own: Arrow's thread may let go of it when Python has ended, and that aborts the process
+        with path.open() if isinstance(path, StoredPath) else pa.OSFile(str(path)) as stream:
             return pa_csv.read_csv(stream, convert_options=pa_csv.ConvertOptions(column_types=schema))
     if path.suffix == ".json":
         return pa.Table.from_pylist(msgspec.json.decode(path.read_bytes()), schema)

@@ -195,11 +195,15 @@ def as_path(path: Path | str) -> Path:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, or a folder with all in it, if it is there."""
+    """Remove a file, or a folder with all in it, if it is there; whoever is killed meanwhile leaves no half of it."""
     if isinstance(path, StoredPath):
         path.remove()
-    elif path.is_dir():
-        shutil.rmtree(path)
+        return
+    aside = path.with_name(f".{path.name}.removed")
+    _drop(aside)
+    if path.is_dir():
+        path.rename(aside)
+        shutil.rmtree(aside)
     else:
         path.unlink(missing_ok=True)
 
