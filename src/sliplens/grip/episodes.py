@@ -1,6 +1,5 @@
 """Episodes of a grip: many in parallel by the network's measured errors, or one after another through pixels."""
 
-import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
@@ -14,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import explain, get_explainer
-from sliplens.files import output_folder, to_builtins
+from sliplens.files import output_folder, remove, to_builtins
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.grip.controllers import Controller, make_controller
 from sliplens.grip.loop import GripLoop, RenderedEyes, TableEyes, Tick
@@ -402,7 +401,7 @@ def _finish(folder: Path, grip: Grip, on_progress: OnProgress | None) -> None:
         write_dataset_table(folder / "data", [trial_info(path, split="test") for path in paths], simulated=True)
         note(on_progress, "The clip is for the eye only: lossy video moves markers; measure in the data set.")
     save_result(grip, folder)
-    shutil.rmtree(folder / "parts")
+    remove(folder / "parts")
 
 
 __all__ = ["MOMENTS_S", "run_episodes", "run_scripts"]

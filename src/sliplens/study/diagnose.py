@@ -1,6 +1,5 @@
 """Where a network fails, and why: slices of its errors, its markers, other frictions, and kinds of explanations."""
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -18,7 +17,7 @@ from sliplens.explainers.shapley import shapley_values
 from sliplens.extras import require_packages
 from sliplens.faithfulness.removal import answer_whole
 from sliplens.faithfulness.scoring import prepare_passes
-from sliplens.files import output_folder
+from sliplens.files import output_folder, remove
 from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_difference
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
@@ -114,7 +113,7 @@ def diagnose(
     with output_folder(target, stage="diagnose", config=config, overwrite=overwrite) as output:
         if not output.complete:
             save_result(make(parts := output.folder / "parts"), output.folder)
-            shutil.rmtree(parts, ignore_errors=True)
+            remove(parts)
     wrote(on_progress, target, "where the network fails, and why", kept=output.complete)
     return load_result(target, Diagnosis, command="sliplens diagnose")
 

@@ -1,6 +1,5 @@
 """A whole study: frames chosen, explained, and their explanations tested in every way that is known."""
 
-import shutil
 import weakref
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -13,7 +12,7 @@ from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import Explainer
 from sliplens.faithfulness.removal import Faithfulness
-from sliplens.files import hash_json, output_folder, scratch_folder
+from sliplens.files import hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
@@ -461,7 +460,7 @@ class _Stages:
                 return load_result(target, _KINDS[name], command=_COMMAND)
             with stage(self.on_progress, title) as count, counting_passes():
                 result = work(out.folder / "parts", count)
-            shutil.rmtree(out.folder / "parts", ignore_errors=True)
+            remove(out.folder / "parts")
             save_result(result, out.folder)
         # as it was kept, whose layout in memory may differ: what follows has the same bytes when it goes on from here
         result = load_result(target, _KINDS[name], command=_COMMAND)

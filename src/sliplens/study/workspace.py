@@ -1,7 +1,6 @@
 """Explanations of one network and their deletion scores, as records, and as folders of a workspace."""
 
 import hashlib
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -208,7 +207,7 @@ def score_explained(
         if not output.complete:
             with stage(on_progress, title) as count:
                 scores = score(parts=output.folder / "parts", on_progress=count)
-            shutil.rmtree(output.folder / "parts")
+            remove(output.folder / "parts")
             save_result(scores, output.folder)
     wrote(on_progress, out, "curves and scores", kept=output.complete)
     return load_result(out, DeletionScores, command="sliplens score")
