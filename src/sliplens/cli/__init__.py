@@ -16,10 +16,9 @@ from sliplens.cli.check import Check
 from sliplens.cli.command import in_options, option_names
 from sliplens.cli.console import fail
 from sliplens.cli.demo import Demo
-from sliplens.cli.diagnose import Diagnose
 from sliplens.cli.doctor import Doctor
 from sliplens.cli.evaluate import Evaluate
-from sliplens.cli.explain import Explain
+from sliplens.cli.explain import Explain, Score
 from sliplens.cli.export import Export
 from sliplens.cli.grip import Grip
 from sliplens.cli.help import EXAMPLES, OPTIONAL, Help, HelpText, describe_options, overview, print_help, tell_unknown
@@ -29,12 +28,11 @@ from sliplens.cli.label import Label
 from sliplens.cli.live import Live
 from sliplens.cli.predict import Predict
 from sliplens.cli.report import Report
-from sliplens.cli.score import Score
 from sliplens.cli.sensor import Sensor
 from sliplens.cli.simulate import Simulate
 from sliplens.cli.split import Split
 from sliplens.cli.status import Status
-from sliplens.cli.study import Study
+from sliplens.cli.study import Diagnose, Study
 from sliplens.cli.track import Track
 from sliplens.cli.train import Train
 from sliplens.cli.view import View
