@@ -6,7 +6,7 @@ from dots import draw_dots, make_grid
 
 from sliplens.errors import ImageError
 from sliplens.markers.gel import marker_spacing, propose_profile
-from sliplens.plots.markers import draw_proposal
+from sliplens.plots.figure import draw_proposal
 from sliplens.recordings.sensor import profile_text
 
 

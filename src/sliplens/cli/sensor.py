@@ -47,7 +47,7 @@ class Sensor(Command):
         from sliplens.files import require_new_file
         from sliplens.markers.gel import propose_profile
         from sliplens.models.checkpoint import read_manifest
-        from sliplens.plots.markers import write_proposal
+        from sliplens.plots.figure import write_proposal
         from sliplens.recordings.sensor import profile_text
 
         require_new_file(self.output, suffix=".toml", overwrite=self.overwrite)

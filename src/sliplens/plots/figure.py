@@ -1,7 +1,8 @@
-"""One figure of a result, whatever it is."""
+"""One figure of a result, whatever it is; and of what a profile of a sensor finds."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from textwrap import fill as wrap
 from typing import Any
 
@@ -10,10 +11,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
+from sliplens.markers.gel import SensorProposal
 from sliplens.plots.errors import plot_answers, plot_faithfulness, plot_learning_curves
 from sliplens.plots.margins import column, plot_grip_force, plot_hold, plot_margins, plot_readings
 from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, stretch_saliency
@@ -28,13 +31,14 @@ from sliplens.plots.style import (
     method_name,
     methods_in_order,
     percent,
+    written_whole,
 )
 from sliplens.results.evaluation import Diagnosis
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import DeletionScores, RemovalScores, is_control
 from sliplens.results.study import Study, Truth
 
-__all__ = ["plot"]
+__all__ = ["draw_proposal", "plot", "write_proposal"]
 
 
 def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
@@ -230,3 +234,44 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
 }
 """What draws a record, by the name of its class."""
+
+
+def draw_proposal(proposal: SensorProposal) -> Figure:
+    """Draw the camera's frame with gel, crop and markers, and beside it the frame as networks and trackers read it."""
+    profile, frame = proposal.profile, proposal.frame
+    with drawing_style():
+        figure = Figure(figsize=(9.6, 4.6), layout="constrained")
+        camera, made = figure.subplots(1, 2, width_ratios=(frame.shape[1] / frame.shape[0], 1.0))
+        camera.imshow(frame)
+        for box, colour, words in (
+            (proposal.gel_px, BLUE, "gel found"),
+            (profile.crop_px or (0, 0, frame.shape[1], frame.shape[0]), VERMILLION, "kept (crop_px)"),
+        ):
+            left, top, width, height = box
+            corner = (left - 0.5, top - 0.5)
+            camera.add_patch(Rectangle(corner, width, height, fill=False, color=colour, linewidth=1.6, label=words))
+        if len(proposal.markers_px):
+            camera.plot(
+                *proposal.markers_px.T, "o", mfc="none", mec="white", ms=9,
+                label=f"{len(proposal.markers_px)} markers ({profile.markers})",
+            )  # fmt: skip
+        camera.set(title="camera", xlabel="x in pixels", ylabel="y in pixels")
+        camera.legend(
+            loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, frameon=True, facecolor="0.7"
+        )  # rings are white
+        result = profile.apply(frame)
+        made.imshow(result)
+        made.set(title=f"{profile.name}, as it is read", xlabel="x in pixels", ylabel="y in pixels")
+        if np.isfinite(proposal.spacing_px):
+            made.text(
+                0.5, -0.22, f"markers {proposal.spacing_px:.1f} pixels apart", ha="center", transform=made.transAxes
+            )
+        for axes in (camera, made):
+            axes.grid(visible=False)
+    return figure
+
+
+def write_proposal(proposal: SensorProposal, path: Path) -> None:
+    """Write the picture as PNG, whole or not at all."""
+    with written_whole(path) as part:
+        draw_proposal(proposal).savefig(part, dpi=120, format="png")

@@ -1,9 +1,7 @@
-"""Markers on pictures: arrows on the frame, the field between them, both beside saliency; and those a profile finds."""
+"""Markers on pictures: arrows on the frame, the field between them, both beside saliency."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,16 +9,12 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
 from sliplens.errors import InputError
 from sliplens.markers import DisplacementField
 from sliplens.plots.saliency import overlay_saliency, plot_colour_bar, stretch_saliency
-from sliplens.plots.style import BLACK, BLUE, GREY, VERMILLION, drawing_style, written_whole
-
-if TYPE_CHECKING:
-    from sliplens.markers.gel import SensorProposal
+from sliplens.plots.style import BLACK, GREY, drawing_style
 
 # light is far: read alike under every common colour blindness
 FIELD_COLOURS = "cividis"
@@ -129,48 +123,6 @@ def _ends(places: Float[np.ndarray, " places"]) -> tuple[float, float]:
     return float(places[0] - half), float(places[-1] + half)
 
 
-def draw_proposal(proposal: "SensorProposal") -> Figure:
-    """Draw the camera's frame with gel, crop and markers, and beside it the frame as networks and trackers read it."""
-    profile, frame = proposal.profile, proposal.frame
-    with drawing_style():
-        figure = Figure(figsize=(9.6, 4.6), layout="constrained")
-        camera, made = figure.subplots(1, 2, width_ratios=(frame.shape[1] / frame.shape[0], 1.0))
-        camera.imshow(frame)
-        for box, colour, words in (
-            (proposal.gel_px, BLUE, "gel found"),
-            (profile.crop_px or (0, 0, frame.shape[1], frame.shape[0]), VERMILLION, "kept (crop_px)"),
-        ):
-            left, top, width, height = box
-            corner = (left - 0.5, top - 0.5)
-            camera.add_patch(Rectangle(corner, width, height, fill=False, color=colour, linewidth=1.6, label=words))
-        if len(proposal.markers_px):
-            camera.plot(
-                *proposal.markers_px.T, "o", mfc="none", mec="white", ms=9,
-                label=f"{len(proposal.markers_px)} markers ({profile.markers})",
-            )  # fmt: skip
-        camera.set(title="camera", xlabel="x in pixels", ylabel="y in pixels")
-        camera.legend(
-            loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, frameon=True, facecolor="0.7"
-        )  # rings are white
-        result = profile.apply(frame)
-        made.imshow(result)
-        made.set(title=f"{profile.name}, as it is read", xlabel="x in pixels", ylabel="y in pixels")
-        if np.isfinite(proposal.spacing_px):
-            made.text(
-                0.5, -0.22, f"markers {proposal.spacing_px:.1f} pixels apart", ha="center", transform=made.transAxes
-            )
-        for axes in (camera, made):
-            axes.grid(visible=False)
-    return figure
-
-
-def write_proposal(proposal: "SensorProposal", path: Path) -> None:
-    """Write the picture as PNG, whole or not at all."""
-    with written_whole(path) as part:
-        draw_proposal(proposal).savefig(part, dpi=120, format="png")
-
-
 __all__ = [
-    "ARROWS", "FIELD_COLOURS", "MarkedFrame", "draw_fields_beside_saliency", "draw_proposal", "plot_arrows",
-    "plot_field", "write_proposal",
+    "ARROWS", "FIELD_COLOURS", "MarkedFrame", "draw_fields_beside_saliency", "plot_arrows", "plot_field",
 ]  # fmt: skip
