@@ -82,6 +82,27 @@ def test_neither_rate_nor_number_of_frames_tells_how_long_a_trial_is(rng: np.ran
     assert rates[7.5].mean() - rates[1.5].mean() == pytest.approx(0.04, abs=0.03)
 
 
+def test_stamps_since_1970_are_told_apart(small_dataset: Dataset, start: Path, tmp_path: Path, monkeypatch):
+    """Floats of 4 bytes know them to two minutes."""
+    load = Dataset.load
+    plain = teach(small_dataset, start, epochs=2)
+
+    def late(self, info, **named):
+        recording = load(self, info, **named)
+        return replace(recording, time_s=recording.time_s + 1.7e9)
+
+    monkeypatch.setattr(Dataset, "load", late)
+    stamped = teach(small_dataset, start, epochs=2)
+    assert plain.training is not None
+    assert stamped.training is not None
+    assert stamped.training.validation_frames == plain.training.validation_frames
+
+
+def test_what_diverges_ends_in_a_sentence(small_dataset: Dataset, start: Path):
+    with pytest.raises(ModelError, match="lower the learning rate"):
+        teach(small_dataset, start, learning_rate=1e30, epochs=3)
+
+
 def test_what_cannot_be_taught_is_refused(small_dataset: Dataset, start: Path, difference_run: Path):
     with pytest.raises(InputError, match="--start-from"):
         train(small_dataset, recipe="sequence")

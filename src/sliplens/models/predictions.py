@@ -259,8 +259,6 @@ def predict(
     known = None if friction is None else as_friction(friction)
     if known is not None:
         trained.require_ratio()
-    if sequence:
-        trained.follow(friction=known)
     with stage(on_progress, "Opening the source"):
         trials = open_trials(
             source,
@@ -274,6 +272,8 @@ def predict(
             sensor=None if sensor is None else load_profile(sensor),
         )
     kinds = [_assume_reference(trained, one) for one in trials.kinds]
+    if sequence:
+        _require_order(trained, kinds, friction=known)
     notes = tuple(dict.fromkeys(words for one in kinds for words in (*one.notes, *_require_comparable(trained, one))))
     metadata = {
         "sliplens.source": kinds[0].opened,
@@ -317,6 +317,16 @@ def _find_network(source: object, sensor: SensorProfile | Path | str | None) -> 
     if profile is not None and profile.network is not None:
         return profile.network, f"which the profile {profile.name} names"
     return _SHIPPED, "which comes with sliplens"
+
+
+def _require_order(trained: Run, trials: Sequence[Capture], *, friction: Friction | None) -> None:
+    """Refuse to read frames in order where the network was not taught to, or nobody knows when they were taken."""
+    trained.follow(friction=friction)
+    if any(one.time_s is None for one in trials):
+        raise InputError(
+            "--sequence reads frames by their times, and nobody tells them here; leave it out, or read a recording whose "
+            "times are known"
+        )
 
 
 def _assume_reference(trained: Run, trial: Capture) -> Capture:
@@ -454,8 +464,7 @@ class _Reading(Work):
             first, touches, features = encoded.popleft()
             estimate = self.trained.to_estimate(*answers, friction=self.friction, features=features)
             if follower is not None:
-                if capture.time_s is None:
-                    raise InputError("--sequence reads frames by their times, and nobody tells them here; leave it out")
+                assert capture.time_s is not None  # `_require_order`
                 times = capture.time_s[first : first + len(touches)]
                 estimate = follower.update(estimate, times, np.array(touches))
             for name, values in (_columns(estimate, capture, first) | {"touches": touches}).items():

@@ -20,7 +20,7 @@ STEP_S, LONGEST_S = 0.1, 1.0
 """Time after which memory takes a step, and the longest that is told apart; a contact begins with the longest."""
 _LEAST_PEAK = 0.02
 """Traction ratio below which nothing is pulled."""
-_ROUNDING_S = 1e-6
+ROUNDING_S = 1e-6
 """By which times that are multiples of a step may miss it."""
 _NEAR_ZERO = 0.1
 """Margins up to which a contact may slide already, in margin units."""
@@ -149,7 +149,8 @@ class Follower:
         """The next frames as they are read after those before.
 
         `estimate`: of each frame by itself, told no friction; `time_s`: when it was taken; `touches`: whether anything
-        touches. A frame that nothing touches keeps its answer, and what was before it is forgotten.
+        touches. A frame that nothing touches keeps its answer, and what was before it is forgotten; so is what was
+        before a clock that runs back.
         """
         assert estimate.probabilities is not None
         assert estimate.ratio is not None
@@ -161,13 +162,14 @@ class Follower:
         read, probabilities = estimate.margin.copy(), estimate.probabilities.copy()
         centres, temperature = self._head.centres.double().cpu().numpy(), self._sequence.calibration.temperature
         for row, (now_s, touched) in enumerate(zip(time_s.tolist(), touches.tolist(), strict=True)):
-            if not touched:
+            if not touched or now_s < self._time_s:
                 self.forget()
+            if not touched:
                 continue
             elapsed_s = LONGEST_S if self._state is None else now_s - self._time_s
             since = torch.tensor([[elapsed_s]], device=device)
             logits, state = self._head(margin[row], ratio[row], since, self._state)
-            if elapsed_s >= STEP_S - _ROUNDING_S:
+            if elapsed_s >= STEP_S - ROUNDING_S:
                 self._state, self._time_s = state, now_s
             probabilities[row] = torch.softmax(logits[0, 0].double() / temperature, dim=-1).cpu().numpy()
             read[row] = probabilities[row] @ centres  # each by itself: sums of many rows are added in another order

@@ -259,8 +259,7 @@ def _evaluate(
     with stage(on_progress, f"Reading {split} trials ({run.manifest.input})") as count:
         frames = load_frames(data, trials, encoding=run.encoding, image_size=size, on_progress=count)
     with stage(on_progress, "Predicting frames") as count:
-        asked: dict[str, Any] = {"split": split, "friction": friction, "sequence": sequence}
-        evaluation = evaluate_frames(run, frames, **asked, on_progress=count)
+        evaluation = evaluate_frames(run, frames, split=split, friction=friction, sequence=sequence, on_progress=count)
     evaluation = replace(evaluation, known_trials=len(find_known(trials, run)))
     if plan is None:
         return evaluation

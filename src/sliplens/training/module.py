@@ -229,15 +229,15 @@ class Clock(Callback):
         metrics = trainer.callback_metrics
         epoch = self.step / self.steps * (trainer.max_epochs or 1)
         train, validation = metrics["train_mse"].item(), metrics["validation_mse"].item()
-        if not math.isfinite(validation):
-            raise DivergedError(
-                f"the validation error is {validation} after epoch {trainer.current_epoch + 1}; "
-                "lower the learning rate and try again"
-            )
         self.add_row(epoch, train, validation)
 
     def add_row(self, epoch: float, train_mse: float, validation_mse: float) -> None:
-        """Add an epoch to the learning curve, and write it."""
+        """Add an epoch to the learning curve, and write it; `DivergedError` where it has no validation error."""
+        if not math.isfinite(validation_mse):
+            raise DivergedError(
+                f"the validation error is {validation_mse} after epoch {len(self.rows) + 1}; "
+                "lower the learning rate and try again"
+            )
         self.rows.append([epoch, train_mse, validation_mse, self.seconds / 60])
         if self.metrics_file is not None:
             lines = ["epoch,train_mse,validation_mse,minutes"]

@@ -13,12 +13,12 @@ from torch import Tensor
 from torch.nn import functional
 from torch.nn.utils.rnn import pad_sequence
 
-from sliplens.errors import InputError
+from sliplens.errors import InputError, RecordingError
 from sliplens.files import versions, whole_file
 from sliplens.models import Run, make_engine, save_checkpoint
 from sliplens.models.backbones import HistogramRegressor, histogram_targets
 from sliplens.models.calibration import calibrate_histogram
-from sliplens.models.sequence import LONGEST_S, STEP_S, SequenceHead, SequenceManifest
+from sliplens.models.sequence import LONGEST_S, ROUNDING_S, STEP_S, SequenceHead, SequenceManifest
 from sliplens.progress import OnProgress, stage
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.results.evaluation import Training
@@ -44,7 +44,7 @@ class AnsweredTrial:
         """The frames with which memory takes its steps; the first one `late_s` after the beginning."""
         rows, next_s = [], self.time_s[0] + late_s
         for row, now_s in enumerate(self.time_s.tolist()):
-            if now_s >= next_s - 1e-6:
+            if now_s >= next_s - ROUNDING_S:
                 rows.append(row)
                 next_s = now_s + step_s
         return AnsweredTrial(**{name: values[rows] for name, values in vars(self).items()})
@@ -157,12 +157,17 @@ def _answer(
                 assert estimate.probabilities is not None
                 assert estimate.ratio is not None
                 kept = {"margin": estimate.probabilities, "ratio": estimate.ratio.probabilities}
+                kept = {name: values.astype(np.float32) for name, values in kept.items()}
+                # whole, for a stamp may be seconds since 1970
                 kept |= {"label": recording.safety_margin[rows], "time_s": recording.time_s[rows]}
                 with whole_file(path) as part:
-                    save_file({name: values.astype(np.float32) for name, values in kept.items()}, part)
+                    save_file(kept, part)
             answered.append(AnsweredTrial(**load_file(path)))
             count(done, len(trials))
-    return [one for one in answered if len(one.label)]
+    labelled = [one for one in answered if len(one.label)]
+    if not labelled:
+        raise RecordingError(f"{data.folder}: no frame of the {what} trials has a label; label them first")
+    return labelled
 
 
 def _fit(
