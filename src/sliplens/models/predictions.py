@@ -324,8 +324,8 @@ def _require_order(trained: Run, trials: Sequence[Capture], *, friction: Frictio
     trained.follow(friction=friction)
     if any(one.time_s is None for one in trials):
         raise InputError(
-            "--sequence reads frames by their times, and nobody tells them here; leave it out, or read a recording whose "
-            "times are known"
+            "--sequence reads frames by their times, and nobody tells them here; leave it out, or read a recording "
+            "whose times are known"
         )
 
 
