@@ -152,6 +152,23 @@ def test_where_a_page_links_into_another_there_is_a_heading(page: Path):
     ]
 
 
+def command_lines(code: str) -> list[list[str]]:
+    """Words of each command of sliplens in a block, without what is said of it."""
+    lines = (line.partition("#")[0].split() for line in code.splitlines())
+    return [words[1:] for words in lines if words[:1] == ["sliplens"]]
+
+
+@PAGE
+def test_what_a_page_trains_and_evaluates_on_has_trials_for_it(page: Path):
+    for _, code in _CODE.findall(page.read_text(encoding="utf-8")):
+        commands = command_lines(code)
+        imported = {words[words.index("-o") + 1]: words for words in commands if words[0] == "import"}
+        for words in commands:
+            for data in imported.keys() & set(words[1:]):
+                needed = {"train": "--validation-trials", "evaluate": "--test-trials"}.get(words[0])
+                assert needed is None or {needed, "--splits"} & set(imported[data]), words
+
+
 def rows_of(page: str) -> list[list[str]]:
     """Cells of every row of a page's tables, heads and rules left out."""
     lines = (ROOT / "docs" / page).read_text(encoding="utf-8").splitlines()
