@@ -3,13 +3,20 @@
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from command_line import run
 from own_recording import write_forces, write_video
+from small import make_recording
 
-from sliplens.recordings import Recording, load_dataset
+from sliplens.parts import TRIES
+from sliplens.recordings import Recording, load_dataset, trial_writer
+from sliplens.recordings.capture import Capture
+from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import save_recording
+from sliplens.recordings.trial_writer import import_trial
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 PROFILE = 'name = "mine"\ncamera_size_px = [112, 112]\nrotate_deg = 90\nnormal_axis = "z"\nnormal_sign = -1\n'
@@ -92,6 +99,40 @@ def test_more_trials_are_added_and_the_old_ones_stay(
     assert labelling.basis.friction.mu == 0.5
     assert [one.trial for one in after.left_out] == ["bad"]
     assert run("check", data) == 0
+
+
+def test_a_trial_that_fails_again_and_again_is_left_out_until_it_is_added(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    manifest, data = tmp_path / "trials.csv", tmp_path / "data"
+    manifest.write_text("trial,video\n" + "".join(f"{name},{name}\n" for name in ("cup", "jar")))
+    for seed, name in enumerate(("cup", "jar")):
+        path = trial_path(tmp_path / name, name)
+        save_recording(make_recording(name, condition="dry", day=1, frames=8, seed=seed), path)
+        write_dataset_table(tmp_path / name, [trial_info(path, split="train")])
+    tries = []
+
+    def import_but_one(capture: Capture, *given: Any, **named: Any) -> None:
+        if capture.trial == "jar":
+            tries.append(capture.trial)
+            raise RuntimeError("out of luck")
+        import_trial(capture, *given, **named)
+
+    monkeypatch.setattr(trial_writer, "import_trial", import_but_one)
+    with pytest.raises(SystemExit, match="1"):
+        run("import", manifest, "-o", data, "--no-audit")
+    assert len(tries) == TRIES
+    after = load_dataset(data)
+    assert [info.trial for info in after.trials] == ["cup"]
+    assert [(one.trial, "out of luck" in one.why and "--add" in one.why) for one in after.left_out] == [("jar", True)]
+    assert not list(tmp_path.glob(".*"))
+    # what was named itself is missed: nothing is made before it is there
+    assert run("import", tmp_path / "cup", tmp_path / "jar", "-o", tmp_path / "named", "--no-audit") == 1
+    assert not (tmp_path / "named").exists()
+    monkeypatch.undo()
+    assert run("import", manifest, "-o", data, "--no-audit", "--add") == 0
+    assert [info.trial for info in load_dataset(data).trials] == ["cup", "jar"]
+    assert not load_dataset(data).left_out
 
 
 def test_many_at_once_give_the_bytes_that_one_by_one_give(imported: Path, source: Path, tmp_path: Path):

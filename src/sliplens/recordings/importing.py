@@ -92,8 +92,8 @@ def import_recordings(
     ----------
     sources
         Bags, videos, folders of images, LeRobot data sets, lists of the thesis or data sets of sliplens. Of a folder of
-        recordings or a manifest (`sliplens.recordings.manifest`) a trial that cannot be imported does not stop the
-        others: `Dataset.left_out` lists it.
+        recordings or a manifest (`sliplens.recordings.manifest`) a trial that cannot be imported, or that ended its
+        process three times, does not stop the others: `Dataset.left_out` lists it, and `add` tries it again.
     out
         Folder to make.
     forces
@@ -130,7 +130,7 @@ def import_recordings(
     RecordingError
         If a trial has neither labels nor forces, nothing touches, or it never slips and no friction is given.
     ShardError
-        If some of several failed that may not be left out, when all others are done.
+        If some of several failed that may not be left out, or all of them, when all others are done.
     """
     EXECUTORS.pick(on.partition("=")[0])
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from sliplens.codec import RESULT_FILE, load_record, save_record
-from sliplens.errors import RecordingError, SliplensError
+from sliplens.errors import RecordingError, ShardError, SliplensError
 from sliplens.files import remove
 from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress, stage
@@ -120,7 +120,8 @@ def write_trials(
     """Write trials into the folder of a data set; gives their rows, and what was left out of many.
 
     Of each trial the item of its shard, its name and its number of frames are given. What was done is kept for another
-    try until all within this ends well.
+    try until all within this ends well. A trial of many that was set aside, as one that ends its process again and
+    again, is left out like one that is damaged.
     """
     parts = folder / "parts"
 
@@ -128,10 +129,24 @@ def write_trials(
         # the folder is of these recordings and settings alone (`files.output_folder`)
         return (shard(item, trial=name, frames=frames, recipe="trial", shown=name) for item, name, frames in trials)
 
+    rows: list[TrialInfo] = []
+    left_out: list[LeftOut] = []
+    set_aside: dict[str, TrialJob] = {}
     with leave_cores(), stage(on_progress, title) as count:
-        make_parts(work, shards, parts, title=title, on=on, retry_failed=retry_failed, on_progress=count)
-    rows, left_out = [], []
+        try:
+            make_parts(work, shards, parts, title=title, on=on, retry_failed=retry_failed, on_progress=count)
+        except ShardError as error:
+            set_aside = {name: work.open(item) for item, name, _ in trials if name in error.why}
+            if len(set_aside) == len(trials) or not all(job.one_of_many for job in set_aside.values()):
+                raise
+            cure = "the same command with --add tries it again"
+            left_out = [
+                LeftOut(trial=name, source=job.capture.source, why=f"{error.why[name]}; {cure}")
+                for name, job in set_aside.items()
+            ]
     for one in shards():
+        if one.name in set_aside:
+            continue
         part = parts / one.part
         written = load_record(part / RESULT_FILE, WrittenTrial, command="the interrupted command")
         if written.left_out is not None:
