@@ -121,10 +121,19 @@ def test_a_slow_reader_gets_the_newest(recording: Recording):
         assert [reading.number for reading in readings] == [11]
 
 
-def test_a_late_listener_is_not_left_waiting(recording: Recording):
+def test_who_asks_late_gets_the_newest_and_is_not_left_waiting(recording: Recording):
     with plain_reader(Burst(recording.frames[:2], [0, 1]), reference=recording.reference) as reader:
-        list(reader.readings())
-        assert list(reader.readings()) == []
+        early = reader.readings()
+        assert reader._over.wait(timeout=10)
+        for readings in early, reader.readings():
+            assert [reading.number for reading in readings] == [1]
+
+
+def test_who_stops_asking_is_told_no_more(recording: Recording):
+    with plain_reader(Burst(recording.frames[:2], [0, 1]), reference=recording.reference) as reader:
+        reader.readings()
+        next(reader.readings())
+        assert not list(reader._listening)
 
 
 def test_without_a_reference_the_first_still_picture_is_taken(recording: Recording, rng: np.random.Generator):

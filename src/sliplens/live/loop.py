@@ -10,6 +10,7 @@ from inspect import signature
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import ParamSpec, TypeVar
+from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -213,7 +214,9 @@ class LiveReader:
             slip=slip,
         )
         self._frames: Mailbox[LiveFrame] = Mailbox()
-        self._listening: list[Mailbox[Reading]] = []
+        self._telling = Lock()
+        self._newest: Reading | None = None
+        self._listening: WeakSet[Mailbox[Reading]] = WeakSet()  # until nobody takes from them any more
         self._subscribers: list[Subscriber] = []
         self._stopped, self._over = Event(), Event()
         self._error: BaseException | None = None
@@ -304,7 +307,9 @@ class LiveReader:
         self._end_outputs()
 
     def readings(self) -> Iterator[Reading]:
-        """Readings as they come; who asks late gets the newest, and `Reading.number` tells what was left out.
+        """Readings as they come; who asks late, even after the end, gets the newest.
+
+        `Reading.number` tells what was left out.
 
         Raises
         ------
@@ -316,14 +321,17 @@ class LiveReader:
         if not self._threads:
             raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
         place: Mailbox[Reading] = Mailbox()
-        self._listening.append(place)
-        if self._over.is_set():
-            place.close()
-        try:
-            while (reading := place.take()) is not None:
-                yield reading
-        finally:
-            self._listening.remove(place)
+        with self._telling:  # from now on, not from when the first is asked for
+            if self._newest is not None:
+                place.put(self._newest)
+            if self._over.is_set():
+                place.close()
+            self._listening.add(place)
+        return self._take_all(place)
+
+    def _take_all(self, place: Mailbox[Reading]) -> Iterator[Reading]:
+        while (reading := place.take()) is not None:
+            yield reading
         if self._error is not None:
             raise self._error
 
@@ -469,14 +477,17 @@ class LiveReader:
 
     def _finish(self) -> None:
         self._end()
-        self._over.set()
-        for place in tuple(self._listening):
-            place.close()
+        with self._telling:
+            self._over.set()
+            for place in self._listening:
+                place.close()
 
     def _tell(self, reading: Reading, frame: LiveFrame | None) -> None:
         self.source.hear(reading)
-        for place in tuple(self._listening):
-            place.put(reading)
+        with self._telling:
+            self._newest = reading
+            for place in self._listening:
+                place.put(reading)
         for callback in tuple(self._subscribers):
             callback(reading, frame)
 
