@@ -1,8 +1,9 @@
 """Time the explainers on an untrained ShuffleNetV2 with one output.
 
-Two ratios say what an explainer adds to the passes it cannot do without: Grad-CAM against one forward and backward
-pass, Integrated Gradients at 50 steps against 50 of them, both one image at a time and in batches of the same size.
-With `--json` the last line is one JSON object.
+Each call is timed as the first of its network, whose earlier passes pay for no faster engine. Two ratios say what an
+explainer adds to the passes it cannot do without: Grad-CAM against one forward and backward pass, Integrated Gradients
+at 50 steps against 50 of them, both one image at a time and in batches of the same size. With `--json` the last line is
+one JSON object.
 """
 
 import argparse
@@ -15,9 +16,10 @@ import torch
 from torch import Tensor, nn
 from torchvision import models
 
-from sliplens.explainers import EXPLAINERS, GradCam, IntegratedGradients, Occlusion
+from sliplens.explainers import EXPLAINERS, GradCam, IntegratedGradients, get_explainer
 from sliplens.extras import missing_packages
 from sliplens.files import machine, versions
+from sliplens.models.engines import counting_passes
 
 STEPS = 50
 INSTALLED = [name for name in EXPLAINERS if name != "lrp" or not missing_packages("zennit", extra="lrp")]
@@ -28,7 +30,8 @@ def median_seconds(work: Callable[[], object], *, repeats: int, device: torch.de
     seconds = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
-        work()
+        with counting_passes():
+            work()
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         seconds.append(time.perf_counter() - start)
@@ -75,9 +78,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def timed(work: Callable[[], object], repeats: int = options.repeats) -> float:
         return median_seconds(work, repeats=repeats, device=options.device)
 
-    seconds, explainers = {}, dict(EXPLAINERS) | {"occlusion-marker": Occlusion(markers_px=marker_grid(options.size))}
+    seconds, markers = {}, marker_grid(options.size)
     for name in options.methods:
-        explain = explainers[name]
+        explain = get_explainer(name, **({"markers_px": markers} if name.endswith("-marker") else {}))
         # thousands of passes average out on their own; one call after the warm-up is enough
         seconds[name] = timed(lambda e=explain: e(model, images), repeats=1 if name == "poly-cam" else options.repeats)
         print(f"{name:<22} {seconds[name] / options.batch:9.4f} s an image, {options.size} px, batch {options.batch}")

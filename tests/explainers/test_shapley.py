@@ -183,6 +183,21 @@ def test_markers_are_players_and_what_lies_between_them_is_one_more() -> None:
     torch.testing.assert_close(by_marker.relevance, by_tile.relevance, atol=1e-6, rtol=0)
 
 
+def test_the_first_guess_costs_few_passes_beside_those_of_the_coalitions() -> None:
+    """A step that no gradient follows, where Integrated Gradients that have to be complete go on to their last step."""
+    seen = []
+
+    class Cliff(nn.Module):
+        def forward(self, images: Tensor) -> Tensor:
+            seen.append(len(images))
+            return torch.sigmoid(1e4 * (images.mean(dim=(1, 2, 3)) - 0.5))
+
+    explanation = Shapley(tile_px=1, pairs=64)(Cliff(), torch.ones(1, 3, 5, 5))
+
+    torch.testing.assert_close(explanation.relevance.sum(dim=(1, 2)), explanation.change)
+    assert sum(seen) <= 2 * 64 + 32
+
+
 def test_uncertain_contributions_are_told() -> None:
     """A network that answers with the parity of its tiles is beyond what few coalitions tell."""
 

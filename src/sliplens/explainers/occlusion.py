@@ -118,10 +118,8 @@ class RegionMethod(Method):
     as `find_markers`; they are then the regions, and what lies between them is one more."""
     radius_px: float | None = None
     """How far a marker reaches; see `marker_regions`."""
-    batch_size: int = 32
 
     def __post_init__(self) -> None:
-        require_at_least_one(self._name, batch_size=self.batch_size)
         if self.tile_px < 1:
             raise InputError(f"{self._name}'s tile_px is {self.tile_px}; give at least 1 pixel")
         if isinstance(self.markers_px, Tensor):
@@ -160,6 +158,12 @@ class Occlusion(RegionMethod):
     ----------
     Zeiler and Fergus, *Visualizing and understanding convolutional networks*, ECCV 2014, section 4.2; by Captum.
     """
+
+    batch_size: int = 32
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_at_least_one(self._name, batch_size=self.batch_size)
 
     @torch.no_grad()
     def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
