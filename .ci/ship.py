@@ -2,7 +2,8 @@
 
 `python .ci/ship.py RUN src/sliplens/weights/NAME --bits 10` keeps so many of the 23 bits behind the point: 10 are
 those of a half-precision number and are stored as one; with more, weights stay float32, whose zeros pack well. RUN may
-be the folder itself. It prints by how much answers on simulated frames move, and refuses more than 0.001 of margin.
+be the folder itself. It prints by how much answers on simulated frames move, and refuses more than 0.001 of any: of the
+margin and, where the network has them, of the ratio F_t / F_n, of margins told a friction and of several frames.
 """
 
 import argparse
@@ -19,10 +20,13 @@ from sliplens.codec import RESULT_FILE, load_result, save_result
 from sliplens.files import RUN_FILE
 from sliplens.grip.readings import ReadingTable
 from sliplens.models import Run, load, save_checkpoint
+from sliplens.recordings import Recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 LARGEST_CHANGE = 1e-3
 HALF_BITS = 10
+FRICTIONS = (0.3, 0.6, 0.9)
+"""Coefficients that a network is told."""
 
 
 def rounded(weights: Tensor, *, bits: int) -> Tensor:
@@ -37,24 +41,40 @@ def rounded(weights: Tensor, *, bits: int) -> Tensor:
     return torch.from_numpy(words.astype(np.uint32).view(np.float32).reshape(weights.shape).copy())
 
 
-def inputs(network: Run) -> Tensor:
-    """Frames of six trials, as the network sees them."""
+def simulate() -> list[Recording]:
+    """Six short trials."""
     plans = [plan for preset in ("thesis", "varied") for plan in plan_trials(PRESETS[preset])[::100][:3]]
-    trials = [simulate_trial(replace(plan, frames=20)) for plan in plans]
-    return torch.cat([network.encode(trial.frames, trial.reference) for trial in trials])
+    return [simulate_trial(replace(plan, frames=20)) for plan in plans]
 
 
-def ship(run: Path, folder: Path, *, bits: int) -> float:
-    """Write the network with rounded weights and give the largest change of an answer, in margin units."""
-    network = load(run)
-    frames = inputs(network)
-    before = network.predict(frames)
+def read(network: Run, trials: list[Recording]) -> dict[str, np.ndarray]:
+    """All that a network answers to the frames of some trials."""
+    parts: dict[str, list[np.ndarray]] = {}
+    for trial in trials:
+        inputs = network.encode(trial.frames, trial.reference)
+        estimate = network.estimate(inputs)
+        parts.setdefault("margin", []).append(estimate.margin)
+        if estimate.ratio is not None:
+            parts.setdefault("ratio", []).append(estimate.ratio.mean)
+        for friction in FRICTIONS if network.manifest.traction is not None else ():
+            told = network.estimate(inputs, friction=friction)
+            parts.setdefault(f"margin told {friction:g}", []).append(told.margin)
+        if network.sequence is not None:
+            several = network.follow().update(estimate, trial.time_s, np.isfinite(trial.safety_margin))
+            parts.setdefault("margin of several frames", []).append(several.margin)
+    return {name: np.concatenate(part) for name, part in parts.items()}
+
+
+def ship(run: Path, folder: Path, *, bits: int) -> dict[str, float]:
+    """Write the network with rounded weights and give the largest change of each of its answers."""
+    network, trials = load(run), simulate()
+    before = read(network, trials)
     kept = {name: rounded(values, bits=bits) for name, values in network.model.state_dict().items()}
     network.model.load_state_dict(kept)
-    change = float((network.predict(frames) - before).abs().max())
-    if change > LARGEST_CHANGE:
+    changes = {name: float(np.abs(after - before[name]).max()) for name, after in read(network, trials).items()}
+    if max(changes.values()) > LARGEST_CHANGE:
         sys.exit(
-            f"answers move by up to {change:.1e}, more than {LARGEST_CHANGE:g}: keep more bits; nothing was written"
+            f"answers move too far ({say(changes)}, {LARGEST_CHANGE:g} at most): keep more bits; nothing was written"
         )
     folder.mkdir(parents=True, exist_ok=True)
     for name in (RUN_FILE, RESULT_FILE):
@@ -67,7 +87,12 @@ def ship(run: Path, folder: Path, *, bits: int) -> float:
         # of the very network that was rounded: what it reads moves by less than the table resolves
         if table.network == network.manifest.weights_sha256:
             save_result(replace(table, network=load(folder).manifest.weights_sha256), folder / "readings")
-    return change
+    return changes
+
+
+def say(changes: dict[str, float]) -> str:
+    """Largest change of each answer, in a line."""
+    return ", ".join(f"{name} {change:.1e}" for name, change in changes.items())
 
 
 if __name__ == "__main__":
@@ -76,4 +101,4 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("--bits", type=int, required=True)
     given = parser.parse_args()
-    print(f"{given.folder.name}: answers move by up to {ship(given.run, given.folder, bits=given.bits):.1e}")
+    print(f"{given.folder.name}: answers move by up to: {say(ship(given.run, given.folder, bits=given.bits))}")

@@ -168,6 +168,15 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
             name: {key: rows["adapted"][ten][key] / rows["adapted"][most][key] for key in ("dry", "wet")}
             for name, rows in means.items()
         }
+        result["share_at_10_by_seed"] = {
+            name: {
+                key: [
+                    few[key] / many[key] for few, many in zip(rows["adapted"][ten], rows["adapted"][most], strict=True)
+                ]
+                for key in ("dry", "wet")
+            }
+            for name, rows in found.items()
+        }
     return result
 
 
