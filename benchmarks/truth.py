@@ -78,6 +78,7 @@ def judged(study: Study, name: str) -> dict[str, Any]:
         "sums": truth.sums,
         "opposing": {kind: float((towards * getattr(effects, kind) < 0).mean()) for kind in ("network", "shapley")},
         "frames": truth.frames,
+        "left_out": study.left_out.get(name),
         "qualifying_trials": study.choice and study.choice.qualified_alone[name],
         "mean_error": study.choice and study.choice.mean_error[name],
     }

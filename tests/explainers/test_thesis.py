@@ -112,9 +112,33 @@ def test_grad_cam_of_the_thesis_is_torch_cams_above_zero_in_its_order(network, i
         oracle = extractor(0, model(images.clone().requires_grad_()), normalized=False)[0]
     shown = spread(oracle, (images.shape[-2], images.shape[-1]))
     explanation = get_explainer("grad-cam-thesis")(model, images, reference=reference)
-    expected = shown * (explanation.change / shown.sum(dim=(1, 2)))[:, None, None]
+    expected = shown * (explanation.change.abs() / shown.sum(dim=(1, 2)))[:, None, None]
     torch.testing.assert_close(explanation.relevance, expected.float(), atol=1e-6, rtol=1e-4)
-    assert bool((explanation.influence >= 0).all())
+    torch.testing.assert_close(explanation.influence, explanation.relevance)
+
+
+@pytest.mark.parametrize("green", [0.5, 1.0])  # the answer rises, and falls
+def test_grad_cam_of_the_thesis_shows_what_raises_the_answer_whichever_way_it_went(green):
+    class RedLessGreen(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.conv = torch.nn.Conv2d(3, 2, 1, bias=False)
+            with torch.no_grad():
+                self.conv.weight.copy_(torch.eye(2, 3)[:, :, None, None])
+
+        def forward(self, images):
+            means = torch.relu(self.conv(images)).mean(dim=(2, 3))
+            return (means[:, 0] - 1.5 * means[:, 1])[:, None]
+
+    image = torch.zeros(1, 3, 16, 16)
+    image[0, 0, 2:6, 2:6] = 1
+    image[0, 1, 10:14, 10:14] = green
+    explanation = get_explainer("grad-cam-thesis")(RedLessGreen(), image, reference=torch.zeros(3, 16, 16))
+    assert bool(explanation.change[0] > 0) == (green < 1)
+    for shown in (explanation.relevance, explanation.influence, explanation.saliency):
+        assert float(shown[0, 3, 3]) == float(shown.max()) > 0
+        assert float(shown[0, 11, 11]) == float(shown.min()) == 0
+    assert float(explanation.relevance.sum()) == pytest.approx(abs(float(explanation.change[0])), rel=1e-5)
 
 
 def test_integrated_gradients_of_the_thesis_are_captums_from_black(network, images, reference):

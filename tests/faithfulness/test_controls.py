@@ -14,6 +14,7 @@ from sliplens.faithfulness.controls import (
     lead_over_controls,
     relative_change,
 )
+from sliplens.intervals import paired_difference
 from sliplens.results.faithfulness import is_control
 
 REFERENCE = torch.full((1, 3, 60, 60), 0.25)
@@ -143,13 +144,30 @@ def test_a_lead_is_no_larger_than_that_over_any_control_alone_nor_over_chance():
     nearest = min(alone, key=lambda one: one.gap.estimate)
     assert (among_all.control, among_all.gap.estimate) == (nearest.control, nearest.gap.estimate)
     lows, highs = zip(*(ends_of(one.gap) for one in alone), strict=True)
-    assert ends_of(among_all.gap) == (min(lows), min(highs))
+    low, high = ends_of(among_all.gap)
+    assert low == min(lows)
+    # behind one of six is no rare thing: the upper end is that of as many comparisons
+    assert high > min(highs)
+    gaps = [paired_difference(own, other, clusters=[TRIALS], rng=rng, comparisons=6) for other in (*others, 0 * own)]
+    assert high == min(ends_of(gap)[1] for gap in gaps)
     # to name the strongest first and look at no other would say too much
     wild = np.where(TRIALS == 0, -9.0, 0.4) + own.mean()
     uncertain = lead(own + 0.5, {"edges": own, "wild": wild})
     assert uncertain.control == "edges"
     assert lead(own + 0.5, {"edges": own}).shows_something
     assert not uncertain.shows_something
+
+
+def test_a_method_as_good_as_every_control_is_seldom_behind_or_ahead_for_sure():
+    rng, found = np.random.default_rng(0), []
+    for _ in range(100):
+        # trials differ, in which all maps are alike, and in which each has its own luck
+        common, *luck = rng.normal(0, 0.2, (10, 7))
+        own, *others = (common[TRIALS] + alone[TRIALS] + 0.5 for alone in luck)
+        found.append(lead(own, {f"{number}-new-weights": gains for number, gains in enumerate(others)}).gap)
+    # without a correction 0.11 of them
+    assert np.mean([gap.below_zero for gap in found]) <= 0.05
+    assert np.mean([gap.above_zero for gap in found]) <= 0.025
 
 
 def test_a_method_that_is_ahead_of_all_in_every_trial_shows_something_and_one_below_chance_does_not():

@@ -445,6 +445,49 @@ def test_a_claim_counts_a_fill_once_too(judged, tmp_path, rng):
     assert all(one.outcome is None and one.gap is not None and one.gap.below_zero for one in opposite)
 
 
+def test_a_fill_that_cannot_judge_has_no_vote_on_a_claim(judged, tmp_path, rng):
+    judged(thesis())
+    results = load_results(tmp_path)
+    table, truth = results.study.faithfulness["difference"].table, results.study.truth["difference"]
+
+    def told(*, unfit: tuple[str, ...], turned: tuple[str, ...]):
+        """The answer where some fills let half of the truth win, and under some the order is the opposite."""
+        gap = Difference(estimate=0.0, low=-0.1, high=0.1, units=14)
+        meta = [replace(truth.meta[0], fill=fill, gap=gap) for fill in unfit]
+        own = (table.method == "poly-cam-thesis") & np.isin(table.fill, turned)
+        pairs = (table.least_first, table.most_first), (table.most_first, table.least_first)
+        first, last = (np.where(own, *pair) for pair in pairs)
+        curves = replace(table, most_first=first, least_first=last)
+        faithful = replace(results.study.faithfulness["difference"], table=curves)
+        study = replace(
+            results.study,
+            faithfulness=results.study.faithfulness | {"difference": faithful},
+            truth=results.study.truth | {"difference": replace(truth, meta=(*truth.meta, *meta))},
+        )
+        return judge_claims(replace(results, study=study), rng=rng)[0].answers[0]
+
+    assert told(unfit=(), turned=("grey", "blur")).outcome == "undecided"
+    answer = told(unfit=("grey", "blur"), turned=("grey", "blur"))
+    assert answer.outcome == "holds"
+    silent = [one for one in answer.findings if one.where in ("grey", "blur")]
+    assert silent
+    assert all(one.outcome is None for one in silent)
+    none = told(unfit=("reference", "grey", "blur", "true"), turned=())
+    assert none.outcome == "undecided"
+    assert "under no fill that was scored does a map made from the truth win for sure" in none.text
+
+
+def test_frames_that_are_left_out_of_the_scores_are_told(judged, tmp_path, rng):
+    judged(thesis())
+    results = load_results(tmp_path)
+    assert results.study.left_out == {}
+    truth = results.study.truth["raw"]
+    fewer = replace(results.study, truth=results.study.truth | {"raw": replace(truth, frames=truth.frames - 2)})
+    assert list(fewer.left_out) == ["raw"]
+    sections = {one.id: one for one in build_sections(replace(results, study=fewer), rng=rng)}
+    assert f"2 of {truth.frames} frames to score are left out with the raw network" in str(sections["choice"].intro)
+
+
 def test_without_scores_nothing_is_believed(tmp_path, rng):
     write_choice(tmp_path, Made())
     write_quality(tmp_path, "raw", {})

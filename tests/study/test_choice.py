@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -6,8 +8,9 @@ from torch import Tensor, nn
 from sliplens.errors import InputError, RecordingError
 from sliplens.models import Run
 from sliplens.recordings import Dataset
+from sliplens.results.explanation import Explained
 from sliplens.results.study import Choice
-from sliplens.study.choice import choose_frames
+from sliplens.study.choice import Material, choose_frames, worth_scoring
 
 
 class Says(nn.Module):
@@ -40,6 +43,20 @@ def test_one_trial_is_shown_whole_and_every_trial_is_scored_at_three_levels(choi
     scored = [pick for pick in choice.frames if pick.scored]
     assert len(scored) == 3 * len(choice.trials) == 6
     assert len({pick.id for pick in choice.frames}) == len(choice.frames) == 9
+
+
+def test_frames_with_nothing_to_explain_are_not_scored(material: Material):
+    explained = material.explained
+
+    def changing_by(*changes: float) -> Explained:
+        frames = zip(explained.frames, changes, strict=True)
+        changed = (replace(one, prediction=one.reference_prediction + by) for one, by in frames)
+        return replace(explained, frames=tuple(changed))
+
+    found = worth_scoring(material.chosen, changing_by(0.3, 1e-4, -1e-4, -0.3, 0.0199, -0.0201))
+    assert [frame.id for frame in found] == [explained.frames[row].id for row in (0, 3, 5)]
+    with pytest.raises(InputError, match=r"in no frame does the difference network answer farther than 0\.02 from"):
+        worth_scoring(material.chosen, changing_by(*[1e-4] * 6))
 
 
 # at levels 1 and 0 a constant answer c is wrong by about max(1 - c, c): 0.5 by half, 0.9 by nine tenths

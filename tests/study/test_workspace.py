@@ -35,6 +35,25 @@ def test_a_folder_holds_what_is_given_back_without_one(difference_run: Path, sma
     assert list(scores.methods) == ["grad-cam", "random"]
 
 
+def test_a_failure_after_the_last_map_loses_none(
+    difference_run: Path, small_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    run = {"run": difference_run, "source": small_dataset, "methods": ("grad-cam",), "levels": LEVELS}
+    run |= {"out": tmp_path / "maps"}
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sliplens.study.workspace.draw_explained", fail)
+        with pytest.raises(OSError, match="no space left"):
+            explain_source(**run)
+    with monkeypatch.context() as patch:
+        patch.setattr("sliplens.explainers.cam._differentiate", fail)  # no map is made again
+        assert len(explain_source(**run).frames) == 2
+    assert not (tmp_path / "maps" / "parts").exists()
+
+
 def test_a_mistake_is_told_before_a_network_is_loaded(small_dataset: Dataset):
     with pytest.raises(InputError, match="there is no explainer named 'gradcam'"):
         explain_source("no such run", small_dataset, methods=("gradcam",))

@@ -244,8 +244,9 @@ class _Cam(Method):
     """Take the reference's activations off. False gives the published map, which does not depend on the reference and
     has no completeness gap; the reference then only decides what `saliency` shows."""
     relu: bool = False
-    """Keep the cells above zero alone, as published; their map is then scaled to add up to f(x) - f(b), so that the
-    order of its pixels is the published one. That is a convention, and says nothing of what one pixel contributes."""
+    """Keep the cells above zero alone, as published: those that raise the prediction, whichever way it went. Their map
+    is then scaled to add up to |f(x) - f(b)|, which is a convention, and says nothing of what one pixel contributes;
+    its pixels are ranked and shown in the published order, where the prediction fell too."""
     batch_size: int = 32
 
     method: ClassVar[str]
@@ -285,11 +286,12 @@ class _Cam(Method):
             if on_progress is not None:
                 on_progress(sum(map(len, maps)), len(comparison.images))
         comparison = comparison.knowing(torch.cat(predictions), torch.cat(reference_predictions))
-        relevance = scale_to(torch.cat(maps), total=comparison.change) if self.relu else torch.cat(maps)
+        relevance = scale_to(torch.cat(maps), total=comparison.change.abs()) if self.relu else torch.cat(maps)
         return comparison.explanation(
             relevance,
             method=self.method,
             complete=self.contrast and not self.one_sided and not self.relu,
+            raises_only=self.relu,
             target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
             warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist()),
         )

@@ -192,6 +192,8 @@ class Explanation:
     """For each image what its map has in common with the exact one; empty where the map is exact."""
     engine: str = "eager"
     """What ran the network: as it is (`eager`), or a faster engine of `models.engines` that answers as it does."""
+    raises_only: bool = False
+    """Whether the method tells only what raises the prediction, as a published map with a ReLU does of f itself."""
 
     @property
     def change(self) -> Float[Tensor, " batch"]:
@@ -200,7 +202,12 @@ class Explanation:
 
     @property
     def influence(self) -> Float[Tensor, "batch height width"]:
-        """Relevance that works towards the target, in margin units: signed by sign(f(x) - f(reference))."""
+        """What the method ranks pixels by: relevance that works towards the target, by sign(f(x) - f(reference)).
+
+        In margin units. A map that `raises_only` is ranked as it was published, whichever way the prediction went.
+        """
+        if self.raises_only:
+            return self.relevance
         return self.change.sign().to(self.relevance.dtype)[:, None, None] * self.relevance
 
     @property
@@ -208,7 +215,8 @@ class Explanation:
         """The supporting evidence in [0, 1], for viewing: 1 at the strongest pixel of each image.
 
         The map is relu(sign(f(x) - f(reference)) relevance) over its largest value: where the margin falls below the
-        reference's, the pixels that lower it. A map without supporting evidence stays zero.
+        reference's, the pixels that lower it; of a map that `raises_only` always those that raise it. A map without
+        supporting evidence stays zero.
         """
         supporting = torch.relu(self.influence)
         peak = supporting.amax(dim=(1, 2), keepdim=True)

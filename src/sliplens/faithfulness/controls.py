@@ -193,16 +193,25 @@ def lead_over_controls(
 ) -> Lead:
     """Mean of a score of frames less that of the strongest control, with a 95 % interval (`paired_difference`).
 
-    No control is chosen beforehand: each end is the lowest of those over all of them, so that a lead is sure only where
-    the method is ahead of each for sure, whichever would be the strongest in other trials. The score is one that is 0
-    by chance, which stands among the controls.
+    No control is chosen beforehand: each end is the lowest of those over all of them. A lead is sure only where the
+    method is ahead of each for sure, whichever would be the strongest in other trials, which needs no correction. To be
+    behind it is enough to be behind any, so the upper ends are those of as many comparisons as there are controls. The
+    score is one that is 0 by chance, which stands among the controls.
 
-    Berger, *Multiparameter hypothesis testing and acceptance sampling* (1982): intersection-union tests.
+    Berger, *Multiparameter hypothesis testing and acceptance sampling* (1982): intersection-union tests, and the
+    union-intersection tests that Bonferroni's inequality bounds.
     """
     others = {**controls, CHANCE: np.zeros(len(own))}
-    gaps = {name: paired_difference(own, other, clusters=clusters, rng=rng) for name, other in others.items()}
+    levels = list(clusters)
+    gaps, corrected = (
+        {
+            name: paired_difference(own, other, clusters=levels, rng=rng, comparisons=comparisons)
+            for name, other in others.items()
+        }
+        for comparisons in (1, len(others))
+    )
     control = min(gaps, key=lambda name: gaps[name].estimate)
-    ends = ([getattr(gap, end) for gap in gaps.values()] for end in ("low", "high"))
+    ends = [gap.low for gap in gaps.values()], [gap.high for gap in corrected.values()]
     low, high = (None if None in over_all else min(over_all) for over_all in ends)
     return Lead(control=control, gap=replace(gaps[control], low=low, high=high))
 

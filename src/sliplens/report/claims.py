@@ -92,6 +92,9 @@ def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Claim, 
     def against_rivals(faithful: RemovalScores) -> list[Answer]:
         return [_beats_rivals(faithful, results, rng=rng)]
 
+    def against_chance(faithful: RemovalScores) -> list[Answer]:
+        return [_no_better(faithful, study.truth.get(faithful.input), rng=rng)]
+
     return (
         Claim(
             id="most-faithful",
@@ -112,9 +115,7 @@ def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Claim, 
             title="Grad-CAM is not faithful",
             test="Tested against maps that know nothing of the network: holds under a fill where Grad-CAM's SRG lies "
             "below chance or below the best control for sure; does not hold where it lies above both for sure.",
-            answers=_of_each(
-                results, study.faithfulness, lambda faithful: [_no_better(faithful, rng=rng)], why=_UNSCORED
-            ),
+            answers=_of_each(results, study.faithfulness, against_chance, why=_UNSCORED),
         ),
         Claim(
             id="noisy",
@@ -182,15 +183,18 @@ def _untested(subject: str, why: str) -> Answer:
 
 
 def _over_fills(
-    subject: str, by_setting: dict[str, Outcome], findings: list[Finding], faithful: RemovalScores
+    subject: str, by_setting: dict[str, Outcome], findings: list[Finding], voting: Sequence[tuple[str, str]]
 ) -> Answer:
-    """Answer by what holds under most fills, each of which votes once, with the intervals of the first."""
-    voting = [fill_name(*one) for one in voting_settings(faithful)]
-    findings = [replace(one, outcome=one.outcome if one.where in voting else None) for one in findings]
-    by_setting = {name: own for name, own in by_setting.items() if name in voting}
+    """Answer by what holds under most fills that vote (`voting_settings`), with the intervals of the first."""
+    by_vote = [fill_name(*one) for one in voting]
+    findings = [replace(one, outcome=one.outcome if one.where in by_vote else None) for one in findings]
+    by_setting = {name: own for name, own in by_setting.items() if name in by_vote}
+    if not by_setting:
+        why = "under no fill that was scored does a map made from the truth win for sure"
+        return replace(_untested(subject, why), findings=tuple(findings))
     names = {found: [name for name, own in by_setting.items() if own == found] for found in (*_OPPOSITE, "undecided")}
     text = sentence("; ".join(f"{outcome} under {listed(where)}" for outcome, where in names.items() if where))
-    first = findings[0].where
+    first = next(one.where for one in findings if one.where in by_setting)
     told = [f"{one.compared}: {tell_interval(one.gap)}" for one in findings if one.gap and one.where == first]
     text += f" Under {first}, {'; '.join(told)}." if told else " "
     outcome = most_of(list(by_setting.values()))
@@ -229,7 +233,8 @@ def _beats_rivals(faithful: RemovalScores, results: Results, *, rng: np.random.G
     rivals = [one for one in _RIVALS if {one, method} <= set(scored)]
     pairs = {f"D, {name} less {method_name(one)}": (scored[method], scored[one]) for one in rivals}
     findings += _by_thesis_score(pairs, rng=rng)
-    return _over_fills(subject, by_setting, findings, faithful)
+    voting = voting_settings(faithful, results.study.truth.get(faithful.input))
+    return _over_fills(subject, by_setting, findings, voting)
 
 
 def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
@@ -255,10 +260,11 @@ def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
     )
     methods = [one for one in (*_RIVALS, POLY_CAM) if one in first and one in second]
     pairs = {f"D of {method_name(one)}, difference less raw": (first[one], second[one]) for one in methods}
-    return _over_fills(subject, by_setting, [*findings, *_by_thesis_score(pairs, rng=rng)], difference)
+    voting = voting_settings(difference, *results.study.truth.values())
+    return _over_fills(subject, by_setting, [*findings, *_by_thesis_score(pairs, rng=rng)], voting)
 
 
-def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
+def _no_better(faithful: RemovalScores, truth: Truth | None, *, rng: np.random.Generator) -> Answer:
     findings, by_setting, subject, name = [], {}, input_name(faithful.input), method_name(GRAD_CAM)
     leads = {fill_name(*one.key[:2]): one.lead_over_controls for one in faithful.scores if one.method == GRAD_CAM}
     for where, curves in removal_by_setting(faithful):
@@ -277,7 +283,7 @@ def _no_better(faithful: RemovalScores, *, rng: np.random.Generator) -> Answer:
         findings.append(Finding(where=where, compared=compared, value=f"{most:.3f} against {chance:.3f}"))
     if not by_setting:
         return _untested(subject, f"{name} was not scored")
-    return _over_fills(subject, by_setting, findings, faithful)
+    return _over_fills(subject, by_setting, findings, voting_settings(faithful, truth))
 
 
 def _noisiest(looks: MapQuality) -> Answer:

@@ -19,7 +19,7 @@ from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots import style
 from sliplens.results.evaluation import Predictions
 from sliplens.results.faithfulness import CHANCE, Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
-from sliplens.results.study import Choice, MarkerEffects, Roughness
+from sliplens.results.study import Choice, MarkerEffects, Roughness, Truth
 
 CITATION = (
     "Max Polak, Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning, Master's thesis, "
@@ -138,10 +138,19 @@ def settings(faithful: RemovalScores) -> list[tuple[str, str]]:
     return [(fill, unit) for unit in units for fill in fills if (fill, unit) in found]
 
 
-def voting_settings(faithful: RemovalScores) -> list[tuple[str, str]]:
-    """One setting of each fill, or a fill tried with several units would vote as often: that by pixels where it is."""
+def voting_settings(faithful: RemovalScores, *truths: Truth | None) -> list[tuple[str, str]]:
+    """One setting of each fill, or a fill tried with several units would vote as often: that by pixels where it is.
+
+    Fills under which a map made from one of the truths does not win for sure have no vote.
+    """
     units = {fill: (fill, unit) for fill, unit in reversed(settings(faithful))}
-    return [one for one in settings(faithful) if units[one[0]] == one]
+    unfit = {fill for truth in truths for fill in unfit_fills(truth)}
+    return [one for one in settings(faithful) if units[one[0]] == one and one[0] not in unfit]
+
+
+def unfit_fills(truth: Truth | None) -> list[str]:
+    """Fills under which a map made from the truth does not win for sure: they cannot judge a map."""
+    return [] if truth is None else [one.fill for one in truth.meta if not one.holds]
 
 
 def removal_by_setting(faithful: RemovalScores) -> list[tuple[str, dict[str, RemovalCurve]]]:

@@ -35,6 +35,7 @@ from sliplens.report.comparisons import (
     sentence,
     tell_interval,
     tell_sample,
+    unfit_fills,
     voting_settings,
 )
 from sliplens.report.results import Results
@@ -438,12 +439,11 @@ def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[St
 
     A fill counts once. Fills under which a map made from the truth does not win for sure are left out.
     """
-    unfit = _unfit_fills(truth)
     scores = {score.key: score for score in faithful.scores}
     leads = {key: score.lead_over_controls for key, score in scores.items()}
     standings = []
     for method in methods_in_order(score.method for score in faithful.scores if not score.control):
-        tested = [one for one in voting_settings(faithful) if leads.get((*one, method)) and one[0] not in unfit]
+        tested = [one for one in voting_settings(faithful, truth) if leads.get((*one, method))]
         beaten = [one for one in tested if (lead := leads[*one, method]) is not None and lead.shows_something]
         gains = [scores[*one, method].srg.estimate for one in tested]
         mean = float(np.mean(gains)) if gains else float("-inf")
@@ -457,7 +457,7 @@ def _believe(faithful: RemovalScores, results: Results) -> Statement:
     ranked = rank_methods(faithful, truth)
     if faithful.trials < FEWEST_UNITS:
         return _too_few(topic, faithful.trials)
-    fills = [FILL_NAMES.get(fill, fill) for fill in _unfit_fills(truth)]
+    fills = [FILL_NAMES.get(fill, fill) for fill in unfit_fills(truth)]
     unfit = f" Left out: {listed(fills)}, where even a map made from the truth does not win for sure." if fills else ""
     if not any(one.tested for one in ranked):
         why = "no method was compared with a control under a fill that can judge it"
@@ -517,10 +517,6 @@ def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) 
         return f" {name}, next by its mean gain, is ahead of it under {listed(behind)}; {means}."
     but = f", and behind it under {listed(behind)}; {means}" if behind else ""
     return f" It is ahead of {name}, the next, under {listed(ahead)}{but}."
-
-
-def _unfit_fills(truth: Truth | None) -> list[str]:
-    return [] if truth is None else [one.fill for one in truth.meta if not one.holds]
 
 
 _KINDS = {

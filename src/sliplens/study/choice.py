@@ -1,6 +1,6 @@
 """What a study looks at: trials, frames, their markers, the methods, and the fastest way to ask a network."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from functools import cache
 from itertools import groupby
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam, get_explainer
+from sliplens.explainers.explanation import CLOSE
 from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, to_network_px
 from sliplens.faithfulness.removal import Units, marker_units, tile_units
 from sliplens.images import absolute_difference
@@ -325,9 +326,14 @@ class Material:
             chosen=tuple(self.chosen[row] for row in chosen),
         )
 
-    def towards_target(self, method: str) -> Float[np.ndarray, "frames size size"]:
-        """The part of a method's relevance that works towards each frame's target."""
-        return self.explained.relevance[method] * self.explained.towards[:, None, None]
+    def raises_only(self, method: str) -> bool:
+        """Whether a method tells only what raises the answer, as one with the published ReLU does."""
+        return getattr(self.explainers.get(method), "relu", False)
+
+    def influence(self, method: str) -> Float[np.ndarray, "frames size size"]:
+        """What a method ranks pixels by (`Explanation.influence`)."""
+        relevance = self.explained.relevance[method]
+        return relevance if self.raises_only(method) else relevance * self.explained.towards[:, None, None]
 
     def units(self) -> dict[str, list[Units]]:
         """What can be removed at once, for each frame: pixels, tiles, and markers where they are known in every one."""
@@ -367,6 +373,27 @@ class MethodStage(MaterialStage[Result]):
         """All methods."""
         for method in self.material.explainers:
             yield shard(method, trial=method, frames=1, recipe="method", shown="")
+
+
+def worth_scoring(chosen: Iterable[ChosenFrame], explained: Explained) -> tuple[ChosenFrame, ...]:
+    """The frames to score in which there is something to explain: the answer changed by `CLOSE` or more.
+
+    That is less than the networks err by, so that the sign of a smaller change, along which maps are ranked, is chance:
+    the same constant makes every explanation say that there is next to nothing to explain.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    changes = {frame.id: abs(frame.prediction - frame.reference_prediction) for frame in explained.frames}
+    found = tuple(frame for frame in chosen if frame.scored and changes[frame.id] >= CLOSE)
+    if not found:
+        raise InputError(
+            f"in no frame does the {explained.input} network answer farther than {CLOSE:g} from what it says of the "
+            "untouched sensor, so there is nothing to explain; train it longer, or leave it out"
+        )
+    return found
 
 
 _TRIALS = 1000

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import Explainer
+from sliplens.explainers.explanation import CLOSE
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.files import hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
@@ -20,7 +21,7 @@ from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explained
-from sliplens.results.faithfulness import DeletionScores
+from sliplens.results.faithfulness import NEW_WEIGHTS, DeletionScores
 from sliplens.results.study import (
     ASKED_FILE,
     STAGES,
@@ -30,6 +31,7 @@ from sliplens.results.study import (
     States,
     Study,
     UntrainedMaps,
+    tell_left_out,
 )
 from sliplens.shards import EXECUTORS, Crew, MakePart, Work, WorkError
 from sliplens.simulation.intervention import rebuild_trial
@@ -46,6 +48,7 @@ from sliplens.study.choice import (
     study_explainers,
     with_markers,
     without_markers,
+    worth_scoring,
 )
 from sliplens.study.explaining import Explaining, frames_at
 from sliplens.study.scoring import (
@@ -71,6 +74,8 @@ _Work: TypeAlias = Callable[[Path, OnProgress], object]
 
 _CONTROLS = {"controls": "each method on a network of new weights a trial", "statistics": "images"}
 """What the controls depend on, and with them all that is compared with them."""
+_SCORED = {"least_change": CLOSE}
+"""What decides which of the chosen frames are scored (`worth_scoring`)."""
 
 
 TESTS = ("score", "remedies", "faithfulness", "randomisation", "map-quality", "truth", "timing")
@@ -284,9 +289,10 @@ class _Network:
     @cached_property
     def material(self) -> Material:
         """Explanations of the frames that are scored."""
-        scored = tuple(frame for frame in self.result("choice").frames if frame.scored)
+        explained = self.result("explain")
+        scored = worth_scoring(self.result("choice").frames, explained)
         own: dict[str, Any] = {"markers": self.result("states").markers, "explainers": self.study.explainers}
-        return gather(self.run, self.result("explain"), self.study.data, scored, **own)
+        return gather(self.run, explained, self.study.data, scored, **own)
 
     @cached_property
     def influence(self) -> Mapping[str, Any]:
@@ -330,12 +336,18 @@ class _Network:
         )
 
     def by_truth(self) -> JudgingByTruth:
-        """What putting markers back does."""
+        """What putting markers back does, held against maps along the answer's change."""
+        towards, raises_only = self.material.explained.towards[:, None, None], self.material.raises_only
+        maps = {
+            # its order is the published one, but where the answer fell what raises it opposes that
+            name: towards * values if raises_only(name.removesuffix(NEW_WEIGHTS)) else values
+            for name, values in self.influence.items()
+        }
         return JudgingByTruth(
             trained=self.run,
             explained=self.material.explained,
             data=self.study.data,
-            maps=self.influence,
+            maps=maps,
             fills=tuple(dict.fromkeys(setting.fill for setting in SETTINGS)),
             seed=self.study.seed,
         )
@@ -413,8 +425,13 @@ class _Stages:
                 stage, own = judging.open(name).stage(test), {"crew": crew, "name": (name, test)}
                 return stage.make(parts, **own, retry_failed=retry_failed, on_progress=count)
 
-            config, title = self._about(name) | depends.get(test, {}), f"{kind.title} ({name})"
+            about = self._about(name) | ({} if test == "explain" else _SCORED)
+            config, title = about | depends.get(test, {}), f"{kind.title} ({name})"
             self.found[name][test] = self._run(test, name, config, title, work)
+            if test == "explain" and tests:
+                chosen = [frame for frame in self._choice.frames if frame.scored]
+                if left := len(chosen) - len(worth_scoring(chosen, self.found[name][test])):
+                    note(self.on_progress, tell_left_out(left, len(chosen), name))
 
     def time(self, name: str, judging: _Judging) -> None:
         """Time one network's methods."""
@@ -423,7 +440,7 @@ class _Stages:
             return time_explainers(judging.open(name).material, on_progress=count)
 
         title = f"Timing the methods ({name})"
-        self.found[name]["timing"] = self._run("timing", name, self._about(name), title, work)
+        self.found[name]["timing"] = self._run("timing", name, self._about(name) | _SCORED, title, work)
 
     @cached_property
     def _choice(self) -> Choice:
@@ -460,8 +477,8 @@ class _Stages:
                 return load_result(target, _KINDS[name], command=_COMMAND)
             with stage(self.on_progress, title) as count, counting_passes():
                 result = work(out.folder / "parts", count)
-            remove(out.folder / "parts")
             save_result(result, out.folder)
+            remove(out.folder / "parts")  # not before: what fails above goes on from them
         # as it was kept, whose layout in memory may differ: what follows has the same bytes when it goes on from here
         result = load_result(target, _KINDS[name], command=_COMMAND)
         for alarm in getattr(result, "alarms", ()):

@@ -361,8 +361,8 @@ Scoring = Callable[[Material, Influence, int, OnProgress], Mapping[str, Faithful
 
 
 def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size size"]]:
-    """Maps to rank parts by: the part of each method's relevance that works towards the target, and the controls."""
-    maps = {name: material.towards_target(name) for name in material.explained.relevance}
+    """Maps to rank parts by, of each method (`Material.influence`) and of the controls."""
+    maps = {name: material.influence(name) for name in material.explained.relevance}
     return maps | control_maps(material.trained.model, material.inputs, material.references)
 
 

@@ -139,9 +139,10 @@ def explain_source(
     if out is None:
         with stage(on_progress, title) as count:
             return explain(on_progress=count)
-    images = chosen.images.numpy().tobytes() + chosen.references.numpy().tobytes()
+    images = hashlib.sha256(chosen.images.numpy().tobytes())
+    images.update(chosen.references.numpy().tobytes())
     recipe: dict[str, Any] = {"weights_sha256": trained.manifest.weights_sha256, "input": trained.manifest.input}
-    recipe |= {"source": chosen.source, "ids": chosen.ids, "images_sha256": hashlib.sha256(images).hexdigest()}
+    recipe |= {"source": chosen.source, "ids": chosen.ids, "images_sha256": images.hexdigest()}
     recipe |= {"method": tuple(methods), "budget": budget, "colours": colours}
     what = f"{len(methods)} maps of each of {len(chosen.ids)} frames, panel.png"
     with output_folder(out, stage="explain", config=recipe, overwrite=overwrite) as output:
@@ -153,9 +154,10 @@ def explain_source(
                 for warning in dict.fromkeys(one for notes in explained.methods.values() for one in notes.warnings):
                     warned = [method for method, notes in explained.methods.items() if warning in notes.warnings]
                     note(on_progress, f"{', '.join(warned)}: {warning}")
-            remove(output.parts / "parts")
             draw_explained(explained, output.folder, colours=colours)
             save_result(explained, output.folder)
+            remove(output.parts / "parts")  # not before: what fails above goes on from them
+            del explained  # it is read once more, and is large
     wrote(on_progress, out, what, kept=output.complete)
     return load_explained(out)
 
@@ -200,15 +202,17 @@ def score_explained(
     if out is None:
         with stage(on_progress, title) as count:
             return score(on_progress=count)
-    maps = hashlib.sha256(b"".join(maps.tobytes() for maps in explained.saliency.values())).hexdigest()
-    recipe: dict[str, Any] = {"weights_sha256": trained.manifest.weights_sha256, "maps_sha256": maps}
+    maps = hashlib.sha256()
+    for own in explained.saliency.values():
+        maps.update(own.tobytes())
+    recipe: dict[str, Any] = {"weights_sha256": trained.manifest.weights_sha256, "maps_sha256": maps.hexdigest()}
     recipe |= {"input": explained.input, "source": explained.source, "fill": fill, "steps": steps, "seed": seed}
     with output_folder(out, stage="score", config=recipe, overwrite=overwrite) as output:
         if not output.complete:
             with stage(on_progress, title) as count:
                 scores = score(parts=output.folder / "parts", on_progress=count)
-            remove(output.folder / "parts")
             save_result(scores, output.folder)
+            remove(output.folder / "parts")
     wrote(on_progress, out, "curves and scores", kept=output.complete)
     return load_result(out, DeletionScores, command="sliplens score")
 
