@@ -10,6 +10,7 @@ import pytest
 
 from sliplens.errors import InputError
 from sliplens.files import (
+    end_removal,
     hash_json,
     output_folder,
     read_json,
@@ -208,7 +209,7 @@ def test_whatever_change_a_process_was_killed_before_the_next_one_makes_the_same
     told = subprocess.run([sys.executable, script, tmp_path], capture_output=True, text=True, timeout=120, check=False)
     assert told.returncode == 0, told.stderr
     tried = json.loads(told.stdout)
-    assert {name for name, _ in tried} == {"make", "replace", "file", "scratch", "split"}
+    assert {name for name, _ in tried} == {"make", "replace", "file", "table", "scratch", "split"}
     assert len(tried) > 40
 
 
@@ -226,5 +227,5 @@ def test_a_folder_that_is_removed_is_there_whole_or_not_at_all(tmp_path: Path, m
         with pytest.raises(KeyboardInterrupt):
             remove(folder)
     assert not folder.exists()
-    remove(folder)
+    end_removal(folder)
     assert not list(tmp_path.iterdir())

@@ -16,8 +16,8 @@ from shard_work import Count, CountInThreads, shards
 
 from sliplens.cli import main
 from sliplens.errors import InputError, ShardError, SliplensError
-from sliplens.files import hash_file
-from sliplens.parts import TRIES, Doing, Shard, read_status, shard
+from sliplens.files import hash_file, remove
+from sliplens.parts import TRIES, Doing, Shard, read_status, require_new_table, shard
 from sliplens.shards import Crew, make_parts, make_table
 
 TITLE = "Counting"
@@ -301,6 +301,40 @@ def test_parts_join_into_a_file_or_stay_a_data_set(log: Path, tmp_path: Path):
     assert {path.name for path in (tmp_path / "set").iterdir()} == {*(f"trial={name}" for name in "abcde"), "run.json"}
     with pytest.raises(SliplensError, match="another sliplens is writing"), _writing(tmp_path / "b.parquet"):
         table(tmp_path / "b.parquet")
+
+
+def test_a_table_whose_parts_were_left_is_made_again_by_the_same_work_alone(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    out, left = tmp_path / "a.parquet", tmp_path / ".a.parquet.partial"
+
+    def table(recipe: int = 1, **more: object) -> bytes:
+        given = partial(shards, "ab", recipe=recipe)
+        make_table(Count(log=log), given, out, title=TITLE, recipe={}, **more)  # pyright: ignore[reportArgumentType]
+        return out.read_bytes()
+
+    def killed(path: Path) -> None:
+        if path == left:
+            raise KeyboardInterrupt
+        remove(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sliplens.parts.remove", killed)
+        with pytest.raises(KeyboardInterrupt):
+            table()
+    first = out.read_bytes()
+    require_new_table(out, suffix=".parquet")
+    for other in (partial(table, 2), partial(table, resumable=False)):
+        with pytest.raises(InputError, match="exists"):
+            other()
+    assert table() == first
+    assert Count(log=log).tries() == {"a": 1, "b": 1}
+    with pytest.raises(InputError, match="exists"):
+        require_new_table(out, suffix=".parquet")
+    left.mkdir()  # begun after the file, which is of something else
+    os.utime(out, (0, 0))
+    with pytest.raises(InputError, match="exists"):
+        require_new_table(out, suffix=".parquet")
 
 
 def _writing(out: Path):

@@ -199,13 +199,32 @@ def remove(path: Path) -> None:
     if isinstance(path, StoredPath):
         path.remove()
         return
-    aside = path.with_name(f".{path.name}.removed")
+    aside = _removed(path)
     _drop(aside)
     if path.is_dir():
         path.rename(aside)
         shutil.rmtree(aside)
     else:
         path.unlink(missing_ok=True)
+
+
+def end_removal(path: Path) -> None:
+    """Remove what is left of a folder whose removal was cut off."""
+    _drop_unheld(_removed(path))
+
+
+def _removed(path: Path) -> Path:
+    return path.with_name(f".{path.name}.removed")
+
+
+def _drop_unheld(folder: Path) -> None:
+    """Remove a folder whose process is gone."""
+    with suppress(OSError):  # it is not there, or somebody else's
+        if (held := hold(folder, surely=True)) is not None:
+            try:
+                shutil.rmtree(folder)
+            finally:
+                os.close(held)
 
 
 MANIFEST_FILE = "manifest.json"
@@ -444,12 +463,7 @@ def scratch_folder() -> Iterator[Path]:
     One whose process was killed is removed by the next that needs one.
     """
     for left in Path(tempfile.gettempdir()).glob(f"{_SCRATCH}*"):
-        with suppress(OSError):  # somebody else's
-            if (held := hold(left, surely=True)) is not None:
-                try:
-                    shutil.rmtree(left)
-                finally:
-                    os.close(held)
+        _drop_unheld(left)
     folder, held = make_and_hold(_make_scratch)
     while held is None:  # an empty one may be taken for one that was left, and held by who clears it
         folder, held = make_and_hold(_make_scratch)

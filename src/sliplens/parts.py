@@ -9,7 +9,7 @@ import os
 import re
 import socket
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
@@ -24,12 +24,14 @@ from sliplens.errors import InputError
 from sliplens.files import (
     StoredPath,
     as_path,
+    end_removal,
     hash_json,
     held_folder,
     hold,
     make_and_hold,
     partial_folder,
     remove,
+    require_new_file,
     scratch_folder,
 )
 
@@ -105,6 +107,19 @@ def parts_folder(target: Path | None) -> Iterator[Path]:
                 remove(folder)
             raise
         remove(folder)
+
+
+def require_new_table(out: Path, *, suffix: str | Sequence[str], overwrite: bool = False) -> None:
+    """Check that a file can be made of parts under its name.
+
+    One that is newer than the parts beside it was made of them by a process that was killed before it could remove
+    them: it is made again by who has the same parts.
+    """
+    left, begun = partial_folder(out), False
+    if not isinstance(out, StoredPath):
+        end_removal(left)
+        begun = out.is_file() and left.is_dir() and out.stat().st_mtime_ns >= left.stat().st_mtime_ns
+    require_new_file(out, suffix=suffix, overwrite=overwrite or begun)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -28,7 +28,7 @@ import pyarrow as pa
 from sliplens.codec import open_table, regrouped, write_tables
 from sliplens.errors import InputError, RecordingError, ShardError, SliplensError
 from sliplens.extras import Table, require_packages
-from sliplens.files import output_folder
+from sliplens.files import output_folder, require_new_file
 from sliplens.parts import (
     Shard,
     claim,
@@ -467,6 +467,8 @@ def make_table(
                 deque(read(output.parts), maxlen=0)
             return schema, None
     with parts_folder(out if resumable else None) as parts:
+        if out is not None and out.exists() and not all(made for _, made in look_for(parts, shards())):
+            require_new_file(out, overwrite=overwrite)  # it was made of other parts
         schema = make(parts)
         return schema, write_tables(regrouped(read(parts), rows=LONGEST), out, schema)
 

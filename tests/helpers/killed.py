@@ -9,11 +9,14 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from changes import count_changes
 
+from sliplens.errors import InputError
 from sliplens.files import output_folder, scratch_folder, whole_file, write_json
+from sliplens.parts import parts_folder, require_new_table
 from sliplens.recordings.dataset import TrialInfo, write_dataset_table
 from sliplens.recordings.splits import split_dataset
 
@@ -40,11 +43,23 @@ def use_scratch(_: Path) -> None:
         (folder / "piece").write_text("x")
 
 
+def make_file(folder: Path) -> None:
+    """Make a file of a part, or be told that it is there."""
+    out = folder / "x.csv"
+    with suppress(InputError):
+        require_new_table(out, suffix=".csv")
+        with parts_folder(out) as parts:
+            write_json(parts / "x.json", {"x": 1})
+            with whole_file(out) as draft:
+                draft.write_text("x")
+
+
 Work = Callable[[Path], object]
 WORKS: dict[str, tuple[Work, Work]] = {
     "make": (lambda _: None, make),
     "replace": (make, lambda folder: make(folder, "y")),
     "file": (lambda _: None, lambda folder: write_json(folder / "x.json", {"x": 1})),
+    "table": (lambda _: None, make_file),
     "scratch": (lambda _: None, use_scratch),
     "split": (prepare_split, lambda folder: split_dataset(folder, "trials")),
 }

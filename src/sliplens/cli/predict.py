@@ -59,11 +59,12 @@ class Predict(SourceCommand):
     def check(self) -> None:
         """Refuse what is wrong at first sight."""
         from sliplens.codec import TABLE_SUFFIXES
+        from sliplens.parts import require_new_table
 
         if self.source is None:
             raise InputError("name what to read: sliplens predict [RUN] SOURCE")
         if self.output is not None and self.output.suffix:
-            require_new_file(self.output, suffix=TABLE_SUFFIXES, overwrite=self.overwrite)
+            require_new_table(self.output, suffix=TABLE_SUFFIXES, overwrite=self.overwrite)
         if self.plot is not None:
             from sliplens.plots.style import require_picture_path
 

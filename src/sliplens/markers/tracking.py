@@ -14,10 +14,11 @@ from sliplens._version import __version__
 from sliplens.codec import read_written, regrouped, write_tables
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2
-from sliplens.files import as_path, require_new_file
+from sliplens.files import as_path
 from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
+from sliplens.parts import require_new_table
 from sliplens.progress import OnProgress, note
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
@@ -140,7 +141,7 @@ def track(
     """
     path = None if out is None else as_path(out)
     if path is not None and path.suffix:
-        require_new_file(path, suffix=".parquet", overwrite=overwrite)
+        require_new_table(path, suffix=".parquet", overwrite=overwrite)
     KINDS.pick(markers)
     import_cv2()
     trials = open_trials(

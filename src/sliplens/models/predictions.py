@@ -15,11 +15,12 @@ from torch import Tensor
 from sliplens._version import __version__
 from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
-from sliplens.files import as_path, hash_file, hash_json, require_new_file
+from sliplens.files import as_path, hash_file, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
 from sliplens.models.engines import Engine, make_engine, one_thread
 from sliplens.models.novelty import read_features
+from sliplens.parts import require_new_table
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
@@ -242,7 +243,7 @@ def predict(
     """
     path = None if out is None else as_path(out)
     if path is not None and path.suffix:
-        require_new_file(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
+        require_new_table(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
     if batch_size < 1:
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
     if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
