@@ -23,14 +23,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import nn
 
-from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, PRESETS, TrialPlan, plan_trials
 from sliplens.simulation.geometry import Dome
 from sliplens.simulation.intervention import (
     MARGIN,
     Sensitivity,
+    least_sigma,
     marker_sensitivity,
-    observations,
     prior_sigma,
     visible_markers,
 )
@@ -349,7 +348,8 @@ def margin_bound(
     Kay, *Fundamentals of Statistical Signal Processing* I (1993), section 3.7; Van Trees, *Detection, Estimation, and
     Modulation Theory* I (1968), section 2.4; Gill and Levit, *Bernoulli* 1 (1995) 59.
     """
-    return np.array([_bound(jacobian, sensitivity.unknowns, noise_px, prior) for jacobian in sensitivity.jacobian])
+    known = {"noise_px": noise_px, "prior": prior}
+    return np.array([least_sigma(jacobian, sensitivity.unknowns, **known) for jacobian in sensitivity.jacobian])
 
 
 def sequence_bound(
@@ -365,29 +365,15 @@ def sequence_bound(
     """
     (frames, coordinates, unknowns), names = sensitivity.jacobian.shape, sensitivity.unknowns
     if pull_known:
-        return _bound(sensitivity.jacobian.reshape(-1, unknowns), names, noise_px, prior)
+        return least_sigma(sensitivity.jacobian.reshape(-1, unknowns), names, noise_px=noise_px, prior=prior)
     own = np.zeros((frames, coordinates, frames))
     own[np.arange(frames), :, np.arange(frames)] = sensitivity.jacobian[..., 0]
     # the last frame's margin first
     stacked = np.concatenate([own[..., ::-1], sensitivity.jacobian[..., 1:]], axis=-1)
     earlier = tuple(f"earlier {index}" for index in range(1, frames))
     unbounded = {**prior, **dict.fromkeys(earlier, np.inf)}
-    return _bound(stacked.reshape(frames * coordinates, -1), (MARGIN, *earlier, *names[1:]), noise_px, unbounded)
-
-
-def _bound(
-    jacobian: Float[np.ndarray, "coordinates unknowns"],
-    unknowns: tuple[str, ...],
-    noise_px: float,
-    prior: Mapping[str, float],
-) -> float:
-    if wrong := set(prior) - set(unknowns):
-        raise ContactError(f"there is no unknown {sorted(wrong)[0]!r}; choose from {', '.join(unknowns)}")
-    rows, scale = observations(jacobian, unknowns, noise_px, prior)
-    # what of the margin's column no nuisance can imitate is what tells it
-    margin, nuisances = rows[:, 0], (rows / scale)[:, 1:]
-    evidence = np.linalg.norm(margin - nuisances @ np.linalg.lstsq(nuisances, margin, rcond=None)[0])
-    return float(1 / evidence) if evidence > 0 else float("inf")
+    rows, every = stacked.reshape(frames * coordinates, -1), (MARGIN, *earlier, *names[1:])
+    return least_sigma(rows, every, noise_px=noise_px, prior=unbounded)
 
 
 def bound_tables(touches: int, *, seed: int) -> list[dict[str, object]]:

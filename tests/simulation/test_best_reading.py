@@ -17,6 +17,7 @@ from sliplens.simulation.intervention import (
     marker_sensitivity,
     prior_sigma,
     reading_gain,
+    reading_limit,
     visible_markers,
 )
 from sliplens.simulation.nuisances import Grasp, Touch
@@ -89,6 +90,13 @@ def test_the_error_is_the_bound_of_the_sensor_too():
         assert passed[0] == pytest.approx(1, rel=1e-6)
         spread = sum((passed[sensitivity.unknowns.index(name)] * sigma) ** 2 for name, sigma in prior.items())
         assert np.sqrt(0.1**2 * gain @ gain + spread) == pytest.approx(bound[number], rel=1e-6)
+
+
+def test_the_limit_of_a_frame_is_the_bound_with_its_own_touch(trial):
+    frame = int(np.nanargmin(np.abs(trial.loading.safety_margin - 0.5)))
+    margin, prior = trial.loading.safety_margin[[frame]], prior_sigma(trial.plan.recipe.nuisances, wet=True)
+    seen = marker_sensitivity(margin, sensor=CHROMATOUCH, touch=trial.touch(frame))
+    assert reading_limit(trial, frame) == pytest.approx(margin_bound(seen, noise_px=NOISE_PX, prior=prior)[0])
 
 
 def test_a_markers_effect_is_what_the_reading_loses_with_it(trial):

@@ -15,8 +15,9 @@ from sliplens.errors import InputError
 from sliplens.files import output_folder
 from sliplens.intervals import Difference
 from sliplens.models import Manifest, Run
+from sliplens.plots.style import signed
 from sliplens.recordings import Dataset, load_dataset
-from sliplens.results.evaluation import ErrorSlice, ErrorTable, FrictionTable
+from sliplens.results.evaluation import ErrorSlice, ErrorTable, ExplainedErrors, FrictionTable
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.study import diagnose as diagnosing
 from sliplens.study.diagnose import (
@@ -28,8 +29,11 @@ from sliplens.study.diagnose import (
     hold_out,
     say_errors,
     say_kinds,
+    say_limits,
     say_slices,
     say_slope,
+    say_told,
+    tell_friction,
 )
 from sliplens.study.truth import reliability_of
 
@@ -102,8 +106,47 @@ def test_slices_are_named_for_what_their_frames_have_in_common(errors, rng):
         assert "top" not in one.name
         assert "sensor" not in one.name
     assert "Wet less dry: +4" in say_errors(wet, rng)
+    assert "same friction" in say_errors(wet, rng)
+    assert "same friction" not in say_errors(replace(wet, friction=np.where(wet.condition == "wet", 0.3, 0.9)), rng)
     tested = found.where(hold_out(found, seed=0) & (found.slice == 0))
     assert (slices[0].frames, slices[0].error) == (len(tested), pytest.approx(np.abs(tested.error).mean()))
+
+
+def test_wet_objects_that_are_slippery_alone_are_no_worse_than_dry_ones_of_their_friction(rng):
+    trial = np.repeat(np.arange(TRIALS), FRAMES)
+    # wet and dry meet between 0.5 and 0.7; below it the margin is read too high, whatever the object
+    friction = np.where(trial % 2 == 0, 0.5 + 0.02 * trial, 0.1 + 0.015 * trial)
+    margin = rng.random(len(trial))
+    wrong = 0.4 * (friction < 0.5) + rng.normal(0, 0.05, len(trial))
+    said = say_errors(table_of_errors(rng, friction=friction, safety_margin=margin, prediction=margin + wrong), rng)
+    first, alike = said.split("Among objects of the same friction, 0.50 to 0.68")
+    assert "which may be chance" not in first
+    assert "which may be chance" in alike
+
+
+def explain_planted(errors: ErrorTable, **columns: np.ndarray) -> ExplainedErrors:
+    """Errors with nothing known of their explanations but what is given."""
+    unknown = ("agreement", "reliability", "network_slipping", "reading_slipping", "told", "limit")
+    columns = dict.fromkeys(unknown, np.full(len(errors), np.nan)) | columns
+    return ExplainedErrors(**vars(errors), cluster=np.zeros(len(errors), int), example=errors.slice, **columns)
+
+
+def test_an_error_is_held_against_what_the_picture_leaves_open(errors, rng):
+    for limit, verdict in ((0.05, "not told from"), (0.02, "above"), (0.12, "below")):
+        dry, wet = say_limits(explain_planted(errors, limit=np.full(len(errors), limit)), rng)
+        assert f"It is {verdict} the {100 * limit:.1f} points" in dry
+        assert wet.startswith("On wet objects the root mean squared error in 240 frames of 20 trials is ")
+    assert say_limits(explain_planted(errors), rng) == []
+
+
+def test_what_friction_that_is_told_takes_off_the_error_is_said(errors, rng):
+    told = errors.safety_margin + 0.01
+    (said,) = say_told(explain_planted(errors, told=told), rng)
+    assert said.count("off by 1.0 points on") == 2
+    for condition in ("dry", "wet"):
+        wrong = np.abs(errors.error[errors.condition == condition]).mean()
+        assert f"on {condition} objects, untold off by {100 * wrong:.1f}: {signed(100 * (0.01 - wrong), 1)} (" in said
+    assert say_told(explain_planted(errors), rng) == []
 
 
 def test_a_group_is_compared_with_the_rest_as_trials_drawn_again_do(errors, rng):
@@ -221,6 +264,8 @@ def test_simulated_frames_are_explained_and_filmed_anew(simulated, tmp_path, mon
     found = sl.diagnose(network, data, tmp_path, trials=1)
     assert found.left_out == ""
     assert np.isfinite(found.explained.agreement).all()
+    assert (found.explained.limit > 0).all()
+    assert np.isnan(found.explained.told).all()  # this network takes no friction
     for own in found.frictions.groups("frame_id").values():
         # the forces stay: 1 - margin is inverse to the friction
         np.testing.assert_allclose((1 - own.safety_margin) * own.friction, (1 - own.safety_margin[0]) * own.friction[0])
@@ -262,6 +307,14 @@ def test_recordings_say_what_is_left_out(difference_run: Path, fine_dataset: Dat
     assert (found.explained.example >= 0).sum() == len(found.pictures) == len(found.maps)
     assert found.sentences[-1] == say_kinds(found.explained, None) or "kinds (silhouette" in found.sentences[-1]
     assert found.left_out.rstrip(".") in sl.write_report(tmp_path).page.read_text(encoding="utf-8")
+
+
+def test_a_network_that_takes_friction_is_told_that_of_each_frame(rng):
+    taught, inputs = sl.load("chromatouch-difference"), torch.rand(2, 3, 224, 224)
+    answers = tell_friction(taught, inputs, np.array([0.3, 0.9]))
+    for at, friction in enumerate((0.3, 0.9)):
+        assert answers[at] == pytest.approx(taught.estimate(inputs[at : at + 1], friction=friction).margin[0], abs=0.02)
+    assert np.isnan(tell_friction(taught, inputs, np.array([0.3, np.nan]))).all()
 
 
 def test_what_is_missing_or_impossible_is_refused(difference_run, fine_dataset, monkeypatch):

@@ -348,6 +348,10 @@ class ExplainedErrors(ErrorTable):
     network_slipping: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
     reading_slipping: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
     """Share on slipping markers, of the sizes of these values on markers in contact."""
+    told: Annotated[Float64[np.ndarray, " frames"], ANSWER, UNKNOWN]
+    """Answer where the network is told the friction that holds; NaN of one that cannot be told."""
+    limit: Annotated[Float64[np.ndarray, " frames"], AMOUNT, UNKNOWN]
+    """Standard deviation, in margin units, below which no unbiased reader of the markers of one frame comes."""
     cluster: Annotated[Int64[np.ndarray, " frames"], AMOUNT]
     """Kind of explanation, that of the largest error first."""
     example: Annotated[Int64[np.ndarray, " frames"], PLACE]

@@ -164,6 +164,20 @@ def observations(
     return rows, np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
 
 
+def least_sigma(jacobian: Jacobian, unknowns: tuple[str, ...], *, noise_px: float, prior: Mapping[str, float]) -> float:
+    """Standard deviation of the margin below which no unbiased reader comes: the bound of Cramer and Rao with priors.
+
+    The square root of the margin's entry in (J^T J / sigma^2 + diag(1 / prior^2))^-1, infinite where nothing tells it.
+    """
+    if wrong := set(prior) - set(unknowns):
+        raise ContactError(f"there is no unknown {sorted(wrong)[0]!r}; choose from {', '.join(unknowns)}")
+    rows, scale = observations(jacobian, unknowns, noise_px, prior)
+    # what of the margin's column no nuisance can imitate is what tells it
+    margin, nuisances = rows[:, 0], (rows / scale)[:, 1:]
+    evidence = np.linalg.norm(margin - nuisances @ np.linalg.lstsq(nuisances, margin, rcond=None)[0])
+    return float(1 / evidence) if evidence > 0 else float("inf")
+
+
 def _sigma(limits: Range) -> float:
     return (limits[1] - limits[0]) / np.sqrt(12)
 
@@ -364,8 +378,21 @@ def reading_slope(trial: FilmedTrial, frame: int) -> float:
     return float(gain @ (moved[MARGIN] + moved["log_friction"] / used))
 
 
+def reading_limit(trial: FilmedTrial, frame: int) -> float:
+    """Standard deviation below which no unbiased reader of a frame's markers comes that knows if objects are wet."""
+    sensitivity, prior = _seen(trial, frame)
+    return least_sigma(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
+
+
 def _best_reading(trial: FilmedTrial, frame: int) -> tuple[np.ndarray, Sensitivity]:
     """Gain of the best linear reading of a frame, and what it rests on."""
+    sensitivity, prior = _seen(trial, frame)
+    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
+    return gain, sensitivity
+
+
+def _seen(trial: FilmedTrial, frame: int) -> tuple[Sensitivity, dict[str, float]]:
+    """How the markers of a frame move with every unknown, and how far these range."""
     recipe, margin = trial.plan.recipe, float(trial.loading.safety_margin[frame])
     if np.isnan(margin):
         raise ContactError(
@@ -377,6 +404,4 @@ def _best_reading(trial: FilmedTrial, frame: int) -> tuple[np.ndarray, Sensitivi
         touch=trial.touch(frame),
         displacement=recipe.resolved_displacement,
     )
-    prior = prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet")
-    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
-    return gain, sensitivity
+    return sensitivity, prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet")

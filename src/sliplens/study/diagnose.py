@@ -20,7 +20,7 @@ from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.files import output_folder, remove
 from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_difference
 from sliplens.models import Run
-from sliplens.models.checkpoint import load
+from sliplens.models.checkpoint import load, tell_each
 from sliplens.plots.style import decimals, signed, tell_ends
 from sliplens.progress import OnProgress, counted, note, stage, wrote
 from sliplens.recordings import Dataset
@@ -35,7 +35,7 @@ from sliplens.results.evaluation import (
     Predictions,
 )
 from sliplens.results.explanation import Explained
-from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_slope
+from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_limit, reading_slope
 from sliplens.study.explaining import explain_frames, frames_at, network_inputs
 from sliplens.study.truth import StagedFrame, find_places, rank_correlation, redrawing, reliability_of, stage_frames
 from sliplens.training import evaluate
@@ -138,7 +138,7 @@ def _diagnose(
             ig, method = "integrated-gradients", "Integrated Gradients"
             maps = explain_frames(run, chosen, methods=(ig,), parts=parts, on_progress=count).relevance[ig]
         rows = adaptive_avg_pool2d(torch.from_numpy(maps)[:, None], _BLOCKS).flatten(1).double().numpy()
-        looked = dict.fromkeys(_LOOKED, np.full(len(own), np.nan))
+        looked = dict.fromkeys((*_LOOKED, "limit"), np.full(len(own), np.nan))
         frictions, pictures, shown = as_frictions([]), explained.pictures[:0], ""
     else:
         with stage(on_progress, "Asking for each marker's part") as count:
@@ -146,15 +146,18 @@ def _diagnose(
         size, rows = run.manifest.image_size, np.stack([one.values for one in found])
         maps = np.stack([find_places(one, image_size=size).paint(row) for one, row in zip(frames, rows, strict=True)])
         looked = {name: np.array([getattr(one, name) for one in found]) for name in _LOOKED}
+        looked["limit"] = np.array([reading_limit(one.scene, one.number) for one in frames])
         method = "Shapley values of the markers"
         with stage(on_progress, "Filming with other frictions") as count:
             frictions, pictures, shown = refilm(run, frames, own.condition.tolist(), on_progress=count)
     kinds, examples, silhouette = cluster_explanations(rows, np.abs(own.error), seed=seed)
     place = np.full(len(own), -1)
     place[examples] = np.arange(len(examples))
-    table = ExplainedErrors(**vars(own), **looked, cluster=kinds, example=place)
+    told = tell_friction(run, network_inputs(run, explained), own.friction)
+    table = ExplainedErrors(**vars(own), **looked, told=told, cluster=kinds, example=place)
     slopes, known = friction_slopes(frictions, rng), (say_errors(errors, rng), say_slices(slices))
-    sentences = (*known, *say_looked(table, slices, rng), *map(say_slope, slopes), say_kinds(table, silhouette))
+    known += (*say_limits(table, rng), *say_told(table, rng), *map(say_slope, slopes))
+    sentences = (*known, *say_looked(table, slices, rng), say_kinds(table, silhouette))
     return Diagnosis(
         input=run.manifest.input, source=data.source, sentences=sentences, left_out=left_out, slices=slices,
         slopes=slopes, method=method, errors=errors, explained=table, frictions=frictions,
@@ -351,6 +354,18 @@ def find_contributions(
     return [keep_part(parts and parts / f"{at:05d}", MarkerContributions, partial(find, at)) for at in indices]
 
 
+def tell_friction(
+    run: Run, inputs: Float[torch.Tensor, "frames colours size size"], friction: Float64[np.ndarray, " frames"]
+) -> Float64[np.ndarray, " frames"]:
+    """Answers where each frame's friction is told; NaN of a network that cannot be told, or where one is not known."""
+    traction = run.manifest.traction
+    if traction is None or not np.isfinite(friction).all():
+        return np.full(len(friction), np.nan)
+    untold = run.estimate_batches(inputs.split(64))
+    told = tell_each(untold, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
+    return told.margin.astype(np.float64)
+
+
 def refilm(
     run: Run, frames: Sequence[StagedFrame], conditions: Sequence[str], *, on_progress: OnProgress | None = None
 ) -> tuple[FrictionTable, UInt8[np.ndarray, "shown size size 3"], str]:
@@ -455,8 +470,22 @@ def say_errors(errors: ErrorTable, rng: np.random.Generator) -> str:
     if {"dry", "wet"} - set(groups):
         return text
     both = ErrorTable.joined([groups["wet"], groups["dry"]])
+    text += f" Wet less dry: {_say_excess(both, rng)}."
+    ends = [np.array([own.friction.min(), own.friction.max()]) for own in (groups["wet"], groups["dry"])]
+    low, high = max(first for first, _ in ends), min(last for _, last in ends)
+    alike = both.where((both.friction >= low) & (both.friction <= high))  # nowhere, where friction is not known
+    fewest = min(len(np.unique(alike.trial[alike.condition == name])) for name in ("dry", "wet"))
+    if fewest < FEWEST_UNITS:
+        return text
+    return (
+        f"{text} Among objects of the same friction, {low:.2f} to {high:.2f} ({_frames(alike)}), wet less dry: "
+        f"{_say_excess(alike, rng)}."
+    )
+
+
+def _say_excess(both: ErrorTable, rng: np.random.Generator) -> str:
     gap = excess_error(both, both.condition == "wet", rng)
-    return f"{text} Wet less dry: {_gap(gap, points=True)}{'' if gap.sure else ', which may be chance'}."
+    return f"{_gap(gap, points=True)}{'' if gap.sure else ', which may be chance'}"
 
 
 def say_slices(slices: Sequence[ErrorSlice]) -> str:
@@ -474,6 +503,38 @@ def say_slices(slices: Sequence[ErrorSlice]) -> str:
     return f"On held-out trials the error is larger than elsewhere where {'; where '.join(texts)}."
 
 
+def say_limits(table: ExplainedErrors, rng: np.random.Generator) -> list[str]:
+    """Say how much of the error is in the picture already: what no unbiased reader of one frame does better than."""
+    texts = []
+    for condition, own in _enough(table, table.limit).items():
+        squared, least = own.error**2, own.limit**2
+        gap = _mean(squared - least, own, rng)
+        verdict = "above" if gap.above_zero else "below" if gap.below_zero else "not told from"
+        reached, bound = (100 * np.sqrt(values.mean()) for values in (squared, least))
+        texts.append(
+            f"On {condition} objects the root mean squared error in {_frames(own)} is {reached:.1f} points. It is "
+            f"{verdict} the {bound:.1f} points that no unbiased reader of the markers of one frame comes below, who is "
+            f"told how far the friction of {condition} objects ranges and no more (over {gap.over})."
+        )
+    return texts
+
+
+def say_told(table: ExplainedErrors, rng: np.random.Generator) -> list[str]:
+    """Say what is left of the error where the network is told the friction that holds."""
+    texts = []
+    for condition, own in _enough(table, table.told).items():
+        told = replace(own, prediction=own.told)
+        gain = _mean(np.abs(told.error) - np.abs(own.error), own, rng)
+        texts.append(f"{_off(told)} points on {condition} objects, untold {_off(own)}: {_gap(gain, points=True)}")
+    return [f"Told the friction that holds, the same network is {'; '.join(texts)}."] if texts else []
+
+
+def _enough(table: ExplainedErrors, known: Float64[np.ndarray, " frames"]) -> dict[str, ExplainedErrors]:
+    """Frames of each condition, where a value is known and trials are enough to say something."""
+    groups = {name: own for (name,), own in table.where(np.isfinite(known)).groups("condition").items()}
+    return {name: own for name, own in groups.items() if len(np.unique(own.trial)) >= FEWEST_UNITS}
+
+
 def say_looked(table: ExplainedErrors, slices: Sequence[ErrorSlice], rng: np.random.Generator) -> list[str]:
     """Say how far the markers' parts are those of the best reading, in each condition and where the error is larger."""
     groups = {f"on {name} objects": table.condition == name for (name,) in table.groups("condition")}
@@ -483,7 +544,8 @@ def say_looked(table: ExplainedErrors, slices: Sequence[ErrorSlice], rng: np.ran
         f"In {_frames(own)} {name} the markers' parts in the answer rank as in the best reading, to a signed rank "
         f"correlation (Spearman's) of {_gap(_mean(own.agreement, own, rng, (-1.0, 1.0)))}; of the parts in contact, "
         f"{100 * own.network_slipping.mean():.0f} % of the answer's and {100 * own.reading_slipping.mean():.0f} % of "
-        "the best reading's are of slipping markers." + _say_sampling(own)
+        "the best reading's are of slipping markers: "
+        f"{_gap(_mean(own.network_slipping - own.reading_slipping, own, rng), points=True)}." + _say_sampling(own)
         for name, own in known.items()
         if len(np.unique(own.trial)) >= FEWEST_UNITS
     ]
