@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sliplens.codec import load_record, load_result, save_record, save_result
 from sliplens.errors import InputError
+from sliplens.explainers import RECOMMENDED_METHOD
 from sliplens.files import output_folder, require_folder
 from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, stage, wrote
@@ -20,12 +21,10 @@ from sliplens.study.scoring import STEPS, Setting
 from sliplens.training import evaluate, train
 
 INPUTS = ("difference", "raw")
-METHODS = ("grad-cam-thesis", "integrated-gradients-thesis", "poly-cam-thesis", "poly-cam")
-"""The three methods of the thesis as they were run there, and Poly-CAM for a regressor."""
-REAL_METHODS = ("grad-cam", "poly-cam")
-"""The quickest methods, for the real frames."""
-STRIP_METHOD = "poly-cam"
-"""Method of the first picture: the one whose maps are quickest to read."""
+METHODS = ("grad-cam-thesis", "integrated-gradients-thesis", "poly-cam-thesis", RECOMMENDED_METHOD)
+"""The three methods of the thesis as they were run there, and the one to look at."""
+STRIP_METHOD = RECOMMENDED_METHOD
+"""Method of the first picture."""
 _BUDGET = 0.1
 """Share of the channels that Poly-CAM measures at first."""
 _study = partial(
@@ -119,8 +118,7 @@ def run_demo(
     _study(data, out=folder, difference=difference, raw=raw, on=on, seed=seed, on_progress=on_progress)
     if real is not None:
         maps = folder / "explain-real"
-        explain = partial(explain_source, methods=REAL_METHODS, budget=_BUDGET, labels_in_names=True)
-        explain(difference, real, out=maps, on_progress=on_progress)
+        explain_source(difference, real, labels_in_names=True, out=maps, on_progress=on_progress)
         score_explained(difference, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
     return show()
 
@@ -167,9 +165,7 @@ def _make_strip(out: Path, data: Dataset, network: str, *, on_progress: OnProgre
     with output_folder(out, stage="strip", config=config) as output:
         if not output.complete:
             with stage(on_progress, "Explaining a grip from stick to slip") as count:
-                strip = explain_trial(
-                    run, data.load(info), source=data.source, method=STRIP_METHOD, budget=_BUDGET, on_progress=count
-                )
+                strip = explain_trial(run, data.load(info), source=data.source, method=STRIP_METHOD, on_progress=count)
             save_result(strip, output.folder)
     wrote(on_progress, out, "a grip from stick to slip", kept=output.complete)
     return load_result(out, Strip, command="sliplens demo")

@@ -62,7 +62,9 @@ def test_markers_are_found_in_the_frames_that_the_caller_gave(trained):
     grids = [make_grid(columns=4, rows=4, pitch=14.0, at=(10.0 + shift, 10.0)) for shift in (0.0, 3.0, -2.0)]
     untouched, *frames = (draw_dots(grid, size=(SIZE, SIZE), radius=3.0) for grid in grids)
     run = trained("difference")
-    explanation = sliplens.explain(run, np.stack(frames), reference=untouched, method="shapley-marker", pairs=40)
+    explanation = sliplens.explain(run, np.stack(frames), reference=untouched, pairs=40)
+    assert explanation.method == "shapley-marker"
+    assert not any("tiles" in warning for warning in explanation.warnings)
     for row, frame in enumerate(frames):
         regions = marker_regions((SIZE, SIZE), markers_in_frame(frame, image_size=SIZE))
         flat = [explanation.relevance[row][regions == number].unique() for number in regions.unique()]
@@ -70,6 +72,13 @@ def test_markers_are_found_in_the_frames_that_the_caller_gave(trained):
         assert all(len(values) == 1 for values in flat)
     with pytest.raises(InputError, match="markers do not show in difference images"):
         sliplens.explain(run, np.stack(frames), method="shapley-marker")
+
+
+def test_without_a_method_tiles_explain_where_no_markers_show_and_it_says_why(trained):
+    explanation = sliplens.explain(trained("difference"), FRAMES[:1])
+    assert explanation.method == "shapley"
+    assert explanation.warnings[0].startswith("tiles, not markers: markers do not show in difference images")
+    torch.testing.assert_close(explanation.relevance.sum(dim=(1, 2)), explanation.change, atol=1e-5, rtol=0)
 
 
 def test_frames_of_another_sensor_or_none_at_all_are_refused(trained):

@@ -3,6 +3,7 @@ import pytest
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import RecordingError
+from sliplens.explainers import RECOMMENDED_METHOD
 from sliplens.models import load_checkpoint
 from sliplens.results.explanation import Strip
 from sliplens.study.workspace import explain_trial
@@ -18,7 +19,7 @@ def run(difference_run):
 @pytest.fixture(scope="module")
 def strip(run) -> Strip:
     levels = (10 / 11, 6 / 11, 0.0)
-    return explain_trial(run, make_recording("t"), source="simulated", method="occlusion", levels=levels)
+    return explain_trial(run, make_recording("t"), source="simulated", levels=levels)
 
 
 def test_a_strip_shows_the_frames_nearest_to_its_levels(strip):
@@ -26,6 +27,10 @@ def test_a_strip_shows_the_frames_nearest_to_its_levels(strip):
     # 12 frames fall evenly from 1 to 0, and the first has no contact
     assert margins == pytest.approx([10 / 11, 6 / 11, 0.0])
     assert np.array_equal(strip.pictures, make_recording("t").frames[list(strip.shown)])
+
+
+def test_a_strip_is_explained_by_the_recommended_method_of_tiles_where_no_markers_show(strip):
+    assert strip.method == RECOMMENDED_METHOD.removesuffix("-marker")
 
 
 def test_a_strip_reads_as_the_network_does(strip, run):

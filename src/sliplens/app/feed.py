@@ -20,7 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from sliplens.errors import SliplensError
 from sliplens.explainers.explanation import CLOSE, Explanation
 from sliplens.explainers.occlusion import marker_regions, to_network_px
-from sliplens.explainers.table import explain
+from sliplens.explainers.table import RECOMMENDED_METHOD, explain
 from sliplens.files import to_builtins
 from sliplens.grip.source import GripSource, Held
 from sliplens.images import encode_jpeg
@@ -35,7 +35,7 @@ from sliplens.recordings.capture import Frame
 CHART_S = 30.0
 """Time that the chart of the page spans, in seconds."""
 LIVE_METHOD = "grad-cam"
-"""Explainer of the running picture, one of the cheapest; any other explains a frozen one."""
+"""Explainer of the running picture, one of the cheapest; the recommended one, or any other, explains a frozen one."""
 _PICTURES_HZ, _LEAST_HZ, _MAPS_HZ = 30.0, 5.0, 2.0
 _LONGEST_PX = 800
 _QUALITY = 85
@@ -353,7 +353,8 @@ class Feed:
     def _explain(self, picture: Picture, method: str) -> Map:
         assert self._network is not None
         # the pixels of maps by hand, not a graph that other threads compile
-        explanation = explain(self._network, picture.frame.image[None], reference=picture.reference, method=method)
+        frames, named = picture.frame.image[None], None if method == RECOMMENDED_METHOD else method
+        explanation = explain(self._network, frames, reference=picture.reference, method=named)
         relevance = explanation.relevance[0].cpu().numpy()
         full = full_colour(relevance)
         # where both margins are the same but for the network's error, the strongest of nothing is not shown in colour
@@ -362,7 +363,7 @@ class Feed:
         return Map(
             facts=MapFacts(
                 number=picture.frame.number,
-                method=method,
+                method=named or explanation.method,  # tiles where no markers are found
                 prediction=float(explanation.prediction[0]),
                 reference_prediction=float(explanation.reference_prediction[0]),
                 rows=rows,

@@ -59,6 +59,7 @@ export default {
     lowers: String,
     raises: String,
     methods: Object,
+    recommended: String,
     network: Boolean,
     grips: Boolean,
   },
@@ -366,7 +367,9 @@ export default {
         else parts.push(
           `why ${points(map.prediction)} rather than ${points(map.reference_prediction)} untouched: ` +
             `${this.methods[map.method] ?? map.method} of frame ${map.number}`,
-          ...(frozen ? map.warnings.map((warning) => `▲ ${warning}`) : []),
+          ...(frozen
+            ? map.warnings.map((warning) => `▲ ${warning}`)
+            : [`for speed, not the recommended map: Explain (E) shows ${this.methods[this.recommended]}`]),
         );
       }
       if (waiting) parts.push(`⏳ ${waiting}`);

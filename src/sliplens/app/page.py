@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 from nicegui import binding, run, ui
 from nicegui.events import KeyEventArguments
 
-from sliplens.app.feed import CHART_S, LIVE_METHOD, Viewer
+from sliplens.app.feed import CHART_S, Viewer
 from sliplens.errors import InputError, SliplensError
-from sliplens.explainers.table import EXPLAINERS
+from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
 from sliplens.grip.controllers import CONTROLLERS
 from sliplens.grip.source import GripSource
 from sliplens.live.sources import SimulatedSource
@@ -40,6 +40,7 @@ class LiveView(ui.element, component="live_view.js"):
             "lowers": LOWERS,
             "raises": RAISES,
             "methods": METHOD_NAMES,
+            "recommended": RECOMMENDED_METHOD,
             "network": network is not None,
             "grips": isinstance(page.reader.source, GripSource),
         })  # fmt: skip
@@ -58,7 +59,7 @@ class _Acts:
 
     def __init__(self, page: "LivePage", viewer: Viewer) -> None:
         self._page, self._feed, self._reader, self.viewer = page, page.feed, page.reader, viewer
-        self.method = LIVE_METHOD
+        self.method = RECOMMENDED_METHOD
         """Explainer of a frozen picture."""
         self.freeze_words = ""
         self._name_freezing()

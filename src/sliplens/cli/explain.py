@@ -34,8 +34,8 @@ class Explain(Command):
     labels_in_names: bool = False
     """Read the safety margin in percent from names such as image_433_20.png."""
     method: tuple[str, ...] | None = None
-    """Explainers to run; --list-methods tells which there are. If not given, Shapley values of the markers, or of tiles
-    where none are found, and Poly-CAM."""
+    """Explainers to run; --list-methods tells which there are. If not given, the recommended one: Shapley values of the
+    markers, or of tiles where none are found."""
     list_methods: bool = False
     """Print the table of explainers and do nothing else."""
     budget: float | None = None

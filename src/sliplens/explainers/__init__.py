@@ -7,10 +7,10 @@ from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients
 from sliplens.explainers.occlusion import Occlusion, find_markers
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.poly_cam_budget import Likeness
-from sliplens.explainers.table import EXPLAINERS, explain, get_explainer
+from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD, explain, get_explainer
 
 __all__ = [
-    "EXPLAINERS", "Approximation", "ExpectedGradients", "Explainer", "Explanation", "GradCam", "HiResCam",
-    "IntegratedGradients", "Layer", "LayerCam", "Level", "Likeness", "Lrp", "Occlusion", "PolyCam", "SmoothGrad",
-    "capture", "explain", "find_layers", "find_markers", "get_explainer",
+    "EXPLAINERS", "RECOMMENDED_METHOD", "Approximation", "ExpectedGradients", "Explainer", "Explanation", "GradCam",
+    "HiResCam", "IntegratedGradients", "Layer", "LayerCam", "Level", "Likeness", "Lrp", "Occlusion", "PolyCam",
+    "SmoothGrad", "capture", "explain", "find_layers", "find_markers", "get_explainer",
 ]  # fmt: skip

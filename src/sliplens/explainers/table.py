@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sliplens.errors import ImageError, InputError
+from sliplens.errors import ImageError, InputError, SliplensError
 from sliplens.explainers.cam import GradCam, HiResCam, LayerCam
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explanation import Explanation
@@ -47,6 +47,11 @@ ranked the pixels of Integrated Gradients by sign or by size, and here their sig
 
 An installed package adds its own by the entry point `sliplens.explainers`.
 """
+RECOMMENDED_METHOD = "shapley-marker"
+"""What explains where no method is named: its maps rank the markers most like the truth in simulation.
+
+Where the markers of a frame are not known the players are tiles (`shapley`).
+"""
 
 
 def explain(
@@ -54,7 +59,7 @@ def explain(
     frames: UInt8[np.ndarray, "batch height width 3"],
     *,
     reference: UInt8[np.ndarray, "height width 3"] | None = None,
-    method: str | Explainer = "poly-cam",
+    method: str | Explainer | None = None,
     on_progress: OnProgress | None = None,
     **options: Any,
 ) -> Explanation:
@@ -69,7 +74,8 @@ def explain(
     reference
         Frame of the untouched sensor, T_0. A network on difference images needs none.
     method
-        Row of `EXPLAINERS`, or an explainer.
+        Row of `EXPLAINERS`, or an explainer. If None, Shapley values of the markers (`RECOMMENDED_METHOD`); where they
+        are not found, as in difference images, of tiles, and a warning says why.
     options
         Options of the method, such as `budget=0.25` of `poly-cam`: the fields of its class.
 
@@ -91,13 +97,23 @@ def explain(
     (torch.Size([1, 224, 224]), 1)
     """
     trained = open_run(run)
-    explainer = get_explainer(method, **options) if isinstance(method, str) else method
+    named = RECOMMENDED_METHOD if method is None else method
+    explainer = get_explainer(named, **options) if isinstance(named, str) else named
     inputs, empty = network_inputs(trained, frames, reference)
-    if isinstance(explainer, RegionMethod) and explainer.markers_px is find_markers and reference is not None:
-        # they show in the camera's frames, at their full size, whatever the network is shown
-        places = tuple(markers_in_frame(frame, image_size=trained.manifest.image_size) for frame in frames)
-        explainer = replace(explainer, markers_px=KnownMarkers(images=inputs, places=places))
-    return explainer(trained.model, inputs, reference=empty, on_progress=on_progress)
+    warnings = ()
+    if isinstance(explainer, RegionMethod) and explainer.markers_px is find_markers:
+        try:
+            if reference is None:
+                find_markers(inputs[0], empty)  # which tells why there are none
+            # they show in the camera's frames, at their full size, whatever the network is shown
+            places = tuple(markers_in_frame(frame, image_size=trained.manifest.image_size) for frame in frames)
+            explainer = replace(explainer, markers_px=KnownMarkers(images=inputs, places=places))
+        except SliplensError as error:
+            if method is not None:
+                raise
+            explainer, warnings = replace(explainer, markers_px=None), (f"tiles, not markers: {error}",)
+    explanation = explainer(trained.model, inputs, reference=empty, on_progress=on_progress)
+    return replace(explanation, warnings=(*warnings, *explanation.warnings))
 
 
 def open_run(run: Run | Path | str, *, device: str = "cpu") -> Run:

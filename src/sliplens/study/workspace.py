@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, SliplensError
-from sliplens.explainers import EXPLAINERS, ExpectedGradients, Explainer, get_explainer
+from sliplens.explainers import EXPLAINERS, RECOMMENDED_METHOD, ExpectedGradients, Explainer, get_explainer
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.explainers.table import open_run
 from sliplens.faithfulness import get_fill
@@ -31,7 +31,7 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import open_source
 from sliplens.results.explanation import Explained, Strip, StripReadings, load_explained
 from sliplens.results.faithfulness import DeletionScores
-from sliplens.study.choice import STUDY_BUDGET, study_explainers, with_markers
+from sliplens.study.choice import STUDY_BUDGET, study_explainers, with_markers, without_markers
 from sliplens.study.explaining import (
     DEFAULT_LEVELS,
     ChosenFrames,
@@ -45,8 +45,6 @@ from sliplens.study.explaining import (
 )
 from sliplens.study.scoring import Deletion, require_same_network
 
-RECOMMENDED_METHODS = ("shapley-marker", "poly-cam")
-"""Methods that explain where none is named, the quickest first."""
 _FULL_STICK = 0.9
 """Safety margin from which a labelled frame counts as one without slip."""
 
@@ -85,8 +83,8 @@ def explain_source(
         Profile of the sensor, its file, or the name of one that comes with sliplens; None for a data set.
     methods, budget
         Rows of `EXPLAINERS`, and the share of the channels that `poly-cam` measures at first. If None, Shapley values
-        of the markers, whose map ranks them most like the truth in simulation, or of tiles where no markers are found;
-        and Poly-CAM, with all its channels for a single image and on a budget for several.
+        of the markers (`RECOMMENDED_METHOD`), or of tiles where no markers are found; and all channels for a single
+        image, a part of them for several.
     split, condition, trials, levels
         Which trials of a data set and how many, and the safety margins at which frames are taken.
     on, retry_failed
@@ -127,9 +125,9 @@ def explain_source(
     choose = partial(_choose_explainers, trained, chosen, opened, budget=budget)
     if methods is None:
         try:
-            explainers = choose(methods=RECOMMENDED_METHODS)
+            explainers = choose(methods=[RECOMMENDED_METHOD])
         except SliplensError:  # difference images, another sensor, or no OpenCV: tiles tell nearly as much
-            explainers = choose(methods=[name.removesuffix("-marker") for name in RECOMMENDED_METHODS])
+            explainers = choose(methods=[RECOMMENDED_METHOD.removesuffix("-marker")])
         methods = tuple(explainers)
     else:
         explainers = choose(methods=methods)
@@ -338,15 +336,14 @@ def explain_trial(
     recording: Recording,
     *,
     source: str,
-    method: str = "poly-cam",
-    budget: float = 1.0,
+    method: str = RECOMMENDED_METHOD,
     levels: Sequence[float] = DEFAULT_LEVELS,
     on_progress: OnProgress | None = None,
 ) -> Strip:
     """Read every frame of a trial, and explain those nearest to a few safety margins.
 
-    The frames are those nearest to `levels` in [0, 1], each shown once; `source` is `simulated` or `real`, and `budget`
-    the share of the channels that `poly-cam` measures at first.
+    The frames are those nearest to `levels` in [0, 1], each shown once; `source` is `simulated` or `real`. Where a
+    method asks for markers and none are found, it is told of tiles.
     """
     margin = known_margin(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
     shown = tuple(sorted({nearest_frame(margin, level) for level in levels}))
@@ -354,10 +351,17 @@ def explain_trial(
     estimate = run.estimate(inputs)
     unknown = np.full(len(margin), np.nan)
     low, high = estimate.interval(_CONFIDENCE) or (unknown, unknown)
-    reference = run.encoding.empty(recording.reference, image_size=run.manifest.image_size)
-    explainer = study_explainers([method], budget=budget)[method]
+    named, explained, size = study_explainers([method]), inputs[list(shown)], run.manifest.image_size
+    reference = run.encoding.empty(recording.reference, image_size=size)
+    try:
+        named = with_markers(
+            named, explained, lambda: [markers_in_recording(recording, row, image_size=size) for row in shown]
+        )
+    except SliplensError:  # another sensor, or no OpenCV
+        named = without_markers(named)
+    [(method, explainer)] = named.items()
     explanation = explainer(
-        run.model, inputs[list(shown)], reference=reference.expand(len(shown), -1, -1, -1), on_progress=on_progress
+        run.model, explained, reference=reference.expand(len(shown), -1, -1, -1), on_progress=on_progress
     )
     read = {"safety_margin": margin, "prediction": estimate.margin, "low": low, "high": high}
     readings = StripReadings(
