@@ -91,6 +91,7 @@ def read_pages(site: Path) -> dict[Path, Page]:
 
 def find_faults(site: Path) -> list[str]:
     """Links that lead to no page or place of the site, and what is loaded from outside of it."""
+    site = site.resolve()  # as the targets of links are
     pages, faults = read_pages(site), []
     for path, page in pages.items():
         for address in sorted(page.links | page.loaded):

@@ -265,3 +265,13 @@ def test_a_table_comes_back_from_every_ending(tmp_path: Path, suffix: str, rows:
     assert write_tables([table.slice(0, min(rows, 1)), table.slice(1, max(rows - 1, 0))], path, schema) is None
     assert read_written(path, schema).equals(table.slice(0, rows))
     assert [one.name for one in tmp_path.iterdir()] == [path.name]
+
+
+def test_tables_joined_in_memory_have_a_piece_each():
+    schema = pa.schema({"trial": pa.string()}, metadata={"kept": "yes"})
+    tables = [pa.table({"trial": [name]}, schema.remove_metadata()) for name in "ab"]
+    for given, pieces in (tables, [1, 1]), ([], [0]):
+        joined = write_tables(given, None, schema)
+        assert joined is not None
+        assert joined.schema.equals(schema, check_metadata=True)
+        assert [len(one) for one in joined["trial"].chunks] == pieces

@@ -30,6 +30,12 @@ def test_a_site_whose_links_lead_somewhere_has_no_fault(docs, site: Path):
     assert docs.find_faults(site) == []
 
 
+def test_a_site_is_found_from_where_one_stands(docs, site: Path, monkeypatch: pytest.MonkeyPatch):
+    (site / "api" / "calls.html").write_text('<a href="../index.html#gone">home</a>')
+    monkeypatch.chdir(site.parent)
+    assert docs.find_faults(Path(site.name)) == docs.find_faults(site) != []
+
+
 @pytest.mark.parametrize(
     ("added", "told"),
     [

@@ -435,7 +435,8 @@ def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schem
         If the file cannot be written.
     """
     if path is None:
-        return pa.concat_tables([schema.empty_table(), *tables]).replace_schema_metadata(schema.metadata)
+        # no empty table before them: each column would begin with an empty chunk
+        return pa.concat_tables(list(tables) or [schema.empty_table()]).replace_schema_metadata(schema.metadata)
     with whole_file(path) as part, _table_writer(part, schema, path.suffix) as writer:
         for table in tables:
             writer.write_table(table.replace_schema_metadata(schema.metadata))

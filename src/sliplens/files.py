@@ -194,6 +194,12 @@ def as_path(path: Path | str) -> Path:
     return StoredPath(*path.parts) if path.parts[:1] == ("s3:",) else path
 
 
+def require_local(target: Path | str) -> None:
+    """Refuse a target in a store, for what writes none."""
+    if isinstance(stored := as_path(target), StoredPath):
+        raise InputError(f"{stored} is in a store, where this writes nothing; name a folder of this machine")
+
+
 def remove(path: Path) -> None:
     """Remove a file, or a folder with all in it, if it is there; whoever is killed meanwhile leaves no half of it."""
     if isinstance(path, StoredPath):
@@ -545,8 +551,8 @@ def output_folder(
     `InputError`. A folder of another format begins empty every time (not `resumable`), and has its `run_file` where
     that format's readers do not look.
     """
-    if target.parts[:1] == ("s3:",) and not isinstance(target, StoredPath):
-        raise InputError(f"{as_path(target)} is in a store, where this writes nothing; name a folder of this machine")
+    if not isinstance(target, StoredPath):
+        require_local(target)
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
     if isinstance(target, StoredPath):

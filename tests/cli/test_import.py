@@ -10,10 +10,12 @@ import pytest
 from command_line import refused, run
 from own_recording import TARE, write_forces, write_video
 
+from sliplens.errors import InputError
 from sliplens.images import write_png
 from sliplens.parts import read_status
 from sliplens.recordings import Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.importing import import_recordings, label_dataset
 from sliplens.recordings.store import read_header, save_recording, write_trial
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -253,3 +255,17 @@ def test_a_real_bag_without_images_is_refused_with_its_topics(
     line = refused(capsys, "import", bag, "-o", tmp_path / "data", "--sensor", "mine")
     assert "/sensors/tactip" in line
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "words", [("s3://lab/cup.mp4",), ("cup.mp4", "--forces", "s3://lab/cup.csv"), ("cup.mp4", "s3://lab/cup.mp4")]
+)
+def test_a_recording_in_a_store_is_refused_by_its_name(words: tuple[str, ...], tmp_path: Path, capsys):
+    told = refused(capsys, "import", *words, "-o", tmp_path / "data")
+    assert f"sliplens import reads and writes no {next(word for word in words if word[:2] == 's3')}; copy it" in told
+
+
+def test_a_store_is_no_place_for_a_data_set_and_that_is_told_first(tmp_path: Path):
+    for make in (import_recordings, label_dataset):
+        with pytest.raises(InputError, match=r"^s3://lab/data is in a store, where this writes nothing"):
+            make(tmp_path / "nothing", out="s3://lab/data")

@@ -311,6 +311,9 @@ def test_rows_in_memory_are_those_of_the_file(trained: Run, small_dataset: Datas
     kept = predict_source(trained, small_dataset, split="test")
     assert kept.frame().equals(written.frame(), check_metadata=True)
     assert kept.frames == kept.frame().num_rows == 24
+    assert "prediction: double" in repr(kept)
+    (tmp_path / "a.parquet").unlink()  # to name it nobody has to read it
+    assert repr(written) == f"Predictions of 24 frames by {written.engine}, in {tmp_path / 'a.parquet'}"
 
 
 def test_an_array_is_a_trial(trained: Run, wet: Recording):

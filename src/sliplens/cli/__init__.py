@@ -13,7 +13,7 @@ import tyro
 
 from sliplens._version import __version__
 from sliplens.cli.check import Check
-from sliplens.cli.command import in_options, option_names
+from sliplens.cli.command import in_options, option_names, paths_of
 from sliplens.cli.console import fail
 from sliplens.cli.demo import Demo
 from sliplens.cli.doctor import Doctor
@@ -76,8 +76,8 @@ def _parse(words: Sequence[str]) -> Any:
     if unknown:
         raise InputError(tell_unknown(unknown[0], option_names(command), what="option", help_of=f"sliplens {words[0]}"))
     for name, value in vars(command).items():
-        if isinstance(value, Path) and isinstance(stored := as_path(value), StoredPath):
-            if not isinstance(command, _STORED):
+        for stored in (path for path in map(as_path, paths_of(value)) if isinstance(path, StoredPath)):
+            if not (isinstance(command, _STORED) and isinstance(value, Path)):
                 raise InputError(f"sliplens {words[0]} reads and writes no {stored}; copy it to this machine first")
             object.__setattr__(command, name, stored)
     return command

@@ -1,7 +1,7 @@
 """What commands share: options that mean the same in several, and the call that hands options to the library."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from inspect import signature
 from pathlib import Path
@@ -57,6 +57,14 @@ def option_names(command: object) -> list[str]:
     groups = [value for value in vars(command).values() if is_dataclass(value)]
     own = [f"--{name.replace('_', '-')}" for name in vars(command)]
     return own + [name for group in groups for name in option_names(group)]
+
+
+def paths_of(value: object) -> Iterator[Path]:
+    """Paths that an option names, be it several, or a group of options."""
+    if isinstance(value, Path):
+        yield value
+    for one in value if isinstance(value, tuple) else vars(value).values() if is_dataclass(value) else ():
+        yield from paths_of(one)
 
 
 @dataclass(frozen=True, kw_only=True)

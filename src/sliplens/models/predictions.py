@@ -114,8 +114,8 @@ class Predictions:
         return self.frames
 
     def __repr__(self) -> str:
-        table = self.frame()
-        return f"Predictions of {self.frames} frames by {self.engine}\n{table.to_string(preview_cols=3)}"
+        told = f"Predictions of {self.frames} frames by {self.engine}"
+        return f"{told}, in {self.path}" if self.rows is None else f"{told}\n{self.rows.to_string(preview_cols=3)}"
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
         """Rows for whatever reads Arrow's stream (the Arrow PyCapsule interface)."""

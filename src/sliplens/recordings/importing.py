@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import InputError, RecordingError, SliplensError
-from sliplens.files import output_folder, whole_file
+from sliplens.files import output_folder, require_local, whole_file
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import (
@@ -132,6 +132,7 @@ def import_recordings(
     ShardError
         If some of several failed that may not be left out, or all of them, when all others are done.
     """
+    require_local(out)
     EXECUTORS.pick(on.partition("=")[0])
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]
     profile = load_profile(sensor) if sensor is not None and is_profile(sensor) else None
@@ -390,6 +391,7 @@ def label_dataset(
     ShardError
         If that is so of some of several trials, when all others are labelled; the data set is as it was.
     """
+    require_local(out)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     labelling, out = labelling or LabelSettings(), Path(out)
     work = _Labelling(data=data, labelling=labelling, edits=read_edits(data.folder))
