@@ -43,8 +43,8 @@ from sliplens.training.module import Clock, DivergedError, Regressor, make_train
 from sliplens.training.sequence import fit_sequence
 
 _ENOUGH_TRIALS, _FEW_TRIALS = 10, 30
-"""Labelled trials with which adapting has nine tenths of the R2 of a hundred, and up to which it beat a network that
-begins with nothing, both on dry objects and as far as was measured; of `benchmarks/adapt.py`."""
+"""Labelled trials with which adapting has about nine tenths of the R2 of a hundred, and up to which it beat a network
+that begins with nothing, both on dry objects and as far as was measured; of `benchmarks/adapt.py`."""
 _KIND = {
     "all": ("backbone", "head"),
     "weights": ("backbone", "head", "image_size"),
@@ -220,8 +220,8 @@ def _advise(
         enough = f"record {_ENOUGH_TRIALS} or more" if count < _ENOUGH_TRIALS else "that is a good beginning"
         yield (
             f"{count} labelled trials, {len(validation)} of them held out; on simulated sensors {_ENOUGH_TRIALS} had "
-            f"0.90 to 0.94 of the R2 of 100 on dry objects, so {enough}: on several days, to the slip, and on slippery "
-            "objects if it is to hold those"
+            f"about nine tenths of the R2 of 100 on dry objects, so {enough}: on several days, to the slip, and on "
+            "slippery objects if it is to hold those"
         )
     elif start is None and count < _FEW_TRIALS:
         yield (
