@@ -349,6 +349,8 @@ def summarise_sequences(read: Sequence[Followed]) -> dict[str, Any]:
 
 def measure_known(run: Run, *, trials: int | None = None) -> dict[str, Any]:
     """How well `known` tells frames of other sensors from those of the network's kind, and how often it is low."""
+    if run.novelty is None:
+        raise SystemExit("networks.py: this network does not tell how far it knows a frame")
     recipe, found, usual = fresh_days("networks, known", KNOWN_DAYS), {}, np.zeros(0)
     for name, sensor in {"own kind": recipe.sensor, **SENSORS}.items():
         rng = np.random.default_rng(0)
@@ -379,6 +381,8 @@ def main() -> None:
     )
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    if options.grasp_spread is not None and not 0 < options.grasp_spread < 0.5:
+        parser.error("--grasp-spread is a share between 0 and 0.5")
     try:
         run = load(options.run)
     except SliplensError as error:
