@@ -126,7 +126,8 @@ def explain_source(
     if methods is None:
         try:
             explainers = choose(methods=[RECOMMENDED_METHOD])
-        except SliplensError:  # difference images, another sensor, or no OpenCV: tiles tell nearly as much
+        except SliplensError as error:  # difference images, another sensor, or no OpenCV: tiles tell nearly as much
+            note(on_progress, f"tiles, not markers: {error}")
             explainers = choose(methods=[RECOMMENDED_METHOD.removesuffix("-marker")])
         methods = tuple(explainers)
     else:
