@@ -8,11 +8,13 @@ import torch
 from known_ends import ends_of
 from torch import Tensor, nn
 
-from sliplens.explainers import Explanation, IntegratedGradients
+from sliplens.explainers import Explanation, IntegratedGradients, get_explainer
 from sliplens.faithfulness.controls import cascade, gini, total_variation
 from sliplens.recordings import Dataset
+from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.study.checks import Measuring, Randomising, Untrained, time_explainers
 from sliplens.study.choice import Material
+from sliplens.study.run import _Judging
 from sliplens.study.scoring import Removal, Setting, influences
 
 
@@ -104,6 +106,40 @@ def test_each_trial_has_a_network_of_its_own(material: Material):
             image, empty = material.inputs[frame, None], material.references[frame, None]
             explanation = material.explainers["grad-cam"](network, image, reference=empty)
             np.testing.assert_allclose(found[frame], explanation.influence[0].numpy(), atol=1e-7)
+
+
+def test_a_map_of_what_raises_the_answer_ranks_by_its_order_and_is_held_against_the_truth_by_its_sign(
+    material: Material, fine_dataset: Dataset
+):
+    explained, name = material.explained, "grad-cam-thesis"
+    relevance = np.abs(explained.relevance["grad-cam"])  # above zero, as the published map is
+    first, *others = explained.frames
+    fell = replace(first, prediction=first.reference_prediction - 0.3)
+    rose = [replace(one, prediction=one.reference_prediction + 0.3) for one in others]
+    explained = replace(explained, frames=(fell, *rose), relevance={**explained.relevance, name: relevance})
+    explainers = {**material.explainers, name: get_explainer(name)}
+    study = _Judging(
+        folder=Path("nowhere"),
+        data=fine_dataset,
+        networks={"difference": material.trained},
+        explainers=explainers,
+        settings=(),
+        random_orders=1,
+        steps=None,
+        seed=0,
+        redrawn=False,
+    )
+    network = study.open("difference")
+    own = replace(material, explained=explained, explainers=explainers)
+    control = {f"{name}{NEW_WEIGHTS}": relevance}
+    vars(network).update(material=own, influence={**influences(own), **control})
+    # parts are removed in the published order
+    np.testing.assert_array_equal(network.influence[name], relevance)
+    held = network.by_truth().maps
+    for kind in (name, *control):
+        np.testing.assert_array_equal(held[kind][0], -relevance[0])
+        np.testing.assert_array_equal(held[kind][1:], relevance[1:])
+    np.testing.assert_array_equal(held["grad-cam"], network.influence["grad-cam"])
 
 
 def test_a_method_that_ignores_the_weights_shows_nothing_about_the_network(material: Material):
