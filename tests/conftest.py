@@ -4,6 +4,7 @@ import os
 import pickle
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 # threads that spin while they wait take the cores from those that work; must be set before torch is imported
@@ -11,12 +12,15 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import pytest
+import torch
 from dots import draw_dots, make_grid
 from hypothesis import settings
 from small import make_recording, save_untrained
 
 from sliplens.images import absolute_difference, write_png
+from sliplens.models import load_checkpoint, save_checkpoint
 from sliplens.models.calibration import Calibration, Traction
+from sliplens.models.sequence import SequenceHead, SequenceManifest
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
@@ -125,6 +129,22 @@ def ratio_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     friction = tuple(0.15 + 0.105 * part for part in range(11))
     traction = Traction(calibration=calibration, told=calibration, friction=friction)
     return save_untrained(tmp_path_factory.mktemp("ratio-run"), frame_size=224, traction=traction)
+
+
+@pytest.fixture(scope="session")
+def sequence_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A network with two answers and a head for several frames, all of random weights."""
+    sure = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
+    traction = Traction(calibration=sure, told=sure, friction=(0.2, 0.7, 1.2))
+    folder = save_untrained(tmp_path_factory.mktemp("sequence") / "run", traction=traction)
+    alone = load_checkpoint(folder)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(3)
+        head = SequenceHead(alone.model.get_buffer("edges"), alone.model.get_buffer("ratio_edges"))
+        torch.nn.init.normal_(head.correction.weight)
+    manifest = replace(alone.manifest, sequence=SequenceManifest(calibration=sure, mse_one=0.02))
+    save_checkpoint(folder, alone.model, manifest, sequence=head)
+    return folder
 
 
 @pytest.fixture(scope="session")

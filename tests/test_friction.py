@@ -103,6 +103,21 @@ def test_a_slip_teaches_what_was_read_as_it_began():
     assert learner.friction.mean == pytest.approx(prior.update(began, 0.03).mean, abs=0.011)  # a frame before
 
 
+def test_ten_slips_of_one_contact_teach_as_the_first():
+    """What a network reads wrong of a contact it reads wrong at each: as independent they would leave 0.016."""
+    learner = SlipLearner(Friction.between(0.2, 1.0))
+    end_s = rising(learner, until=0.5, sigma=0.05)
+    for number in range(10):
+        learner.update(end_s + number, slipping_s=number + 0.05)
+        assert learner.friction.sigma == pytest.approx(0.05, rel=0.02)
+        learner.update(end_s + number + 0.5, slipping_s=None)
+    learner.update(20.0, slipping_s=None, touches=False)
+    before = learner.friction
+    learner.note(0.5, sigma=0.05, time_s=21.0)
+    learner.update(21.2, slipping_s=0.1)
+    assert learner.friction.sigma < before.sigma  # another contact teaches again
+
+
 def test_the_next_grasp_of_a_slip_that_was_learnt_is_less_sure():
     learner = SlipLearner(Friction.between(0.2, 1.0))
     learner.update(rising(learner, until=0.5), slipping_s=0.05)

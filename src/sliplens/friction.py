@@ -104,7 +104,7 @@ class Friction:
         Parameters
         ----------
         ratios
-            F_t / F_n at which the object slipped, one a slip.
+            F_t / F_n at which the object slipped, one a grasp: errors within a grasp are alike.
         sigma
             Standard deviation of each such ratio, as it was read.
         grasp_spread
@@ -176,10 +176,12 @@ class Friction:
 
 
 class SlipLearner:
-    """Friction of an object while it is held: each gross slip narrows it down, and a new grasp widens it again.
+    """Friction of an object while it is held: the first gross slip narrows it down, and a new grasp widens it again.
 
     As a contact begins to slip, F_t / F_n is the static friction; what is read while it slides is less. So a slip is
-    told together with the time since it began, and the ratio that was read just before counts.
+    told together with the time since it began, and the ratio that was read just before counts. Later slips of the
+    same contact teach nothing: what a network reads wrong of a contact it reads wrong alike at each of them, so that
+    they would make it surer and no better.
 
     Parameters
     ----------
@@ -200,7 +202,7 @@ class SlipLearner:
     def __init__(self, friction: Friction) -> None:
         self.friction = friction
         self._read: deque[tuple[float, float, float]] = deque(maxlen=_KEPT)
-        self._slips = self._learnt = False
+        self._learnt = False
 
     def note(self, ratio: float, *, sigma: float, time_s: float) -> None:
         """Keep a ratio F_t / F_n that was read, and its standard deviation."""
@@ -208,11 +210,10 @@ class SlipLearner:
 
     def update(self, time_s: float, *, slipping_s: float | None, touches: bool = True) -> None:
         """Learn from whether the contact slips now, and since how many seconds; None where it holds."""
-        if slipping_s is not None and not self._slips:
+        if slipping_s is not None and not self._learnt:
             before = [(ratio, sigma) for then_s, ratio, sigma in self._read if then_s <= time_s - slipping_s]
             if before and before[-1][0] > 0 and len(self.friction.nodes[0]) > 1:
                 self.friction, self._learnt = self.friction.update(*before[-1]), True
-        self._slips = slipping_s is not None
         if not touches:
             self._read.clear()
             if self._learnt:

@@ -449,10 +449,10 @@ def make_table(
 
     def read(folder: Path) -> Iterator[pa.Table]:
         for one in shards():
-            table = open_table(folder / one.part).read()
+            part = open_table(folder / one.part)
             if on_rows is not None:
-                on_rows(table)
-            yield table
+                on_rows(part.read())
+            yield from map(part.read_row_group, range(part.num_row_groups))
 
     if out is not None and not out.suffix:
         every = hashlib.sha256()

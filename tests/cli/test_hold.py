@@ -36,6 +36,7 @@ def test_a_line_of_json_a_command_and_a_table_of_all(small_dataset: Dataset, tmp
             "an image a source, 1, got 2",
         ),
         (("simulated", "--dry-run", "--controller", "fixed", "--set", "speed=3"), "has no constant 'speed'"),
+        (("simulated", "--dry-run", "--sequence", "--friction", "0.6"), "leave out one of them"),
     ],
 )
 def test_mistakes_are_one_sentence(capsys, words, told):

@@ -23,6 +23,7 @@ from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, Slip
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models import Run
 from sliplens.recordings import ContactState, Dataset, Recording
+from sliplens.recordings.source import open_source
 
 plain_reader = partial(sl.LiveReader, health=None, slip=None)
 """What is captured and read, without judging it."""
@@ -84,6 +85,30 @@ def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, diffe
         assert reading.withheld is None
         # one frame at a time or many: float32 sums in another order
         assert reading.margin == pytest.approx(np.clip(told[reading.number], 0, 1), abs=1e-4)
+
+
+def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, sequence_run: Path):
+    run, info = sl.load(sequence_run), small_dataset.trials[0]
+    recording, [capture] = small_dataset.load(info), open_source(small_dataset, trial=info.trial)
+    table = sl.predict(run, [replace(capture, frame_time_s=0.05 * np.arange(12))], sequence=True).frame()
+    source = Patient(recording.frames[1:], list(range(1, 12)))  # nothing touches the first, and it is forgotten
+    readings = source.all_readings(
+        plain_reader(source, run, reference=recording.reference, sequence=True, engine="eager", stall_s=10.0)
+    )
+    assert [reading.number for reading in readings] == list(range(1, 12))
+    assert all(reading.sequence for reading in readings)
+    # one frame at a time or eight: the network's float32 sums differ by 1e-7, and the head's weights of about 1 add 64
+    margins = [reading.margin for reading in readings]
+    np.testing.assert_allclose(margins, np.clip(table["prediction"].to_numpy()[1:], 0, 1), atol=1e-5)
+    alone = sl.predict(run, recording.frames, reference=recording.reference).frame()["prediction"].to_numpy()
+    assert np.abs(margins - alone[1:].clip(0, 1)).max() > 0.01
+
+
+def test_frames_after_a_gap_are_read_by_themselves_and_say_so(recording: Recording, sequence_run: Path):
+    numbers = [1, 2, 3, 20, 21, 22]  # 0.85 s were withheld, or lost
+    source = Patient(recording.frames[[1, 2, 3, 4, 5, 6]], numbers)
+    reader = plain_reader(source, sequence_run, reference=recording.reference, sequence=True, engine="eager")
+    assert [reading.sequence for reading in source.all_readings(reader)] == [True] * 3 + [False] * 3
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 0.01])

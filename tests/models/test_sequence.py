@@ -4,40 +4,30 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
-from small import save_untrained
 
 import sliplens as sl
 from sliplens.errors import CheckpointError, InputError
+from sliplens.live.contract import SourceOptions
 from sliplens.models import Run, load_checkpoint, save_checkpoint
-from sliplens.models.calibration import Calibration, Traction
+from sliplens.models.calibration import Calibration
 from sliplens.models.checkpoint import Estimate
-from sliplens.models.sequence import SequenceHead, SequenceManifest
+from sliplens.models.sequence import GAP_S, SequenceHead
 from sliplens.recordings import Dataset
+from sliplens.recordings.source import open_source
 from sliplens.recordings.trial import ContactState
+from sliplens.training.data import load_frames
+from sliplens.training.evaluation import evaluate_frames
 
 EDGES, RATIO_EDGES = torch.linspace(-0.1, 1.1, 61), torch.linspace(-0.1, 1.5, 81)
 SURE = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A network with two answers and a head for several frames, all of random weights."""
-    traction = Traction(calibration=SURE, told=SURE, friction=(0.2, 0.7, 1.2))
-    folder = save_untrained(tmp_path_factory.mktemp("sequence") / "run", traction=traction)
-    alone = load_checkpoint(folder)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(3)
-        head = SequenceHead(EDGES, RATIO_EDGES)
-        torch.nn.init.normal_(head.correction.weight)
-    save_checkpoint(
-        folder,
-        alone.model,
-        replace(alone.manifest, sequence=SequenceManifest(calibration=SURE, mse_one=0.02)),
-        sequence=head,
-    )
-    return load_checkpoint(folder)
+def run(sequence_run: Path) -> Run:
+    return load_checkpoint(sequence_run)
 
 
 def answers(frames: int, *, seed: int = 0) -> Estimate:
@@ -96,6 +86,28 @@ def test_a_clock_that_runs_back_begins_anew(run: Run):
     )  # times differ by a shift, whose differences round
 
 
+def test_after_a_gap_the_rest_of_a_contact_is_read_frame_by_frame(run: Run):
+    estimate, follower = answers(18), run.follow()
+    times, touches = np.arange(18) / 10, np.ones(18, dtype=bool)
+    times[6:] += 30
+    touches[11] = False
+    read = follower.update(estimate, times, touches).margin
+    assert not np.isclose(read[:6], estimate.margin[:6]).any()
+    assert np.array_equal(read[6:12], estimate.margin[6:12])
+    # the next contact is followed as if there had been none before
+    anew = run.follow().update(estimate.at(np.arange(12, 18)), times[12:], touches[12:]).margin
+    np.testing.assert_allclose(read[12:], anew, atol=1e-6)
+    assert not follower.lost
+
+
+@pytest.mark.parametrize(("step_s", "lost"), [(0.5, False), (GAP_S, False), (GAP_S + 0.01, True)])
+def test_memory_holds_as_long_as_was_taught(run: Run, step_s: float, lost: bool):
+    estimate, follower = answers(5), run.follow()
+    read = follower.update(estimate, 7 + step_s * np.arange(5), np.ones(5, dtype=bool)).margin
+    assert follower.lost == lost
+    assert np.isclose(read, estimate.margin)[1:].all() == lost
+
+
 def test_a_head_that_learnt_nothing_leaves_answers_as_they_are(run: Run):
     untaught = replace(run, sequence=SequenceHead(EDGES, RATIO_EDGES).eval())
     estimate = answers(5)
@@ -137,6 +149,28 @@ def test_a_recording_is_read_as_the_follower_reads_it(run: Run, small_dataset: D
     assert written["prediction"].equals(table["prediction"])
 
 
+def test_a_table_says_that_it_was_read_in_order(run: Run, small_dataset: Dataset):
+    in_order, alone = (sl.predict(run, small_dataset, split="test", sequence=one) for one in (True, False))
+    assert run.manifest.sequence is not None
+    metadata = in_order.frame().schema.metadata
+    assert metadata[b"sliplens.sequence"].decode() == run.manifest.sequence.weights_sha256
+    assert any("read in order" in sentence for sentence in in_order.notes)
+    assert b"sliplens.sequence" not in alone.frame().schema.metadata
+    assert not any("read in order" in sentence for sentence in alone.notes)
+
+
+def test_the_rows_of_a_long_trial_are_written_as_they_come(
+    run: Run, small_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    whole = sl.predict(run, small_dataset, split="test", sequence=True, batch_size=4)
+    monkeypatch.setattr("sliplens.models.predictions.LONGEST", 4)
+    for name in ("margins", "margins.parquet"):
+        table = sl.predict(run, small_dataset, split="test", sequence=True, batch_size=4, out=tmp_path / name).frame()
+        assert table.equals(whole.frame())
+    parts = list((tmp_path / "margins").glob("*/*.parquet"))
+    assert [pq.ParquetFile(part).num_row_groups for part in parts] == [3, 3]
+
+
 def test_evaluation_reads_labelled_frames_in_order(run: Run, small_dataset: Dataset):
     evaluation = sl.evaluate(run, small_dataset, sequence=True)
     assert evaluation.sequence
@@ -156,6 +190,23 @@ def test_what_cannot_be_followed_is_refused(run: Run, small_dataset: Dataset):
         sl.predict(run, small_dataset, sequence=True, friction=0.6)
     with pytest.raises(InputError, match="times"):
         sl.predict(run, small_dataset.load(small_dataset.trials[0]).frames, sequence=True)
+
+
+def test_frames_that_come_too_seldom_are_refused(run: Run, small_dataset: Dataset):
+    trials = small_dataset.select(split="test")
+    [capture] = open_source(small_dataset, trial=trials[0].trial)
+    assert capture.time_s is not None
+    seldom = replace(capture, frame_time_s=30 * capture.time_s)  # one a second
+    with pytest.raises(InputError, match=r"has a frame each 1 s, .* without --sequence, or record 2 a second"):
+        sl.predict(run, [seldom], sequence=True)
+    assert len(sl.predict(run, [seldom])) == len(capture)
+    frames = load_frames(small_dataset, trials, encoding=run.encoding, image_size=32)
+    with pytest.raises(InputError, match=r"the trial test-\S+ has a frame each 1 s"):
+        evaluate_frames(run, replace(frames, time_s=30 * frames.time_s), sequence=True)
+    slow, reference = SourceOptions(rate_hz=1.0), small_dataset.load(trials[0]).reference
+    reader = sl.LiveReader(seldom, run, options=slow, reference=reference, sequence=True, engine="eager")
+    with pytest.raises(InputError, match="has a frame each 1 s"), reader:
+        pass
 
 
 def test_a_damaged_head_is_refused(run: Run, tmp_path: Path):

@@ -11,9 +11,10 @@ from small import save_untrained
 from sliplens.errors import InputError, ModelError
 from sliplens.models import load_checkpoint
 from sliplens.models.calibration import Calibration, Traction
+from sliplens.models.sequence import GAP_S
 from sliplens.recordings import Dataset
+from sliplens.training import evaluate, train
 from sliplens.training import sequence as sequences
-from sliplens.training import train
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +81,35 @@ def test_neither_rate_nor_number_of_frames_tells_how_long_a_trial_is(rng: np.ran
         assert rates[duration_s].min() >= 0.1 - 1e-6
     # the step is a multiple of the time between frames, 0.02 or 0.1 s, which rounds it up by half of that on average
     assert rates[7.5].mean() - rates[1.5].mean() == pytest.approx(0.04, abs=0.03)
+
+
+def test_no_step_is_taught_that_is_never_read(rng: np.random.Generator):
+    """Every second frame, 0.7 s apart, would be further than memory reaches when a trial is read."""
+    time_s = 0.35 * np.arange(20)
+    empty = np.zeros((20, 1), "f4")
+    trial = sequences.AnsweredTrial(margin=empty, ratio=empty, label=time_s, time_s=time_s)
+    steps = [np.diff(trial.some(rng).time_s) for _ in range(50)]
+    assert np.concatenate(steps).max() <= GAP_S
+    assert np.allclose(np.concatenate(steps), 0.35)
+
+
+def test_a_trial_is_taught_and_read_up_to_its_first_gap(small_dataset: Dataset, start: Path, monkeypatch):
+    load = Dataset.load
+    times = np.where(np.arange(12) < 7, 0.0, 30.0) + 0.1 * np.arange(12)
+    monkeypatch.setattr(Dataset, "load", lambda *args, **named: replace(load(*args, **named), time_s=times))
+    run = teach(small_dataset, start, epochs=20)
+    assert run.manifest.sequence is not None
+    assert run.training is not None
+    assert run.training.validation_frames == 2 * 6  # the first of 7 has no label
+    in_order, alone = (
+        evaluate(run, small_dataset, split="validation", sequence=one).predictions for one in (True, False)
+    )
+    before = in_order.frame < 7
+    errors = in_order.prediction[before] - in_order.safety_margin[before]
+    # the error that the manifest tells is that of the trials as they are read, but for single precision
+    assert np.mean(errors**2) == pytest.approx(run.manifest.sequence.calibration.mse, rel=1e-4)
+    assert np.array_equal(in_order.prediction[~before], alone.prediction[~before])
+    assert np.abs(in_order.prediction - alone.prediction)[before].min() > 1e-3
 
 
 def test_stamps_since_1970_are_told_apart(small_dataset: Dataset, start: Path, tmp_path: Path, monkeypatch):

@@ -437,13 +437,14 @@ export default {
         "of that": ["decode", "checks", "encode", "network"].map((part) => `${part} ${ms(latency[`${part}_ms`])}`).join(", "),
         drawn: `${ms(drawn_ms)} after the capture`,
         ...(reading?.friction ? { friction: `taken for ${reading.friction}` } : {}),
+        ...(reading?.sequence ? { "read in order": "earlier frames of the contact count" } : {}),
         dropped: `${reading?.dropped ?? 0} frames`,
         contact: `${reading?.contact_state ?? "unknown"}`,
         viewers: `${viewers}`,
         ...(sinks.length ? { sent: sinks.map(({ name, sent, lost }) => `${name} ${sent}, ${lost} lost`).join("; ") } : {}),
       };
       const list = this.$refs.facts;
-      // a row more where friction is told, which a withheld reading does not say
+      // rows more where friction is told or frames are read in order, which a withheld reading does not say
       if (list.dataset.names !== `${Object.keys(rows)}`) {
         list.dataset.names = `${Object.keys(rows)}`;
         list.replaceChildren(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import msgspec
 import tyro
 
-from sliplens.cli.command import Command, Device, Friction
+from sliplens.cli.command import Command, Device, Friction, InOrder
 from sliplens.cli.console import say, wrote
 from sliplens.cli.grip import constant
 from sliplens.errors import InputError, SliplensError
@@ -51,6 +51,7 @@ class Hold(Command):
     reference: tuple[Path, ...] = ()
     """Image of each untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None
+    sequence: InOrder = False
     sensor: str | None = None
     """Profile of the sensors, a file or a name such as digit."""
     seconds: float | None = None
@@ -105,7 +106,7 @@ class Hold(Command):
             raise InputError(f"--reference takes an image a source, {len(self.sources)}, got {len(self.reference)}")
         shipped = all(source.partition(":")[0] in {"grip", "simulated"} for source in self.sources)
         name = self.network or ("chromatouch-difference" if shipped else None)
-        common = {name: getattr(self, name) for name in ("friction", "sensor", "engine", "device")}
+        common = {name: getattr(self, name) for name in ("friction", "sequence", "sensor", "engine", "device")}
         common["network"] = None if name is None else load(name, device=self.device)
         return [
             LiveReader(

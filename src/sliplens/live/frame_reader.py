@@ -20,6 +20,7 @@ from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run
 from sliplens.models.engines import Engine
 from sliplens.models.predictions import LEVEL
+from sliplens.models.sequence import require_frequent
 from sliplens.recordings.capture import Frame
 from sliplens.recordings.labels.lag import soften
 from sliplens.recordings.trial import ContactState, contact_states
@@ -159,6 +160,8 @@ class FrameReader:
     def begin(self, engine: Engine | None, reference: Frame | None) -> None:
         """Take the source, which is open, as it is now, and an image of the untouched sensor if there is one."""
         self.engine, self._size = engine, self.source.size
+        if self._follower is not None and self.source.rate_hz:
+            require_frequent(np.arange(2) * self.source.speed / self.source.rate_hz, what=self.source.name)
         if reference is None:
             self._taker = _ReferenceTaker()
             return
@@ -288,6 +291,7 @@ class FrameReader:
             high=high,
             ratio=ratio,
             friction=None if friction is None else str(friction),
+            sequence=self._follower is not None and not self._follower.lost,
             risk=margin_risk(reading.health, float(estimate.beyond(OFF)[0])) if reading.health else None,
             contact_state=state,
             lag_s=self._smooth.time_constant_s,

@@ -131,6 +131,8 @@ class Reading:
     """Traction ratio F_t / F_n, of a network that tells it."""
     friction: str | None = None
     """Coefficient of friction that the margin was read with, in words; None where none was told."""
+    sequence: bool = False
+    """Whether the margin was read in order: what the frames of the contact before this one told counts too."""
     risk: float | None = None
     """Chance that the margin is off by more than 0.2, from all of health and the network's own spread
     (`margin_risk`); None without a margin."""

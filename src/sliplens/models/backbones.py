@@ -199,14 +199,18 @@ def last_layer(model: nn.Module) -> nn.Linear:
     return layers[-1]
 
 
-def with_ratio(model: nn.Module, weights: Mapping[str, Tensor]) -> nn.Module:
-    """Fill a network of two answers with the weights of one that has the margin alone; its ratio begins as unknown.
+def fill_head(model: nn.Module, weights: Mapping[str, Tensor]) -> nn.Module:
+    """Fill a network that has one answer more, or one less, than that of these weights; margins stay what they were.
 
-    The margins stay what they were; the new rows of the last layer are zero: every ratio is as likely.
+    Rows of the last layer for a ratio that is new are zero: every ratio is as likely. Those for a ratio that is not
+    wanted are left out.
     """
     state = model.state_dict()
-    for name, value in weights.items():
-        state[name] = torch.cat([value, torch.zeros_like(state[name][len(value) :])]) if value.ndim else value
+    for name in state.keys() & weights.keys():
+        value, kept = weights[name], state[name]
+        if value.ndim:
+            value = torch.cat([value[: len(kept)], torch.zeros_like(kept[len(value) :])])
+        state[name] = value
     model.load_state_dict(state)
     return model
 

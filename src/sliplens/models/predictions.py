@@ -20,6 +20,7 @@ from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
 from sliplens.models.engines import Engine, make_engine, one_thread
 from sliplens.models.novelty import read_features
+from sliplens.models.sequence import require_frequent
 from sliplens.parts import require_new_table
 from sliplens.progress import OnProgress, note, stage
 from sliplens.recordings import Dataset, load_dataset
@@ -284,6 +285,10 @@ def predict(
     if known is not None:
         notes = (*notes, f"The coefficient of friction is taken for {known}.")
         metadata["sliplens.friction"] = str(known)
+    if sequence:
+        assert trained.manifest.sequence is not None  # `_require_order`
+        notes = (*notes, "Frames were read in order: each answer counts those of its contact before it.")
+        metadata["sliplens.sequence"] = trained.manifest.sequence.weights_sha256
     for sentence in notes:
         note(on_progress, sentence)
     schema = _schema(trained, kinds, metadata)
@@ -291,7 +296,6 @@ def predict(
     make = partial(make_engine, engine, trained, **run_with)
     recipe = run_with | {"onnx_file": onnx_file and hash_file(onnx_file), "engine": engine, **metadata}
     recipe |= {"columns": schema.names, "device": str(trained.device), "source": trials.recipe}
-    recipe |= {"sequence": True} if sequence else {}
     written, rows = make_table(
         _Reading(trained=trained, trials=trials, schema=schema, friction=known, sequence=sequence, make_engine=make),
         partial(trials.shards, recipe, longest=None if sequence else LONGEST),
@@ -328,6 +332,9 @@ def _require_order(trained: Run, trials: Sequence[Capture], *, friction: Frictio
             "--sequence reads frames by their times, and nobody tells them here; leave it out, or read a recording "
             "whose times are known"
         )
+    for one in trials:
+        assert one.time_s is not None
+        require_frequent(one.time_s, what=one.name)
 
 
 def _assume_reference(trained: Run, trial: Capture) -> Capture:
@@ -423,7 +430,7 @@ class _Reading(Work):
 
         def make(item: tuple[str, int, int], path: Path, on_progress: OnProgress) -> None:
             rows = self._rows(ready, *read(*item), count=item[-1], on_progress=on_progress)
-            write_tables([pa.Table.from_pydict(rows, schema)], path, schema)
+            write_tables((pa.Table.from_pydict(some, schema) for some in rows), path, schema)
 
         return make
 
@@ -435,9 +442,11 @@ class _Reading(Work):
         *,
         count: int,
         on_progress: OnProgress,
-    ) -> dict[str, list]:
+    ) -> Iterator[dict[str, list]]:
+        """Columns of some thousand frames at a time: what is read in order is cut nowhere else."""
         # plain numbers: small arrays kept between the large ones of each batch would leave holes in the memory
         rows: dict[str, list] = {name: [] for name in self.schema.names}
+        done = 0
         capture = _assume_reference(self.trained, capture)
         reference = None if capture.read_reference is None else capture.read_reference()
         untouched, states = None if reference is None else soften(reference), _states(capture)
@@ -471,8 +480,12 @@ class _Reading(Work):
             for name, values in (_columns(estimate, capture, first) | {"touches": touches}).items():
                 if name in rows:
                     rows[name].extend(values)
-            on_progress(len(rows["frame"]), count)
-        return rows
+            on_progress(done := done + len(touches), count)
+            if len(rows["frame"]) >= LONGEST:
+                yield rows
+                rows = {name: [] for name in rows}
+        if rows["frame"]:
+            yield rows
 
 
 def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, list]:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from sliplens.errors import InputError
 from sliplens.models.calibration import Calibration
 
 if TYPE_CHECKING:
@@ -18,6 +19,10 @@ WIDTH = 32
 """Numbers that the head remembers of a contact."""
 STEP_S, LONGEST_S = 0.1, 1.0
 """Time after which memory takes a step, and the longest that is told apart; a contact begins with the longest."""
+GAP_S = 0.6
+"""Longest time from a step of memory to a frame that is read by it. Training takes steps of 0.1 to 0.4 s, and the
+frame that makes one may come a frame later, which for the shipped head is 0.17 s at most. Days of selection are read
+better with steps of up to 0.6 s than frame by frame, or as well; wet ones worse with 1 to 1.5 s (R2 0.70 for 0.77)."""
 _LEAST_PEAK = 0.02
 """Traction ratio below which nothing is pulled."""
 ROUNDING_S = 1e-6
@@ -114,6 +119,16 @@ def _moments(probabilities: Float[Tensor, "*frames bins"], centres: Float[Tensor
     return mean, (probabilities * (centres - mean[..., None]) ** 2).sum(dim=-1).sqrt()
 
 
+def require_frequent(time_s: Float[np.ndarray, " frames"], *, what: str) -> None:
+    """Refuse a recording whose frames mostly come too seldom to be read in order."""
+    step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
+    if step_s > GAP_S + ROUNDING_S:
+        raise InputError(
+            f"{what} has a frame each {step_s:.2g} s, and --sequence follows a contact over {GAP_S:g} s at most; read "
+            "such frames by themselves, without --sequence, or record 2 a second or more"
+        )
+
+
 class Follower:
     """Reads the frames of one sensor in order; each answer tells what the frames of this contact so far tell.
 
@@ -141,6 +156,8 @@ class Follower:
         """Begin anew with the next contact."""
         self._state: State | None = None
         self._time_s = np.nan
+        self.lost = False
+        """Whether there was a gap in this contact, so that its frames are read by themselves."""
 
     @torch.inference_mode()
     def update(
@@ -150,7 +167,8 @@ class Follower:
 
         `estimate`: of each frame by itself, told no friction; `time_s`: when it was taken; `touches`: whether anything
         touches. A frame that nothing touches keeps its answer, and what was before it is forgotten; so is what was
-        before a clock that runs back.
+        before a clock that runs back. After a gap (`GAP_S`) the rest of the contact keeps its answers too: nobody knows
+        what happened meanwhile, and to a head that does not know the largest pull, what slides seems to hold.
         """
         assert estimate.probabilities is not None
         assert estimate.ratio is not None
@@ -164,7 +182,8 @@ class Follower:
         for row, (now_s, touched) in enumerate(zip(time_s.tolist(), touches.tolist(), strict=True)):
             if not touched or now_s < self._time_s:
                 self.forget()
-            if not touched:
+            self.lost |= now_s - self._time_s > GAP_S + ROUNDING_S
+            if not touched or self.lost:
                 continue
             elapsed_s = LONGEST_S if self._state is None else now_s - self._time_s
             since = torch.tensor([[elapsed_s]], device=device)

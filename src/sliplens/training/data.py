@@ -182,6 +182,11 @@ def _ratios(labels: Labels) -> Float[np.ndarray, " frames"]:
     return np.where(pressed, labels.tangential_force_n / np.where(pressed, labels.normal_force_n, 1), np.nan)
 
 
+def tells_ratio(labels: Labels) -> bool:
+    """Whether F_t / F_n and the friction of any labelled frame are known."""
+    return bool(np.isfinite(trial_friction(labels)) and np.isfinite(_ratios(labels)[labels.labelled]).any())
+
+
 def load_frames(
     data: Dataset,
     trials: Sequence[TrialInfo],

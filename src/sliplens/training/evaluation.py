@@ -20,6 +20,7 @@ from sliplens.markers import KINDS, MarkerStatus, track_markers
 from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get_estimator
 from sliplens.models import Run
 from sliplens.models.checkpoint import Estimate, load, tell_each
+from sliplens.models.sequence import require_frequent
 from sliplens.progress import OnProgress, counted, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset, trial_path
@@ -325,6 +326,9 @@ def evaluate_frames(
     """
     if not len(frames):
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
+    names = np.array(frames.trial)
+    for name in np.unique(names) if sequence else ():
+        require_frequent(np.sort(frames.time_s[names == name]), what=f"the trial {name}")
     estimate = _estimate(run, frames.batches(batch_size, on_progress), frames.friction, told=friction)
     if sequence:
         estimate = _follow_trials(run, estimate, frames.trial, frames.time_s)

@@ -25,8 +25,8 @@ from sliplens.models.backbones import (
     REFERENCE_SIGNS,
     HistogramRegressor,
     bin_edges,
+    fill_head,
     last_layer,
-    with_ratio,
     with_reference,
 )
 from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
@@ -38,7 +38,15 @@ from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import Training
 from sliplens.training.config import TrainConfig, get_recipe, open_logger
-from sliplens.training.data import EpochShuffle, FrameSet, extract_features, get_augmentation, load_frames, make_loaders
+from sliplens.training.data import (
+    EpochShuffle,
+    FrameSet,
+    extract_features,
+    get_augmentation,
+    load_frames,
+    make_loaders,
+    tells_ratio,
+)
 from sliplens.training.module import Clock, DivergedError, Regressor, make_trainer, run_trainer, share_of_batch
 from sliplens.training.sequence import fit_sequence
 
@@ -120,6 +128,7 @@ def train(
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = ENCODINGS.pick(input), _choose_trials(data, condition)
     _require_varied_labels(data, trials[0])
+    config = config if start is None or changes.get("head") else _as_told(config, data, trials)
     for sentence in _advise(config, *trials, start=start) if trainer.is_global_zero else ():  # one process speaks
         note(on_progress, sentence)
     # what shapes the result besides the recipe
@@ -211,10 +220,18 @@ def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInf
     return train, validation
 
 
+def _as_told(config: TrainConfig, data: Dataset, trials: Sequence[Sequence[TrialInfo]]) -> TrainConfig:
+    """The same without the second answer, where all that answers changes and the labels do not tell that one."""
+    if config.head != "margin-and-ratio" or config.learns not in {"all", "weights"}:
+        return config
+    told = all(any(tells_ratio(data.read_labels(info)) for info in some) for some in trials)
+    return config if told else replace(config, head="histogram")
+
+
 def _advise(
     config: TrainConfig, train: Sequence[TrialInfo], validation: Sequence[TrialInfo], *, start: Run | None
 ) -> Iterator[str]:
-    """Say how many trials to record, where there are few."""
+    """Say how many trials to record, where there are few, and what is lost of the network to start from."""
     count = len(train) + len(validation)
     if config.learns == "weights":
         enough = f"record {_ENOUGH_TRIALS} or more" if count < _ENOUGH_TRIALS else "that is a good beginning"
@@ -227,6 +244,16 @@ def _advise(
         yield (
             f"{count} labelled trials are few for a network that begins with nothing; begin with one that is there: "
             "--recipe adapt --start-from chromatouch-difference"
+        )
+    if start is not None and start.manifest.head == "margin-and-ratio" and config.head == "histogram":
+        yield (
+            "the labels do not tell forces and friction, so that it learns the margin alone: it takes neither "
+            "--friction nor --sequence afterwards"
+        )
+    elif start is not None and start.sequence is not None and config.learns != "sequence":
+        yield (
+            "the network to start from reads several frames too, by a head that knows its answers as they are; teach "
+            "the new one its own with --recipe sequence"
         )
 
 
@@ -464,7 +491,7 @@ def _begin(config: TrainConfig, encoding: Encoding, start: Run | None) -> nn.Mod
         weights = start.model.state_dict()
         if encoding.colours > start.encoding.colours:
             weights = with_reference(weights, sign=REFERENCE_SIGNS[start.manifest.input])
-        fill = model.load_state_dict if start.manifest.head == config.head else partial(with_ratio, model)
+        fill = model.load_state_dict if start.manifest.head == config.head else partial(fill_head, model)
         fill(weights)
     return model
 
@@ -517,11 +544,11 @@ def require_same_kind(start: Run, config: TrainConfig, encoding: str) -> None:
     """Refuse to start from a network whose weights would mean something else."""
     for name, value in (("input", encoding), ("backbone", config.backbone), ("head", config.head)):
         kept = getattr(start.manifest, name)
-        # a second answer can be learnt beside the first, and the reference be seen beside the frame, but not both at
-        # once: the first answer would stay as it was for other images
+        # a second answer can be learnt beside the first or left out, and the reference be seen beside the frame; not
+        # by a last layer alone: the first answer would stay as it was for other images
         paired = value == "pair" and kept in REFERENCE_SIGNS and config.learns != "ratio"
-        grown = paired or (kept, value) == ("histogram", "margin-and-ratio")
-        if kept != value and not grown:
+        changed = {kept, value} == {"histogram", "margin-and-ratio"}
+        if kept != value and not (paired or changed):
             raise ModelError(
                 f"the network to start from has the {name} {kept}, and {value} is to be trained; "
                 f"train {kept}, or start from another network"

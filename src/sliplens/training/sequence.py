@@ -18,7 +18,15 @@ from sliplens.files import versions, whole_file
 from sliplens.models import Run, make_engine, save_checkpoint
 from sliplens.models.backbones import HistogramRegressor, histogram_targets
 from sliplens.models.calibration import calibrate_histogram
-from sliplens.models.sequence import LONGEST_S, ROUNDING_S, STEP_S, SequenceHead, SequenceManifest
+from sliplens.models.sequence import (
+    GAP_S,
+    LONGEST_S,
+    ROUNDING_S,
+    STEP_S,
+    SequenceHead,
+    SequenceManifest,
+    require_frequent,
+)
 from sliplens.progress import OnProgress, stage
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.results.evaluation import Training
@@ -40,13 +48,23 @@ class AnsweredTrial:
     label: Float[np.ndarray, " frames"]
     time_s: Float[np.ndarray, " frames"]
 
+    def unbroken(self) -> "AnsweredTrial":
+        """The frames before the first gap, those after which are read by themselves."""
+        gaps = np.flatnonzero(np.diff(self.time_s) > GAP_S + ROUNDING_S)
+        end = gaps[0] + 1 if len(gaps) else None
+        return AnsweredTrial(**{name: values[:end] for name, values in vars(self).items()})
+
     def steps(self, step_s: float = STEP_S, *, late_s: float = 0.0) -> "AnsweredTrial":
-        """The frames with which memory takes its steps; the first one `late_s` after the beginning."""
-        rows, next_s = [], self.time_s[0] + late_s
-        for row, now_s in enumerate(self.time_s.tolist()):
-            if now_s >= next_s - ROUNDING_S:
+        """The frames with which memory takes its steps; the first one `late_s` after the beginning.
+
+        Where the frame after one would come when memory has ended, a step is taken before its time.
+        """
+        rows, next_s, ends_s = [], self.time_s[0] + late_s, np.inf
+        times = self.time_s.tolist()
+        for row, (now_s, then_s) in enumerate(zip(times, [*times[1:], -np.inf], strict=True)):
+            if now_s >= next_s - ROUNDING_S or then_s > ends_s:
                 rows.append(row)
-                next_s = now_s + step_s
+                next_s, ends_s = now_s + step_s, now_s + GAP_S + ROUNDING_S
         return AnsweredTrial(**{name: values[rows] for name, values in vars(self).items()})
 
     def some(self, rng: np.random.Generator) -> "AnsweredTrial":
@@ -150,6 +168,7 @@ def _answer(
                 engine = engine or make_engine("auto", run, frames=sum(one.frames for one in trials))
                 recording = data.load(info, truth=False)
                 rows = np.flatnonzero(recording.labelled)
+                require_frequent(recording.time_s[rows], what=f"the trial {info.trial}")
                 images = (
                     recording.frames[rows[at : at + engine.batch_size]] for at in range(0, len(rows), engine.batch_size)
                 )
@@ -164,7 +183,7 @@ def _answer(
                     save_file(kept, part)
             answered.append(AnsweredTrial(**load_file(path)))
             count(done, len(trials))
-    labelled = [one for one in answered if len(one.label)]
+    labelled = [one.unbroken() for one in answered if len(one.label)]
     if not labelled:
         raise RecordingError(f"{data.folder}: no frame of the {what} trials has a label; label them first")
     return labelled
