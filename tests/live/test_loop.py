@@ -98,7 +98,7 @@ def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, 
     assert [reading.number for reading in readings] == list(range(1, 12))
     assert all(reading.sequence for reading in readings)
     # one frame at a time or eight: the network's float32 sums differ by 1e-7, and the head's weights of about 1 add 64
-    margins = [reading.margin for reading in readings]
+    margins = np.array([reading.margin for reading in readings], dtype=np.float64)
     np.testing.assert_allclose(margins, np.clip(table["prediction"].to_numpy()[1:], 0, 1), atol=1e-5)
     alone = sl.predict(run, recording.frames, reference=recording.reference).frame()["prediction"].to_numpy()
     assert np.abs(margins - alone[1:].clip(0, 1)).max() > 0.01
