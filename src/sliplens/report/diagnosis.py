@@ -42,7 +42,8 @@ def table_slices(diagnosis: Diagnosis) -> Table:
         ("Slice", "Frames", "Trials", "Mean |error|", "Mean error", "Less elsewhere (95 %)"),
         [
             (
-                one.name, f"{one.frames:,}", str(one.trials), f"{100 * one.error:.1f}", _points(one.bias),
+                one.name.replace(", ", ",\n"), f"{one.frames:,}", str(one.trials), f"{100 * one.error:.1f}",
+                _points(one.bias),
                 f"{_points(one.excess.estimate)} ({tell_ends(one.excess, _points)}){', larger' if one.holds else ''}",
             )
             for one in diagnosis.slices
@@ -81,7 +82,8 @@ def plate_frictions(diagnosis: Diagnosis) -> Plate:
         alt=f"Answer against true margin as friction alone changes: {told}",
         caption="The same press and pull filmed anew with other frictions, the forces kept, a line a frame: a network "
         "that reads friction from what it sees rises as the dashed line does, one that answers by habit stays level. "
-        "Best: the best reading of the markers, which knows how far frictions and loads range.",
+        "Best: the slope of the best reading of the markers, which knows how far frictions and loads range: far below "
+        "1 where the picture hardly shows the friction.",
         numbers=named_columns(names, rows_of(*(getattr(diagnosis.frictions, name) for name in names))),
     )
 

@@ -251,9 +251,10 @@ SECTIONS: tuple[Section, ...] = (
         id="diagnosis",
         title="Where the network fails, and why",
         short_title="Why it fails",
-        intro="Slices of the trials in which the error is large, tested on trials they were not found on; what the "
-        "network looked at there, and what the best reading of the markers needed; what it says of the same press and "
-        "pull where friction alone differs; and the kinds of explanations there are.",
+        intro="Slices of the trials in which the error is large, tested on trials they were not found on; how much of "
+        "the error no reader of one frame could spare; what the network says of the same press and pull where friction "
+        "alone differs; what it looked at, and what the best reading of the markers needed; and the kinds of "
+        "explanations.",
         apart=True,
         build=_diagnosis,
         needs=lambda results: results.diagnoses,

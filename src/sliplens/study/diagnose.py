@@ -490,16 +490,20 @@ def _say_excess(both: ErrorTable, rng: np.random.Generator) -> str:
 
 def say_slices(slices: Sequence[ErrorSlice]) -> str:
     """Say where the error is larger on trials that the tree has not seen."""
+    tested = [one for one in slices if one.trials >= FEWEST_UNITS]
+    if not tested:
+        return f"Where the error is larger is not known: no slice has the {FEWEST_UNITS} held-out trials to test it on."
+    held = [one for one in tested if one.holds]
     texts = [
         f"{one.name}: off by {100 * one.error:.1f} ({signed(100 * one.bias, 1)} mean) in {one.frames} frames of "
         f"{one.trials} trials, against elsewhere {_gap(one.excess, points=True)}"
-        for one in slices
-        if one.holds
+        for one in held or tested[:1]
     ]
-    if all(one.trials < FEWEST_UNITS for one in slices):
-        return f"Where the error is larger is not known: no slice has the {FEWEST_UNITS} held-out trials to test it on."
-    if not texts:
-        return "No slice found on half of the trials has a larger error on the other half beyond chance."
+    if not held:
+        return (
+            "No slice found on half of the trials has a larger error on the other half beyond chance, all slices taken "
+            f"together. The largest is {texts[0]}."
+        )
     return f"On held-out trials the error is larger than elsewhere where {'; where '.join(texts)}."
 
 
