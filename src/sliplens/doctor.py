@@ -19,7 +19,7 @@ from sliplens.live.camera import list_cameras
 from sliplens.models.checkpoint import Run, load
 from sliplens.models.engines import ENGINES, prepare
 from sliplens.models.onnx import TOLERANCE
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, number_of
 from sliplens.recordings.store import load_recording, save_recording
 from sliplens.simulation import make_recipe, plan_trials, simulate_trial
 
@@ -180,7 +180,7 @@ def _cameras() -> str:
         return _absent("none is connected")
     if not any(camera.modes for camera in found):
         raise InputError(f"{found[0].path} {found[0].name}; close what holds it, or join the group video")
-    return ", ".join(f"{camera.path} {camera.name} ({len(camera.modes)} modes)" for camera in found)
+    return ", ".join(f"{camera.path} {camera.name} ({number_of(len(camera.modes), 'mode')})" for camera in found)
 
 
 def _reference(folder: Path) -> str:
@@ -189,7 +189,7 @@ def _reference(folder: Path) -> str:
     inside = {path.parent for path in files if path.suffix == ".png"}
     sizes = {read_image(list_images(one)[0]).shape[:2] for one in sorted(inside)}
     read = ", ".join(f"images of {height} x {width} pixels" for height, width in sorted(sizes))
-    return "; ".join(filter(None, (f"{len(files)} files", read)))
+    return "; ".join(filter(None, (number_of(len(files), "file"), read)))
 
 
 __all__ = ["Item", "examine_installation"]

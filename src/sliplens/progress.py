@@ -29,6 +29,18 @@ def visible(text: str) -> str:
     return "".join(one if is_seen else repr(one)[1:-1] for one, is_seen in zip(text, seen, strict=True))
 
 
+def number_of(count: int, noun: str) -> str:
+    """How many there are of what a noun names that takes an s.
+
+    Examples
+    --------
+    >>> from sliplens.progress import number_of
+    >>> number_of(1, "trial"), number_of(1204, "trial")
+    ('1 trial', '1,204 trials')
+    """
+    return f"{count:,} {noun}" if count == 1 else f"{count:,} {noun}s"
+
+
 @runtime_checkable
 class Stages(Protocol):
     """A callback for progress that also shows stages, what they wrote, and what a reader should know."""
@@ -132,4 +144,4 @@ def ignore(_done: int, _total: int) -> None:
     """Show nothing."""
 
 
-__all__ = ["OnProgress", "Stages", "continued", "counted", "fold_equal", "note", "stage", "wrote"]
+__all__ = ["OnProgress", "Stages", "continued", "counted", "fold_equal", "note", "number_of", "stage", "wrote"]

@@ -67,7 +67,7 @@ def test_a_data_set_comes_back_from_other_formats(
     assert "kept" in capsys.readouterr().out
     refused("holds a result of other settings", small_dataset.folder, "-o", output, f"--{kind}")
     run(small_dataset.folder, "-o", output, f"--{kind}", "--trials", "test-dry-6", "--overwrite")
-    assert "1 trials, 12 frames" in capsys.readouterr().out
+    assert "1 trial, 12 frames" in capsys.readouterr().out
     assert names(tmp_path) == ["out"]
 
 

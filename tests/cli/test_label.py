@@ -267,7 +267,7 @@ def test_edits_give_the_labels_of_their_settings_and_undone_those_of_before(
     for edit in edits:
         keep_edit(data, edit)
     assert run("label", folder, "--no-audit") == 0
-    assert "5 edits by hand were applied, to 1 trials" in capsys.readouterr().err
+    assert "5 edits by hand applied to 1 trial" in capsys.readouterr().err
     edited = load_recording(trial_path(folder, name))
     np.testing.assert_array_equal(edited.safety_margin, expected.safety_margin)
     np.testing.assert_array_equal(edited.reference, trial.frames[5])

@@ -311,6 +311,12 @@ def test_rows_in_memory_are_those_of_the_file(trained: Run, small_dataset: Datas
     kept = predict_source(trained, small_dataset, split="test")
     assert kept.frame().equals(written.frame(), check_metadata=True)
     assert kept.frames == kept.frame().num_rows == 24
+    margins = zip(kept.frame()["trial"].to_pylist(), kept.frame()["prediction"].to_pylist(), strict=True)
+    by_trial: dict[str, list[float]] = {}
+    for trial, margin in margins:
+        by_trial.setdefault(trial, []).append(margin)
+    assert {told.trial: told.margin.tolist() for told in kept.trials()} == by_trial
+    assert len(by_trial) == 2
     assert "prediction: double" in repr(kept)
     (tmp_path / "a.parquet").unlink()  # to name it nobody has to read it
     assert repr(written) == f"Predictions of 24 frames by {written.engine}, in {tmp_path / 'a.parquet'}"

@@ -100,7 +100,7 @@ def test_a_broken_law_is_found_at_its_frame(tmp_path: Path, recording: Recording
 
 def test_the_command_lists_what_is_wrong(tmp_path: Path, recording: Recording, capsys: pytest.CaptureFixture[str]):
     assert main(["check", str(write(tmp_path / "good", recording))]) == 0
-    assert "is sound: 1 trials, 12 frames" in capsys.readouterr().out
+    assert "is sound: 1 trial, 12 frames" in capsys.readouterr().out
     bad = replace(recording, safety_margin=changed(recording.safety_margin, 5, 0.123))
     assert main(["check", str(write(tmp_path / "bad", bad))]) == 2
     captured = capsys.readouterr()

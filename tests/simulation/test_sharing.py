@@ -86,7 +86,7 @@ def test_the_command_tells_what_is_shared_and_what_a_network_knows(
     data: Dataset, capsys: pytest.CaptureFixture, difference_run: Path
 ):
     assert main(["check", str(data.folder), str(data.folder), "--split", "train", "--other-split", "test"]) == 0
-    assert "share 0 trials, 0 days, 1 sensors (told by their seeds and frames)" in " ".join(
+    assert "share 0 trials, 0 days, 1 sensor (told by their seeds and frames)" in " ".join(
         capsys.readouterr().out.split()
     )
     assert main(["check", str(data.folder), str(difference_run)]) == 0

@@ -10,6 +10,7 @@ import tyro
 from sliplens.cli.command import Data
 from sliplens.cli.console import Terminal, print_table, say
 from sliplens.errors import RecordingError
+from sliplens.progress import number_of
 
 if TYPE_CHECKING:
     from sliplens.recordings import Dataset
@@ -44,20 +45,21 @@ class Check:
         if findings:
             print_table("Found", ("where", "what"), [(one.where, one.what) for one in findings])
             raise RecordingError(
-                f"{self.data} has {len(findings)} thing{'s' if len(findings) > 1 else ''} wrong, listed above; "
+                f"{self.data} has {number_of(len(findings), 'thing')} wrong, listed above; "
                 "mend or make these trials again"
             )
-        say(f"{self.data} is sound: {len(data.trials)} trials, {data.frames:,} frames, every hash and law holds")
+        held = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
+        say(f"{self.data} is sound: {held}, every hash and law holds")
 
     def _compare(self, data: "Dataset", other: Path) -> None:
         from sliplens.simulation.sharing import compare_datasets
 
         shared = compare_datasets(data, other, splits=(self.split, self.other_split))
-        for what in ("trials", "days", "sensors"):
-            pairs = getattr(shared, what)
-            if pairs:
-                print_table(f"Shared {what}", (str(self.data), str(other)), list(pairs))
-        counts = ", ".join(f"{len(getattr(shared, what))} {what}" for what in ("trials", "days", "sensors"))
+        pairs = {"trial": shared.trials, "day": shared.days, "sensor": shared.sensors}
+        for noun, found in pairs.items():
+            if found:
+                print_table(f"Shared {noun}s", (str(self.data), str(other)), list(found))
+        counts = ", ".join(number_of(len(found), noun) for noun, found in pairs.items())
         told = "seeds and frames" if shared.by_seeds else "names and frames"
         say(f"{self.data} and {other} share {counts} (told by their {told})")
 

@@ -7,6 +7,7 @@ import tyro
 
 from sliplens.cli.command import Command, Data, Device, InOrder, Network, Output
 from sliplens.cli.console import print_table, say
+from sliplens.progress import number_of
 
 if TYPE_CHECKING:
     from sliplens.results.evaluation import Baselines, Evaluation, RegressionScores
@@ -119,7 +120,7 @@ def _print_baselines(evaluation: "Evaluation", baselines: "Baselines") -> None:
     if baselines.failed:
         name, why = next(iter(baselines.failed.items()))
         say(
-            f"  note: markers could not be followed in {len(baselines.failed)} trials, which are answered with the "
+            f"  note: markers could not be followed in {number_of(len(baselines.failed), 'trial')}, answered with the "
             f"training mean, or not fitted on; {name}: {why}"
         )
 

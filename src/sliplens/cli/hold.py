@@ -14,6 +14,7 @@ from sliplens.cli.console import say, wrote
 from sliplens.cli.grip import constant
 from sliplens.errors import InputError, SliplensError
 from sliplens.files import to_builtins
+from sliplens.progress import number_of
 
 if TYPE_CHECKING:
     from sliplens.grip.hold import HoldStep
@@ -92,7 +93,7 @@ class Hold(Command):
             )
         say(hold.why, aside=True)
         if self.output is not None:
-            wrote(self.output, f"{len(hold.steps):,} commands")
+            wrote(self.output, number_of(len(hold.steps), "command"))
         if hold.ended == "failed":
             raise SliplensError(hold.why)
 

@@ -10,7 +10,7 @@ import tyro
 
 from sliplens.cli.command import Command, On, Output, RetryFailed
 from sliplens.cli.console import Terminal, print_table, say, wrote
-from sliplens.progress import fold_equal
+from sliplens.progress import fold_equal, number_of
 from sliplens.recordings.options import LabelSettings, ReadOptions
 
 _MOST_ROWS = 24
@@ -108,7 +108,7 @@ def show_labelling(title: str, data: "Dataset") -> None:
         lost[info.trial] = Counter({reason: count for reason, count in counts.items() if reason != "valid"})
     print_table(title, ("trial", "valid", "mu", "lag, ms", "reference"), rows[:_MOST_ROWS])
     if len(rows) > _MOST_ROWS:
-        say(f"  and {len(rows) - _MOST_ROWS} more trials, which the page of all trials shows")
+        say(f"  and {number_of(len(rows) - _MOST_ROWS, 'more trial')}, which the page of all trials shows")
         lost = {f"all {len(rows)} trials": sum(lost.values(), Counter())}
     for line in fold_equal(dict.fromkeys(notes)):
         say(f"  note: {line}")

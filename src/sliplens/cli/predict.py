@@ -11,6 +11,7 @@ from sliplens.cli.command import NETWORK_HELP, SOURCE_HELP, Device, Friction, In
 from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
 from sliplens.files import require_new_file
+from sliplens.progress import number_of
 
 if TYPE_CHECKING:
     from sliplens.models.predictions import Predictions, TrialMargins
@@ -35,8 +36,8 @@ class Predict(SourceCommand):
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=SOURCE_HELP)] = None
     output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",), metavar="FILE.csv|FOLDER")] = None
     """Table to write, by its ending .parquet, .csv or .json; without one a folder, a Parquet data set with a file a
-    trial: trial, frame, time, margin, interval, and label and forces where they are known. Memory does not grow with
-    the recording."""
+    trial: trial, frame, time, margin, interval, and label and forces where they are known. Frames are never all in
+    memory at once; the rows of the table are, when they are shown at the end."""
     plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
     """Picture to draw: margin with its interval over time, and label and forces where they are known."""
     engine: str = "auto"
@@ -84,7 +85,7 @@ class Predict(SourceCommand):
         predictions = self.call(predict, **named)
         _show(predictions)
         if strange := predictions.strange:
-            say(f"{strange:,} frames are strange to the network (known below 1 %): do not rely on their margins")
+            say(f"strange to the network (known below 1 %), not to be relied on: {number_of(strange, 'frame')}")
         if self.friction is not None:
             say(f"margins for a friction of {self.friction}, as you told it")
         if self.plot is not None:
@@ -92,9 +93,9 @@ class Predict(SourceCommand):
 
             read_by = "" if self.model is None else f", read by {self.model.name}"
             shown = draw_margins(predictions.frame(), self.plot, title=f"{self.source.name}{read_by}")
-            wrote(self.plot, f"margin over time of {shown} trial{'s' if shown > 1 else ''}")
+            wrote(self.plot, f"margin over time of {number_of(shown, 'trial')}")
         if self.output is not None:
-            wrote(self.output, f"{predictions.frames:,} frames, by {predictions.engine}")
+            wrote(self.output, f"{number_of(predictions.frames, 'frame')}, by {predictions.engine}")
 
 
 def _show(predictions: "Predictions") -> None:
@@ -117,7 +118,7 @@ def _show(predictions: "Predictions") -> None:
     for trial in trials[:_TRIALS]:
         say(_course(trial))
     if len(trials) > _TRIALS:
-        say(f"and {len(trials) - _TRIALS} more trials; -o margins.csv writes every frame")
+        say(f"and {number_of(len(trials) - _TRIALS, 'more trial')}; -o margins.csv writes every frame")
     say("bars: safety margin, 0 % to 100 %, the lowest of the frames that share one")
 
 
@@ -128,7 +129,7 @@ def _course(trial: "TrialMargins") -> str:
     touching = "" if trial.touching is None else f", {trial.touching:,} touch" if trial.touching else ", none touches"
     return (
         f"{trial.trial}  {_sparkline(trial.margin.tolist())}  lowest {_percent(float(trial.margin[trial.lowest]))}"
-        f"{interval} at {where}, {len(trial.margin):,} frames{touching}"
+        f"{interval} at {where}, {number_of(len(trial.margin), 'frame')}{touching}"
     )
 
 

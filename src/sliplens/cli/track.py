@@ -11,6 +11,7 @@ from sliplens.cli.command import On, RetryFailed, Source, SourceCommand, TableFi
 from sliplens.cli.console import say, wrote
 from sliplens.errors import InputError
 from sliplens.files import require_new_file
+from sliplens.progress import number_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +57,7 @@ class Track(SourceCommand):
             tracking = self.call(track, **given, markers=markers, out=self.output, on_tracked=draw)
         for trial in tracking.trials:
             say(str(trial))
-        count = len(tracking.trials)
-        wrote(self.output, f"{tracking.frames:,} frames of {count} {'trial' if count == 1 else 'trials'}")
+        count = number_of(len(tracking.trials), "trial")
+        wrote(self.output, f"{number_of(tracking.frames, 'frame')} of {count}")
         if self.video is not None:
             wrote(self.video, "for the eye only: lossy video moves markers")

@@ -10,6 +10,7 @@ from sliplens.cli.command import SOURCE_HELP, SourceCommand
 from sliplens.cli.console import Terminal, say, wrote
 from sliplens.errors import InputError
 from sliplens.files import require_new_file
+from sliplens.progress import number_of
 
 if TYPE_CHECKING:
     from sliplens.plots.viewer import Viewed
@@ -59,7 +60,7 @@ class View(SourceCommand):
                 open_viewer(viewed, beside=beside, on_progress=bar)
             else:
                 write_rrd(viewed, self.output, beside=beside, on_progress=bar)
-        told = f"{viewed.trial.trial}, {len(viewed.trial):,} frames"
+        told = f"{viewed.trial.trial}, {number_of(len(viewed.trial), 'frame')}"
         if self.output is None:
             say(f"{told}, are in the Rerun viewer")
             say("the viewer tells its makers that it is used, not what is seen; `rerun analytics disable` ends that")

@@ -11,6 +11,7 @@ import numpy as np
 from sliplens.errors import RecordingError
 from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import LiveFrame
+from sliplens.progress import number_of
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.dataset import Dataset, begin_recording, finish_recording, load_dataset
 from sliplens.recordings.formats.tables import (
@@ -45,7 +46,7 @@ class RecordingState:
     def __str__(self) -> str:
         lost = f", {self.lost:,} lost" if self.lost else ""
         trouble = f"; {self.trouble}" if self.trouble else ""
-        return f"{self.folder}: {self.frames:,} frames in {self.seconds:.1f} s{lost}{trouble}"
+        return f"{self.folder}: {number_of(self.frames, 'frame')} in {self.seconds:.1f} s{lost}{trouble}"
 
 
 class Recorder:

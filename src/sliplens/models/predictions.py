@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -141,16 +141,18 @@ class Predictions:
         }
         known = "touches" in table.column_names
         touches = table["touches"].to_numpy(zero_copy_only=False).astype(bool) if known else np.ones(len(table), bool)
+        # the rows of a trial stand together
+        bounds = dict.fromkeys([0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)])
         found = []
-        for trial in dict.fromkeys(names.tolist()):
-            own = {name: values[names == trial] for name, values in numbers.items()}
-            touching = touches[names == trial]
+        for first, end in pairwise(bounds):
+            own = {name: values[first:end] for name, values in numbers.items()}
+            touching = touches[first:end]
             # of an untouched sensor a difference image shows noise alone, brightened
             lowest = int(np.where(touching | ~touching.any(), own["prediction"], np.inf).argmin())
             at = {name: float(values[lowest]) for name, values in own.items()}
             found.append(
                 TrialMargins(
-                    trial=trial,
+                    trial=names[first],
                     margin=own["prediction"],
                     lowest=lowest,
                     touching=int(touching.sum()) if known else None,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sliplens.files import output_folder
-from sliplens.progress import OnProgress, stage, wrote
+from sliplens.progress import OnProgress, number_of, stage, wrote
 from sliplens.recordings.dataset import Dataset, load_dataset
 
 
@@ -100,5 +100,5 @@ def _export(
             with stage(on_progress, "Writing frames") as count:
                 write(data, output.folder, trials=chosen, on_progress=count)
     frames = sum(info.frames for info in chosen)
-    wrote(on_progress, out, f"{len(chosen)} trials, {frames:,} frames", kept=output.complete)
+    wrote(on_progress, out, f"{number_of(len(chosen), 'trial')}, {number_of(frames, 'frame')}", kept=output.complete)
     return Export(folder=out, trials=tuple(info.trial for info in chosen), frames=frames)

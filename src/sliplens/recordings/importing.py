@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import output_folder, require_local, whole_file
-from sliplens.progress import OnProgress, note, stage, wrote
+from sliplens.progress import OnProgress, note, number_of, stage, wrote
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import (
     Dataset,
@@ -155,7 +155,7 @@ def import_recordings(
     old = () if before is None else before.trials
     known = {info.trial for info in old}
     if kept := [job.capture.trial for job in work.opened.values() if job.capture.trial in known]:
-        note(on_progress, f"{len(kept)} trials are in {out} already and stay as they are, such as {kept[0]}")
+        note(on_progress, f"already in {out}, and left as it is: {number_of(len(kept), 'trial')}, such as {kept[0]}")
     jobs = {item: job for item, job in work.opened.items() if job.capture.trial not in known}
     captures = [job.capture for job in jobs.values()]
     if before is not None and not jobs:
@@ -419,7 +419,7 @@ def label_dataset(
                 write_dataset_table(output.folder, named, simulated=data.simulated, left_out=data.left_out)
                 _keep_words(data.folder, output.folder)
     if count := sum(map(len, edits)):
-        note(on_progress, f"{count} edits by hand were applied, to {sum(map(bool, edits))} trials")
+        note(on_progress, f"{number_of(count, 'edit')} by hand applied to {number_of(sum(map(bool, edits)), 'trial')}")
     if gone := sorted({edit.trial for edit in work.edits} - {info.trial for info in data.trials}):
         note(on_progress, f"{data.folder / EDITS_FILE} edits {gone[0]}, which is no trial of the data set; it is kept")
     return _tell(load_dataset(out), on_progress, kept=output.complete)
@@ -499,7 +499,8 @@ def _relabelling(data: Dataset, capture: Capture, labelling: LabelSettings, edit
 def _tell(data: Dataset, on_progress: OnProgress | None, *, kept: bool) -> Dataset:
     headers = [(info.trial, read_header(trial_path(data.folder, info.trial))) for info in data.trials]
     tell_flags([(trial, header.labelling) for trial, header in headers], on_progress)
-    wrote(on_progress, data.folder, f"{len(data.trials)} trials, {data.frames:,} frames", kept=kept)
+    count = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
+    wrote(on_progress, data.folder, count, kept=kept)
     return data
 
 

@@ -16,7 +16,7 @@ from torch.utils.data import Dataset as TorchDataset
 from sliplens.errors import InputError
 from sliplens.extras import require_device
 from sliplens.files import output_folder, scratch_folder
-from sliplens.progress import OnProgress, counted, stage, wrote
+from sliplens.progress import OnProgress, counted, number_of, stage, wrote
 from sliplens.recordings import Dataset, GroundTruth, Recording
 from sliplens.recordings.dataset import load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording
@@ -133,8 +133,8 @@ def simulate(
             with stage(on_progress, "Simulating frames") as count:
                 simulate_dataset(output.folder, recipe, device=device, on_progress=count)
     data = load_dataset(out)
-    frames = sum(trial.frames for trial in data.trials)
-    wrote(on_progress, out, f"{len(data.trials)} trials, {frames:,} frames", kept=output.complete)
+    written = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
+    wrote(on_progress, out, written, kept=output.complete)
     return data
 
 
