@@ -52,7 +52,7 @@ blocks = re.findall(r"^```python\\n(.*?)^```", Path(sys.argv[1]).read_text("utf-
 # by the quickest method: what is tried is the package
 exec(compile(block.replace("poly-cam", "grad-cam"), "README.md", "exec"), given)
 assert given["readings"].frame().num_rows == 1
-for name in ("chromatouch-raw", "thesis-difference", "thesis-raw"):
+for name in ("chromatouch-pair", "thesis-difference", "thesis-raw"):
     assert sl.predict(name, trial.frames, reference=untouched).frame().num_rows == 20
 sl.plot(given["readings"]).savefig("readings.png")
 """

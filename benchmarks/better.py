@@ -40,7 +40,7 @@ from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 
-NETWORKS = ("chromatouch-difference", "chromatouch-raw")
+NETWORKS = ("chromatouch-difference", "thesis-raw")
 RECIPE = SimulationRecipe(dry_trials=24, wet_trials=0, days=12, frames_per_trial=40, seed=11)
 FILLS = ("reference", "grey", "blur", "noisy-linear")
 UNITS = {"pixel": lambda shape: tile_units(shape, size=1), "tile": lambda shape: tile_units(shape, size=16)}

@@ -106,6 +106,7 @@ def require_disjoint(plans: list[TrialPlan]) -> None:
             frames_per_trial=60,
             pulls=PULLS["varied"],
         ),
+        replace(varied, seed=5, dry_trials=5100, days=1700, test_days=10, wet_trials=10),
         PRESETS["thesis"],
         PRESETS["small"],
     ]
@@ -371,7 +372,7 @@ def measure_known(run: Run, *, trials: int | None = None) -> dict[str, Any]:
 def main() -> None:
     """Print what was measured, as a table or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--run", type=Path, default=Path("chromatouch-difference"), help="a trained network")
+    parser.add_argument("--run", type=Path, default=Path("chromatouch-pair"), help="a trained network")
     parser.add_argument("--selection", action="store_true", help="the days on which variants are compared")
     parser.add_argument("--trials", type=int, help="about so many trials, for a quick look")
     parser.add_argument("--sequences", action="store_true", help="only what several frames tell")

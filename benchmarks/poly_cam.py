@@ -35,7 +35,7 @@ from sliplens.recordings import Dataset, load_dataset
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.study import frames_from_dataset, frames_from_folder
 
-NETWORKS = ("chromatouch-difference", "chromatouch-raw")
+NETWORKS = ("chromatouch-difference", "thesis-raw")
 REAL = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference")) / "chromatouch" / "difference"
 BUDGET = 0.25
 RECIPE = SimulationRecipe(dry_trials=8, wet_trials=0, frames_per_trial=24, seed=7)

@@ -57,14 +57,14 @@ def test_a_video_alone_is_read_by_a_network_and_beside_a_frame_that_are_named(
 ):
     trial = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=20))
     write_video(trial, tmp_path / "cup.mkv")
-    (tmp_path / "tip.toml").write_text('name = "tip"\nnetwork = "chromatouch-raw"\n')
+    (tmp_path / "tip.toml").write_text('name = "tip"\nnetwork = "thesis-raw"\n')
     run(tmp_path / "cup.mkv", "--engine", "eager")
     alone = " ".join(capsys.readouterr().err.split())
     assert "no network was named, so chromatouch-difference reads it, which comes with sliplens" in alone
     assert "its first frame was taken for the untouched sensor" in alone
     run(tmp_path / "cup.mkv", "--engine", "eager", "--sensor", tmp_path / "tip.toml")
     known = " ".join(capsys.readouterr().err.split())
-    assert "so chromatouch-raw reads it, which the profile tip names" in known
+    assert "so thesis-raw reads it, which the profile tip names" in known
     assert "reads frames of tip" in known
     assert "untouched" not in known
 

@@ -312,4 +312,4 @@ def test_friction_told_shapes_what_is_read_through_pixels(ratio_run: Path):
 
 def test_a_network_of_the_margin_alone_takes_no_friction():
     with pytest.raises(InputError, match="answers with the margin alone and cannot use it"):
-        few("margin", network="chromatouch-raw", friction=0.6)
+        few("margin", network="thesis-raw", friction=0.6)

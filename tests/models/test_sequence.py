@@ -185,7 +185,7 @@ def test_evaluation_reads_labelled_frames_in_order(run: Run, small_dataset: Data
 
 def test_what_cannot_be_followed_is_refused(run: Run, small_dataset: Dataset):
     with pytest.raises(InputError, match="--recipe sequence"):
-        sl.predict("chromatouch-raw", small_dataset, sequence=True)
+        sl.predict("thesis-raw", small_dataset, sequence=True)
     with pytest.raises(InputError, match="leave out one of them"):
         sl.predict(run, small_dataset, sequence=True, friction=0.6)
     with pytest.raises(InputError, match="times"):

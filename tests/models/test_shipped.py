@@ -20,7 +20,7 @@ from sliplens.study import frames_from_folder
 
 
 def test_the_networks_that_come_with_the_package():
-    assert shipped_names() == ["chromatouch-difference", "chromatouch-raw", "thesis-difference", "thesis-raw"]
+    assert shipped_names() == ["chromatouch-difference", "chromatouch-pair", "thesis-difference", "thesis-raw"]
 
 
 @pytest.mark.parametrize("name", shipped_names())

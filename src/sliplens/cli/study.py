@@ -35,7 +35,7 @@ class Study(Command):
     """Network on difference images: a folder, or a name of one that comes with sliplens; none to leave it out. If not
     given, chromatouch-difference, or with --preset thesis-difference."""
     raw: str | None = None
-    """Network on raw images: a folder, a name, or none. If not given, chromatouch-raw, or with --preset thesis-raw."""
+    """Network on raw images: a folder, a name, or none. If not given, none, or with --preset thesis-raw."""
     preset: Literal["thesis"] | None = None
     """Simulate the data set first: the days and trials of the thesis, 80 frames each, some 1.5 GB; and explain networks
     that were trained on its training trials with the recipe of the thesis."""
@@ -69,9 +69,9 @@ class Study(Command):
         if (self.data is None) == (self.preset is None):
             raise InputError("name a data set, or --preset thesis to simulate one")
         require_device(self.device)
-        kind = self.preset or "chromatouch"
-        asked = {"difference": self.difference, "raw": self.raw}
-        given = {name: run or f"{kind}-{name}" for name, run in asked.items() if run != _NONE}
+        own = ("thesis-difference", "thesis-raw") if self.preset else ("chromatouch-difference", _NONE)
+        asked = {"difference": self.difference or own[0], "raw": self.raw or own[1]}
+        given = {name: run for name, run in asked.items() if run != _NONE}
         # a mistake is told before a data set is simulated
         networks = {name: load_network(run, name, device=self.device) for name, run in given.items()}
         study_explainers(methods := self.method or STUDY_METHODS, budget=self.budget)

@@ -86,7 +86,7 @@ def run_study(
     data: Dataset | Path | str,
     *,
     difference: Network | None = "chromatouch-difference",
-    raw: Network | None = "chromatouch-raw",
+    raw: Network | None = None,
     out: Path | str | None = None,
     methods: Sequence[str] = STUDY_METHODS,
     split: str = "test",
