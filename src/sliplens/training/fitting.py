@@ -243,7 +243,7 @@ def _advise(
     elif start is None and count < _FEW_TRIALS:
         yield (
             f"{count} labelled trials are few for a network that begins with nothing; begin with one that is there: "
-            "--recipe adapt --start-from chromatouch-difference"
+            "--recipe adapt --start-from chromatouch-pair"
         )
     if start is not None and start.manifest.head == "margin-and-ratio" and config.head == "histogram":
         yield (
