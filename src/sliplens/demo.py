@@ -20,7 +20,9 @@ from sliplens.study import explain_source, explain_trial, run_study, score_expla
 from sliplens.study.scoring import STEPS, Setting
 from sliplens.training import evaluate, train
 
-INPUTS = ("difference", "raw")
+NETWORKS = {"difference": "chromatouch-difference", "raw": "thesis-raw"}
+"""Networks of the package that the demo reads with, by what they see."""
+INPUTS = tuple(NETWORKS)
 METHODS = ("grad-cam-thesis", "integrated-gradients-thesis", "poly-cam-thesis", RECOMMENDED_METHOD)
 """The three methods of the thesis as they were run there, and the one to look at."""
 STRIP_METHOD = RECOMMENDED_METHOD
@@ -102,7 +104,7 @@ def run_demo(
     )
     make = _to_look_at if train_minutes is None else _to_train_on
     data = make(folder / "data", seed=seed, on_progress=on_progress)
-    networks = {name: f"chromatouch-{name}" for name in INPUTS}
+    networks = dict(NETWORKS)
     if train_minutes is not None:
         minutes = max(_SHORTEST_TRAINING, (train_minutes - _OTHER_MINUTES) / len(INPUTS))
         for name in INPUTS:

@@ -7,8 +7,9 @@ import pytest
 from command_line import refused, run
 
 import sliplens.demo
-from sliplens.demo import find_real_frames, run_demo
-from sliplens.files import read_json
+from sliplens.demo import NETWORKS, find_real_frames, run_demo
+from sliplens.files import read_json, shipped_names
+from sliplens.models import load
 from sliplens.report.page import Written
 
 SMALL = {"dry_trials": 3, "wet_trials": 1, "frames_per_trial": 24, "days": 2, "test_days": 1}
@@ -131,3 +132,8 @@ def test_the_command_says_where_the_page_is_as_soon_as_it_is_there(
     assert printed.index(f"open {tmp_path / 'demo' / 'report.html'} now") < printed.index("the demo took")
     assert "1 note" in printed
     assert "random order" not in printed  # the page tells them
+
+
+def test_the_networks_of_the_demo_come_with_the_package():
+    assert set(NETWORKS.values()) <= set(shipped_names())
+    assert all(load(name).manifest.input == seen for seen, name in NETWORKS.items())
