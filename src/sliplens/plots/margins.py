@@ -176,8 +176,8 @@ def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
 def _subtitle(strip: Strip) -> str:
     network = INPUT_NAMES.get(strip.input, strip.input).lower()
     return (
-        f"Camera frames under the map of {method_name(strip.method)}, for the network on {network}: "
-        "orange lowers the margin that it reads, blue raises it"
+        f"Frames under the map of {method_name(strip.method)}, network on {network}: "
+        "orange lowers its margin, blue raises it"
     )
 
 
