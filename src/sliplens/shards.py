@@ -450,9 +450,11 @@ def make_table(
     def read(folder: Path) -> Iterator[pa.Table]:
         for one in shards():
             part = open_table(folder / one.part)
-            if on_rows is not None:
-                on_rows(part.read())
-            yield from map(part.read_row_group, range(part.num_row_groups))
+            if on_rows is None:
+                yield from map(part.read_row_group, range(part.num_row_groups))
+            else:
+                on_rows(table := part.read())
+                yield table
 
     if out is not None and not out.suffix:
         every = hashlib.sha256()

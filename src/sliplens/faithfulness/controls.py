@@ -211,7 +211,7 @@ def lead_over_controls(
         for comparisons in (1, len(others))
     )
     control = min(gaps, key=lambda name: gaps[name].estimate)
-    ends = ([getattr(gap, end) for gap in own.values()] for own, end in ((gaps, "low"), (corrected, "high")))
+    ends = ([getattr(gap, end) for gap in found.values()] for found, end in ((gaps, "low"), (corrected, "high")))
     low, high = (None if None in over_all else min(over_all) for over_all in ends)
     return Lead(control=control, gap=replace(gaps[control], low=low, high=high))
 
