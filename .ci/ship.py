@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from sliplens.codec import RESULT_FILE, load_result, save_result
-from sliplens.files import RUN_FILE
+from sliplens.files import RUN_FILE, scratch_folder
 from sliplens.grip.readings import ReadingTable
 from sliplens.models import Run, load, save_checkpoint
 from sliplens.recordings import Recording
@@ -70,8 +70,11 @@ def ship(run: Path, folder: Path, *, bits: int) -> dict[str, float]:
     network, trials = load(run), simulate()
     before = read(network, trials)
     kept = {name: rounded(values, bits=bits) for name, values in network.model.state_dict().items()}
-    network.model.load_state_dict(kept)
-    changes = {name: float(np.abs(after - before[name]).max()) for name, after in read(network, trials).items()}
+    network.model.load_state_dict(kept, assign=True)
+    with scratch_folder() as draft:  # what is read back is what ships: a head takes the rounded edges of the bins
+        save_checkpoint(draft, network.model, network.manifest, sequence=network.sequence)
+        read_back = read(load(draft), trials)
+    changes = {name: float(np.abs(after - before[name]).max()) for name, after in read_back.items()}
     if max(changes.values()) > LARGEST_CHANGE:
         sys.exit(
             f"answers move too far ({say(changes)}, {LARGEST_CHANGE:g} at most): keep more bits; nothing was written"
@@ -80,7 +83,6 @@ def ship(run: Path, folder: Path, *, bits: int) -> dict[str, float]:
     for name in (RUN_FILE, RESULT_FILE):
         if run.resolve() != folder.resolve():
             shutil.copyfile(run / name, folder / name)
-    network.model.load_state_dict(kept, assign=True)
     save_checkpoint(folder, network.model, network.manifest, sequence=network.sequence)
     if (folder / "readings").is_dir():
         table = load_result(folder / "readings", ReadingTable, command="make weights")

@@ -1,30 +1,35 @@
-"""Which input reads the margin best at equal compute: networks of several inputs and seeds, on sensors none has seen.
+"""Which input or backbone reads the margin best from the same images: networks of several seeds, on new sensors too.
 
-Each network is trained by the same command but for its input and its seed:
+Each network is trained by the same command but for its input or backbone and its seed:
 
     sliplens simulate DATA --preset varied --dry-trials 1230 --days 410 --frames-per-trial 20 --seed 2
     sliplens train DATA -o RUNS/pair-0 --input pair --image-size 112 --epochs 5 --seed 0
 
 The sets are fresh days of pieces of the ChromaTouch's kind, and the three sensors of `adapt.py`, which no network was
 shown: a dome with other markers, the flat gel, another lens. Their seeds share nothing with any training. R2 of each
-input is a mean over its networks; differences to the first input are those of networks with the same seed, with
-intervals that hold 95 % over networks, then days.
+kind is a mean over its networks; differences to the first kind are those of networks with the same seed, with
+intervals that hold 95 % over networks, then days. The set `selection` has other days
+of the ChromaTouch's kind, on which variants are compared.
+
+`time_over_first` is the median time of one image on one core, over that of the first kind, measured in turns.
 """
 
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from adapt import SENSORS
-from networks import draw_in_contact, film_frames, fresh_days, r2, require_disjoint
+from networks import SETS, draw_in_contact, film_frames, fresh_days, r2, require_disjoint
 from sliplens.errors import SliplensError
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
@@ -34,6 +39,7 @@ from sliplens.simulation.trials import prepare_trial
 
 DAYS = 20
 RESAMPLES = 2000
+TURNS = 50
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +55,8 @@ class Read:
 def recipes() -> dict[str, SimulationRecipe]:
     """The sets: days, sensors and trials of a series of their own."""
     varied = fresh_days("inputs, test", DAYS)
-    return {"chromatouch": varied} | {name: replace(varied, sensor=sensor) for name, sensor in SENSORS.items()}
+    others = {name: replace(varied, sensor=sensor) for name, sensor in SENSORS.items()}
+    return {"chromatouch": varied, **others, "selection": fresh_days(*SETS["selection"])}
 
 
 def read(runs: dict[str, Run], recipe: SimulationRecipe, *, trials: int | None) -> Read:
@@ -77,26 +84,44 @@ def read(runs: dict[str, Run], recipe: SimulationRecipe, *, trials: int | None) 
     )
 
 
-def by_input(runs: dict[str, Run]) -> dict[str, dict[int, str]]:
-    """Names of the networks, by input and seed.
+def by_kind(runs: dict[str, Run]) -> dict[str, dict[int, str]]:
+    """Names of the networks, by input and backbone, and seed.
 
     Raises
     ------
     SystemExit
-        If inputs were not trained with the same seeds, on the same images and as long.
+        If kinds were not trained with the same seeds, on the same images and as long.
     """
     found: dict[str, dict[int, str]] = {}
     for name, run in runs.items():
         if run.training is None:
             raise SystemExit(f"inputs.py: nothing tells how {name} was trained")
-        found.setdefault(run.manifest.input, {})[run.training.seed] = name
+        kind = f"{run.manifest.input}, {run.manifest.backbone}"
+        found.setdefault(kind, {})[run.training.seed] = name
     first = next(iter(found.values()))
     if any(one.keys() != first.keys() for one in found.values()):
-        raise SystemExit("inputs.py: name networks of the same seeds for each input")
+        raise SystemExit("inputs.py: name networks of the same seeds for each input or backbone")
     costs = {(one.image_size, one.epochs, one.train_frames) for run in runs.values() if (one := run.training)}
     if len(costs) > 1 or len({run.manifest.data_hash for run in runs.values()}) > 1:
         raise SystemExit("inputs.py: the networks saw other data, sizes of image or numbers of epochs")
     return found
+
+
+def time_over_first(runs: Sequence[Run]) -> list[float]:
+    """Median time of one image, over that of the first network; the networks take turns on one core."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    images = [torch.rand(1, run.encoding.colours, run.manifest.image_size, run.manifest.image_size) for run in runs]
+    seconds = np.zeros((TURNS, len(runs)))
+    with torch.inference_mode():
+        for turn in range(-3, TURNS):  # the first few are not counted
+            for at, (run, image) in enumerate(zip(runs, images, strict=True)):
+                start = perf_counter()
+                run.model(image)
+                seconds[turn, at] = perf_counter() - start
+    torch.set_num_threads(threads)
+    medians = np.median(seconds, axis=0)
+    return (medians / medians[0]).tolist()
 
 
 def resampled(seeds: list[int], days: Int[np.ndarray, " _"]) -> Iterator[tuple[list[int], Int[np.ndarray, " _"]]]:
@@ -109,7 +134,7 @@ def resampled(seeds: list[int], days: Int[np.ndarray, " _"]) -> Iterator[tuple[l
 
 
 def compare(found: dict[str, dict[int, str]], seen: Read, *, wet: bool) -> dict[str, Any]:
-    """R2 of each input by seed, and what each is ahead of the first."""
+    """R2 of each kind by seed, and what each is ahead of the first."""
     rows = seen.wet == wet
     margin, day = seen.margin[rows], seen.day[rows]
     answers = {name: answer[rows] for name, answer in seen.answers.items()}
@@ -136,8 +161,8 @@ def compare(found: dict[str, dict[int, str]], seen: Read, *, wet: bool) -> dict[
 def main() -> None:
     """Print what was measured, as a table or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("runs", nargs="+", type=Path, help="trained networks; the input of the first is compared with")
-    parser.add_argument("--sets", nargs="+", default=list(recipes()), choices=list(recipes()))
+    parser.add_argument("runs", nargs="+", type=Path, help="trained networks; the kind of the first is compared with")
+    parser.add_argument("--sets", nargs="+", default=["chromatouch", *SENSORS], choices=list(recipes()))
     parser.add_argument("--trials", type=int, help="about so many trials of each set, for a quick look")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -145,13 +170,16 @@ def main() -> None:
         runs = {str(path): load(path) for path in options.runs}
     except SliplensError as error:
         sys.exit(f"{Path(__file__).name}: {error}")
-    found, told = by_input(runs), {}
+    found, told = by_kind(runs), {}
     for name in options.sets:
         seen = read(runs, recipes()[name], trials=options.trials)
         told[name] = {"wet" if wet else "dry": compare(found, seen, wet=wet) for wet in (False, True)}
+    times = time_over_first([runs[next(iter(names.values()))] for names in found.values()])
     if options.json:
-        print(json.dumps(told))
+        print(json.dumps({**told, "time_over_first": dict(zip(found, times, strict=True))}))
         return
+    for name, time in zip(found, times, strict=True):
+        print(f"{name:40} {time:.2f} of the time of the first")
     for name, condition in product(told, ("dry", "wet")):
         for one, value in told[name][condition].items():
             words = " ".join(f"{number:.3f}" for number in value) if isinstance(value, list) else value

@@ -91,7 +91,7 @@ CASES = {
     "evaluate": Case(("evaluate", "@/run", "@/data", "-o", "out")),
     "explain": Case(("explain", "@/run", "@/data", "-o", "out", "--method", "grad-cam", "integrated-gradients")),
     "score": Case(("score", "@/run", "@/explained", "-o", "out", "--steps", "8")),
-    "study": Case(("study", "@/drawn", "-o", "out", "--difference", "@/of-drawn", "--raw", "none", *_QUICK)),
+    "study": Case(("study", "@/drawn", "-o", "out", "--network", "@/of-drawn", *_QUICK)),
     "track": Case(("track", "@/drawn", "-o", "out.parquet")),
     "export --onnx": Case(("export", "@/run", "-o", "out.onnx", "--onnx")),
     "export --lerobot": Case(("export", "@/data", "-o", "out", "--lerobot")),

@@ -3,6 +3,7 @@
     python benchmarks/live.py --json                # 10 minutes, and one more with maps
     python benchmarks/live.py --minutes 0.5
     python benchmarks/live.py --minutes 0.5 --page none
+    python benchmarks/live.py --ratios --json       # one network over another, in two minutes
 
 `p50_ms` and `p99_ms` are from the moment a replayed frame is due to its margin, over the frames that have one, while a
 headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page shows maps,
@@ -11,6 +12,10 @@ the end than after the first 10 seconds (or a tenth of a shorter run), `opens_s`
 to the first picture that it has drawn. `of_it_ms` says where the time of the slowest hundredth went, on average:
 `network` is what a frame waits for that after its checks, `waiting` what none of them took, `gc_ms` the longest pause
 of Python's garbage collector.
+
+`--ratios` compares ways to read, without a page: readers take turns, frame by frame, so that whatever else the machine
+does hits all alike. `p50_ratios` and `p99_ratios` are of `chromatouch-pair` over `chromatouch-difference`, as they come
+(112 and 224 px), both at 224 px, and both told a range of friction, and of frames in order over one by one.
 """
 
 import argparse
@@ -25,6 +30,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from queue import SimpleQueue
 
 # threads that spin while they wait take the cores from those that work; must be set before torch is imported
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -34,7 +40,8 @@ from PIL import Image
 
 import sliplens as sl
 from sliplens.app import LivePage
-from sliplens.live import LiveFrame, Reading, ReplaySource
+from sliplens.live import LiveFrame, LiveSource, Reading, ReplaySource
+from sliplens.models import Run
 from sliplens.recordings.source import open_source
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -206,6 +213,91 @@ def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown:
     )
 
 
+class TurnSource(LiveSource):
+    """Frames that are captured as soon as they are handed in."""
+
+    name, size, rate_hz = "the benchmark", SIZE, RATE_HZ
+    speed = 0.0  # its clock goes on with the frames, however long the others take
+
+    def __init__(self) -> None:
+        self.handed: SimpleQueue[LiveFrame | None] = SimpleQueue()
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Frames as they are handed in."""
+        while (frame := self.handed.get()) is not None:
+            yield replace(frame, captured_s=time.monotonic())
+
+    def close(self) -> None:
+        """End with the frames that were handed in."""
+        self.handed.put(None)
+
+
+def load_at(name: str, image_size: int | None = None) -> Run:
+    """A network of the package for frames of this camera, at its own image size or another, at which it errs."""
+    network = sl.load(name)
+    manifest = replace(network.manifest, frame_size=SIZE)
+    if image_size is not None:
+        assert manifest.novelty is not None
+        novelty = replace(manifest.novelty, limit=np.inf)  # strange as such pictures are to it, none is withheld
+        manifest = replace(manifest, image_size=image_size, novelty=novelty)
+    return replace(network, manifest=manifest)
+
+
+RATIOS = {
+    "pair": ("pair", "difference"),
+    "pair_at_224": ("pair_at_224", "difference"),
+    "pair_told": ("pair_told", "difference_told"),
+    "sequence_of_difference": ("difference_sequence", "difference"),
+    "sequence_of_pair": ("pair_sequence", "pair"),
+}
+"""Ways to read that are compared, the one over the other."""
+
+
+def measure_in_turn(frames: np.ndarray, untouched: np.ndarray, *, rounds: int) -> dict[str, np.ndarray]:
+    """Milliseconds from capture to reading by way to read, over the frames of which each has a margin."""
+    ways: dict[str, tuple[Run, dict]] = {"pair_at_224": (load_at("chromatouch-pair", 224), {})}
+    for name in ("difference", "pair"):
+        network = load_at(f"chromatouch-{name}")
+        for suffix, options in (("", {}), ("_told", {"friction": (0.3, 0.9)}), ("_sequence", {"sequence": True})):
+            ways[name + suffix] = network, options
+    readers = {
+        name: sl.LiveReader(TurnSource(), network, reference=untouched, stall_s=3600, **options)
+        for name, (network, options) in ways.items()
+    }
+    names, told = list(readers), {name: SimpleQueue[Reading]() for name in readers}
+    totals_ms = np.full((rounds, len(names)), np.nan)
+    with ExitStack() as stack:
+        for name, reader in readers.items():
+            reader.subscribe(lambda reading, _, place=told[name]: place.put(reading))
+            stack.enter_context(reader)
+        for number in range(rounds):
+            frame = LiveFrame(
+                image=frames[number % len(frames)], number=number, time_s=number / RATE_HZ, captured_s=np.nan
+            )
+            for at in np.roll(range(len(names)), number):
+                reader = readers[names[at]]
+                assert isinstance(reader.source, TurnSource)
+                reader.source.handed.put(frame)
+                reading = told[names[at]].get(timeout=60)
+                if reading.margin is not None and number > WARM_S * RATE_HZ:
+                    totals_ms[number, at] = reading.latency.total_ms
+    totals_ms = totals_ms[np.isfinite(totals_ms).all(axis=1)]
+    return dict(zip(names, totals_ms.T, strict=True))
+
+
+def compare_ways(frames: np.ndarray, untouched: np.ndarray, *, rounds: int) -> dict[str, object]:
+    """Ratios of the latencies of ways to read, and the latencies themselves."""
+    totals_ms = measure_in_turn(frames, untouched, rounds=rounds)
+    result: dict[str, object] = {}
+    for quantile in (0.5, 0.99):
+        ms = {name: float(np.quantile(values, quantile)) for name, values in totals_ms.items()}
+        result[f"p{100 * quantile:.0f}_ratios"] = {
+            name: round(ms[one] / ms[other], 3) for name, (one, other) in RATIOS.items()
+        }
+        result[f"p{100 * quantile:.0f}_ms"] = {name: round(value, 2) for name, value in ms.items()}
+    return {**result, "rounds": rounds, "with_a_margin": len(next(iter(totals_ms.values())))}
+
+
 def slowest_parts_ms(latencies: Latencies) -> dict[str, float]:
     """Mean time of each part over the slowest hundredth of the frames."""
     slowest = latencies.total_ms >= np.quantile(latencies.total_ms, 0.99)
@@ -213,20 +305,13 @@ def slowest_parts_ms(latencies: Latencies) -> dict[str, float]:
     return {name: round(float(value), 1) for name, value in zip(PARTS, means, strict=True)}
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=10.0, help="length of the run without maps")
-    parser.add_argument("--page", choices=("browser", "none"), default="browser", help="what looks at the page")
-    parser.add_argument("--json", action="store_true", help="print one line of JSON")
-    options = parser.parse_args()
-    frames, untouched = make_frames()
-    seconds, shown = 60 * options.minutes, options.page == "browser"
+def measure_pace(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown: bool) -> dict[str, object]:
+    """Latencies at the camera's pace, with a page open or not."""
     begun = time.monotonic()
     alone = measure(frames, untouched, seconds=seconds, shown=shown, maps=False)
     beside = measure(frames, untouched, seconds=max(5.0, seconds / 10), shown=shown, maps=True) if shown else None
     median_ms = np.median(alone.parts_ms, axis=0)
-    result = {
+    return {
         "p50_ms": round(float(np.median(alone.total_ms)), 2),
         "p99_ms": round(float(np.quantile(alone.total_ms, 0.99)), 2),
         "p99_ms_with_maps": None if beside is None else round(float(np.quantile(beside.total_ms, 0.99)), 2),
@@ -244,9 +329,25 @@ def main() -> None:
         "pictures": alone.pictures,
         "maps": None if beside is None else beside.maps,
         "engine": alone.engine,
-        "load": round(os.getloadavg()[0], 1),
         "took_s": round(time.monotonic() - begun, 1),
     }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--minutes", type=float, default=10.0, help="length of the run without maps")
+    parser.add_argument("--page", choices=("browser", "none"), default="browser", help="what looks at the page")
+    parser.add_argument("--ratios", action="store_true", help="compare ways to read in place of that")
+    parser.add_argument("--rounds", type=int, default=1200, help="frames that each way reads, for --ratios")
+    parser.add_argument("--json", action="store_true", help="print one line of JSON")
+    options = parser.parse_args()
+    frames, untouched = make_frames()
+    if options.ratios:
+        result = compare_ways(frames, untouched, rounds=options.rounds)
+    else:
+        result = measure_pace(frames, untouched, seconds=60 * options.minutes, shown=options.page == "browser")
+    result["load"] = round(os.getloadavg()[0], 1)
     if options.json:
         print(json.dumps(result))
         return

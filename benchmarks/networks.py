@@ -1,9 +1,12 @@
 """How well a network reads the margin where friction is told, and where it is not, on one untouched test.
 
 The trials are of days, sensors, frictions and seeds of their own (a series of its own is drawn into every seed, and the
-seeds are checked against those of the trainings and of the selection): 40 days, three dry trials each (friction 0.5 to
-1.2 by day) and three wet ones (0.15 to 0.7, drifting). Variants are compared with `--selection`, on other days; the
-test is for the one that was chosen.
+seeds are checked against those of the trainings and of the other sets): 120 days, three dry trials each (friction 0.5
+to 1.2 by day) and three wet ones (0.15 to 0.7, drifting). Variants are compared with `--set selection`, on 40 other
+days; the test is for the one that was chosen. `--set first-test` has the 40 days that were the test before it; whatever
+was chosen since knows what earlier networks read on them.
+
+`--against` names another network: what the first is ahead in R2, the days resampled together.
 
 What is told: nothing; the static friction of each trial, exactly; a number that is wrong by up to 10 %, as a range of
 10 % either way; or what one earlier slip of the same object has taught. For that the object is grasped once before, at
@@ -33,7 +36,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from adapt import SENSORS
 from sliplens.errors import SliplensError
@@ -47,8 +50,16 @@ from sliplens.simulation.plan import PULLS, TrialPlan, plan_trials
 from sliplens.simulation.trials import prepare_trial
 from sliplens.training.metrics import auroc
 
-DAYS, TRIALS, FRAMES, DRAWN = 40, 3, 40, 10
-"""Days; trials of a day and condition; frames of a trial, and how many of them with contact are drawn."""
+TRIALS, FRAMES, DRAWN = 3, 40, 10
+"""Trials of a day and condition; frames of a trial, and how many of them with contact are drawn."""
+SETS = {
+    "test": ("networks, second test", 120),
+    "first-test": ("networks, test", 40),
+    "selection": ("networks, selection", 40),
+}
+"""Series of their own, and days."""
+DRAWS = {"test": 23, "first-test": 20, "selection": 21}
+"""Seeds of which frames are drawn, and of earlier grasps."""
 BEFORE_SLIP, RATE_HZ, TRIAL_S = 5, 30, 8
 WITHIN = 0.1
 FAST_S = 3.0
@@ -82,9 +93,13 @@ def fresh_days(series: str, days: int) -> SimulationRecipe:
     )
 
 
-def test_recipe(*, selection: bool) -> SimulationRecipe:
-    """Days of the selection, or of the test."""
-    return fresh_days("networks, selection" if selection else "networks, test", DAYS)
+def test_plans(name: str, *, trials: int | None) -> list[TrialPlan]:
+    """Trials of a set, or about so many of them."""
+    plans = [plan for plan in plan_trials(fresh_days(*SETS[name])) if plan.split == "test"]
+    require_disjoint(plans)
+    if trials:  # of both conditions, which stand in groups of a day
+        plans = sorted(plans, key=lambda plan: plan.condition)[:: max(1, len(plans) // trials)]
+    return plans
 
 
 def require_disjoint(plans: list[TrialPlan]) -> None:
@@ -96,21 +111,15 @@ def require_disjoint(plans: list[TrialPlan]) -> None:
         replace(varied, seed=1, dry_trials=3060, days=1020),
         replace(varied, seed=2, dry_trials=1230, days=410),
         replace(varied, seed=3, dry_trials=1230, days=410, frames_per_trial=20),
-        replace(
-            varied,
-            seed=4,
-            dry_trials=1020,
-            days=340,
-            test_days=10,
-            wet_trials=30,
-            frames_per_trial=60,
-            pulls=PULLS["varied"],
+        *(
+            replace(varied, dry_trials=dry, days=days, test_days=10, wet_trials=30, frames_per_trial=60, seed=seed)
+            for dry, days, seed in ((1020, 340, 4), (2040, 680, 7))
         ),
-        replace(varied, seed=5, dry_trials=5100, days=1700, test_days=10, wet_trials=10),
+        *(replace(varied, seed=seed, dry_trials=5100, days=1700, test_days=10, wet_trials=10) for seed in (5, 6)),
         PRESETS["thesis"],
         PRESETS["small"],
     ]
-    for recipe in [*trained, test_recipe(selection=True), test_recipe(selection=False)]:
+    for recipe in [*trained, *(fresh_days(*one) for one in SETS.values())]:
         theirs = plan_trials(recipe)
         if theirs[0].recipe_hash == plans[0].recipe_hash:
             continue
@@ -200,17 +209,28 @@ def r2_over_days(name: str, truth: np.ndarray, answer: np.ndarray, days: np.ndar
     return over_days(name, days, lambda some: r2(truth[some], answer[some]))
 
 
-def measure(
-    run: Run, *, selection: bool, trials: int | None = None, grasp_spread: float | None = None
-) -> dict[str, Any]:
-    """R2 of the margin by what is told, dry and wet, with intervals; what the 90 % intervals hold; what is `known`."""
-    rng, aside = np.random.default_rng(20 + selection), np.random.default_rng(22)
-    plans = [plan for plan in plan_trials(test_recipe(selection=selection)) if plan.split == "test"]
-    require_disjoint(plans)
-    plans = plans[:: max(1, len(plans) // trials)] if trials else plans
+@dataclass(frozen=True, kw_only=True)
+class Read:
+    """What a network answers to frames of a set, trial by trial, by what it is told; and the truth of all frames."""
+
+    told: dict[str, list[Estimate]]
+    margin: Float[np.ndarray, " frames"]
+    ratio: Float[np.ndarray, " frames"]
+    day: Int[np.ndarray, " frames"]
+    wet: Bool[np.ndarray, " frames"]
+    pulled: Bool[np.ndarray, " frames"]
+
+    def answers(self, name: str) -> Float[np.ndarray, " frames"]:
+        """Margins where so much is told."""
+        return np.concatenate([one.margin for one in self.told[name]])
+
+
+def read_frames(run: Run, name: str, *, trials: int | None = None, grasp_spread: float | None = None) -> Read:
+    """Read a few frames of each trial of a set, told more or less of its friction."""
+    rng, aside = np.random.default_rng(DRAWS[name]), np.random.default_rng(22)
     told: dict[str, list[Estimate]] = {}
     truth, ratios, days, wet, pulled = [], [], [], [], []
-    for plan in plans:
+    for plan in test_plans(name, trials=trials):
         seen, friction = draw(run, plan, rng=rng), friction_of(plan)
         untold = run.estimate(seen.inputs)
         slip = draw(run, earlier_grasp(plan, friction, rng=rng), rng=rng, before_slip=BEFORE_SLIP)
@@ -229,38 +249,56 @@ def measure(
             slipped = run.estimate(draw(run, unlike, rng=aside, before_slip=BEFORE_SLIP).inputs).ratio
             assert slipped is not None
             known |= {"one_slip_unlike": learn(slipped), "one_slip_unlike_told": learn(slipped, spread=grasp_spread)}
-        for name, one in known.items():
+        for what, one in known.items():
             traction = run.require_ratio()
             estimate = untold.told(one, trained_friction=np.array(traction.friction), calibration=traction.told)
-            told.setdefault(name, []).append(estimate)
+            told.setdefault(what, []).append(estimate)
         truth.append(seen.margin)
         ratios.append(seen.ratio)
         pulled.append(seen.pulled)
         days.append(np.full(len(seen.margin), plan.day))
         wet.append(np.full(len(seen.margin), plan.condition == "wet"))
     margin, ratio, day, is_wet, is_pulled = map(np.concatenate, (truth, ratios, days, wet, pulled))
-    seen_ratios = [one.ratio for one in told["one_frame"] if one.ratio is not None]
-    is_known = [one.known for one in told["one_frame"] if one.known is not None]
-    found: dict[str, Any] = {
-        "trials": len(plans),
-        "frames": len(margin),
-        "set": "selection" if selection else "test",
-        "weights_sha256": run.manifest.weights_sha256,
-    }
-    for condition, rows in (("dry", ~is_wet), ("wet", is_wet)):
-        if seen_ratios:
-            found[f"ratio_r2_{condition}"] = r2(ratio[rows], np.concatenate([one.mean for one in seen_ratios])[rows])
-            found[f"ratio_in_90_{condition}"] = held(ratio, [one.interval(0.9) for one in seen_ratios], rows)
+    return Read(told=told, margin=margin, ratio=ratio, day=day, wet=is_wet, pulled=is_pulled)
+
+
+def summarise(read: Read) -> dict[str, Any]:
+    """R2 of the margin by what is told, dry and wet, with intervals; what the 90 % intervals hold; what is `known`."""
+    untold = read.told["one_frame"]
+    ratios = [one.ratio for one in untold if one.ratio is not None]
+    is_known = [one.known for one in untold if one.known is not None]
+    found: dict[str, Any] = {"trials": len(untold), "frames": len(read.margin)}
+    for condition, rows in (("dry", ~read.wet), ("wet", read.wet)):
+        if ratios:
+            found[f"ratio_r2_{condition}"] = r2(read.ratio[rows], np.concatenate([one.mean for one in ratios])[rows])
+            found[f"ratio_in_90_{condition}"] = held(read.ratio, [one.interval(0.9) for one in ratios], rows)
         if is_known:
             found[f"known_below_5_{condition}"] = float(np.mean(np.concatenate(is_known)[rows] < 0.05))
-        for name, estimates in told.items():
-            answer = np.concatenate([one.margin for one in estimates])
-            key = f"{name}_r2_{condition}"
-            found |= r2_over_days(key, margin[rows], answer[rows], day[rows])
-            some = rows & is_pulled
-            found[f"{key}_pull_alone"] = r2(margin[some], answer[some])
-            found[f"{name}_in_90_{condition}"] = held(margin, [one.interval(0.9) for one in estimates], rows)
+        for name, estimates in read.told.items():
+            answer, key = read.answers(name), f"{name}_r2_{condition}"
+            found |= r2_over_days(key, read.margin[rows], answer[rows], read.day[rows])
+            some = rows & read.pulled
+            found[f"{key}_pull_alone"] = r2(read.margin[some], answer[some])
+            found[f"{name}_in_90_{condition}"] = held(read.margin, [one.interval(0.9) for one in estimates], rows)
     return found
+
+
+def lead(
+    name: str, truth: np.ndarray, answers: tuple[np.ndarray, np.ndarray], days: np.ndarray, rows: np.ndarray
+) -> dict[str, float]:
+    """How far the first answers are ahead of the second in R2 on some rows, both on the same resampled days."""
+    margin, first, second = truth[rows], answers[0][rows], answers[1][rows]
+    return over_days(name, days[rows], lambda some: r2(margin[some], first[some]) - r2(margin[some], second[some]))
+
+
+def leads(read: Read, other: Read) -> dict[str, float]:
+    """What one network is ahead of another on the same frames, by what is told to both."""
+    found: dict[str, float] = {}
+    for name in read.told.keys() & other.told.keys():
+        for condition, rows in (("dry", ~read.wet), ("wet", read.wet)):
+            answers = read.answers(name), other.answers(name)
+            found |= lead(f"{name}_lead_{condition}", read.margin, answers, read.day, rows)
+    return dict(sorted(found.items()))
 
 
 def learn(slipped: Ratio, spread: float = GRASP_SPREAD) -> Friction:
@@ -308,13 +346,15 @@ def follow(run: Run, plan: TrialPlan) -> Followed:
     )
 
 
-def measure_sequences(run: Run, *, selection: bool, trials: int | None = None) -> dict[str, Any]:
-    """R2 of the margin from one frame, and where all frames of a trial are read in order, with intervals."""
-    recipe = test_recipe(selection=selection)
-    require_disjoint([plan for plan in plan_trials(recipe) if plan.split == "test"])
-    plans = [plan for plan in plan_trials(replace(recipe, pulls=PULLS["varied"])) if plan.split == "test"]
-    plans = plans[:: max(1, len(plans) // trials)] if trials else plans
-    return summarise_sequences([follow(run, plan) for plan in plans])
+def follow_all(run: Run, name: str, *, trials: int | None = None) -> list[Followed]:
+    """Read all frames of the trials of a set in order, their pulls varied."""
+    plans = test_plans(name, trials=trials)
+    return [follow(run, replace(plan, recipe=replace(plan.recipe, pulls=PULLS["varied"]))) for plan in plans]
+
+
+def joined(read: Sequence[Followed], of: Callable[[Followed], Any]) -> np.ndarray:
+    """Something of each trial, for all of its frames."""
+    return np.concatenate([np.broadcast_to(of(one), len(one.margin)) for one in read])
 
 
 def summarise_sequences(read: Sequence[Followed]) -> dict[str, Any]:
@@ -322,12 +362,10 @@ def summarise_sequences(read: Sequence[Followed]) -> dict[str, Any]:
     found: dict[str, Any] = {"sequence_frames": sum(len(one.margin) for one in read)}
     for condition, wet in (("dry", False), ("wet", True)):
         some = [one for one in read if one.wet == wet]
-        margin, one, several, in_90 = (
-            np.concatenate([getattr(each, name) for each in some]) for name in ("margin", "one", "several", "in_90")
-        )
-        slipped = np.concatenate([np.cumsum(each.margin == 0) > 0 for each in some])
-        day = np.concatenate([np.full(len(each.margin), each.day) for each in some])
-        fast = np.concatenate([np.full(len(each.margin), each.pull_s < FAST_S) for each in some])
+        margin, day = joined(some, lambda one: one.margin), joined(some, lambda one: one.day)
+        one, several = joined(some, lambda one: one.one), joined(some, lambda one: one.several)
+        slipped = joined(some, lambda one: np.cumsum(one.margin == 0) > 0)
+        fast = joined(some, lambda one: one.pull_s < FAST_S)
         for name, answer in (("one_of_several", one), ("several", several)):
             key = f"{name}_r2_{condition}"
             found |= r2_over_days(key, margin, answer, day)
@@ -335,17 +373,20 @@ def summarise_sequences(read: Sequence[Followed]) -> dict[str, Any]:
             found[f"{key}_before_slip"] = r2(margin[pulled], answer[pulled])
             for when, rows in (("before", ~slipped), ("after", slipped)):
                 found[f"{name}_rmse_{condition}_{when}_slip"] = float(np.sqrt(np.mean((answer - margin)[rows] ** 2)))
-        found[f"several_in_90_{condition}"] = float(in_90.mean())
+        found[f"several_in_90_{condition}"] = float(joined(some, lambda one: one.in_90).mean())
         found[f"fast_trials_{condition}"] = sum(each.pull_s < FAST_S for each in some)
         for speed, rows in (("", np.ones(len(day), dtype=bool)), ("_fast", fast), ("_slow", ~fast)):
             if rows.any():
-                before, after, truth = one[rows], several[rows], margin[rows]
-                found |= over_days(
-                    f"several_gain_{condition}{speed}",
-                    day[rows],
-                    lambda at, b=before, a=after, t=truth: r2(t[at], a[at]) - r2(t[at], b[at]),
-                )
+                found |= lead(f"several_gain_{condition}{speed}", margin, (several, one), day, rows)
     return found
+
+
+def sequence_leads(read: Sequence[Followed], other: Sequence[Followed]) -> dict[str, float]:
+    """What one network is ahead of another on the same trials, of which both read all frames in order."""
+    margin, day = joined(read, lambda one: one.margin), joined(read, lambda one: one.day)
+    answers = joined(read, lambda one: one.several), joined(other, lambda one: one.several)
+    wet = joined(read, lambda one: one.wet)
+    return lead("several_lead_dry", margin, answers, day, ~wet) | lead("several_lead_wet", margin, answers, day, wet)
 
 
 def measure_known(run: Run, *, trials: int | None = None) -> dict[str, Any]:
@@ -373,7 +414,8 @@ def main() -> None:
     """Print what was measured, as a table or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path("chromatouch-pair"), help="a trained network")
-    parser.add_argument("--selection", action="store_true", help="the days on which variants are compared")
+    parser.add_argument("--against", type=Path, help="another network; told is what the first is ahead of it")
+    parser.add_argument("--set", choices=SETS, default="test", help="the test, or days on which variants are compared")
     parser.add_argument("--trials", type=int, help="about so many trials, for a quick look")
     parser.add_argument("--sequences", action="store_true", help="only what several frames tell")
     parser.add_argument("--known", action="store_true", help="only how far it knows its own kind of sensor, and others")
@@ -385,16 +427,22 @@ def main() -> None:
     if options.grasp_spread is not None and not 0 < options.grasp_spread < 0.5:
         parser.error("--grasp-spread is a share between 0 and 0.5")
     try:
-        run = load(options.run)
+        run, other = load(options.run), options.against and load(options.against)
     except SliplensError as error:
         sys.exit(f"{Path(__file__).name}: {error}")
-    chosen = {"selection": options.selection, "trials": options.trials}
-    if options.known:
-        found = measure_known(run, trials=options.trials)
-    else:
-        found = {} if options.sequences else measure(run, **chosen, grasp_spread=options.grasp_spread)
+    found: dict[str, Any] = {"weights_sha256": run.manifest.weights_sha256}
+    chosen = {"name": options.set, "trials": options.trials}
+    found |= measure_known(run, trials=options.trials) if options.known else {"set": options.set}
+    if not (options.known or options.sequences):
+        read = read_frames(run, **chosen, grasp_spread=options.grasp_spread)
+        found |= summarise(read)
+        if other is not None:
+            found |= leads(read, read_frames(other, **chosen, grasp_spread=options.grasp_spread))
     if run.sequence is not None and not options.known:
-        found |= measure_sequences(run, **chosen)
+        followed = follow_all(run, **chosen)
+        found |= summarise_sequences(followed)
+        if other is not None and other.sequence is not None:
+            found |= sequence_leads(followed, follow_all(other, **chosen))
     if options.json:
         print(json.dumps(found))
         return

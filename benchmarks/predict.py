@@ -2,7 +2,12 @@
 
 In every round each engine predicts once, in an order that turns, so that whatever else the machine does hits all alike.
 Decoding is left out; encoding (compare, resize, normalise) is reported apart. The answers of each engine are compared
-with those of `eager`. With `--json` the last line is one JSON object.
+with those of `eager`.
+
+`fps_ratios` compares whole calls of `predict` by each engine, in turn too: frames a second of `chromatouch-pair` over
+those of `chromatouch-difference`, as they come (112 and 224 px) and both at 224 px, and of frames in order over frames
+one by one. `python benchmarks/predict.py --engines eager folded onnxruntime openvino --rounds 100 --json` takes two
+minutes. With `--json` the last line is one JSON object.
 """
 
 import argparse
@@ -10,6 +15,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 # as the command line does; must be set before torch is imported
@@ -20,11 +26,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+import sliplens as sl
 from sliplens.errors import SliplensError
 from sliplens.files import machine, versions
 from sliplens.models import Manifest, Run, build_model
 from sliplens.models.engines import ENGINES, Engine, make_engine
 from sliplens.models.onnx import difference
+from sliplens.recordings.source import open_source
+from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 WARM_UP = 5
 ENCODED = ((224, 224), (480, 640))
@@ -81,17 +90,17 @@ def make_ready(
     return engines, seconds, missing
 
 
-def time_rounds(work: dict[str, Callable[[], object]], *, rounds: int) -> dict[str, np.ndarray]:
+def time_rounds(work: dict[str, Callable[[], object]], *, rounds: int, warm_up: int = WARM_UP) -> dict[str, np.ndarray]:
     """Milliseconds of every call; in each round all are called once."""
     names = list(work)
     found: dict[str, list[float]] = {name: [] for name in names}
-    for number in range(WARM_UP + rounds):
+    for number in range(warm_up + rounds):
         turn = number % len(names)
         for name in names[turn:] + names[:turn]:
             start = time.perf_counter()
             work[name]()
             found[name].append(1e3 * (time.perf_counter() - start))
-    return {name: np.array(times[WARM_UP:]) for name, times in found.items()}
+    return {name: np.array(times[warm_up:]) for name, times in found.items()}
 
 
 def encoders(trained: Run) -> dict[str, Callable[[], object]]:
@@ -107,6 +116,34 @@ def encoders(trained: Run) -> dict[str, Callable[[], object]]:
 def parity(trained: Run, engine: Engine, eager: Engine, inputs: Tensor) -> float:
     """Largest difference between the margins of an engine and those of `eager`."""
     return difference(engine.estimate(trained, inputs).margin, eager.estimate(trained, inputs).margin)
+
+
+RATIOS = {
+    "pair": ("pair", "difference"),
+    "pair_at_224": ("pair_at_224", "difference"),
+    "sequence_of_difference": ("difference_sequence", "difference"),
+    "sequence_of_pair": ("pair_sequence", "pair"),
+}
+"""Ways to read that are compared, the one over the other."""
+
+
+def whole_calls(engine: str, *, frames: int) -> dict[str, Callable[[], object]]:
+    """Calls of `predict` with networks of the package on a simulated grip, by way to read."""
+    grip = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=frames))
+    trials = [replace(open_source(grip.frames, reference=grip.reference)[0], frame_time_s=grip.time_s)]
+    # each of its own: an engine is kept for the last size of images that a network was asked for
+    difference, pair, enlarged = (sl.load(f"chromatouch-{name}") for name in ("difference", "pair", "pair"))
+    enlarged = replace(enlarged, manifest=replace(enlarged.manifest, image_size=difference.manifest.image_size))
+    networks = {"difference": difference, "pair": pair, "pair_at_224": enlarged}
+    one_by_one = {name: partial(sl.predict, network, trials, engine=engine) for name, network in networks.items()}
+    in_order = {f"{name}_sequence": partial(one_by_one[name], sequence=True) for name in ("difference", "pair")}
+    return {**one_by_one, **in_order}
+
+
+def time_calls(engines: Sequence[str], *, frames: int, rounds: int) -> dict[str, dict[str, np.ndarray]]:
+    """Frames a second of every call, by engine and way to read."""
+    calls = {engine: time_rounds(whole_calls(engine, frames=frames), rounds=rounds, warm_up=1) for engine in engines}
+    return {engine: {name: 1e3 * frames / ms for name, ms in times.items()} for engine, times in calls.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -130,6 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     times = time_rounds(work, rounds=options.rounds)
     load.append(os.getloadavg()[0])
     encode_times = time_rounds(encoders(trained), rounds=options.rounds)
+    fps = time_calls(list(engines), frames=120, rounds=max(1, options.rounds // 20))
     eager = engines.get("eager") or make_engine("eager", trained, batch_size=1, streams=1)
     result = {
         "p50_ms": {name: float(np.percentile(values, 50)) for name, values in times.items()},
@@ -141,6 +179,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "margin_sd": float(eager.estimate(trained, inputs).margin.std()),
         "encode_p50_ms": {name: float(np.percentile(values, 50)) for name, values in encode_times.items()},
         "encode_p99_ms": {name: float(np.percentile(values, 99)) for name, values in encode_times.items()},
+        "fps": {
+            engine: {name: float(np.median(values)) for name, values in own.items()} for engine, own in fps.items()
+        },
+        "fps_ratios": {
+            engine: {name: float(np.median(own[one] / own[other])) for name, (one, other) in RATIOS.items()}
+            for engine, own in fps.items()
+        },
         "load_average": load,
         "rounds": options.rounds,
         "size": options.size,
@@ -159,6 +204,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
     for name, values in encode_times.items():
         print(f"encoding {name}: {np.percentile(values, 50):.2f} ms, p99 {np.percentile(values, 99):.2f} ms")
+    for engine, ratios in result["fps_ratios"].items():
+        told = ", ".join(f"{name} {value:.2f}" for name, value in ratios.items())
+        print(f"frames a second by {engine}: {told}")
     for name, why in missing.items():
         print(f"{name}: {why}")
     print(f"{options.threads} threads, {options.size} px, load average {load[0]:.1f} before and {load[1]:.1f} after")

@@ -2,8 +2,8 @@
 
 The truth are Shapley values of the markers over scenes drawn anew (docs/study.md). A method is recommended where its
 signed rank correlation with them leads every control and every other method, both intervals off zero. With networks of
-a second seed (`--second-difference`, `--second-raw`) the whole is done once more on other trials of the same sensor, of
-four later days, and the two answers are compared.
+a second seed (`--second-network`) the whole is done once more on other trials of the same sensor, of four later days,
+and the two answers are compared. Other networks have been chosen with other trials: `--seed` simulates those.
 Each seed is a study that can be interrupted and goes on where it stopped (`--keep`).
 """
 
@@ -28,12 +28,11 @@ from sliplens.results import Study
 from sliplens.simulation import simulate
 from sliplens.study import run_study
 
-INPUTS = ("difference", "raw")
 LATER: dict[str, Any] = {"dry_trials": 32, "wet_trials": 8, "days": 8, "test_days": 4}
 """Days 5 to 8 of the preset's sensor, which has four."""
 
 
-def look(networks: dict[str, str | None], folder: Path, *, days: dict[str, Any], options: argparse.Namespace) -> Study:
+def look(networks: list[str], folder: Path, *, days: dict[str, Any], options: argparse.Namespace) -> Study:
     """Study the explanations of the networks that are named on test trials of the preset, or of other days."""
     terminal = Terminal()
     data = folder / "data"
@@ -41,12 +40,11 @@ def look(networks: dict[str, str | None], folder: Path, *, days: dict[str, Any],
     simulated = (
         load_dataset(data)
         if data.exists()
-        else simulate(data, preset="thesis", frames_per_trial=frames, seed=0, on_progress=terminal, **days)
+        else simulate(data, preset="thesis", frames_per_trial=frames, seed=options.seed, on_progress=terminal, **days)
     )
     return run_study(
         simulated,
-        difference=networks["difference"],
-        raw=networks["raw"],
+        networks,
         out=folder / "study",
         trials=options.trials,
         tests=("truth",),
@@ -97,29 +95,28 @@ def show(name: str, found: dict[str, Any]) -> None:
 def main() -> None:
     """Print correlations, leads and verdicts by input, as text or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    for name in INPUTS:
-        parser.add_argument(f"--{name}", default=f"thesis-{name}", help="network: folder or name")
-        parser.add_argument(f"--second-{name}", help="network of another seed")
+    own = ["thesis-difference", "thesis-raw"]
+    parser.add_argument("--network", nargs="+", default=own, help="networks, one an input: folders or names")
+    parser.add_argument("--second-network", nargs="+", default=[], help="networks of another seed")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the simulated trials")
     parser.add_argument("--trials", type=int, default=14)
     parser.add_argument("--frames-per-trial", type=int, default=80)
     parser.add_argument("--on", default="processes=2")
     parser.add_argument("--keep", type=Path, help="folder to keep data and studies in, and to go on from")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    first = {name: getattr(options, name) for name in INPUTS}
-    second = {name: getattr(options, f"second_{name}") for name in INPUTS}
     with tempfile.TemporaryDirectory() as scratch:
         work = options.keep or Path(scratch)
         try:
             looks = [
                 look(networks, work / folder, days=days, options=options)
-                for networks, folder, days in ((first, "1", {}), (second, "2", LATER))
-                if any(networks.values())
+                for networks, folder, days in ((options.network, "1", {}), (options.second_network, "2", LATER))
+                if networks
             ]
         except SliplensError as error:
             sys.exit(f"{Path(__file__).name}: {error}")
     result = {}
-    for name in INPUTS:
+    for name in looks[0].truth:
         one, *others = [judged(study, name) for study in looks if name in study.truth]
         show(name, one)
         for other in others:

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from data_sets import save_dataset
+
 # threads that spin while they wait take the cores from those that work; must be set before torch is imported
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
@@ -21,9 +23,7 @@ from sliplens.images import absolute_difference, write_png
 from sliplens.models import load_checkpoint, save_checkpoint
 from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.sequence import SequenceHead, SequenceManifest
-from sliplens.recordings import Dataset, Recording, load_dataset
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.store import save_recording
+from sliplens.recordings import Dataset, Recording
 from sliplens.shards import EXECUTORS
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_trials, simulate_trial
 
@@ -98,28 +98,21 @@ def small_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Eight small trials in all splits, dry and wet."""
     folder = tmp_path_factory.mktemp("data")
     plan = [("train", "dry")] * 4 + [("validation", "dry")] * 2 + [("test", "dry"), ("test", "wet")]
-    table = []
-    for index, (split, condition) in enumerate(plan):
-        recording = make_recording(f"{split}-{condition}-{index}", condition=condition, day=1 + index % 4, seed=index)
-        path = trial_path(folder, recording.trial)
-        save_recording(recording, path)
-        table.append(trial_info(path, split=split))
-    write_dataset_table(folder, table, simulated=True)
-    return load_dataset(folder)
+    recordings = [
+        make_recording(f"{split}-{condition}-{index}", condition=condition, day=1 + index % 4, seed=index)
+        for index, (split, condition) in enumerate(plan)
+    ]
+    return save_dataset(folder, *recordings, split=[split for split, _ in plan], simulated=True)
 
 
 @pytest.fixture(scope="session")
 def fine_dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     """Three dry trials and a wet one to test on, with a frame near every margin."""
-    folder = tmp_path_factory.mktemp("fine-data")
-    table = []
-    for index, condition in enumerate(("dry", "dry", "dry", "wet")):
-        recording = make_recording(f"test-{condition}-{index}", condition=condition, frames=40, seed=index)
-        path = trial_path(folder, recording.trial)
-        save_recording(recording, path)
-        table.append(trial_info(path, split="test"))
-    write_dataset_table(folder, table)
-    return load_dataset(folder)
+    recordings = [
+        make_recording(f"test-{condition}-{index}", condition=condition, frames=40, seed=index)
+        for index, condition in enumerate(("dry", "dry", "dry", "wet"))
+    ]
+    return save_dataset(tmp_path_factory.mktemp("fine-data"), *recordings, split="test")
 
 
 @pytest.fixture(scope="session")
@@ -155,6 +148,11 @@ def difference_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def raw_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_untrained(tmp_path_factory.mktemp("raw-run"), kind="raw", seed=1)
+
+
+@pytest.fixture(scope="session")
+def pair_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_untrained(tmp_path_factory.mktemp("pair-run"), kind="pair", seed=2)
 
 
 @pytest.fixture

@@ -1,10 +1,10 @@
 """The figures of benchmarks/results.toml are whole, and the tables drawn from them are theirs."""
 
-import importlib.util
 import re
+import runpy
 from decimal import Decimal
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,17 +14,7 @@ NO_FIGURES = {"fairness"}
 """What the scripts share; it measures nothing."""
 
 
-def load_tables() -> ModuleType:
-    """Load the script that draws the tables."""
-    spec = importlib.util.spec_from_file_location("benchmark_tables", ROOT / "docs" / "benchmark_tables.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-TABLES = load_tables()
+TABLES = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "benchmark_tables.py")))
 SECTIONS: dict[str, dict[str, Any]] = TABLES.load_sections()
 
 

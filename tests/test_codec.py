@@ -26,7 +26,7 @@ from sliplens.codec import (
 from sliplens.errors import InputError
 from sliplens.results import evaluation, explanation, faithfulness, grip, study
 
-NEVER_LOADED = {faithfulness.DeletionCurve, faithfulness.RemovalCurve, study.MarkedFrame, study.StateFrame}
+NEVER_LOADED = {faithfulness.DeletionCurve, faithfulness.RemovalCurve, study.MarkerPlaces, study.StateFrame}
 """Records of `results` that are made of tables when these have been read."""
 
 

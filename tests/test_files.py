@@ -144,7 +144,7 @@ def test_hash_does_not_depend_on_the_order_of_keys():
     assert hash_json({"a": 1}) != hash_json({"a": 2})
 
 
-def test_numpy_numbers_and_paths_become_json(tmp_path: Path):
+def test_numpy_numbers_and_paths_become_json():
     value = {"a": np.float32(0.5), "b": Path("c"), "d": (np.int64(1),)}
     assert json.loads(json.dumps(to_builtins(value))) == {"a": 0.5, "b": "c", "d": [1]}
 

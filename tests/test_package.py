@@ -1,13 +1,14 @@
 """Laws of the package as a whole."""
 
 import re
+import runpy
 import subprocess
 import sys
 import tomllib
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 
 from readme_renderer.markdown import render
+from there import there
 
 ROOT = Path(__file__).parents[1]
 
@@ -61,14 +62,9 @@ def test_contributing_names_files_that_there_are():
 
 
 def test_a_package_index_shows_the_readme_whole():
-    spec = spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
-    assert spec is not None
-    assert spec.loader is not None
-    build = module_from_spec(spec)
-    spec.loader.exec_module(build)
+    build = runpy.run_path(str(ROOT / "hatch_build.py"))
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    page = render(build.describe(readme))
-    assert page is not None
+    page = there(render(build["describe"](readme)))
     # nothing there is relative to the repository
     assert "<img" not in page
     assert not re.findall(r'href="(?!https?:|#)', page)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from data_sets import contents
 from shard_work import Count, shards
 
 from sliplens import load_dataset, predict
@@ -61,10 +62,6 @@ def log(tmp_path: Path) -> Path:
     return tmp_path / "log"
 
 
-def content(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def upload(data: Dataset, target: str) -> str:
     StoredPath(target).upload(data.folder)
     return target
@@ -77,7 +74,7 @@ def test_a_path_in_a_store_reads_as_one_on_disk_does(bucket: str, tmp_path: Path
             (folder / name).write_text(name)
     stored = as_path(Path(f"{bucket}/"))  # a path that was made without knowing
     assert str(stored / "a" / "b.txt") == f"{bucket}/a/b.txt"
-    assert content(stored) == content(tmp_path)
+    assert contents(stored) == contents(tmp_path)
     for ask in (Path.exists, Path.is_file, Path.is_dir):
         for name in ("a", "a/b.txt", "a/b", "nothing", "."):
             assert ask(stored / name) == ask(tmp_path / name), (ask, name)
@@ -96,11 +93,11 @@ def test_parts_in_a_store_are_those_on_disk(bucket: str, log: Path, tmp_path: Pa
     make_parts(Count(log=log), shards, tmp_path / "out", title="Counting")
     out = as_path(f"{bucket}/out")
     make_parts(Count(log=log), shards, out, title="Counting")
-    assert content(out) == content(tmp_path / "out")
+    assert contents(out) == contents(tmp_path / "out")
     tries = Count(log=log).tries()
     (out / next(shards()).part).unlink()
     make_parts(Count(log=log), shards, out, title="Counting")
-    assert content(out) == content(tmp_path / "out")
+    assert contents(out) == contents(tmp_path / "out")
     assert Count(log=log).tries() == tries | {"a": tries["a"] + 1}
 
 
@@ -126,7 +123,7 @@ def test_failures_in_a_store_are_seen_from_elsewhere(bucket: str, log: Path, cap
     with pytest.raises(ShardError):
         make_parts(Count(log=log), shards, out, title="Counting")
     make_parts(Count(log=log), shards, out, title="Counting", retry_failed=True)
-    assert sorted(content(out)) == sorted(one.part for one in shards())
+    assert sorted(contents(out)) == sorted(one.part for one in shards())
     assert read_status(out) == []
 
 
@@ -139,13 +136,13 @@ def test_a_table_in_a_store_is_complete_when_it_says_so(bucket: str, log: Path, 
     make(str(tmp_path / "a.parquet"))
     make(f"{bucket}/a.parquet")
     assert as_path(f"{bucket}/a.parquet").read_bytes() == (tmp_path / "a.parquet").read_bytes()
-    assert list(content(as_path(bucket))) == ["a.parquet"]  # and no parts
+    assert list(contents(as_path(bucket))) == ["a.parquet"]  # and no parts
     with pytest.raises(ShardError):
         make(f"{bucket}/set", refuse=frozenset("c"))
     assert not as_path(f"{bucket}/set/run.json").exists()
     make(f"{bucket}/set", retry_failed=True)
     make(str(tmp_path / "set"))
-    left, right = content(as_path(f"{bucket}/set")), content(tmp_path / "set")
+    left, right = contents(as_path(f"{bucket}/set")), contents(tmp_path / "set")
     assert left.pop("run.json")
     assert right.pop("run.json")
     assert left == right
@@ -155,7 +152,7 @@ def test_a_table_in_a_store_is_complete_when_it_says_so(bucket: str, log: Path, 
     with pytest.raises(InputError, match="holds a result of other settings"):
         make(f"{bucket}/set", recipe={"another": 1})
     make(f"{bucket}/set", recipe={"another": 1}, overwrite=True)
-    assert len(content(as_path(f"{bucket}/set"))) == 6
+    assert len(contents(as_path(f"{bucket}/set"))) == 6
     as_path(f"{bucket}/mine/diary.txt").write_text("mine")
     with pytest.raises(InputError, match="was not made by sliplens"):
         make(f"{bucket}/mine", overwrite=True)
@@ -170,7 +167,7 @@ def test_a_folder_that_was_begun_by_another_recipe_is_begun_anew(bucket: str):
     assert (out / "old").exists()
     with output_folder(out, stage="test", config=2) as output:
         (output.folder / "new").write_text("new")
-    assert sorted(content(out)) == ["new", "run.json"]
+    assert sorted(contents(out)) == ["new", "run.json"]
 
 
 def test_margins_of_a_data_set_in_a_store_are_those_on_disk(
@@ -179,7 +176,7 @@ def test_margins_of_a_data_set_in_a_store_are_those_on_disk(
     data = upload(small_dataset, f"{bucket}/data")
     assert load_dataset(data).hash == small_dataset.hash
     stored = predict(difference_run, data, split="test", on=elsewhere, out=f"{bucket}/margins")
-    about, *parts = sorted(content(as_path(f"{bucket}/margins")))
+    about, *parts = sorted(contents(as_path(f"{bucket}/margins")))
     assert about == "run.json"
     trials = [f"trial={one.trial}" for one in small_dataset.select(split="test")]
     assert [name.rpartition("/")[0] for name in parts] == trials
@@ -194,7 +191,7 @@ def test_maps_in_a_store_are_those_on_disk(bucket: str, small_dataset: Dataset, 
     found = explain_source(difference_run, data, out=as_path(f"{bucket}/maps"), **own)
     expected = load_explained(tmp_path / "maps")
     assert found.relevance["grad-cam"].tobytes() == expected.relevance["grad-cam"].tobytes()
-    assert sorted(content(as_path(f"{bucket}/maps"))) == sorted(content(tmp_path / "maps"))
+    assert sorted(contents(as_path(f"{bucket}/maps"))) == sorted(contents(tmp_path / "maps"))
 
 
 def test_what_is_wrong_with_a_store_is_one_sentence(

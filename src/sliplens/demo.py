@@ -111,17 +111,17 @@ def run_demo(
             networks[name] = str(folder / f"train-{name}")
             trained = partial(train, image_size=image_size, epochs=60, max_minutes=minutes, seed=seed)
             trained(data, networks[name], input=name, on_progress=on_progress)
-    difference, raw = networks["difference"], networks["raw"]
-    _make_strip(folder / "strip", data, difference, on_progress=on_progress)
+    _make_strip(folder / "strip", data, networks["difference"], on_progress=on_progress)
     show(*later)
     for name in INPUTS:
         evaluate(networks[name], data, folder / f"evaluate-{name}", on_progress=on_progress)
     show(*later[1:])
-    _study(data, out=folder, difference=difference, raw=raw, on=on, seed=seed, on_progress=on_progress)
+    _study(data, tuple(networks.values()), out=folder, on=on, seed=seed, on_progress=on_progress)
     if real is not None:
         maps = folder / "explain-real"
-        explain_source(difference, real, labels_in_names=True, out=maps, on_progress=on_progress)
-        score_explained(difference, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
+        network = networks["difference"]
+        explain_source(network, real, labels_in_names=True, out=maps, on_progress=on_progress)
+        score_explained(network, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
     return show()
 
 

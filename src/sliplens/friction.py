@@ -20,6 +20,8 @@ GRASP_SPREAD = 0.06
 day lie evenly within a tenth of its friction."""
 MOST_FRICTION = 20.0
 """Larger than the coefficient of anything that slides: beyond, something sticks, or the number is none."""
+_REACH = 4.0
+"""Standard deviations to either side within which friction of a mean and a spread is held possible."""
 _NODES = 400
 """Over two decades a step is then 1 %, finer than any slip tells."""
 _NEGLIGIBLE = 1e-6
@@ -38,8 +40,9 @@ def require_friction(value: float) -> None:
 class Friction:
     """A coefficient of friction mu, as far as it is known: values and how likely each is.
 
-    `Friction(0.62)` is known exactly, `Friction.between(0.5, 0.8)` lies anywhere in a range, and
-    `Friction.from_slips([0.58])` was learnt from slips seen before on the same object.
+    `Friction(0.62)` is known exactly, `Friction.between(0.5, 0.8)` lies anywhere in a range,
+    `Friction.about(0.58, 0.05)` has a mean and a standard deviation, and `Friction.from_slips([0.58])` was learnt from
+    slips seen before on the same object.
 
     Parameters
     ----------
@@ -83,9 +86,25 @@ class Friction:
     def between(cls, low: float, high: float, *, values: int = 41) -> "Friction":
         """Friction anywhere in a range, evenly; at so many values, each in the middle of its share of the range."""
         if not 0 < low < high <= MOST_FRICTION:
-            raise InputError(f"a range of friction runs from a positive low to a larger high, got {low:g}..{high:g}")
+            raise InputError(
+                f"a range of friction runs from a positive low to a larger high, at most {MOST_FRICTION:g}, got "
+                f"{low:g}..{high:g}; give the smaller number first, such as 0.5..0.8"
+            )
         middles = low + (high - low) * (np.arange(values) + 0.5) / values
         return cls(middles, note=f"{low:g} to {high:g}, told as a range")
+
+    @classmethod
+    def about(cls, mean: float, sigma: float, *, values: int = 81) -> "Friction":
+        """Friction of a mean and a standard deviation, normal in the logarithm, where none becomes negative."""
+        if not (0 < mean <= MOST_FRICTION and 0 < sigma < mean):
+            raise InputError(
+                f"friction about a mean has a positive standard deviation that is less than it, got {mean:g}+-{sigma:g}"
+            )
+        spread = math.sqrt(math.log1p((sigma / mean) ** 2))
+        steps = np.linspace(-_REACH, _REACH, values)
+        nodes = mean * np.exp(spread * steps - spread**2 / 2)
+        kept = nodes <= MOST_FRICTION
+        return cls(nodes[kept], np.exp(-0.5 * steps[kept] ** 2), note="told with its spread")
 
     @classmethod
     def from_slips(
@@ -169,6 +188,11 @@ class Friction:
         values, weights = self.nodes
         return float(np.sqrt(weights @ (values - self.mean) ** 2))
 
+    @property
+    def text(self) -> str:
+        """Mean and standard deviation as `as_friction` and `--friction` take them, such as 0.58+-0.05."""
+        return f"{self.mean:.3g}+-{self.sigma:.2g}" if self.sigma > 0 else f"{self.mean:.6g}"
+
     def __str__(self) -> str:
         if self.note.endswith("range"):
             return self.note
@@ -176,33 +200,48 @@ class Friction:
 
 
 class SlipLearner:
-    """Friction of an object while it is held: the first gross slip narrows it down, and a new grasp widens it again.
+    """Friction of what is held, as the first gross slip of each grasp teaches it.
 
     As a contact begins to slip, F_t / F_n is the static friction; what is read while it slides is less. So a slip is
     told together with the time since it began, and the ratio that was read just before counts. Later slips of the
     same contact teach nothing: what a network reads wrong of a contact it reads wrong alike at each of them, so that
     they would make it surer and no better.
 
+    Nobody sees whether the next grasp is of the same object. So what a slip taught ends with its grasp, unless it was
+    said that the object stays the same: then it counts in the next ones, a little less surely. Where nothing was told,
+    it counts from the next grasp on, so that a controller's constants do not change while it answers the slip.
+
     Parameters
     ----------
     friction
-        What is known beforehand; what is known exactly stays so.
+        What is known beforehand; what is known exactly stays so. None where nothing is.
+    same_object
+        Whether all grasps are of one object.
 
     Examples
     --------
     >>> from sliplens.friction import Friction, SlipLearner
-    >>> learner = SlipLearner(Friction.between(0.2, 1.0))
+    >>> learner = SlipLearner(Friction.between(0.2, 1.0), same_object=True)
     >>> for tick in range(10):
     ...     learner.note(0.06 * tick, sigma=0.03, time_s=0.1 * tick)
     >>> learner.update(0.95, slipping_s=0.2)
     >>> str(learner.friction)
     '0.42 +- 0.03, learnt from slips'
+    >>> learner.release()
+    >>> learner.friction.text  # another grasp
+    '0.421+-0.039'
     """
 
-    def __init__(self, friction: Friction) -> None:
-        self.friction = friction
+    def __init__(self, friction: Friction | None = None, *, same_object: bool = False) -> None:
+        self.friction = self._told = friction
+        """What is known of the friction of this grasp; None where nothing is."""
+        self.learnt: Friction | None = None
+        """What slips taught of the object that slipped last, for a grasp to come; None before any."""
+        self.slips = 0
+        """How many slips that was learnt from."""
+        self.same_object = same_object
         self._read: deque[tuple[float, float, float]] = deque(maxlen=_KEPT)
-        self._learnt = False
+        self._slipped = False
 
     def note(self, ratio: float, *, sigma: float, time_s: float) -> None:
         """Keep a ratio F_t / F_n that was read, and its standard deviation."""
@@ -210,14 +249,23 @@ class SlipLearner:
 
     def update(self, time_s: float, *, slipping_s: float | None, touches: bool = True) -> None:
         """Learn from whether the contact slips now, and since how many seconds; None where it holds."""
-        if slipping_s is not None and not self._learnt:
+        if slipping_s is not None and not self._slipped:
             before = [(ratio, sigma) for then_s, ratio, sigma in self._read if then_s <= time_s - slipping_s]
-            if before and before[-1][0] > 0 and len(self.friction.nodes[0]) > 1:
-                self.friction, self._learnt = self.friction.update(*before[-1]), True
+            known = _anything() if self.friction is None else self.friction
+            if before and before[-1][0] > 0 and len(known.nodes[0]) > 1:
+                slipped, self._slipped = known.update(*before[-1]), True
+                self.learnt, self.slips = slipped.next_grasp(), self.slips + 1 if self.same_object else 1
+                if self.friction is not None:
+                    self.friction = slipped
         if not touches:
-            self._read.clear()
-            if self._learnt:
-                self.friction, self._learnt = self.friction.next_grasp(), False
+            self.release()
+
+    def release(self) -> None:
+        """Let the object go: the next contact is another grasp."""
+        self._read.clear()
+        if self._slipped:
+            self.friction = self.learnt if self.same_object else self._told
+            self._slipped = False
 
 
 _KEPT = 120
@@ -225,7 +273,7 @@ _KEPT = 120
 
 
 FrictionLike: TypeAlias = Friction | float | tuple[float, float] | str
-"""Friction as a caller may give it: `Friction`, one number, (low, high), or as text 0.62 or 0.5..0.8."""
+"""Friction as a caller may give it: `Friction`, one number, (low, high), or as text 0.62, 0.5..0.8 or 0.58+-0.05."""
 
 
 def as_friction(told: FrictionLike) -> Friction:
@@ -239,19 +287,27 @@ def as_friction(told: FrictionLike) -> Friction:
     Examples
     --------
     >>> from sliplens.friction import as_friction
-    >>> str(as_friction("0.5..0.8"))
-    '0.5 to 0.8, told as a range'
+    >>> str(as_friction("0.5..0.8")), str(as_friction("0.58+-0.05"))
+    ('0.5 to 0.8, told as a range', '0.58 +- 0.05, told with its spread')
     """
     if isinstance(told, Friction):
         return told
-    parts = told.split("..") if isinstance(told, str) else told if isinstance(told, tuple) else (told,)
+    about = isinstance(told, str) and "+-" in told
+    parts = (
+        told.split("+-" if about else "..") if isinstance(told, str) else told if isinstance(told, tuple) else (told,)
+    )
     try:
         numbers = [float(part) for part in parts]
     except (TypeError, ValueError):
         numbers = []
     if len(numbers) not in {1, 2}:
-        raise InputError(f"{told!r} is no friction; give a number such as 0.62, or a range such as 0.5..0.8")
-    return Friction(numbers[0]) if len(numbers) == 1 else Friction.between(*numbers)
+        raise InputError(
+            f"{told!r} is no friction; give a number such as 0.62, a range such as 0.5..0.8, or mean and spread such "
+            "as 0.58+-0.05"
+        )
+    if len(numbers) == 1:
+        return Friction(numbers[0])
+    return Friction.about(*numbers) if about else Friction.between(*numbers)
 
 
 def _anything() -> Friction:

@@ -194,7 +194,7 @@ def absolute_difference(
     array([[ 0, 30],
            [60, 90]], dtype=uint8)
     """
-    _require_same_size(frames, reference)
+    require_same_size(frames, reference)
     # max - min instead of a subtraction: it stays in uint8 and cannot wrap
     return np.maximum(frames, reference) - np.minimum(frames, reference)
 
@@ -220,12 +220,13 @@ def signed_difference(
     >>> signed_difference(frame, untouched)[..., 0]
     array([[128, 148, 108]], dtype=uint8)
     """
-    _require_same_size(frames, reference)
+    require_same_size(frames, reference)
     # T_n / 2 - T_0 / 2 + 128 without leaving uint8: halves of both, rounded alike, so that equal pixels give 128
     return (frames >> 1) + (np.uint8(128) - (reference >> 1))
 
 
-def _require_same_size(frames: np.ndarray, reference: np.ndarray) -> None:
+def require_same_size(frames: np.ndarray, reference: np.ndarray) -> None:
+    """Refuse frames of another size than their reference frame."""
     if frames.shape[-3:] != reference.shape:
         frame, untouched = (f"{image.shape[-3]} x {image.shape[-2]}" for image in (frames, reference))
         raise ImageError(

@@ -57,7 +57,7 @@ def paired_difference(
     *,
     clusters: Iterable[Shaped[np.ndarray, " images"]],
     rng: np.random.Generator,
-    comparisons: int = 1,
+    comparisons: int | tuple[int, int] = 1,
 ) -> Difference:
     """Difference of two scores of the same images, with an interval that holds for other networks, days and trials.
 
@@ -69,7 +69,8 @@ def paired_difference(
 
     `clusters` are labels of each image, outermost first: `[networks, days, trials]`, the last of them, or none where
     images are trials of their own. Equal labels are the same cluster: days that several networks saw count beside them.
-    Of so many `comparisons`, looked at together, all intervals hold 95 times in 100 at least (Bonferroni).
+    Of so many `comparisons`, looked at together, all intervals hold 95 times in 100 at least (Bonferroni); two numbers
+    are those of the lower ends and of the upper ones.
 
     References
     ----------
@@ -97,8 +98,8 @@ def paired_difference(
             free.append(level)
     over = dict(zip(("units", "days", "networks"), counts[::-1], strict=False))
     estimate = float(gap.mean())
-    tail = 0.025 / comparisons
-    at = np.array([tail, 1 - tail])
+    low_tail, high_tail = np.broadcast_to(0.025 / np.array(comparisons), 2)
+    at = np.array([low_tail, 1 - high_tail])
     ends = _drawn_ends(gap, free[0], at, rng) if len(free) == 1 else _student_ends(gap, free, at)
     low, high = (None, None) if ends is None else (estimate + ends).tolist()
     return Difference(estimate=estimate, low=low, high=high, **over)
@@ -157,7 +158,7 @@ def _drawn_ends(
     known = errors > 0  # the same cluster in every place has no spread
     if not known[0]:
         return np.zeros(2)
-    return -errors[0] * np.quantile((means - means[0])[known] / errors[known], at)[::-1]
+    return -errors[0] * np.quantile((means - means[0])[known] / errors[known], 1 - at)
 
 
 def _student_ends(

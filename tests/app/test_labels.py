@@ -10,18 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from data_sets import save_dataset
 from hostile_names import ATTACK, assert_inert, watch
 
 from sliplens.app import LabelPage
 from sliplens.codec import to_builtins
 from sliplens.errors import InputError, RecordingError
 from sliplens.images import decode_png
-from sliplens.recordings import Dataset, Recording, load_dataset
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.edits import EDITS_FILE, make_edit, read_edits
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.importing import relabel_trial
-from sliplens.recordings.store import save_recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 pytest.importorskip("nicegui", reason="the page needs NiceGUI (extra live)")
@@ -36,10 +35,7 @@ def trial() -> Recording:
 
 @pytest.fixture(scope="module")
 def data(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
-    folder = tmp_path_factory.mktemp("to-repair")
-    save_recording(trial, trial_path(folder, trial.trial))
-    write_dataset_table(folder, [trial_info(trial_path(folder, trial.trial), split="train")], simulated=True)
-    return load_dataset(folder)
+    return save_dataset(tmp_path_factory.mktemp("to-repair"), trial, simulated=True)
 
 
 @pytest.fixture(scope="module")

@@ -125,6 +125,12 @@ def test_what_is_recorded_is_a_data_set_that_passes(seen, page: Served):
     assert check_dataset(page.record_into) == ()
 
 
+def test_a_new_object_is_announced_by_key(seen):
+    seen.locator("body").click(position={"x": 2, "y": 2})
+    seen.keyboard.press("n")
+    seen.get_by_text("nothing is known of the friction of the new object").wait_for()
+
+
 def test_a_narrow_window_needs_no_scrolling_sideways(seen):
     assert seen.evaluate("document.documentElement.scrollWidth") <= 320
 

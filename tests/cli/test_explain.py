@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import tyro
+from matplotlib.figure import Figure
 from PIL import Image
 
 from sliplens.cli.explain import Explain
@@ -62,28 +63,44 @@ def test_maps_overlays_and_a_panel(difference_run: Path, small_dataset: Dataset,
     assert "kept" in capsys.readouterr().out
 
 
+def of_relevance(relevance: np.ndarray) -> Explained:
+    """Explanations of grey frames 0, 1, ..."""
+    frame = {"trial": "t", "condition": "dry", "safety_margin": 0.2, "prediction": 0.2, "reference_prediction": 1.0}
+    return Explained(
+        input="difference",
+        source="real",
+        weights_sha256="",
+        frames=tuple(ExplainedFrame(id=str(number), **frame) for number in range(len(relevance))),
+        methods={"occlusion": MethodNotes(seconds_per_frame=0.0, warnings=())},
+        images=np.full((len(relevance), 3, 8, 8), 100, dtype=np.uint8),
+        pictures=np.full((len(relevance), 8, 8, 3), 100, dtype=np.uint8),
+        relevance={"occlusion": relevance},
+        saliency={"occlusion": np.abs(relevance)},
+    )
+
+
 def test_a_frame_with_nothing_to_explain_looks_empty(tmp_path: Path):
     relevance = np.zeros((2, 8, 8), dtype=np.float32)
     relevance[0, 2:4, 2:4] = -0.2  # 80 points of margin; the second frame changes by a hundredth of a point
     relevance[1, 2:4, 2:4] = 0.000025
-    frame = {"trial": "t", "condition": "dry", "safety_margin": 0.2, "prediction": 0.2, "reference_prediction": 1.0}
-    explained = Explained(
-        input="difference",
-        source="real",
-        weights_sha256="",
-        frames=(ExplainedFrame(id="touched", **frame), ExplainedFrame(id="untouched", **frame)),
-        methods={"occlusion": MethodNotes(seconds_per_frame=0.0, warnings=())},
-        images=np.full((2, 3, 8, 8), 100, dtype=np.uint8),
-        pictures=np.full((2, 8, 8, 3), 100, dtype=np.uint8),
-        relevance={"occlusion": relevance},
-        saliency={"occlusion": np.abs(relevance)},
-    )
+    explained = of_relevance(relevance)
     draw_explained(explained, tmp_path, colours="signed")
     strong, empty = (read_image(tmp_path / "overlays" / "occlusion" / f"{one.id}.png") for one in explained.frames)
     assert np.ptp(strong[2, 2].astype(int)) > 100
     assert np.ptp(empty.astype(int)) <= 1
     with Image.open(tmp_path / "panel.png") as panel:  # two rows, and the colours that they are drawn in below
         assert panel.height > panel.width
+
+
+def test_a_panel_of_many_frames_shows_a_few_from_the_first_to_the_last(tmp_path: Path, monkeypatch):
+    shown = {}
+    monkeypatch.setattr("sliplens.study.workspace.draw_panel", lambda _, **words: shown.update(words) or Figure())
+    draw_explained(of_relevance(np.zeros((40, 8, 8), dtype=np.float32)), tmp_path, colours="signed")
+    columns = [int(title.partition("\n")[0]) for title in shown["titles"]]
+    assert (columns[0], columns[-1], len(columns)) == (0, 39, 12)
+    assert set(np.diff(columns)) == {3, 4}  # 39 steps over 11 gaps
+    assert "12 of 40 frames" in shown["bar_label"]
+    assert len(list((tmp_path / "overlays" / "occlusion").iterdir())) == 40
 
 
 def test_without_a_method_the_recommended_one_explains(difference_run: Path, difference_folder: Path, tmp_path: Path):

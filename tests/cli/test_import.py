@@ -8,23 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import refused, run
+from data_sets import save_dataset
 from own_recording import TARE, write_forces, write_video
+from there import there
 
 from sliplens.errors import InputError
 from sliplens.images import write_png
 from sliplens.parts import read_status
 from sliplens.recordings import Recording, load_dataset
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.importing import import_recordings, label_dataset
-from sliplens.recordings.store import read_header, save_recording, write_trial
-from sliplens.simulation import PRESETS, plan_trials, simulate_trial
-
-
-@pytest.fixture(scope="module")
-def trial() -> Recording:
-    """A simulated trial at 30 frames a second, of every other pixel: its motion is seen all the same."""
-    whole = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=240))
-    return replace(whole, frames=whole.frames[:, ::2, ::2].copy(), reference=whole.reference[::2, ::2].copy())
+from sliplens.recordings.store import read_header, write_trial
 
 
 @pytest.fixture(scope="module")
@@ -58,13 +51,10 @@ def test_labels_of_an_imported_video_are_those_of_the_simulator(
     assert back.valid.sum() > 180
     error = (back.safety_margin - trial.safety_margin)[back.valid]
     assert np.sqrt(np.mean(error**2)) < 0.03
-    labelling = read_header(tmp_path / "data" / "trials" / "cup.parquet").labelling
-    assert labelling is not None
-    assert labelling.basis is not None
-    basis = labelling.basis
-    assert trial.truth is not None
+    labelling = there(read_header(tmp_path / "data" / "trials" / "cup.parquet").labelling)
+    basis = there(labelling.basis)
     slip = int(np.argmax(trial.safety_margin == 0))
-    assert basis.friction.mu == pytest.approx(trial.truth.static_friction[slip], rel=0.05)
+    assert basis.friction.mu == pytest.approx(there(trial.truth).static_friction[slip], rel=0.05)
     assert (basis.axes.normal, basis.axes.sign) == ("z", -1)
     np.testing.assert_allclose(basis.axes.tare_n, TARE, atol=0.01)
     # the reference was taken before the contact
@@ -100,12 +90,10 @@ def test_bad_samples_of_the_force_sensor_cost_their_frames_and_are_told(
     assert "is sound" in repeated.out
     data = load_dataset(tmp_path / "data")
     labels = data.read_labels(data.trials[0])
-    assert labels.valid is not None
-    assert labels.reason is not None
-    reasons = dict(zip(np.round(trial.time_s, 3).tolist(), labels.reason, strict=True))
+    reasons = dict(zip(np.round(trial.time_s, 3).tolist(), there(labels.reason), strict=True))
     assert {reason for time, reason in reasons.items() if 2.5 <= time <= 2.7} == {"drop-out of the force"}
     assert "spike of the force" in {reason for time, reason in reasons.items() if 3.95 <= time <= 4.05}
-    error = (labels.safety_margin - trial.safety_margin)[labels.valid]
+    error = (labels.safety_margin - trial.safety_margin)[there(labels.valid)]
     assert len(error) > 150  # the random draws behind the uncertainty decide about some
     assert np.sqrt(np.mean(error**2)) < 0.03
 
@@ -136,12 +124,8 @@ def test_lag_and_tare_by_hand_are_taken(tmp_path: Path, table: Path, video: Path
     # the same samples at the same times, but for the rounding of their stamps to 10 us, of forces that change by some
     # 50 N/s at most
     np.testing.assert_allclose(first.normal_force_n, second.normal_force_n, atol=1e-3)
-    labelling = read_header(tmp_path / "b" / "trials" / "cup.parquet").labelling
-    assert labelling is not None
-    assert labelling.basis is not None
-    basis = labelling.basis
-    assert basis.lag is not None
-    assert (basis.lag.lag_s, basis.lag_applied, basis.axes.tare_found) == (0.05, True, "declared")
+    basis = there(there(read_header(tmp_path / "b" / "trials" / "cup.parquet").labelling).basis)
+    assert (there(basis.lag).lag_s, basis.lag_applied, basis.axes.tare_found) == (0.05, True, "declared")
 
 
 def test_times_of_images_come_from_a_table_or_from_their_names(
@@ -169,10 +153,7 @@ def test_times_of_images_come_from_a_table_or_from_their_names(
 def test_friction_by_hand_is_taken(tmp_path: Path, table: Path, video: Path):
     assert run("import", video, "-o", tmp_path / "data", "--sensor", "mine", "--forces", table, "--mu", 1.4) == 0
     data = load_dataset(tmp_path / "data")
-    labelling = read_header(tmp_path / "data" / "trials" / "cup.parquet").labelling
-    assert labelling is not None
-    assert labelling.basis is not None
-    basis = labelling.basis
+    basis = there(there(read_header(tmp_path / "data" / "trials" / "cup.parquet").labelling).basis)
     assert (basis.friction.mu, basis.friction.found) == (1.4, "declared")
     # with more friction than there was the trial never comes near slip
     assert np.nanmin(data.load(data.trials[0]).safety_margin) > 0.2
@@ -182,9 +163,7 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
     tmp_path: Path, trial: Recording, monkeypatch: pytest.MonkeyPatch
 ):
     source = tmp_path / "source"
-    for name in "ab":
-        save_recording(replace(trial, trial=name), trial_path(source, name))
-    write_dataset_table(source, [trial_info(trial_path(source, name), split="train") for name in "ab"])
+    save_dataset(source, replace(trial, trial="a"), replace(trial, trial="b"))
     whole, broken = (("import", source, "-o", tmp_path / name, "--no-audit") for name in "wb")
     assert run(*whole) == 0
     written = []

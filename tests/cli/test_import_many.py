@@ -1,32 +1,23 @@
 """`sliplens import` of a folder or a manifest: many trials, some of them bad, and more of them later."""
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from command_line import run
+from data_sets import save_dataset
 from own_recording import write_forces, write_video
 from small import make_recording
+from there import there
 
 from sliplens.parts import TRIES
 from sliplens.recordings import Recording, load_dataset, trial_writer
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.store import save_recording
 from sliplens.recordings.trial_writer import import_trial
-from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 PROFILE = 'name = "mine"\ncamera_size_px = [112, 112]\nrotate_deg = 90\nnormal_axis = "z"\nnormal_sign = -1\n'
-
-
-@pytest.fixture(scope="module")
-def trial() -> Recording:
-    """A simulated trial at 30 frames a second, of every other pixel: its motion is seen all the same."""
-    whole = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=240))
-    return replace(whole, frames=whole.frames[:, ::2, ::2].copy(), reference=whole.reference[::2, ::2].copy())
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +52,7 @@ def test_bad_trials_are_listed_and_do_not_stop_the_others(imported: Path, trial:
     cup = data.load(data.find("cup"))
     np.testing.assert_array_equal(cup.frames[100], np.rot90(trial.frames[100], k=-1))
     assert cup.sensor == "mine"
-    profile = data.profile("mine")
-    assert profile is not None
+    profile = there(data.profile("mine"))
     assert profile.normal_sign == -1
 
 
@@ -93,10 +83,8 @@ def test_more_trials_are_added_and_the_old_ones_stay(
     assert {name: after.find(name) for name in before} == before
     mug = after.find("mug")
     assert (mug.day, mug.object, mug.condition, mug.sensor) == (3, "mug", "wet", "mine")
-    labelling = after.read_labels(mug).labelling
-    assert labelling is not None
-    assert labelling.basis is not None
-    assert labelling.basis.friction.mu == 0.5
+    labelling = there(after.read_labels(mug).labelling)
+    assert there(labelling.basis).friction.mu == 0.5
     assert [one.trial for one in after.left_out] == ["bad"]
     assert run("check", data) == 0
 
@@ -107,9 +95,7 @@ def test_a_trial_that_fails_again_and_again_is_left_out_until_it_is_added(
     manifest, data = tmp_path / "trials.csv", tmp_path / "data"
     manifest.write_text("trial,video\n" + "".join(f"{name},{name}\n" for name in ("cup", "jar")))
     for seed, name in enumerate(("cup", "jar")):
-        path = trial_path(tmp_path / name, name)
-        save_recording(make_recording(name, condition="dry", day=1, frames=8, seed=seed), path)
-        write_dataset_table(tmp_path / name, [trial_info(path, split="train")])
+        save_dataset(tmp_path / name, make_recording(name, frames=8, seed=seed))
     tries = []
 
     def import_but_one(capture: Capture, *given: Any, **named: Any) -> None:

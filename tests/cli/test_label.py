@@ -8,11 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import refused, run
+from data_sets import contents, save_dataset
+from there import there
 
 from sliplens.images import write_png
 from sliplens.parts import read_status
 from sliplens.recordings import ContactState, LabelSettings, Recording, load_dataset
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.edits import EDITS_FILE, edits_in_force, keep_edit, make_edit, read_edits
 from sliplens.recordings.importing import relabel_trial
 from sliplens.recordings.store import (
@@ -21,7 +23,6 @@ from sliplens.recordings.store import (
     load_recording,
     read_header,
     save_forces,
-    save_recording,
 )
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -35,10 +36,7 @@ def trial() -> Recording:
 @pytest.fixture(scope="module")
 def simulated(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulated")
-    path = trial_path(folder, trial.trial)
-    save_recording(trial, path)
-    write_dataset_table(folder, [trial_info(path, split="validation")], simulated=True)
-    return folder
+    return save_dataset(folder, trial, split="validation", simulated=True).folder
 
 
 @pytest.fixture(scope="module")
@@ -78,15 +76,11 @@ def test_what_is_said_on_the_command_line_counts_before_what_the_source_tells(tm
 
 def test_the_labels_of_a_simulated_trial_come_back_from_its_forces(trial: Recording, relabelled: Path):
     back = load_recording(trial_path(relabelled, trial.trial))
-    labelling = back.labelling
-    assert labelling is not None
-    assert labelling.basis is not None
-    assert trial.truth is not None
-    assert back.valid is not None
+    labelling = there(back.labelling)
     slip = int(np.argmax(trial.safety_margin == 0))
     # forces without noise: what is left is the time of a frame over which they are averaged
-    assert labelling.basis.friction.mu == pytest.approx(trial.truth.static_friction[slip], rel=0.02)
-    error = (back.safety_margin - trial.safety_margin)[back.valid]
+    assert there(labelling.basis).friction.mu == pytest.approx(there(trial.truth).static_friction[slip], rel=0.02)
+    error = (back.safety_margin - trial.safety_margin)[there(back.valid)]
     assert np.sqrt(np.mean(error**2)) < 0.02
     np.testing.assert_array_equal(back.reference, trial.reference)
     assert run("check", relabelled) == 0
@@ -126,26 +120,21 @@ def test_a_trial_of_the_default_simulation_is_labelled_though_its_frames_tell_no
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     trial = simulate_trial(plan_trials(PRESETS["small"])[0])
-    path = trial_path(tmp_path / "data", trial.trial)
-    save_recording(trial, path)
-    write_dataset_table(tmp_path / "data", [trial_info(path, split="train")], simulated=True)
+    save_dataset(tmp_path / "data", trial, simulated=True)
     assert run("label", tmp_path / "data", "-o", tmp_path / "out", "--no-audit") == 0
     assert "not told" in capsys.readouterr().out
     back = load_recording(trial_path(tmp_path / "out", trial.trial))
-    assert back.valid is not None
     # six frames a second: the slip is known to a sixth of a second, in which the margin changes by some 0.02
-    error = (back.safety_margin - trial.safety_margin)[back.valid]
+    error = (back.safety_margin - trial.safety_margin)[there(back.valid)]
     assert len(error) > 35
     assert np.sqrt(np.mean(error**2)) < 0.02
 
 
 def test_labels_made_anew_tell_how_the_reference_was_chosen(tmp_path: Path, trial: Recording, relabelled: Path):
     assert run("label", relabelled, "-o", tmp_path / "data", "--no-audit", "--reference-frame", 2) == 0
-    chosen = read_header(trial_path(tmp_path / "data", trial.trial)).labelling
+    chosen = there(read_header(trial_path(tmp_path / "data", trial.trial)).labelling)
     assert run("label", tmp_path / "data", "--no-audit", "--mu", 1.6) == 0
-    anew = read_header(trial_path(tmp_path / "data", trial.trial)).labelling
-    assert chosen is not None
-    assert anew is not None
+    anew = there(read_header(trial_path(tmp_path / "data", trial.trial)).labelling)
     assert (anew.reference.index, anew.reference) == (2, chosen.reference)
 
 
@@ -236,8 +225,7 @@ def test_real_clips_come_with_what_is_known_of_them_and_no_label(tmp_path: Path,
     for info in data.trials:
         back = data.load(info)
         assert back.labelling is not None
-        assert back.labelling.clip is not None
-        assert back.labelling.clip.slips
+        assert there(back.labelling.clip).slips
         assert not back.labelled.any()
         assert set(back.contact_state) == {ContactState.UNKNOWN}
         np.testing.assert_array_equal(back.reference, back.frames[back.labelling.reference.index])
@@ -256,9 +244,7 @@ def test_edits_give_the_labels_of_their_settings_and_undone_those_of_before(
     data, name = load_dataset(folder), trial.trial
     before = load_recording(trial_path(folder, name))
     assert before.labelling is not None
-    assert before.labelling.basis is not None
-    slip_s = before.labelling.basis.friction.onset_s
-    assert slip_s is not None
+    slip_s = there(there(before.labelling.basis).friction.onset_s)
     said = {"slip_s": slip_s - 0.5, "contact_s": 0.7, "reference_frame": 5, "tare": (0.01, 0.0, -0.02)}
     bad = (60, 79)
     settings = LabelSettings(**said, bad_frames=(bad,))
@@ -274,8 +260,7 @@ def test_edits_give_the_labels_of_their_settings_and_undone_those_of_before(
     assert edited.reason is not None
     assert {edited.reason[place] for place in range(bad[0], bad[1] + 1)} == {"marked by hand"}
     assert edited.labelling is not None
-    assert edited.labelling.basis is not None
-    assert edited.labelling.basis.friction.onset_s == pytest.approx(said["slip_s"])
+    assert there(edited.labelling.basis).friction.onset_s == pytest.approx(said["slip_s"])
     assert edited.labelling.edits == tuple(edits)
     assert {edited.reason[place] for place in np.flatnonzero(trial.time_s < 0.7)} == {"no contact"}
     assert run("check", folder) == 0
@@ -298,16 +283,14 @@ def test_what_cannot_be_labelled_is_listed_and_the_data_set_is_as_it_was(
     short = load_recording(trial_path(relabelled, name), truth=False)
     samples = load_forces(forces_path(relabelled, name))
     for other, force_n in (("cup", samples.force_n), ("jar", 0 * samples.force_n)):  # nothing touches it
-        save_recording(replace(short, trial=other), trial_path(data, other))
         save_forces(replace(samples, force_n=force_n), forces_path(data, other))
-    infos = [trial_info(trial_path(data, other), split="train") for other in ("cup", "jar")]
-    write_dataset_table(data, infos, simulated=True)
-    before = {path: path.read_bytes() for path in data.rglob("*") if path.is_file()}
+    save_dataset(data, replace(short, trial="cup"), replace(short, trial="jar"), simulated=True)
+    before = contents(data)
     assert run("label", data, "--mu", 1.6, "--no-audit") == 1
     told = capsys.readouterr().err
     assert "1 of 2 could not be done" in told
     assert told.count("jar: ") == 1
-    assert {path: path.read_bytes() for path in data.rglob("*") if path.is_file()} == before
+    assert contents(data) == before
     (status,) = read_status(data)
     assert status.done == 1
     assert [(one.name, len(one.why)) for one in status.failed] == [("jar", 1)]  # it cannot go better

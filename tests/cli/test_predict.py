@@ -53,7 +53,7 @@ def test_a_data_set_is_predicted(
 
 
 def test_a_video_alone_is_read_by_a_network_and_beside_a_frame_that_are_named(
-    small_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     trial = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=20))
     write_video(trial, tmp_path / "cup.mkv")

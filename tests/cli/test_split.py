@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from command_line import refused, run
+from data_sets import contents
 
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.splits import SPLITS_FILE
@@ -20,10 +21,6 @@ trial = "*-5"
 [[split]]
 name = "train"
 """
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 def cells(out: str) -> list[list[str]]:

@@ -13,8 +13,8 @@ STAGES = ("evaluate", "explain", "score", "remedies", "faithfulness", "randomisa
 
 
 @pytest.fixture(scope="module")
-def words(difference_run: Path, raw_run: Path, fine_dataset: Dataset) -> tuple[object, ...]:
-    networks = ("--difference", difference_run, "--raw", raw_run)
+def words(difference_run: Path, pair_run: Path, fine_dataset: Dataset) -> tuple[object, ...]:
+    networks = ("--network", difference_run, pair_run)
     quick = ("--method", "grad-cam", "occlusion", "--trials", 2, "--random-orders", 2)
     return ("study", fine_dataset.folder, *networks, *quick)
 
@@ -25,10 +25,10 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
     output = tmp_path / "study"
     assert run(*words, "-o", output, "--on", "serial") == 0
     folders = {path.name for path in output.iterdir() if path.is_dir() and not path.name.startswith(".")}
-    stages = {f"{stage}-{name}" for stage in STAGES for name in ("difference", "raw")}
+    stages = {f"{stage}-{name}" for stage in STAGES for name in ("difference", "pair")}
     assert folders >= {"choice", "states", *stages}
     assert (output / "report.html").is_file()
-    for name in ("difference", "raw"):
+    for name in ("difference", "pair"):
         told = json.loads((output / f"faithfulness-{name}" / "result.json").read_text())
         assert (told["frames"], told["trials"]) == (6, 2)
         new = {f"{method}-new-weights" for method in ("grad-cam", "occlusion", "weights-1")}
@@ -37,7 +37,7 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
         assert all((one["lead_over_controls"] is None) == one["control"] for one in told["scores"])
     # as after an interruption: one stage is missing, the others stay as they are; now in processes
     before = {path: path.stat().st_mtime_ns for path in output.glob("*/result.json")}
-    gone = output / "map-quality-raw"
+    gone = output / "map-quality-pair"
     kept = json.loads((gone / "result.json").read_text())
     for path in gone.iterdir():
         path.unlink()
@@ -59,18 +59,18 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
             assert methods[1][name][key] == (pytest.approx(figure, rel=1e-5) if isinstance(figure, float) else figure)
 
 
-def test_a_network_of_the_wrong_input_is_refused(
+def test_two_networks_of_one_input_are_refused(
     difference_run: Path, fine_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    line = refused(capsys, "study", fine_dataset.folder, "--raw", difference_run, "-o", tmp_path / "study")
-    assert "give one that was trained on raw" in line
+    networks = ("--network", difference_run, "chromatouch-difference")
+    line = refused(capsys, "study", fine_dataset.folder, *networks, "-o", tmp_path / "study")
+    assert "two networks read the input difference" in line
     assert not (tmp_path / "study").exists()
 
 
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (("--difference", "none", "--raw", "none"), "a study needs a network"),
         (("--method", "guess"), "no explainer named 'guess'"),
         (("--random-orders", 0), "at least 1"),
         (("--on", "cloud"), "no place to work named 'cloud'"),
@@ -97,7 +97,7 @@ def test_too_few_trials_are_told_before_a_network_is_loaded(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("sliplens.study.run.note", lambda _, words: told.append(words))
-    monkeypatch.setattr("sliplens.study.run.load_network", stop)
+    monkeypatch.setattr("sliplens.study.run.load_networks", stop)
     with pytest.raises(KeyboardInterrupt):
         run_study(fine_dataset, out=tmp_path / "study", trials=2)
     assert told == [

@@ -2,14 +2,13 @@ import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from data_sets import save_dataset
 
 from sliplens.cli.track import Track
 from sliplens.errors import ImageError, InputError
 from sliplens.images import write_png
 from sliplens.markers import track_markers
 from sliplens.markers.tracking import track
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.store import save_recording
 
 pytest.importorskip("cv2", reason="markers are found with OpenCV, of the extra `markers`")
 
@@ -68,9 +67,7 @@ def test_a_folder_of_parts_holds_the_same_rows_wherever_they_were_made(folder, t
 
 def test_a_data_set_gives_what_the_tracker_gives(trials, tmp_path):
     trial = trials["chromatouch"]
-    data = tmp_path / "data"
-    save_recording(trial, trial_path(data, trial.trial))
-    write_dataset_table(data, [trial_info(trial_path(data, trial.trial), split="test")], simulated=True)
+    data = save_dataset(tmp_path / "data", trial, split="test", simulated=True).folder
     output, clip = tmp_path / "tracks.parquet", tmp_path / "clip.mp4"
     Track(source=data, output=output, markers="chromatouch", video=clip).run()
     table = pq.read_table(output)

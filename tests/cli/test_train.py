@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from data_sets import save_dataset
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sliplens.cli import main
 from sliplens.models import load_checkpoint
 from sliplens.recordings import Dataset
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
+from sliplens.recordings.dataset import trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
 
 SMALL = ("--image-size", "32", "--epochs", "3", "--batch-size", "11", "--head", "point", "--untouched-share", "0")
@@ -184,7 +185,6 @@ def test_frames_of_two_sizes(small_dataset: Dataset, tmp_path: Path, capsys):
 
 
 def test_no_label(small_dataset: Dataset, tmp_path: Path, capsys):
-    from sliplens.recordings.store import save_recording  # noqa: PLC0415 (used here alone)
 
     (tmp_path / "data").mkdir()
     for info in small_dataset.trials:
@@ -216,14 +216,9 @@ def test_a_network_to_start_from_must_fit(finished: Path, small_dataset: Dataset
 def test_labels_that_are_all_the_same_are_refused(
     tmp_path: Path, small_dataset: Dataset, capsys: pytest.CaptureFixture[str]
 ):
-    table = []
-    for info in small_dataset.trials:
-        recording = small_dataset.load(info)
-        margin = np.where(recording.labelled, 1.0, np.nan)
-        path = trial_path(tmp_path / "data", info.trial)
-        save_recording(replace(recording, safety_margin=margin), path)
-        table.append(trial_info(path, split=info.split))
-    write_dataset_table(tmp_path / "data", table)
+    whole = [small_dataset.load(info) for info in small_dataset.trials]
+    stuck = [replace(one, safety_margin=np.where(one.labelled, 1.0, np.nan)) for one in whole]
+    save_dataset(tmp_path / "data", *stuck, split=[info.split for info in small_dataset.trials])
     line = refused(capsys, tmp_path / "data", tmp_path / "run")
     assert "all 44 labels that" in line
     assert "has to train on are 100 %, and of a constant there is nothing to learn" in line

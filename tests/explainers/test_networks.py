@@ -4,24 +4,15 @@ import copy
 
 import pytest
 import torch
+from quick import QUICK, SHORT
 
-from sliplens.explainers import EXPLAINERS, ExpectedGradients, IntegratedGradients, Occlusion, PolyCam, SmoothGrad
-from sliplens.explainers.shapley import Shapley
+from sliplens.explainers import EXPLAINERS, PolyCam
 
 pytestmark = pytest.mark.usefixtures("short_guess")
 every_network = pytest.mark.parametrize("name", ["shufflenet", "resnet", "mobilenet", "vgg"])
-SHORT = IntegratedGradients(steps=8, max_steps=40)
-MARKERS = torch.tensor([[10.0, 12.0], [40.0, 20.0], [25.0, 50.0]])
-# as in test_explainers.py, and one small layer for Poly-CAM; the thesis's level is one of ShuffleNetV2's layers
+# and one small layer for Poly-CAM; the thesis's level is one of ShuffleNetV2's layers
 CHEAP = {
-    **{name: explain for name, explain in EXPLAINERS.items() if name not in ("lrp", "poly-cam-thesis")},
-    "integrated-gradients": SHORT,
-    "expected-gradients": ExpectedGradients(integrated=SHORT),
-    "smooth-grad": SmoothGrad(samples=2),
-    "occlusion": Occlusion(tile_px=32),
-    "occlusion-marker": Occlusion(markers_px=MARKERS),
-    "shapley": Shapley(tile_px=32),
-    "shapley-marker": Shapley(markers_px=MARKERS, pairs=8),
+    name: explain for name, explain in (dict(EXPLAINERS) | QUICK).items() if name not in ("lrp", "poly-cam-thesis")
 }
 FIRST = {"shufflenet": "conv1", "resnet": "relu", "mobilenet": "features.0", "vgg": "features.1"}
 

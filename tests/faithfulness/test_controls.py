@@ -5,9 +5,9 @@ from known_ends import ends_of
 from torch import nn
 
 from sliplens.explainers import PolyCam
+from sliplens.explainers.explanation import change_of
 from sliplens.faithfulness.controls import (
     centre,
-    change,
     control_maps,
     edges,
     even_channels,
@@ -77,7 +77,7 @@ def test_the_change_is_the_mean_distance_from_the_untouched_sensor():
     images[0, :, 30, 30] += torch.tensor([0.3, -0.6, 0.0])
     expected = torch.zeros(1, 60, 60)
     expected[0, 30, 30] = 0.3
-    torch.testing.assert_close(change(images, REFERENCE), expected)
+    torch.testing.assert_close(change_of(images, REFERENCE), expected)
 
 
 def test_the_local_change_compares_a_marker_with_its_surroundings():

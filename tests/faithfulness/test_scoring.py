@@ -53,6 +53,16 @@ def test_the_gain_of_the_true_effects_is_their_ordered_sum(run):
     assert faithfulness.frame().num_rows == 3 * len(AREAS)
 
 
+def test_frames_with_next_to_nothing_to_explain_count_and_an_alarm_says_so(run):
+    # grey everywhere: 0.9 + 100 x (-0.005 x level / 255), which changes by 0.02 at a level of 10.2
+    dark, less_dark = (np.full((1, SIZE, SIZE, 3), level, dtype=np.uint8) for level in (10, 11))
+    frames = np.concatenate([dark, less_dark, dark])
+    faithfulness = sliplens.score(run, frames, EFFECTS, random_orders=1)
+    assert len(faithfulness.symmetric_gain) == 3
+    assert any(alarm.startswith("next to nothing to explain in 2 of 3 frames") for alarm in faithfulness.alarms)
+    assert not any("nothing to explain" in alarm for alarm in sliplens.score(run, less_dark, EFFECTS[:1]).alarms)
+
+
 def test_an_explanation_is_scored_by_what_works_towards_its_target(run):
     explanation = sliplens.explain(run, FRAMES, method="occlusion", tile_px=1)
     np.testing.assert_allclose(explanation.relevance, EFFECTS, atol=1e-6)

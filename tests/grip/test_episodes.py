@@ -12,7 +12,7 @@ import torch
 import sliplens as sl
 from sliplens.codec import load_result
 from sliplens.errors import InputError
-from sliplens.friction import Friction
+from sliplens.friction import GRASP_SPREAD, Friction, SlipLearner
 from sliplens.grip import (
     CONDITIONS,
     Fingertip,
@@ -272,7 +272,13 @@ def pulled(friction: float, ratio: float) -> Plant:
 @pytest.mark.parametrize(("scale", "read"), [(0.0, 0.24), (1.0, 0.18)])
 def test_a_friction_that_is_told_makes_the_margin_of_the_ratio(table, scale, read):
     known, options = [Friction(0.3), Friction(0.6), Friction.between(0.3, 0.9)], {"fingertips": np.arange(3.0)}
-    eyes = TableEyes(told_table(table), rng=np.random.default_rng(0), error_scale=scale, friction=known, **options)
+    eyes = TableEyes(
+        told_table(table),
+        rng=np.random.default_rng(0),
+        error_scale=scale,
+        learners=[SlipLearner(one) for one in known],
+        **options,
+    )
     sight = eyes.look(pulled(0.3, 0.24).state, np.full(3, np.nan))
     for row, friction in enumerate(known):
         values, weights = friction.nodes
@@ -288,7 +294,7 @@ def test_a_slip_narrows_what_was_told_of_friction(table):
         told_table(table),
         fingertips=np.zeros(3),
         rng=np.random.default_rng(0),
-        friction=[Friction.between(0.1, 0.9)] * 3,
+        learners=[SlipLearner(Friction.between(0.1, 0.9)) for _ in range(3)],
     )
     plant, none = pulled(0.3, 0.29), np.full(3, np.nan)
     before = eyes.look(plant.state, none)
@@ -301,7 +307,7 @@ def test_a_slip_narrows_what_was_told_of_friction(table):
 
 def test_friction_told_shapes_what_is_read_through_pixels(ratio_run: Path):
     network, known = sl.load(ratio_run), Friction(0.4)
-    eyes = RenderedEyes(network, seed=11, engine="eager", friction=known)
+    eyes = RenderedEyes(network, seed=11, engine="eager", learner=SlipLearner(known))
     plant = Plant(pick_object("cup"))
     plant.state = replace(plant.state, force_n=np.ones(1), shear_n=np.full((1, 2), 0.2))
     sight = eyes.look(plant.state, np.full(1, np.nan))
@@ -313,3 +319,62 @@ def test_friction_told_shapes_what_is_read_through_pixels(ratio_run: Path):
 def test_a_network_of_the_margin_alone_takes_no_friction():
     with pytest.raises(InputError, match="answers with the margin alone and cannot use it"):
         few("margin", network="thesis-raw", friction=0.6)
+
+
+def test_a_row_of_grasps_has_the_same_objects_at_a_friction_of_their_own():
+    grip = few("fixed", settings={"force_n": 3.0}, grasps=3, episodes=200)
+    first, second, third = (grip.episodes.where(grip.episodes.grasp == number) for number in (1, 2, 3))
+    for name, value in vars(
+        few("fixed", settings={"force_n": 3.0}, episodes=200).episodes.where(np.arange(200))
+    ).items():
+        np.testing.assert_array_equal(getattr(first, name), value)
+    for later in (second, third):
+        np.testing.assert_array_equal(later.mass_kg, first.mass_kg)
+        # a standard deviation of 200 normal numbers is off by 5 %
+        assert np.std(later.friction / first.friction) == pytest.approx(GRASP_SPREAD, rel=0.2)
+    assert np.isnan(grip.episodes.known_friction).all()
+
+
+def test_what_slips_taught_counts_in_the_grasps_that_follow_only_of_the_same_object():
+    kept = few("margin", "unknown", grasps=3, same_object=True, episodes=60).episodes
+    first, *later = (kept.where(kept.grasp == number) for number in (1, 2, 3))
+    assert np.isnan(first.known_friction).all()
+    learnt = np.isfinite(later[0].known_friction)
+    assert 0 < learnt.sum() < 60
+    assert np.isfinite(later[1].known_friction[learnt]).all()  # it is not forgotten
+    forgotten = few("margin", "unknown", grasps=2, episodes=60).episodes
+    assert np.isnan(forgotten.known_friction).all()
+    np.testing.assert_array_equal(forgotten.where(forgotten.grasp == 1).mean_force_n, first.mean_force_n)
+
+
+def test_frames_of_a_grip_are_read_in_order_through_pixels(network: Run):
+    eyes = [RenderedEyes(network, seed=11, engine="eager", sequence=way) for way in (False, True)]
+    followers, differ = [network.follow() for _ in range(2)], list[float]()
+    plant = Plant(pick_object("cup"))
+    for step in range(3):
+        state = replace(plant.state, time_s=0.1 * step, force_n=np.ones(1), shear_n=np.full((1, 2), 0.1 + 0.1 * step))
+        one, several = (eye.look(state, np.full(1, np.nan)) for eye in eyes)
+        assert one.frames is not None
+        assert several.frames is not None
+        np.testing.assert_array_equal(one.frames, several.frames)
+        inputs = [network.encode(f[None], r) for f, r in zip(one.frames, eyes[0].references, strict=True)]
+        for finger, follower in enumerate(followers):
+            estimate = follower.update(network.estimate(inputs[finger]), np.array([0.1 * step]), np.array([True]))
+            # both fingers go through the network together, which adds in another order
+            assert several.margin[0, finger] == pytest.approx(float(estimate.margin[0]), abs=1e-4)
+        differ.append(float(np.abs(one.margin - several.margin).max()))
+    assert max(differ) > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"grasps": 0}, "0 grasps of an object cannot be run"),
+        ({"sequence": True}, "looked up have no order"),
+        ({"sequence": True, "rendered": True, "friction": 0.6}, "leave out one of them"),
+        ({"same_object": True, "network": "thesis-raw"}, "answers with the margin alone"),
+    ],
+)
+def test_what_cannot_be_learnt_or_followed_is_refused(options: dict[str, Any], told: str):
+    with pytest.raises(InputError, match=told):
+        few("margin", **options)

@@ -3,6 +3,7 @@
 from itertools import combinations
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -49,6 +50,12 @@ def pulled_trial(
             *[FULL_SLIP] * slide,
         ),
     )
+
+
+def pictures(figure: Figure) -> tuple[list[Axes], list[Axes]]:
+    """Axes of the camera frames and of the differences, from left to right and top to bottom."""
+    shown = [ax for ax in figure.axes if ax.images]
+    return shown[::2], shown[1::2]
 
 
 def misplaced(figure: Figure) -> tuple[list[str], list[tuple[str, str]]]:

@@ -11,7 +11,7 @@ from sliplens.codec import save_record, save_result
 from sliplens.files import Machine, Provenance
 from sliplens.recordings import TrialInfo
 from sliplens.recordings.dataset import write_dataset_table
-from sliplens.results.evaluation import Evaluation, LearningCurve, Predictions, Reliability, Training
+from sliplens.results.evaluation import Evaluation, LearningCurve, Reliability, ScoredFrames, Training
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
 from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore
 from sliplens.training.metrics import find_lead_times, risk_coverage, score_predictions
@@ -88,7 +88,7 @@ def write_training(workspace: Path, name: str, *, size: int, rng: np.random.Gene
     return write_run(workspace / f"network-{name}", "train", config, result, minute=5)
 
 
-def made_up_evaluation(predictions: Predictions, *, name: str = "difference", sure: bool = False) -> Evaluation:
+def made_up_evaluation(predictions: ScoredFrames, *, name: str = "difference", sure: bool = False) -> Evaluation:
     """Scores of some predictions, reliability apart, which is made up too."""
     by_condition = {
         one: predictions.where(predictions.condition == one) for one in np.unique(predictions.condition).tolist()
@@ -130,7 +130,7 @@ def write_evaluation(
             condition += [surface] * 40
             labels.append(label)
             answers.append(label + noise + 0.05 * (1 - label))
-    predictions = Predictions(
+    predictions = ScoredFrames(
         trial=np.array(trial),
         condition=np.array(condition),
         day=np.full(len(trial), 4),

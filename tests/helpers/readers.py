@@ -4,6 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+import pytest
+
+from sliplens.errors import RecordingError
 from sliplens.recordings.formats import images, lerobot, rosbag, tables, thesis, video
 from sliplens.recordings.options import ReadOptions
 
@@ -20,3 +23,9 @@ read_lerobot = _by_keyword(lerobot.read_lerobot)
 read_rosbag = _by_keyword(rosbag.read_rosbag)
 read_thesis = _by_keyword(thesis.read_thesis)
 read_video = _by_keyword(video.read_video)
+
+
+def refused(read: Callable[..., object], path: Path, match: str, **options: object) -> None:
+    """Check that a reader refuses a recording in a sentence."""
+    with pytest.raises(RecordingError, match=match):
+        read(path, **options)

@@ -9,6 +9,7 @@ from torch import nn
 
 from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.models.calibration import Calibration, Traction
+from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import ContactState, Recording
 
 FRAME_SIZE = 48
@@ -61,7 +62,7 @@ def save_untrained(
     folder.mkdir(parents=True, exist_ok=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = build_model(head=head)
+        model = build_model(head=head, colours=ENCODINGS.pick(kind).colours)
     prepare(model)
     manifest = Manifest(
         backbone="shufflenet_v2_x1_0",

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -288,6 +288,68 @@ def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
     for reading, frame, friction in zip(readings, trial.frames[10:14], [told] * 3 + [learnt], strict=True):
         again = network.estimate(network.encode(frame[None], trial.reference), friction=friction)
         assert reading.margin == pytest.approx(float(again.margin[0]), abs=1e-4)
+
+
+class Grasps:
+    """Markers that tell a grasp, a slip in its fourth frame, and that it is let go in the last of each five."""
+
+    def __init__(self, _: np.ndarray) -> None:
+        self.count = 0
+
+    def update(self, _: np.ndarray, _time_s: float, /) -> MarkerReading:
+        place, self.count = self.count % 5, self.count + 1
+        if place == 4:
+            return MarkerReading(state=SlipState.CANNOT_TELL, contact=False)
+        return MarkerReading(state=SlipState.STICKING, contact=True, slipping_s=0.06 if place == 3 else None)
+
+
+@pytest.mark.parametrize("sequence", [False, True])
+@pytest.mark.parametrize("same_object", [False, True])
+def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another(
+    trials: dict[str, Recording], *, same_object: bool, sequence: bool
+):
+    trial = trials["chromatouch"]
+    images = np.tile(trial.frames[10:15], (3, 1, 1, 1))
+    source, friction, kept = Patient(images, list(range(15))), list[str | None](), list[bool]()
+    options = {"same_object": same_object, "sequence": sequence, "slip": Grasps, "health": None, "engine": "eager"}
+    reader = sl.LiveReader(source, "chromatouch-difference", reference=trial.reference, stall_s=10.0, **options)
+
+    def hear(reading: Reading, _: object) -> None:
+        friction.append(reading.friction)
+        kept.append(reading.sequence)
+        if reading.number == 9:
+            assert reader.learnt is not None
+            assert reader.lesson is not None
+            assert reader.learnt.text in reader.lesson
+            reader.new_object()
+            assert reader.lesson is None
+
+    reader.subscribe(hear)
+    source.all_readings(reader)
+    first, second, third = friction[:4], friction[5:9], friction[10:14]
+    assert set(first) == set(third) == {None}
+    assert all("learnt from slips" in str(one) for one in second) if same_object else set(second) == {None}
+    # in order where nothing is known
+    assert kept[:4] == kept[10:14] == [sequence] * 4
+    assert kept[5:9] == [sequence and not same_object] * 4
+
+
+def test_a_new_object_may_be_told_its_friction(ratio_run: Path, difference_run: Path):
+    with closing(plain_reader("simulated", ratio_run, friction="0.5..0.8")) as reader:
+        reader.new_object("0.58+-0.05")
+        reader.new_object()
+        with pytest.raises(InputError, match="'wood' is no friction"):
+            reader.new_object("wood")
+    alone = pytest.raises(InputError, match="answers with the margin alone")
+    with closing(plain_reader("simulated", difference_run)) as reader, alone:
+        reader.new_object(0.5)
+
+
+def test_only_a_network_that_tells_f_t_over_f_n_can_learn_friction(difference_run: Path):
+    with pytest.raises(InputError, match="--same-object learns of what a network reads"):
+        plain_reader("simulated", same_object=True)
+    with pytest.raises(InputError, match="--same-object learns friction from F_t / F_n"):
+        plain_reader("simulated", difference_run, same_object=True)
 
 
 def test_friction_needs_a_network_that_tells_f_t_over_f_n(difference_run: Path):

@@ -96,8 +96,7 @@ def test_a_recording_is_studied(fine_dataset: Dataset, difference_run: Path, tmp
     assert data is not None
     study = sl.run_study(
         data,
-        difference=difference_run,
-        raw=None,
+        difference_run,
         methods=["grad-cam"],
         trials=1,
         tests=("score",),

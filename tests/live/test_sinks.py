@@ -225,6 +225,7 @@ def test_a_sink_that_breaks_off_says_so_and_the_reading_goes_on(slow: Slow):
     with sl.LiveReader(source, reference=frames[0], health=None, slip=None) as reader:
         reader.send_to("slow")
         reader.senders[0].put(replace(READING, number=99), None)
+        assert slow.began.wait(10)  # else the readings that follow may push it out before it is sent
         numbers = [reading.number for reading in reader.readings()]
     assert numbers[-1] == 5
     assert slow.closed

@@ -55,7 +55,7 @@ def test_motion_that_goes_on_as_it_is_looks_alike_however_long_the_clip(strides,
     assert np.abs(whole).max() > 0.1
 
 
-def test_a_clip_in_which_nothing_moves_has_no_motion(rng):
+def test_a_clip_in_which_nothing_moves_has_no_motion():
     np.testing.assert_allclose(motion_features(make_clip(np.zeros((60, len(REST), 2)))), 0, atol=1e-6)
 
 

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional
 
 from sliplens.errors import ImageError, InputError
 from sliplens.models.encodings import ENCODINGS
@@ -32,6 +33,16 @@ def test_a_pair_is_the_frame_and_beside_it_the_untouched_sensor(frames: np.ndarr
     empty = ENCODINGS["pair"].empty(reference, image_size=16)
     assert torch.equal(empty[:3], empty[3:])
     assert torch.equal(seen[:, 3:], empty[3:].expand(3, -1, -1, -1))
+
+
+def test_frame_and_untouched_sensor_are_made_small_as_one_image_of_six_channels(rng: np.random.Generator):
+    *frames, reference = rng.integers(0, 256, (4, 30, 41, 3), dtype=np.uint8)
+    reference.flags.writeable = False  # as an image that Pillow holds; torch warns of such memory
+    six = np.stack([np.concatenate([frame, reference], axis=-1) for frame in frames])
+    whole = functional.interpolate(
+        torch.from_numpy(six).permute(0, 3, 1, 2), size=(17, 17), mode="bilinear", antialias=True
+    )
+    assert torch.equal(ENCODINGS["pair"].compare_small(np.stack(frames), reference, image_size=17), whole)
 
 
 def test_a_difference_forgets_its_amplitude(frames: np.ndarray):

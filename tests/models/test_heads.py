@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
+from there import there
 
 from sliplens.errors import ModelError
 from sliplens.models import build_model
@@ -37,8 +38,7 @@ def test_the_answer_is_the_mean_of_the_distribution_and_has_a_gradient():
     assert answer.shape == (2, 1)
     torch.testing.assert_close(answer[:, 0], model.probabilities(images) @ model.centres)
     answer.sum().backward()
-    assert images.grad is not None
-    assert float(images.grad.abs().max()) > 0
+    assert float(there(images.grad).abs().max()) > 0
 
 
 class Says(torch.nn.Module):
@@ -114,10 +114,8 @@ def test_an_estimate_tells_its_spread_and_its_interval():
     probabilities[0, [4, 5]] = 0.5
     calibration = Calibration(temperature=1.0, offsets={"0.9": 0.05}, frames=10, mse=0.01)
     estimate = Estimate(margin=np.array([0.5]), probabilities=probabilities, edges=edges, calibration=calibration)
-    assert estimate.sigma is not None
-    assert estimate.sigma[0] == pytest.approx(0.05)
-    interval = estimate.interval(0.9)
-    assert interval is not None
+    assert there(estimate.sigma)[0] == pytest.approx(0.05)
+    interval = there(estimate.interval(0.9))
     # 5 % of a distribution that is even from 0.4 to 0.6
     np.testing.assert_allclose([interval[0][0], interval[1][0]], [0.41 - 0.05, 0.59 + 0.05])
     with pytest.raises(ModelError, match=r"no interval of level 0\.75; choose 0\.9"):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from there import there
 from torch import nn
 
 from sliplens.models import build_model
@@ -30,8 +31,7 @@ def test_with_all_directions_the_distance_is_that_of_mahalanobis(rng: np.random.
     torch.manual_seed(0)
     model = torch.nn.Sequential(torch.nn.Conv2d(3, 3, 1, bias=False), torch.nn.AvgPool2d(8))
     images = torch.from_numpy(rng.normal(size=(300, 3, 16, 16)) + rng.normal(size=(300, 3, 1, 1))).float()
-    novelty = fit_novelty(model, [images[:200]], [images[200:]])
-    assert novelty is not None
+    novelty = there(fit_novelty(model, [images[:200]], [images[200:]]))
     features = read_features(model, novelty.layer, images)
     centred = features - features[:200].mean(axis=0)
     inverse = np.linalg.inv(np.cov(features[:200].T, bias=True))
@@ -51,8 +51,7 @@ def sure() -> tuple[nn.Module, Novelty]:
     images = torch.from_numpy(np.random.default_rng(0).uniform(0, 1, (160, 3, 32, 32))).float()
     torch.manual_seed(0)
     model = build_model("shufflenet_v2_x0_5", head="histogram").eval()
-    novelty = fit_novelty(model, images[:80].split(20), images[80:].split(20))
-    assert novelty is not None
+    novelty = there(fit_novelty(model, images[:80].split(20), images[80:].split(20)))
     return model, novelty
 
 
@@ -79,8 +78,7 @@ def test_frames_like_those_of_the_validation_are_known_evenly_and_others_less_th
 def test_an_answer_that_is_spread_wide_makes_a_frame_strange_by_itself(sure: tuple[nn.Module, Novelty]):
     model, novelty = sure
     features = read_features(model, novelty.layer, torch.rand(1, 3, 32, 32, generator=torch.Generator().manual_seed(1)))
-    assert novelty.spread_limit is not None
-    narrow, wide = (novelty.known(features, np.array([ratio * novelty.spread_limit]))[0] for ratio in (0.1, 3.0))
+    narrow, wide = (novelty.known(features, np.array([ratio * there(novelty.spread_limit)]))[0] for ratio in (0.1, 3.0))
     assert wide < 0.005 < narrow
 
 

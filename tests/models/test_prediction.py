@@ -12,6 +12,7 @@ import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from there import there
 
 import sliplens as sl
 from sliplens.errors import ImageError, InputError, RecordingError, ShardError
@@ -101,10 +102,8 @@ def test_how_sure_the_network_is_comes_from_its_distribution(
 ):
     rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
     estimate = trained.estimate(trained.encode(wet.frames, wet.reference))
-    interval = estimate.interval(0.9)
-    assert interval is not None
-    assert estimate.sigma is not None
-    for name, values in zip(("sigma", "low_90", "high_90"), (estimate.sigma, *interval), strict=True):
+    interval = there(estimate.interval(0.9))
+    for name, values in zip(("sigma", "low_90", "high_90"), (there(estimate.sigma), *interval), strict=True):
         np.testing.assert_allclose(rows[name][12:], values, atol=1e-5)  # as above
     assert np.all(np.array(rows["low_90"]) <= rows["high_90"])
 

@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from there import there
 
 import sliplens as sl
 from sliplens.errors import CheckpointError, InputError
@@ -56,9 +57,9 @@ def test_frames_one_by_one_are_read_as_all_at_once(run: Run):
 
 def test_an_answer_depends_on_the_frames_so_far_alone(run: Run):
     first, other = answers(12), answers(12, seed=1)
-    assert first.probabilities is not None
-    assert other.probabilities is not None
-    mixed = replace(first, probabilities=np.concatenate([first.probabilities[:7], other.probabilities[7:]]))
+    mixed = replace(
+        first, probabilities=np.concatenate([there(first.probabilities)[:7], there(other.probabilities)[7:]])
+    )
     assert np.array_equal(follow(run, first)[:7], follow(run, mixed)[:7])
     assert not np.isclose(follow(run, first)[7:], follow(run, mixed)[7:]).any()
 
@@ -118,8 +119,7 @@ def test_a_head_that_learnt_nothing_leaves_answers_as_they_are(run: Run):
 def test_the_gradient_of_a_fresh_head_points_from_the_answer_to_the_label():
     head = SequenceHead(EDGES, RATIO_EDGES, dropout=0.0)
     estimate = answers(8)
-    assert estimate.ratio is not None
-    margin, ratio = (torch.from_numpy(one.probabilities).float()[None] for one in (estimate, estimate.ratio))
+    margin, ratio = (torch.from_numpy(one.probabilities).float()[None] for one in (estimate, there(estimate.ratio)))
     label = torch.full((8,), 20)
     logits, _ = head(margin, ratio, torch.full((1, 8), 0.1))
     torch.nn.functional.cross_entropy(logits[0], label).backward()
@@ -151,9 +151,8 @@ def test_a_recording_is_read_as_the_follower_reads_it(run: Run, small_dataset: D
 
 def test_a_table_says_that_it_was_read_in_order(run: Run, small_dataset: Dataset):
     in_order, alone = (sl.predict(run, small_dataset, split="test", sequence=one) for one in (True, False))
-    assert run.manifest.sequence is not None
     metadata = in_order.frame().schema.metadata
-    assert metadata[b"sliplens.sequence"].decode() == run.manifest.sequence.weights_sha256
+    assert metadata[b"sliplens.sequence"].decode() == there(run.manifest.sequence).weights_sha256
     assert any("read in order" in sentence for sentence in in_order.notes)
     assert b"sliplens.sequence" not in alone.frame().schema.metadata
     assert not any("read in order" in sentence for sentence in alone.notes)
@@ -195,8 +194,7 @@ def test_what_cannot_be_followed_is_refused(run: Run, small_dataset: Dataset):
 def test_frames_that_come_too_seldom_are_refused(run: Run, small_dataset: Dataset):
     trials = small_dataset.select(split="test")
     [capture] = open_source(small_dataset, trial=trials[0].trial)
-    assert capture.time_s is not None
-    seldom = replace(capture, frame_time_s=30 * capture.time_s)  # one a second
+    seldom = replace(capture, frame_time_s=30 * there(capture.time_s))  # one a second
     with pytest.raises(InputError, match=r"has a frame each 1 s, .* without --sequence, or record 2 a second"):
         sl.predict(run, [seldom], sequence=True)
     assert len(sl.predict(run, [seldom])) == len(capture)

@@ -6,7 +6,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 import pytest
-from drawn import misplaced, pulled_trial
+from drawn import misplaced, pictures, pulled_trial
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
@@ -107,12 +107,6 @@ def told(figure: Figure) -> str:
 
 def charts(figure: Figure) -> list[Axes]:
     return [ax for ax in figure.axes if ax.get_ylabel()]
-
-
-def pictures(figure: Figure) -> tuple[list[Axes], list[Axes]]:
-    """Axes of the camera frames and of the differences, from left to right."""
-    shown = [ax for ax in figure.axes if ax.images]
-    return shown[::2], shown[1::2]
 
 
 def bands(ax: Axes) -> list[PolyCollection]:

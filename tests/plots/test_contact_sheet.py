@@ -5,11 +5,12 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 import pytest
-from drawn import misplaced, pulled_trial
+from drawn import misplaced, pictures, pulled_trial
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
+from there import there
 
 from sliplens.errors import InputError
 from sliplens.plots.contact_sheet import (
@@ -50,12 +51,6 @@ def texts(figure: Figure) -> list[str]:
     return [found.get_text().replace("\N{NO-BREAK SPACE}", " ") for found in figure.findobj(Text)]
 
 
-def pictures(figure: Figure) -> tuple[list[Axes], list[Axes]]:
-    """Axes of the camera frames and of the differences, from left to right and top to bottom."""
-    shown = [ax for ax in figure.axes if ax.images]
-    return shown[::2], shown[1::2]
-
-
 def factor_told(figure: Figure) -> float:
     """The one factor that the sheet tells; it must not tell two."""
     told = {found for text in texts(figure) for found in re.findall(r"\N{MULTIPLICATION SIGN} ([\d.]+)", text)}
@@ -69,17 +64,15 @@ def test_chosen_frames_are_the_nearest_to_the_margins(pull):
 
     for nominal, index in zip(NOMINAL_MARGINS, choose_margins(trial), strict=True):
         nearest = np.nanmin(np.abs(trial.safety_margin - nominal))
-        assert index is not None
         # frames within half a percentage point are told apart by their force alone
-        assert abs(trial.safety_margin[index] - nominal) <= nearest + 0.005
+        assert abs(trial.safety_margin[there(index)] - nominal) <= nearest + 0.005
 
 
 def test_full_stick_is_shown_where_the_sensor_is_pressed_hardest():
     trial = pulled_trial()
 
-    first = choose_margins(trial)[0]
+    first = there(choose_margins(trial)[0])
 
-    assert first is not None
     assert trial.contact_state[first] == CONTACT
     assert (
         trial.normal_force_n[first] == trial.normal_force_n[[state == CONTACT for state in trial.contact_state]].max()
@@ -89,9 +82,8 @@ def test_full_stick_is_shown_where_the_sensor_is_pressed_hardest():
 def test_full_slip_is_shown_rather_than_its_onset():
     trial = pulled_trial()
 
-    last = choose_margins(trial)[-1]
+    last = there(choose_margins(trial)[-1])
 
-    assert last is not None
     assert trial.contact_state[last] == FULL_SLIP
 
 
@@ -123,9 +115,8 @@ def test_no_frame_stands_in_two_columns():
 
 
 def test_untouched_frame_has_no_contact():
-    index = choose_untouched(pulled_trial())
+    index = there(choose_untouched(pulled_trial()))
 
-    assert index is not None
     assert pulled_trial().contact_state[index] == NO_CONTACT
 
 

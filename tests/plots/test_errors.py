@@ -15,7 +15,7 @@ from sliplens.plots.errors import (
     plot_margin_over_time,
     plot_predictions,
 )
-from sliplens.plots.style import BLUE, INPUT_COLOURS, ORANGE
+from sliplens.plots.style import BLUE, GREEN, INPUT_COLOURS, ORANGE
 from sliplens.report import Results, load_results
 
 
@@ -89,7 +89,7 @@ def test_bars_of_two_inputs_do_not_overlap(results, ax):
 
 
 def test_an_input_keeps_its_colour_in_every_figure(results):
-    assert INPUT_COLOURS == {"raw": ORANGE, "difference": BLUE}
+    assert INPUT_COLOURS == {"raw": ORANGE, "difference": BLUE, "pair": GREEN}
     bars = draw("bins", results, Figure().subplots())
     learning = draw("learning", results, Figure().subplots())
     time = draw("time", results, Figure().subplots())

@@ -8,7 +8,7 @@ from PIL import Image
 
 from sliplens.errors import InputError
 from sliplens.plots.errors import draw_evaluation
-from sliplens.results.evaluation import Baselines, BaselineScores, Evaluation, Predictions
+from sliplens.results.evaluation import Baselines, BaselineScores, Evaluation, ScoredFrames
 
 
 def evaluation(*, sure: bool = True) -> Evaluation:
@@ -20,7 +20,7 @@ def evaluation(*, sure: bool = True) -> Evaluation:
     condition = np.repeat(["dry", "dry", "wet"], 60)
     answers = np.tile(labels, 3) + bias + rng.normal(0, 0.04, 180)
     sigma = np.where(condition == "wet", 0.12, 0.05) * rng.uniform(0.7, 1.3, 180) if sure else np.full(180, np.nan)
-    predictions = Predictions(
+    predictions = ScoredFrames(
         trial=np.repeat(["a", "b", "c_$1"], 60),
         condition=condition,
         day=np.zeros(180, dtype=np.int64),

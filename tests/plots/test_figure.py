@@ -1,5 +1,6 @@
 """One figure of whatever result."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from sliplens.errors import InputError
 from sliplens.explainers import Explanation
 from sliplens.models.predictions import Predictions
 from sliplens.report import load_results
-from sliplens.results.evaluation import Predictions as EvaluatedPredictions
+from sliplens.results.evaluation import ScoredFrames
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +59,12 @@ def test_what_raises_is_blue_and_what_lowers_is_orange(explanation):
     assert "why 20" in ax.get_title(loc="left")
 
 
+def test_of_a_frame_beside_its_reference_the_frame_is_drawn(explanation):
+    beside = torch.cat([explanation.images, torch.zeros_like(explanation.images)], dim=1)
+    alone, both = (sl.plot(one, index=1).axes[0] for one in (explanation, replace(explanation, images=beside)))
+    np.testing.assert_array_equal(both.images[0].get_array(), alone.images[0].get_array())
+
+
 def test_axes_of_ones_own_are_drawn_on(results):
     figure = Figure()
     first, second = figure.subplots(1, 2)
@@ -78,7 +85,7 @@ def test_what_has_no_picture_is_told():
 
 
 def test_predictions_of_any_trial_are_drawn(results):
-    frames: EvaluatedPredictions = results.evaluations["raw"].predictions
+    frames: ScoredFrames = results.evaluations["raw"].predictions
     predictions = Predictions(frames=len(frames.trial), engine="eager", path=None, rows=frames.table())
 
     assert sl.plot(predictions, index=1).axes[0].get_title(loc="left") == "day4-dry-001"

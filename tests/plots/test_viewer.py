@@ -12,6 +12,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from data_sets import save_dataset
+from there import there
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.images import decode_png
@@ -22,7 +24,7 @@ from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.labels import LabelSettings
 from sliplens.recordings.source import open_source
-from sliplens.recordings.store import forces_path, read_header, save_recording
+from sliplens.recordings.store import forces_path, read_header
 from sliplens.recordings.trial import SIGNALS
 from sliplens.recordings.trial_writer import import_trial
 from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
@@ -79,15 +81,6 @@ def pictures(entities: dict[str, list[pa.RecordBatch]], entity: str) -> np.ndarr
     return np.stack([decode_png(bytes(blob), where=entity) for (blob,) in found.values])
 
 
-def stored(folder: Path, *recordings: Recording) -> Dataset:
-    table = []
-    for recording in recordings:
-        save_recording(recording, trial_path(folder, recording.trial))
-        table.append(trial_info(trial_path(folder, recording.trial), split="train"))
-    write_dataset_table(folder, table)
-    return load_dataset(folder)
-
-
 @pytest.fixture(scope="module")
 def trial() -> Recording:
     """A simulated trial with its truth."""
@@ -97,7 +90,7 @@ def trial() -> Recording:
 @pytest.fixture(scope="module")
 def written(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulated")
-    data = stored(folder / "data", trial)
+    data = save_dataset(folder / "data", trial)
     told = []
     write_rrd(
         view_stored(data, data.trials[0]),
@@ -144,19 +137,17 @@ def test_every_frame_has_its_time_and_its_number(trial: Recording, simulated: di
     }
     for entity, component in parts.items():
         found = rows(simulated, entity, component)
-        assert found.time_ns is not None
         # Rerun counts whole nanoseconds
-        np.testing.assert_allclose(found.time_ns / 1e9, trial.time_s, rtol=0, atol=0.6e-9)
+        np.testing.assert_allclose(there(found.time_ns) / 1e9, trial.time_s, rtol=0, atol=0.6e-9)
         np.testing.assert_array_equal(found.frame, np.arange(FRAMES))
 
 
 def test_labels_and_forces_are_those_of_the_recording(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
-    assert trial.truth is not None
     expected = {
         "force/normal": trial.normal_force_n,
         "force/tangential": trial.tangential_force_n,
         "force/limit": trial.friction_coefficient * trial.normal_force_n,
-        "ratio/static_friction": trial.truth.static_friction,
+        "ratio/static_friction": there(trial.truth).static_friction,
         "margin/gamma": 100 * trial.safety_margin,
         "margin/stick_ratio": 100 * trial.stick_ratio,
     }
@@ -172,17 +163,15 @@ def test_labels_and_forces_are_those_of_the_recording(trial: Recording, simulate
 
 def test_states_begin_where_they_change(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
     found = rows(simulated, "state/contact", "StateChange:state")
-    assert found.frame is not None
     states = [state for (state,) in found.values]
-    last = np.searchsorted(found.frame, np.arange(FRAMES), side="right") - 1
+    last = np.searchsorted(there(found.frame), np.arange(FRAMES), side="right") - 1
     assert [states[at] for at in last] == [str(state) for state in trial.contact_state]
     assert all(one != other for one, other in pairwise(states))
     assert "state/label" not in simulated
 
 
 def test_truth_lies_over_the_pixels_it_belongs_to(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
-    truth = trial.truth
-    assert truth is not None
+    truth = there(trial.truth)
     found = rows(simulated, "camera/zones", "SegmentationImage:buffer").values
     maps = np.stack([np.array(one, dtype=np.uint8).reshape(trial.reference.shape[:2]) for (one,) in found])
     np.testing.assert_array_equal(maps, truth.contact_map)
@@ -232,7 +221,7 @@ def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
         valid=valid,
         contact_state=states,
     )
-    data = stored(tmp_path / "data", bare)
+    data = save_dataset(tmp_path / "data", bare)
     write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
     np.testing.assert_array_equal(numbers(found, "margin/gamma"), 100 * margin)
@@ -244,8 +233,7 @@ def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
     np.testing.assert_array_equal(numbers(found, "ratio/friction"), trial.friction_coefficient)
     assert not {"ratio/static_friction", "camera/markers", "camera/zones", "sensor/force"} & set(found)
     label = rows(found, "state/label", "StateChange:state")
-    assert label.frame is not None
-    last = np.searchsorted(label.frame, np.arange(FRAMES), side="right") - 1
+    last = np.searchsorted(there(label.frame), np.arange(FRAMES), side="right") - 1
     np.testing.assert_array_equal([label.values[at] == ["valid"] for at in last], valid & np.isfinite(margin))
     np.testing.assert_array_equal(pictures(found, "camera/frame"), trial.frames)
 
@@ -259,7 +247,7 @@ def test_a_trial_where_nothing_is_known_can_be_looked_at(trial: Recording, tmp_p
         contact_state=(ContactState.UNKNOWN,) * FRAMES,
         **dict.fromkeys(SIGNALS[1:], nothing),
     )
-    data = stored(tmp_path / "data", bare)
+    data = save_dataset(tmp_path / "data", bare)
     write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
     assert np.isnan(numbers(found, "margin/gamma")).all()
@@ -267,7 +255,7 @@ def test_a_trial_where_nothing_is_known_can_be_looked_at(trial: Recording, tmp_p
 
 
 def test_what_networks_and_trackers_say_stands_on_the_clock_of_the_frames(trial: Recording, tmp_path: Path):
-    data, frames = stored(tmp_path / "data", trial), np.arange(0, FRAMES, 2)
+    data, frames = save_dataset(tmp_path / "data", trial), np.arange(0, FRAMES, 2)
     rng = np.random.default_rng(3)
     margin = rng.uniform(0, 1, len(frames))
     own = {"trial": [trial.trial] * len(frames), "frame": frames, "prediction": margin, "low_90": margin - 0.1}
@@ -298,15 +286,15 @@ def test_what_networks_and_trackers_say_stands_on_the_clock_of_the_frames(trial:
     assert [len(points) for points in moving][5] == 2
     np.testing.assert_allclose(moving[4], positions[4] + 0.5, atol=1e-3)
     shown = rows(found, "map/poly-cam", "EncodedImage:blob")
-    assert shown.frame is not None
-    assert [at for at, blob in zip(shown.frame.tolist(), shown.values, strict=True) if blob is not None] == [3, 4, 9]
+    drawn = zip(there(shown.frame).tolist(), shown.values, strict=True)
+    assert [at for at, blob in drawn if blob is not None] == [3, 4, 9]
     cleared = rows(found, "map/poly-cam", "Clear:is_recursive")
-    assert cleared.frame is not None
-    assert [at for at, one in zip(cleared.frame.tolist(), cleared.values, strict=True) if one is not None] == [5, 10]
+    undrawn = zip(there(cleared.frame).tolist(), cleared.values, strict=True)
+    assert [at for at, one in undrawn if one is not None] == [5, 10]
 
 
 def test_what_is_of_another_trial_is_refused(trial: Recording, tmp_path: Path):
-    data = stored(tmp_path / "data", trial)
+    data = save_dataset(tmp_path / "data", trial)
     nothing = {"trial": ["other"], "frame": [0], "prediction": [0.5], "low_90": [0.1], "high_90": [0.9]}
     pq.write_table(pa.table(nothing), tmp_path / "margins.parquet")
     for beside, words in (
@@ -393,12 +381,10 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
     labelling, found = read_header(path).labelling, read_rrd(tmp_path / "a.rrd")
     assert labelling is not None
     assert labelling.basis is not None
-    assert labelling.basis.lag is not None
     late = rows(found, "sensor/force", "Scalars:scalars")
     assert late.frame is None
-    assert late.time_ns is not None
-    shift = labelling.basis.lag.lag_s if applied else 0.0
-    np.testing.assert_allclose(late.time_ns / 1e9, time + shift, rtol=0, atol=0.6e-9)
+    shift = there(labelling.basis.lag).lag_s if applied else 0.0
+    np.testing.assert_allclose(there(late.time_ns) / 1e9, time + shift, rtol=0, atol=0.6e-9)
     np.testing.assert_array_equal(np.array(late.values), force)
     if applied:  # half a frame at 15 a second
         assert shift == pytest.approx(LAG_S, abs=1 / 30)
@@ -418,7 +404,7 @@ def test_another_suffix_is_refused(small_dataset: Dataset, tmp_path: Path, name:
 
 
 def test_a_damaged_trial_leaves_no_file(trial: Recording, tmp_path: Path):
-    data = stored(tmp_path / "data", trial)
+    data = save_dataset(tmp_path / "data", trial)
     path = trial_path(data.folder, trial.trial)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(RecordingError, match="is not a readable Parquet file"):
@@ -474,7 +460,7 @@ def test_an_open_viewer_is_given_what_a_file_is(
 
     monkeypatch.setattr(rerun.RecordingStream, "connect_grpc", connect)
     monkeypatch.setattr("sliplens.plots.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
-    data = stored(tmp_path / "data", trial)
+    data = save_dataset(tmp_path / "data", trial)
     open_viewer(view_stored(data, data.trials[0]))
     sent = read_rrd(tmp_path / "sent.rrd")
     assert set(sent) == set(simulated)
@@ -485,7 +471,7 @@ def test_no_viewer_opens_for_a_trial_that_is_not_there(
     monkeypatch: pytest.MonkeyPatch, trial: Recording, tmp_path: Path
 ):
     monkeypatch.setattr("sliplens.plots.viewer.start_viewer", lambda: pytest.fail("a viewer was started"))
-    data = stored(tmp_path / "data", trial)
+    data = save_dataset(tmp_path / "data", trial)
     trial_path(data.folder, trial.trial).unlink()
     with pytest.raises(RecordingError, match="does not exist; make the data set again"):
         open_viewer(view_stored(data, data.trials[0]))

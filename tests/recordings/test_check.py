@@ -7,23 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from data_sets import save_dataset
 
 from sliplens.cli import main
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.check import check_dataset
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.store import save_recording
+from sliplens.recordings.dataset import trial_path
 from sliplens.simulation import FLAT_GEL, SimulationRecipe, simulate_dataset
-
-
-def write(folder: Path, *recordings: Recording) -> Path:
-    table = []
-    for recording in recordings:
-        path = trial_path(folder, recording.trial)
-        save_recording(recording, path)
-        table.append(trial_info(path, split="train"))
-    write_dataset_table(folder, table)
-    return folder
 
 
 def whats(folder: Path) -> list[str]:
@@ -53,7 +43,7 @@ def test_a_changed_file_and_a_missing_one_are_found(tmp_path: Path, small_datase
 
 
 def test_a_trial_in_two_splits_is_found(tmp_path: Path, recording: Recording):
-    folder = write(tmp_path, recording)
+    folder = save_dataset(tmp_path, recording).folder
     table = json.loads((folder / "dataset.json").read_text())
     table["trials"].append({**table["trials"][0], "split": "test"})
     (folder / "dataset.json").write_text(json.dumps(table))
@@ -61,7 +51,7 @@ def test_a_trial_in_two_splits_is_found(tmp_path: Path, recording: Recording):
 
 
 def test_a_table_that_lies_is_found(tmp_path: Path, recording: Recording):
-    folder = write(tmp_path, recording)
+    folder = save_dataset(tmp_path, recording).folder
     table = json.loads((folder / "dataset.json").read_text())
     table["trials"][0] |= {"day": 7, "frames": 99}
     (folder / "dataset.json").write_text(json.dumps(table))
@@ -92,17 +82,17 @@ def changed(values: np.ndarray, at: int, value: float) -> np.ndarray:
     ],
 )
 def test_a_broken_law_is_found_at_its_frame(tmp_path: Path, recording: Recording, change, message: str):
-    assert whats(write(tmp_path / "good", recording)) == []
-    found = whats(write(tmp_path / "bad", replace(recording, **change(recording))))
+    assert whats(save_dataset(tmp_path / "good", recording).folder) == []
+    found = whats(save_dataset(tmp_path / "bad", replace(recording, **change(recording))).folder)
     assert len(found) == 1
     assert f"trial: {message}" in found[0]
 
 
 def test_the_command_lists_what_is_wrong(tmp_path: Path, recording: Recording, capsys: pytest.CaptureFixture[str]):
-    assert main(["check", str(write(tmp_path / "good", recording))]) == 0
+    assert main(["check", str(save_dataset(tmp_path / "good", recording).folder)]) == 0
     assert "is sound: 1 trial, 12 frames" in capsys.readouterr().out
     bad = replace(recording, safety_margin=changed(recording.safety_margin, 5, 0.123))
-    assert main(["check", str(write(tmp_path / "bad", bad))]) == 2
+    assert main(["check", str(save_dataset(tmp_path / "bad", bad).folder)]) == 2
     captured = capsys.readouterr()
     assert "frame 5" in captured.out
     assert "has 1 thing wrong, listed above; mend or make these trials again" in captured.err

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from data_sets import contents
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -428,8 +429,8 @@ def test_the_rules_are_kept_as_their_file_said_them(data: Dataset, tmp_path: Pat
 
 
 def test_a_dry_run_tells_the_splits_and_writes_nothing(data: Dataset):
-    before = {path: path.read_bytes() for path in data.folder.rglob("*") if path.is_file()}
+    before = contents(data.folder)
     result = split_dataset(data.folder, "thesis", dry_run=True)
-    assert {path: path.read_bytes() for path in data.folder.rglob("*") if path.is_file()} == before
+    assert contents(data.folder) == before
     assert result == split_dataset(data, "thesis")
     assert tuple(info.split for info in load_dataset(data.folder).trials) == result.splits

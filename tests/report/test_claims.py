@@ -154,7 +154,7 @@ def test_one_network_alone_is_judged_alone(judged):
     answers = judged(thesis(inputs=("raw",)))
 
     assert {subject for _, subject in answers} == {RAW, BOTH}
-    assert "those of one are there" in answers["difference", BOTH].text
+    assert "scored were raw images" in answers["difference", BOTH].text
 
 
 def test_every_interval_of_a_claim_is_told_with_its_setting(judged):

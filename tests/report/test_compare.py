@@ -3,14 +3,14 @@ import pytest
 from known_ends import ends_of
 
 from sliplens.report.comparisons import compare_deletion, compare_errors
-from sliplens.results.evaluation import Predictions
+from sliplens.results.evaluation import ScoredFrames
 from sliplens.results.faithfulness import DeletionCurve
 
 
-def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> Predictions:
+def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> ScoredFrames:
     trials, frames = error.shape
     rows = np.arange(error.size) if order is None else order
-    return Predictions(
+    return ScoredFrames(
         trial=np.repeat([f"t{index}" for index in range(trials)], frames)[rows],
         condition=np.full(error.size, "dry")[rows],
         day=np.zeros(error.size, dtype=np.int64),

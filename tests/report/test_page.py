@@ -10,6 +10,7 @@ import pytest
 from sliplens.errors import InputError
 from sliplens.plots.saliency import choose_columns
 from sliplens.report import load_results, write_report
+from sliplens.report.page import set_code
 from sliplens.results.explanation import ExplainedFrame
 
 HOSTILE = "<script>alert(1)</script>"
@@ -113,6 +114,10 @@ def test_warnings_and_alarms_are_shown(text):
     assert "On 3 frames the filled image is answered like the frame itself." in text
     assert "Integrated Gradients, real touch: completeness gap 1.8 % on 2 frames." in text
     assert "<li>Frames in which the fill decides, rather than the map: 1 (raw images 1)</li>" in text
+
+
+def test_what_stands_between_backticks_is_code_and_all_is_escaped():
+    assert set_code("run `a & b` < `c`") == "run <code>a &amp; b</code> &lt; <code>c</code>"
 
 
 def test_same_results_make_the_same_page(text, complete, tmp_path):

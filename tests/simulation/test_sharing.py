@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from data_sets import save_dataset
 
 from sliplens.cli import main
 from sliplens.files import output_folder
 from sliplens.recordings import Dataset, Recording, import_recordings, load_dataset
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.store import save_recording
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.simulation.sharing import compare_datasets
 
@@ -59,17 +58,10 @@ def test_simulated_trials_that_were_imported_are_told_by_what_they_show(data: Da
         assert shared.trials == tuple((trial.trial, trial.trial) for trial in data.trials)
 
 
-def recorded(folder: Path, *recordings: Recording) -> Dataset:
-    for recording in recordings:
-        save_recording(recording, trial_path(folder, recording.trial))
-    write_dataset_table(folder, [trial_info(trial_path(folder, one.trial), split="train") for one in recordings])
-    return load_dataset(folder)
-
-
 def test_recorded_data_are_told_by_files_and_names(recording: Recording, tmp_path: Path):
     one = replace(recording, sensor="tip", day=2)
     brighter = replace(one, trial="again", frames=np.clip(one.frames, 3, None))
-    first = recorded(tmp_path / "first", one)
+    first = save_dataset(tmp_path / "first", one)
     for other, trials, days, sensors in (
         (one, 1, 1, 1),
         (brighter, 0, 1, 1),
@@ -77,7 +69,7 @@ def test_recorded_data_are_told_by_files_and_names(recording: Recording, tmp_pat
         (replace(brighter, sensor="thumb"), 0, 0, 0),
         (replace(brighter, sensor=""), 0, 0, 0),
     ):
-        shared = compare_datasets(first, recorded(tmp_path / f"{other.trial}{other.sensor}{other.day}", other))
+        shared = compare_datasets(first, save_dataset(tmp_path / f"{other.trial}{other.sensor}{other.day}", other))
         assert not shared.by_seeds
         assert (len(shared.trials), len(shared.days), len(shared.sensors)) == (trials, days, sensors)
 

@@ -7,7 +7,7 @@ import pytest
 
 from sliplens.models import Run, load_checkpoint
 from sliplens.recordings import Dataset
-from sliplens.results.study import Choice, MarkedFrame
+from sliplens.results.study import Choice, MarkerPlaces
 from sliplens.study import explain_frames
 from sliplens.study.choice import Material, choose_frames, gather, study_explainers
 from sliplens.study.explaining import frames_at
@@ -37,6 +37,6 @@ def material(network: Run, fine_dataset: Dataset, choice: Choice) -> Material:
         explain_frames(network, chosen, methods=METHODS, explainers=explainers),
         fine_dataset,
         tuple(frame for frame in choice.frames if frame.scored),
-        markers={frame.id: MarkedFrame(rest_px=grid, now_px=grid) for frame in choice.frames},
+        markers={frame.id: MarkerPlaces(rest_px=grid, now_px=grid) for frame in choice.frames},
         explainers=explainers,
     )

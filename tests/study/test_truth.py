@@ -22,7 +22,7 @@ from sliplens.results.explanation import MethodNotes
 from sliplens.results.study import Study, Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
 from sliplens.simulation.intervention import draw_with_markers_back, marker_readings, visible_markers
-from sliplens.study import frames_from_dataset
+from sliplens.study import explain_frames, frames_from_dataset
 from sliplens.study.explaining import network_inputs
 from sliplens.study.pool import _with_truth as pooled_truth
 from sliplens.study.truth import (
@@ -81,11 +81,11 @@ def trained() -> Run:
     return run_of(Linear())
 
 
-def run_of(model: nn.Module) -> Run:
+def run_of(model: nn.Module, *, input: str = "amplitude") -> Run:
     manifest = Manifest(
         backbone="none",
         # the size of the difference to the untouched sensor, as it is
-        input="amplitude",
+        input=input,
         image_size=SIZE,
         frame_size=(224, 224),
         sensor="chromatouch",
@@ -191,6 +191,20 @@ def test_effects_are_what_putting_one_marker_back_changes(trained, explained, da
             assert (row["x_px"], row["y_px"]) == pytest.approx(((x + 0.5) / 2 - 0.5, (y + 0.5) / 2 - 0.5))
             assert row["state"] == frame.contact_map[round(y), round(x)]
         np.testing.assert_array_equal([row["margin"] for row in rows], marker_readings(frame.scene, frame.number)[1])
+
+
+def test_markers_of_the_frame_are_put_back_and_the_reference_beside_it_stays(data):
+    trained = run_of(nn.Sequential(nn.AdaptiveAvgPool3d(1), nn.Flatten()), input="pair")
+    explained = explain_frames(trained, frames_from_dataset(trained, data, levels=LEVELS[1:]), methods=())
+    (frame,) = frames = stage_frames(trained, explained, data)
+    empty = trained.encoding.empty(frame.reference, image_size=SIZE)
+    drawn = redrawing(trained, frames)(0, np.array([[False] * len(frame.markers), [True] * len(frame.markers)]))
+    assert torch.equal(drawn[:, 3:], empty[3:].expand(2, -1, -1, -1))
+    as_it_was, without = (one - empty for one in drawn)
+    # a grey level where it was resized elsewhere
+    torch.testing.assert_close(drawn[0], network_inputs(trained, explained)[0], atol=1.5 / 255, rtol=0)
+    markers = torch.from_numpy(find_places(frame, image_size=SIZE).markers)
+    assert without[:3, markers].abs().mean() < 0.5 * as_it_was[:3, markers].abs().mean()
 
 
 def test_maps_show_the_effects_on_the_markers(judged, explained):

@@ -16,7 +16,7 @@ from sliplens.markers import track_markers
 from sliplens.markers.estimators import ESTIMATORS, field_trial, get_estimator
 from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.recordings import Dataset
-from sliplens.results.evaluation import BaselinePredictions, Baselines, Predictions
+from sliplens.results.evaluation import BaselinePredictions, Baselines, ScoredFrames
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.training.evaluation import BaselinePlan, choose_training, evaluate_baselines, marker_kind
 
@@ -57,7 +57,7 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def labelled_frames(data: Dataset, *, split: str = "test") -> Predictions:
+def labelled_frames(data: Dataset, *, split: str = "test") -> ScoredFrames:
     """The frames of a split, as if a network had answered with nothing."""
     parts = []
     for info in data.select(split=split):
@@ -65,7 +65,7 @@ def labelled_frames(data: Dataset, *, split: str = "test") -> Predictions:
         rows = np.flatnonzero(recording.labelled)
         unknown = np.full(len(rows), np.nan)
         parts.append(
-            Predictions(
+            ScoredFrames(
                 trial=np.full(len(rows), info.trial),
                 condition=np.full(len(rows), info.condition),
                 day=np.full(len(rows), info.day),
@@ -78,8 +78,8 @@ def labelled_frames(data: Dataset, *, split: str = "test") -> Predictions:
                 high_90=unknown,
             )
         )
-    return Predictions(
-        **{item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(Predictions)}
+    return ScoredFrames(
+        **{item.name: np.concatenate([getattr(part, item.name) for part in parts]) for item in fields(ScoredFrames)}
     )
 
 

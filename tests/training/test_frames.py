@@ -3,11 +3,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from data_sets import save_dataset
 
 from sliplens.models.encodings import ENCODINGS
-from sliplens.recordings import Dataset, Recording, load_dataset
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.store import save_recording
+from sliplens.recordings import Dataset, Recording
 from sliplens.training.data import UNTOUCHED, load_frames
 
 
@@ -60,10 +59,7 @@ def test_the_untouched_sensor_is_added_as_full_stick_only_when_asked_for(small_d
 
 def test_frames_whose_label_cannot_be_trusted_are_left_out(tmp_path: Path, recording: Recording):
     doubted = replace(recording, valid=np.arange(12) < 7)
-    path = trial_path(tmp_path, "trial")
-    save_recording(doubted, path)
-    write_dataset_table(tmp_path, [trial_info(path, split="train")])
-    data = load_dataset(tmp_path)
+    data = save_dataset(tmp_path, doubted)
     frames = load_frames(data, data.trials, encoding=ENCODINGS.pick("difference"), image_size=32)
     # frame 0 has no contact, frames 7 to 11 are not trusted
     assert frames.frame == (1, 2, 3, 4, 5, 6)

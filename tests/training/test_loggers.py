@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 from lightning.pytorch.loggers import TensorBoardLogger
+from there import there
 
 from sliplens.errors import InputError
 from sliplens.training import TrainConfig
@@ -44,8 +45,7 @@ def test_wandb_stays_on_this_machine_unless_told_otherwise(tmp_path: Path, monke
     needs("wandb")
     monkeypatch.delenv("WANDB_MODE", raising=False)
     with open_logger("wandb", tmp_path, run_name="run", recipe=RECIPE) as logger:
-        assert logger is not None
-        logger.log_metrics({"validation_mse": 0.25}, step=1)
+        there(logger).log_metrics({"validation_mse": 0.25}, step=1)
     folders = [path.name for path in (tmp_path / "wandb").iterdir() if path.is_dir()]
     assert len([name for name in folders if name.startswith("offline-run-")]) == 1
     assert not [name for name in folders if name.startswith("run-")]
@@ -62,8 +62,7 @@ def test_mlflow_keeps_its_runs_in_the_folder(tmp_path: Path, monkeypatch: pytest
         logger.log_metrics({"validation_mse": 0.25}, step=1)
         logger.finalize("success")
     client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow' / 'mlflow.db'}")
-    experiment = client.get_experiment_by_name("sliplens")
-    assert experiment is not None
+    experiment = there(client.get_experiment_by_name("sliplens"))
     (run,) = client.search_runs([experiment.experiment_id])
     assert run.data.metrics == {"validation_mse": 0.25}
     assert run.data.params["learning_rate"] == json.dumps(RECIPE["learning_rate"])

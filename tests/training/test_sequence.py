@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from small import save_untrained
+from there import there
 
 from sliplens.errors import InputError, ModelError
 from sliplens.models import load_checkpoint
@@ -98,21 +99,19 @@ def test_a_trial_is_taught_and_read_up_to_its_first_gap(small_dataset: Dataset, 
     times = np.where(np.arange(12) < 7, 0.0, 30.0) + 0.1 * np.arange(12)
     monkeypatch.setattr(Dataset, "load", lambda *args, **named: replace(load(*args, **named), time_s=times))
     run = teach(small_dataset, start, epochs=20)
-    assert run.manifest.sequence is not None
-    assert run.training is not None
-    assert run.training.validation_frames == 2 * 6  # the first of 7 has no label
+    assert there(run.training).validation_frames == 2 * 6  # the first of 7 has no label
     in_order, alone = (
         evaluate(run, small_dataset, split="validation", sequence=one).predictions for one in (True, False)
     )
     before = in_order.frame < 7
     errors = in_order.prediction[before] - in_order.safety_margin[before]
     # the error that the manifest tells is that of the trials as they are read, but for single precision
-    assert np.mean(errors**2) == pytest.approx(run.manifest.sequence.calibration.mse, rel=1e-4)
+    assert np.mean(errors**2) == pytest.approx(there(run.manifest.sequence).calibration.mse, rel=1e-4)
     assert np.array_equal(in_order.prediction[~before], alone.prediction[~before])
     assert np.abs(in_order.prediction - alone.prediction)[before].min() > 1e-3
 
 
-def test_stamps_since_1970_are_told_apart(small_dataset: Dataset, start: Path, tmp_path: Path, monkeypatch):
+def test_stamps_since_1970_are_told_apart(small_dataset: Dataset, start: Path, monkeypatch):
     """Floats of 4 bytes know them to two minutes."""
     load = Dataset.load
     plain = teach(small_dataset, start, epochs=2)
@@ -123,9 +122,7 @@ def test_stamps_since_1970_are_told_apart(small_dataset: Dataset, start: Path, t
 
     monkeypatch.setattr(Dataset, "load", late)
     stamped = teach(small_dataset, start, epochs=2)
-    assert plain.training is not None
-    assert stamped.training is not None
-    assert stamped.training.validation_frames == plain.training.validation_frames
+    assert there(stamped.training).validation_frames == there(plain.training).validation_frames
 
 
 def test_what_diverges_ends_in_a_sentence(small_dataset: Dataset, start: Path):

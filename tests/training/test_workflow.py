@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from there import there
 
 import sliplens as sl
 from sliplens.errors import InputError
@@ -59,9 +60,7 @@ def test_what_was_written_comes_back_as_it_was_returned(small_dataset: Dataset, 
     run = sl.train(small_dataset.folder, tmp_path / "run", **SMALL)
     again = sl.load(tmp_path / "run")
     assert again.manifest == run.manifest
-    assert again.training is not None
-    assert run.training is not None
-    assert again.training.curve.table() == run.training.curve.table()
+    assert there(again.training).curve.table() == there(run.training).curve.table()
     first = sl.evaluate(tmp_path / "run", small_dataset.folder, tmp_path / "scores")
     kept = sl.evaluate(run, small_dataset, tmp_path / "scores")
     assert kept.conditions == first.conditions

@@ -71,6 +71,12 @@ class _Acts:
         """Take a new reference as soon as the picture is still."""
         self._feed.take_reference()
 
+    async def new_object(self) -> None:
+        """Drop what is known of the friction, and tell what was learnt."""
+        lesson = self._reader.lesson
+        self._reader.new_object()
+        ui.notify(lesson or "nothing is known of the friction of the new object", timeout=10_000)
+
     async def freeze(self) -> None:
         """Keep the picture, or let it run again."""
         if self.viewer.frozen is None:
@@ -143,6 +149,9 @@ def build_live(page: "LivePage") -> None:
             ui.button("Reference (R)", on_click=_told(acts.take_reference)).tooltip(
                 "take a new image of the untouched sensor, as soon as the picture is still"
             )
+            ui.button("New object (N)", on_click=_told(acts.new_object)).tooltip(
+                "another one is held from now on, or this one was wetted: what is known of its friction is dropped"
+            )
             ui.button(on_click=_told(acts.freeze)).bind_text_from(acts, "freeze_words").tooltip(
                 "keep this picture; the margin runs on"
             )
@@ -150,7 +159,9 @@ def build_live(page: "LivePage") -> None:
                 reader, "recorder", lambda recorder: "Record (C)" if recorder is None else "Stop recording (C)"
             ).tooltip(f"every frame into {page.record_into}")
         _build_overlays(acts, network=reader.network is not None)
-    by_key = {"r": acts.take_reference, "f": acts.freeze, "e": acts.explain, "c": acts.record}
+    by_key = {
+        "r": acts.take_reference, "n": acts.new_object, "f": acts.freeze, "e": acts.explain, "c": acts.record
+    }  # fmt: skip
 
     async def press_key(event: KeyEventArguments) -> None:
         modifiers = event.modifiers

@@ -23,8 +23,13 @@ Output = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
 SOURCE_HELP = "Data set, folder of images, video, ROS 2 bag, or whatever `sliplens import` reads."
 Source = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE", help=SOURCE_HELP)]
 TableFile = Annotated[Path, tyro.conf.arg(aliases=("-o",), metavar="FILE.parquet", help="File to write.")]
-_FRICTION = "Coefficient of friction of the object, where it is known: 0.62, or a range such as 0.5..0.8."
-Friction = Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH", help=_FRICTION)]
+_FRICTION = (
+    "Coefficient of friction of the object, where it is known: 0.62, a range such as 0.5..0.8, or mean and spread such "
+    "as 0.58+-0.05."
+)
+Friction = Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH|MU+-SD", help=_FRICTION)]
+_SAME_OBJECT = "Every grasp is of one object: what a slip taught of its friction counts in the grasps that follow."
+SameObject = Annotated[bool, tyro.conf.arg(help=_SAME_OBJECT)]
 _SEQUENCE = "Read frames in order: what those before tell counts too; for a network of the recipe sequence."
 InOrder = Annotated[bool, tyro.conf.arg(help=_SEQUENCE)]
 On = Annotated[str, tyro.conf.arg(metavar="serial|processes[=N]|ray[=ADDRESS]", help="Where the work is done.")]

@@ -16,7 +16,8 @@ class Explain(Command):
     """Show which parts of a frame made the network answer as it did, rather than as for the untouched sensor.
 
     Explains frames of a data set along the safety margin, or a folder of images (`--frames`). The folder holds the maps
-    without loss (arrays.npz), an overlay of each (overlays/METHOD/FRAME.png) and all of them side by side (panel.png).
+    without loss (arrays.npz), an overlay of each (overlays/METHOD/FRAME.png) and up to twelve frames side by side
+    (panel.png).
     """
 
     model: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN")] = None

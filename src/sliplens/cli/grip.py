@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sliplens.cli.command import Command, Output
+from sliplens.cli.command import Command, InOrder, Output, SameObject
 from sliplens.cli.console import print_table
 from sliplens.errors import InputError
 
@@ -39,8 +39,12 @@ class Grip(Command):
     """Mass of the object in kilograms; drawn if not given."""
     friction: float | None = None
     """Coefficient of friction at the beginning; drawn if not given."""
-    told_friction: Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH|each")] = None
+    told_friction: Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH|MU+-SD|each")] = None
     """What a network that tells F_t / F_n is told of it: 0.62, 0.3..0.9, or each for that of each episode."""
+    grasps: int = 1
+    """How many times each object is gripped, one grasp after another."""
+    same_object: SameObject = False
+    sequence: InOrder = False
     pull: float | None = None
     """Pull on the object in newtons, for 1.5 s; drawn if not given."""
     wet_patch: float | None = None
@@ -89,6 +93,19 @@ class Grip(Command):
             ("time with a margin under 20 %", f"{table.under_20_s.mean():.2f} s"),
         ]
         print_table(f"{self.controller} on a {self.object}, {self.condition}", ("", ""), rows)
+        if self.grasps > 1:
+            by_grasp = [table.where(table.grasp == one) for one in range(1, self.grasps + 1)]
+            rows = [
+                (
+                    f"{number}",
+                    f"{int(one.dropped.sum())} of {len(one)}",
+                    f"{100 * one.force_excess.mean():.0f} %",
+                    f"{int((one.known_friction > 0).sum())} of {len(one)}",
+                )
+                for number, one in enumerate(by_grasp, start=1)
+            ]
+            columns = ("grasp", "dropped", "over the least that holds", "friction known")
+            print_table("Grasp after grasp", columns, rows)
         Report(workspace=self.output).run()
 
 

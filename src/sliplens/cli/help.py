@@ -36,7 +36,7 @@ EXAMPLES = {
     "explain": "sliplens explain runs/mine/train --frames frames --reference untouched.png -o runs/mine/explain",
     "score": "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score",
     "diagnose": "sliplens diagnose runs/mine/train runs/mine/data -o runs/mine/why",
-    "study": "sliplens study runs/mine/data --difference runs/mine/train --raw none -o runs/mine/study",
+    "study": "sliplens study runs/mine/data --network runs/mine/train -o runs/mine/study",
     "status": "sliplens status runs/mine/margins",
     "grip": "sliplens grip -o runs/grip --object egg",
     "hold": "sliplens hold grip:cup --gripper simulated",

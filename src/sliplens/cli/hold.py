@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import msgspec
 import tyro
 
-from sliplens.cli.command import Command, Device, Friction, InOrder
+from sliplens.cli.command import Command, Device, Friction, InOrder, SameObject
 from sliplens.cli.console import say, wrote
 from sliplens.cli.grip import constant
 from sliplens.errors import InputError, SliplensError
@@ -52,6 +52,7 @@ class Hold(Command):
     reference: tuple[Path, ...] = ()
     """Image of each untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None
+    same_object: SameObject = False
     sequence: InOrder = False
     sensor: str | None = None
     """Profile of the sensors, a file or a name such as digit."""
@@ -80,9 +81,10 @@ class Hold(Command):
             if gripper not in GRIPPERS:
                 opened = open_gripper(gripper, messages=self.messages, joint=self.joint)
                 gripper = stack.enter_context(closing(opened))
+            readers = [stack.enter_context(reader) for reader in self._readers()]
             hold = self.call(
                 hold_grip,
-                source=[stack.enter_context(reader) for reader in self._readers()],
+                source=readers,
                 gripper=gripper,
                 network=None,
                 settings=settings,
@@ -92,6 +94,9 @@ class Hold(Command):
                 on_step=_Steps(json=self.json),
             )
         say(hold.why, aside=True)
+        for source, reader in zip(self.sources, readers, strict=True):
+            if reader.lesson is not None:
+                say(f"{source}: {reader.lesson}" if len(readers) > 1 else reader.lesson, aside=True)
         if self.output is not None:
             wrote(self.output, number_of(len(hold.steps), "command"))
         if hold.ended == "failed":
@@ -107,7 +112,9 @@ class Hold(Command):
             raise InputError(f"--reference takes an image a source, {len(self.sources)}, got {len(self.reference)}")
         shipped = all(source.partition(":")[0] in {"grip", "simulated"} for source in self.sources)
         name = self.network or ("chromatouch-difference" if shipped else None)
-        common = {name: getattr(self, name) for name in ("friction", "sequence", "sensor", "engine", "device")}
+        common = {
+            name: getattr(self, name) for name in ("friction", "same_object", "sequence", "sensor", "engine", "device")
+        }
         common["network"] = None if name is None else load(name, device=self.device)
         return [
             LiveReader(

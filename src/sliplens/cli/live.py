@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sliplens.cli.command import Device, Friction, InOrder
+from sliplens.cli.command import Device, Friction, InOrder, SameObject
 from sliplens.cli.console import print_table, say
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ class Live:
     reference: Path | None = None
     """Image of the untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None
+    same_object: SameObject = False
     sequence: InOrder = False
     list: bool = False
     """List the cameras with their formats, sizes and rates, and what else can be read, and end."""
@@ -92,7 +93,7 @@ class Live:
         shipped = "chromatouch-difference" if grips or self.source in {"simulated", "simulated:chromatouch"} else None
         wishes = {name: getattr(self, name) for name in ("speed", "trial", "pixel_format")}
         options = SourceOptions(rate_hz=self.rate, size=parse_size(self.size), **wishes)
-        names = ("reference", "engine", "device", "seconds", "forces", "friction", "sequence")
+        names = ("reference", "engine", "device", "seconds", "forces", "friction", "same_object", "sequence")
         named = {name: getattr(self, name) for name in names} | {"smoothing_s": self.smoothing, "options": options}
         profile = named["sensor"] = load_profile(self.sensor) if is_profile(self.sensor) else None
         named |= {"source": open_grip(self.source, options), "options": None} if grips else {"source": self.source}
@@ -107,6 +108,7 @@ class Live:
             if self.record is not None:
                 reader.record(self.record, facts=facts)
             stack.callback(lambda: [say(str(state), aside=True) for state in reader.outputs])
+            stack.callback(lambda: reader.lesson and say(reader.lesson, aside=True))
             with suppress(KeyboardInterrupt), reader, self._shown(reader, facts):  # the way to end it
                 self._watch(reader)
 

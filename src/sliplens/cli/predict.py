@@ -1,7 +1,7 @@
 """`sliplens predict`."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -83,6 +83,7 @@ class Predict(SourceCommand):
         run, source = (self.source, None) if self.model is None else (self.model, self.source)
         named = {"run": run, "source": source, "options": self.options, "onnx_file": self.onnx, "out": self.output}
         predictions = self.call(predict, **named)
+        predictions = replace(predictions, rows=predictions.frame())  # a file is read back once
         _show(predictions)
         if strange := predictions.strange:
             say(f"strange to the network (known below 1 %), not to be relied on: {number_of(strange, 'frame')}")

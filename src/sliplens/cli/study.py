@@ -15,7 +15,6 @@ from sliplens.extras import require_device
 
 _PRESET_FRAMES = 80
 """Frames of each simulated trial; the thesis has about 800, which takes ten times as long and says the same."""
-_NONE = "none"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,11 +30,9 @@ class Study(Command):
     """Data set with labels; leave out with --preset."""
     output: Output
     """Folder to make, one subfolder a stage; the page is report.html in it."""
-    difference: str | None = None
-    """Network on difference images: a folder, or a name of one that comes with sliplens; none to leave it out. If not
-    given, chromatouch-difference, or with --preset thesis-difference."""
-    raw: str | None = None
-    """Network on raw images: a folder, a name, or none. If not given, none, or with --preset thesis-raw."""
+    network: tuple[str, ...] | None = None
+    """Networks to explain, folders or names of those that come with sliplens, one an input. If not given,
+    chromatouch-difference, or with --preset thesis-difference and thesis-raw."""
     preset: Literal["thesis"] | None = None
     """Simulate the data set first: the days and trials of the thesis, 80 frames each, some 1.5 GB; and explain networks
     that were trained on its training trials with the recipe of the thesis."""
@@ -64,23 +61,20 @@ class Study(Command):
     def run(self) -> None:
         """Run every stage that is not there yet, and draw the report."""
         from sliplens.study.choice import STUDY_METHODS, study_explainers
-        from sliplens.study.run import load_network, run_study
+        from sliplens.study.run import load_networks, run_study
 
         if (self.data is None) == (self.preset is None):
             raise InputError("name a data set, or --preset thesis to simulate one")
         require_device(self.device)
-        own = ("thesis-difference", "thesis-raw") if self.preset else ("chromatouch-difference", _NONE)
-        asked = {"difference": self.difference or own[0], "raw": self.raw or own[1]}
-        given = {name: run for name, run in asked.items() if run != _NONE}
+        own = ("thesis-difference", "thesis-raw") if self.preset else ("chromatouch-difference",)
         # a mistake is told before a data set is simulated
-        networks = {name: load_network(run, name, device=self.device) for name, run in given.items()}
+        networks = load_networks(self.network or own, device=self.device)
         study_explainers(methods := self.method or STUDY_METHODS, budget=self.budget)
         data = self.data or self._simulate()
         self.call(
             run_study,
             data=data,
-            difference=networks.get("difference"),
-            raw=networks.get("raw"),
+            networks=tuple(networks.values()),
             out=self.output,
             methods=methods,
             on=self.on or ("serial" if self.device != "cpu" else "processes=2"),

@@ -13,7 +13,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from sliplens.errors import ImageError, InputError, ModelError
-from sliplens.explainers.explanation import Explanation, check_maps
+from sliplens.explainers.explanation import Explanation, check_maps, frame_of
 from sliplens.models.engines import Engine, prepare
 from sliplens.progress import OnProgress, counted
 
@@ -203,7 +203,7 @@ def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
 def black_frames(images: Float[Tensor, "*batch colours height width"]) -> Float[Tensor, "*batch colours height width"]:
     """Images whose frame is black; the reference beside it, where the network sees one, stays."""
     black = images.clone()
-    black[..., :3, :, :] = 0
+    frame_of(black).zero_()
     return black
 
 

@@ -112,11 +112,30 @@ def scale_to(
     return saliencies * factor[:, None, None]
 
 
+def frame_of(images: Float[Tensor, "*batch colours height width"]) -> Float[Tensor, "*batch 3 height width"]:
+    """Frame of each input, which is what is explained: without the reference that some networks see beside it."""
+    return images[..., :3, :, :]
+
+
+def with_reference_of(
+    images: Float[Tensor, "batch _ height width"], image: Float[Tensor, "colours height width"]
+) -> Float[Tensor, "batch colours height width"]:
+    """Frames of some inputs beside the reference of another; the inputs themselves where none is seen beside them."""
+    return torch.cat([frame_of(images), image[3:].expand(len(images), -1, -1, -1)], dim=1)
+
+
+def change_of(
+    images: Float[Tensor, "*batch colours height width"], references: Float[Tensor, "*batch colours height width"]
+) -> Float[Tensor, "*batch height width"]:
+    """Mean of |x - b| over the colours of the frame."""
+    return frame_of(images - references).abs().mean(dim=-3)
+
+
 def local_change(
     image: Float[Tensor, "colours height width"], reference: Float[Tensor, "colours height width"], *, widths: int = 1
 ) -> Float[Tensor, "height width"]:
-    """Mean of |x - b| over the colours and a square of some `CHANGE_WINDOW` around each pixel, the border repeated."""
-    change = (image - reference).abs().mean(dim=0)
+    """Mean of `change_of` over a square of some `CHANGE_WINDOW` around each pixel, the border repeated."""
+    change = change_of(image, reference)
     reach = round(widths * CHANGE_WINDOW * change.shape[0]) // 2
     padded = functional.pad(change[None, None], [reach] * 4, mode="replicate")
     return functional.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
@@ -194,6 +213,11 @@ class Explanation:
     """What ran the network: as it is (`eager`), or a faster engine of `models.engines` that answers as it does."""
     raises_only: bool = False
     """Whether the method tells only what raises the prediction, as a published map with a ReLU does of f itself."""
+
+    @property
+    def frames(self) -> Float[Tensor, "batch 3 height width"]:
+        """What of the images is explained: the frames, without the reference that some networks see beside them."""
+        return frame_of(self.images)
 
     @property
     def change(self) -> Float[Tensor, " batch"]:

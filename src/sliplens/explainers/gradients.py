@@ -11,7 +11,7 @@ from torch import Tensor, fx, nn
 
 from sliplens.errors import InputError
 from sliplens.explainers.contract import Comparison, Method, black_frames, freeze, require_at_least_one
-from sliplens.explainers.explanation import Explanation, check_slopes
+from sliplens.explainers.explanation import Explanation, check_slopes, frame_of, with_reference_of
 from sliplens.extras import require_packages
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.engines import fold_batch_norm
@@ -176,23 +176,28 @@ class ExpectedGradients(Method):
 
     background: Float[Tensor, "frames colours height width"] | None = None
     """Frames without slip as the network takes them, float in [0, 1], shape (frames, 3, height, width); the call's
-    reference is then not used. Without one the call's reference is the whole background, and a warning says so."""
+    reference is then not used, but that beside each image stays where the network sees one. Without a background the
+    call's reference is the whole of it, and a warning says so."""
     integrated: IntegratedGradients = field(default_factory=IntegratedGradients)
     """How each line is integrated."""
 
     def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
-        if self.background is None:
-            frames, heights = comparison.reference[:, None], comparison.reference_prediction[:, None]
-        else:
-            # checked as images are, and brought to the network's type
-            with freeze(comparison.model, self.background, reference=None) as behind:
-                heights = behind.prediction.expand(len(comparison.images), -1)
-                frames = behind.images.expand(len(comparison.images), -1, -1, -1, -1)
-        comparison = comparison.knowing(comparison.prediction, heights.mean(dim=1))
+        def behind(index: int) -> Comparison:
+            """What an image is compared with, checked as images are, and brought to the network's type."""
+            image = comparison.images[index]
+            if self.background is None:
+                own = comparison.reference_prediction[index, None]
+                return replace(comparison, images=comparison.reference[index, None]).knowing(own, own)
+            with freeze(comparison.model, self.background, reference=None) as background:
+                return replace(background, images=with_reference_of(background.images, image))
+
+        predictions = comparison.prediction  # whose faults are told first
+        heights = torch.stack([behind(index).prediction for index in range(len(predictions))])
+        comparison = comparison.knowing(predictions, heights.mean(dim=1))
 
         def mean_over(index: int) -> Tensor:
             image, prediction = comparison.images[index], comparison.prediction[index]
-            pairs = zip(frames[index], heights[index], strict=True)
+            pairs = zip(behind(index).images, heights[index], strict=True)
             lines = [self.integrated.integrate(comparison, image, frame, prediction, height) for frame, height in pairs]
             return torch.stack([relevance for relevance, _ in lines]).mean(dim=0)
 
@@ -232,22 +237,22 @@ class SmoothGrad(Method):
 
     def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
         change = comparison.change.tolist()
-        tunnel = attr.NoiseTunnel(attr.Saliency(comparison.predict))
 
         def smoothed(index: int) -> Tensor:
-            image, empty = comparison.images[index, None], comparison.reference[index, None]
+            image, frame = comparison.images[index], frame_of(comparison.images[index, None])
+            tunnel = attr.NoiseTunnel(attr.Saliency(lambda noisy: comparison.predict(with_reference_of(noisy, image))))
             # Captum draws from the global state, which is given back as it was
             with torch.random.fork_rng(devices=[image.device] if image.is_cuda else []):
                 torch.manual_seed(self.seed)
                 gradient: Any = tunnel.attribute(
-                    image,
+                    frame,
                     nt_type="smoothgrad",
                     nt_samples=self.samples,
                     nt_samples_batch_size=min(self.batch_size, self.samples),
                     stdevs=float(self.noise),
                     abs=False,
                 )
-            return (gradient.detach() * (image - empty)).sum(dim=1)[0]
+            return (gradient.detach() * (frame - frame_of(comparison.reference[index]))).sum(dim=1)[0]
 
         relevance = comparison.map_each(smoothed, on_progress=on_progress)
         return comparison.explanation(
@@ -269,7 +274,8 @@ class Lrp(Method):
     The prediction is handed back from layer to layer, each giving its inputs their share of its output. A histogram
     has no share of its own: its mean is handed to the logits as gradient times logit. Biases keep their share, and
     the prediction itself is handed back, not its difference from the reference, so there is no completeness gap, and
-    the reference only decides what `saliency` shows.
+    the reference only decides what `saliency` shows. Where the network sees the reference beside the frame, the map is
+    what the frame gets back.
 
     Works on a copy whose batch normalisation is folded into the convolutions, and whose means over space and sums of
     branches, functions in TorchVision's networks, are made modules: zennit knows rules for modules only.
@@ -294,10 +300,10 @@ class Lrp(Method):
             parts.append(_propagate(copy, part))
             if on_progress is not None:
                 on_progress(sum(map(len, parts)), len(comparison.images))
-        relevance = torch.cat(parts)
-        shares = (relevance.sum(dim=(1, 2)) / prediction).tolist()
+        handed_back = torch.cat(parts)
+        shares = (handed_back.sum(dim=(1, 2, 3)) / prediction).tolist()
         return comparison.explanation(
-            relevance,
+            frame_of(handed_back).sum(dim=1),
             method="lrp",
             complete=False,
             target="f(x)",
@@ -363,4 +369,4 @@ def _propagate(model: nn.Module, images: Tensor) -> Tensor:
             output = changed(images)
             start = output.detach()
         (relevance,) = torch.autograd.grad(output, images, grad_outputs=start)
-    return relevance.sum(dim=1)
+    return relevance

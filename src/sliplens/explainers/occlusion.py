@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.explainers.contract import Comparison, Method, require_at_least_one
-from sliplens.explainers.explanation import Explanation
+from sliplens.explainers.explanation import Explanation, frame_of
 from sliplens.markers import detect_markers
 from sliplens.progress import OnProgress
 from sliplens.recordings import Recording
@@ -30,7 +30,7 @@ def find_markers(
     ImageError
         If too few markers are found.
     """
-    image, reference = image[:3], reference[:3]
+    image, reference = frame_of(image), frame_of(reference)
     if not float(reference.std(dim=(1, 2)).max()):
         # a uniform reference is that of differences, in which a marker shows twice or, at rest, not at all
         raise InputError(

@@ -16,6 +16,7 @@ from sliplens.explainers.explanation import (
     Approximation,
     Explanation,
     Level,
+    change_of,
     check_approximations,
     check_rounding,
     check_weights,
@@ -295,10 +296,9 @@ class PolyCam(Method):
         active = regions.active()
         count(sum(sizes) - len(active))
         if self.budget < 1 and len(active):
-            contrast = (regions.image - regions.empty).abs().mean(dim=0)
             search = ChannelSearch(
                 activations=activations,
-                process=GaussianProcess(mask_kernel(contrast, regions.masks, active)),
+                process=GaussianProcess(mask_kernel(change_of(regions.image, regions.empty), regions.masks, active)),
                 active=active,
                 at_empty=supports(at_empty)[0],
                 measure=lambda channels: supports(measure(channels)),

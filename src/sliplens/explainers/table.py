@@ -154,8 +154,8 @@ def network_images(
     trained.require_frame_size(frames.shape[1:3])
     encoding, image_size = trained.encoding, trained.manifest.image_size
     if reference is not None:
-        compared = encoding.compare(frames, reference)
-        return encoding.resize(compared, image_size=image_size), encoding.empty(reference, image_size=image_size)
+        images = encoding.compare_small(frames, reference, image_size=image_size)
+        return images, encoding.empty(reference, image_size=image_size)
     if not encoding.empty_is_black:
         raise InputError(
             f"a network on {encoding.name} images needs the untouched sensor; give it as reference, on the command "

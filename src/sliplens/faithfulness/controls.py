@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers.cam import capture, recall_layers
-from sliplens.explainers.explanation import combine, local_change, pearson_r
+from sliplens.explainers.explanation import change_of, combine, frame_of, local_change, pearson_r
 from sliplens.intervals import paired_difference
 from sliplens.results.explanation import require_saliency
 from sliplens.results.faithfulness import CHANCE, Lead
@@ -120,17 +120,12 @@ _BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm
 
 
 def edges(images: Images) -> ControlMaps:
-    """Strength of the edges: length of Sobel's gradient, mean over the channels."""
+    """Strength of the edges of the frame: length of Sobel's gradient, mean over the colours."""
     across = torch.tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8
     kernels = torch.stack([across, across.T]).to(images)[:, None].repeat(3, 1, 1, 1)
-    padded = functional.pad(images, (1, 1, 1, 1), mode="replicate")
+    padded = functional.pad(frame_of(images), (1, 1, 1, 1), mode="replicate")
     slopes = functional.conv2d(padded, kernels, groups=3).unflatten(1, (3, 2))
     return slopes.square().sum(dim=2).sqrt().mean(dim=1)
-
-
-def change(images: Images, references: Images) -> ControlMaps:
-    """What there is to explain, before any network saw it: |x - b|, mean over the channels."""
-    return (images - references).abs().mean(dim=1)
 
 
 def relative_change(images: Images, references: Images) -> ControlMaps:
@@ -174,7 +169,7 @@ def control_maps(model: nn.Module, images: Images, references: Images) -> dict[s
     Clark et al., *XAI-TRIS* (2024), edge filters; Adebayo et al., *Sanity Checks for Saliency Maps* (2018).
     """
     maps = {
-        "change": change(images, references),
+        "change": change_of(images, references),  # all there is to explain, before any network saw it
         "local-change": relative_change(images, references),
         "centre": centre(images),
         "edges": edges(images),
@@ -203,15 +198,12 @@ def lead_over_controls(
     """
     others = {**controls, CHANCE: np.zeros(len(own))}
     levels = list(clusters)
-    gaps, corrected = (
-        {
-            name: paired_difference(own, other, clusters=levels, rng=rng, comparisons=comparisons)
-            for name, other in others.items()
-        }
-        for comparisons in (1, len(others))
-    )
+    gaps = {
+        name: paired_difference(own, other, clusters=levels, rng=rng, comparisons=(1, len(others)))
+        for name, other in others.items()
+    }
     control = min(gaps, key=lambda name: gaps[name].estimate)
-    ends = ([getattr(gap, end) for gap in found.values()] for found, end in ((gaps, "low"), (corrected, "high")))
+    ends = ([getattr(gap, end) for gap in gaps.values()] for end in ("low", "high"))
     low, high = (None if None in over_all else min(over_all) for over_all in ends)
     return Lead(control=control, gap=replace(gaps[control], low=low, high=high))
 
@@ -314,5 +306,6 @@ def smooth_maps(
     total = np.zeros((len(images), *images.shape[-2:]))
     for _ in range(samples):
         noise = _NOISE_SD * torch.randn(images.shape, generator=generator).to(images)
+        noise[:, 3:] = 0  # the frame's alone
         total += explain(model, (images + noise).clamp(0, 1))
     return total / samples

@@ -9,6 +9,7 @@ from torch.nn import functional
 from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import InputError
+from sliplens.explainers.explanation import frame_of
 from sliplens.extras import Table
 
 NOISE_SD = 0.01
@@ -195,7 +196,7 @@ def get_fill(name: str) -> Fill:
     def prepare(images: Images, references: Images | None, seed: int) -> Painter:
         if images.shape[1] == 3:
             return fill(images, references, seed)
-        paint = fill(images[:, :3], None if references is None else references[:, :3], seed)
+        paint = fill(frame_of(images), None if references is None else frame_of(references), seed)
         return lambda rows, gone: torch.cat([paint(rows, gone), images[rows, 3:]], dim=1)
 
     return prepare

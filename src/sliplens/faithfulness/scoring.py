@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sliplens.errors import InputError, SaliencyError
 from sliplens.explainers import Explanation
+from sliplens.explainers.explanation import CLOSE
 from sliplens.explainers.table import network_inputs, open_run
 from sliplens.faithfulness.controls import control_maps
 from sliplens.faithfulness.fills import Fill, get_fill
@@ -202,6 +203,17 @@ def follows_last_step(
     return [f"{name} correlates with its last step by {tied:.2f}: it measures the fill rather than the map"]
 
 
+def little_to_explain(change: Float[np.ndarray, " images"]) -> list[str]:
+    """Say in how many images the answer is nearly that on the untouched sensor, so that its direction is chance."""
+    few = int(np.sum(np.abs(change) < CLOSE))
+    sentence = (
+        f"next to nothing to explain in {few} of {len(change)} frames: the answer lies within {CLOSE} of that on the "
+        "untouched sensor, less than networks err by, and the direction that a gain counts along is chance; leave them "
+        "out"
+    )
+    return [sentence] if few else []
+
+
 def saturated(answers: Float[np.ndarray, " images"]) -> list[str]:
     """Say how many answers lie at an end of [0, 1] or outside: they move one way only."""
     ends = int(np.sum((answers < _SATURATED) | (answers > 1 - _SATURATED)))
@@ -275,7 +287,8 @@ def score(
 
     The score is the symmetric gain, in margin units: how much further the answer moves towards that on the untouched
     sensor with the most influential parts removed first rather than the least. A map that gains no more than the
-    controls, which know nothing of the network, has shown nothing.
+    controls, which know nothing of the network, has shown nothing. Every frame that is given counts; an alarm says of
+    how many the answer is nearly that on the untouched sensor, which a study leaves out (`worth_scoring`).
 
     Parameters
     ----------
@@ -326,6 +339,7 @@ def score(
     own = named.pop(method)
     filled = whole - towards * own.curves[0, :, -1]
     alarms = (
+        *little_to_explain(whole - untouched),
         *saturated(whole),
         *flat_maps({method: influence[method]}),
         *fill_decides(whole, filled, fill=fill),

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -14,16 +14,16 @@ from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import explain, get_explainer
 from sliplens.files import output_folder, remove, to_builtins
-from sliplens.friction import Friction, FrictionLike, as_friction
+from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import Controller, make_controller
 from sliplens.grip.loop import GripLoop, RenderedEyes, TableEyes, Tick
 from sliplens.grip.plant import PERIOD_S, Episodes, HeldObject, Plant, least_force, pick_object
 from sliplens.grip.readings import ReadingTable, load_readings, measure_readings, require_calibration
-from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion
+from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion, next_grasp
 from sliplens.mechanics import stick_ratio
 from sliplens.models import Run, load
 from sliplens.plots.clip import write_clip
-from sliplens.progress import OnProgress, note, stage, wrote
+from sliplens.progress import OnProgress, note, number_of, stage, wrote
 from sliplens.recordings import Recording
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
@@ -62,6 +62,9 @@ def run_episodes(
     readings: ReadingTable | None = None,
     error_scale: float = 1.0,
     friction: FrictionLike | Literal["each"] | None = None,
+    grasps: int = 1,
+    same_object: bool = False,
+    sequence: bool = False,
     latency_s: float = 0.02,
     seed: int = 0,
     script: Mapping[str, float] | None = None,
@@ -99,6 +102,16 @@ def run_episodes(
     friction
         What is told of the coefficient of friction, as `predict` takes it, for a network that tells F_t / F_n; `each`
         tells each episode its own, as it begins. Slips that the markers tell narrow a range down.
+    grasps
+        How many times each object is gripped, one grasp after another, each with other fingertips and a friction within
+        some percent of the object's (`GRASP_SPREAD`). The table has a row a grasp, first
+        those of all first ones.
+    same_object
+        Whether what a slip taught counts in the grasps that follow, as `LiveReader` takes it, for a network that tells
+        F_t / F_n.
+    sequence
+        Whether frames are read in order, as `predict` takes it; only through pixels. Where the friction is known, each
+        is read by itself.
     latency_s
         From an image to the command that answers it, in seconds.
     script
@@ -124,6 +137,10 @@ def run_episodes(
     """
     if error_scale < 0 or latency_s < 0:
         raise InputError("latency and error scale must not be negative; give 0 or more")
+    if grasps < 1:
+        raise InputError(f"{grasps} grasps of an object cannot be run; ask for 1 or more")
+    if sequence and not rendered:
+        raise InputError("readings that are looked up have no order; grip through pixels (rendered), or one by one")
     held = pick_object(object)
     if isinstance(controller, str):
         make_controller(controller, settings)  # mistakes are told before anything is measured
@@ -131,14 +148,15 @@ def run_episodes(
         raise InputError("settings are for the controllers of the table; set those of your own where you make it")
     if method is not None:
         get_explainer(method)
-    told: Friction | Literal["each"] | None = None
-    if friction is not None:
-        told = "each" if isinstance(friction, str) and friction == "each" else as_friction(friction)
+    own = isinstance(friction, str) and friction == "each"
+    told = None if friction is None else "each" if own else as_friction(friction)
     scripts = draw_scripts(held, condition, episodes=episodes, seed=seed, script=script)
     run = network if isinstance(network, Run) else load(network)
     require_calibration(run)
-    if told is not None:
+    if told is not None or same_object:
         run.require_ratio()
+    if sequence:
+        run.follow(friction=told)
     if not rendered and readings is None:
         readings = _readings_of(run, on_progress)
     setup = GripSetup(
@@ -148,6 +166,9 @@ def run_episodes(
         settings=dict(settings or _constants(controller)),
         network=run.manifest.weights_sha256[:12],
         friction=None if told is None else "that of each episode as it begins" if isinstance(told, str) else str(told),
+        grasps=grasps,
+        same_object=same_object,
+        sequence=sequence,
         latency_s=latency_s,
         rendered=rendered,
         seed=seed,
@@ -170,7 +191,7 @@ def run_episodes(
             grip = load_result(output.folder, Grip, command="sliplens grip")
         else:
             grip = job.all(output.folder, on_progress)
-    counted = f"{episodes} episode{'s' * (episodes > 1)}, {100 * grip.drop_rate:.1f} % dropped"
+    counted = f"{number_of(len(grip.episodes), 'episode')}, {100 * grip.drop_rate:.1f} % dropped"
     wrote(on_progress, Path(out), counted, kept=output.complete)
     return grip
 
@@ -217,10 +238,11 @@ class _Job:
                 chosen = self.scripts.where(np.arange(first, min(first + size, total)))
                 done.append(keep_part(part, _Batch, partial(self.batch, number, chosen, folder)))
                 count(first + len(chosen), total)
+        episodes = EpisodeTable.joined([one.episodes for one in done])
         grip = Grip(
             setup=self.setup,
             seconds=time.perf_counter() - begin,
-            episodes=EpisodeTable.joined([one.episodes for one in done]),
+            episodes=episodes.where(np.argsort(episodes.grasp, kind="stable")),
             trace=done[0].trace,
             moments_s=MOMENTS_S[: len(done[0].maps)],
             pictures=done[0].pictures,
@@ -231,39 +253,63 @@ class _Job:
         return grip
 
     def batch(self, number: int, scripts: Scripts, folder: Path | None) -> _Batch:
-        """Run some episodes; what the cameras saw is saved where there is a folder."""
+        """Run some episodes, and further grasps of the same objects; what the cameras saw of the first is saved."""
+        learners, tables, ticks = self._learners(scripts), list[EpisodeTable](), list[Tick]()
+        pictures, maps = np.zeros((0, 1, 1, 3), dtype=np.uint8), np.zeros((0, 1, 1), dtype=np.float32)
+        for grasp in range(self.setup.grasps):
+            seed = np.random.SeedSequence((self.setup.seed, number, *((grasp,) if grasp else ())))
+            held = next_grasp(scripts, rng=np.random.default_rng(seed.spawn(1)[0])) if grasp else scripts
+            told = np.array([one.friction.mean if one.friction is not None else np.nan for one in learners])
+            told = told if learners else np.full(len(held), np.nan)
+            parts: list[tuple[np.ndarray, EpisodeTable]] = []
+            for known in (True, False):
+                rows = np.flatnonzero(np.isfinite(told) == known)
+                if not len(rows):
+                    continue
+                eyes = self._eyes(held.where(rows), [learners[row] for row in rows] if learners else None, seed)
+                keep = not grasp and (self.setup.rendered or number == 0)
+                table = self._run(held.where(rows), eyes, known=known, on_tick=ticks.append if keep else None)
+                parts.append((rows, replace(table, grasp=table.grasp + grasp, known_friction=told[rows])))
+                if isinstance(eyes, RenderedEyes) and not grasp:
+                    frames = np.stack([tick.sight.frames for tick in ticks if tick.sight.frames is not None])
+                    if folder is not None:
+                        _save_trials(folder, eyes, ticks, frames, condition=self.setup.condition, number=number)
+                    if self.method is not None and number == 0:
+                        pictures = np.ascontiguousarray(frames[[round(at / PERIOD_S) for at in MOMENTS_S], 0])
+                        why = explain(self.run, pictures, reference=eyes.references[0], method=self.method)
+                        maps = why.relevance.cpu().numpy()
+            order = np.argsort(np.concatenate([rows for rows, _ in parts]))
+            tables.append(EpisodeTable.joined([table for _, table in parts]).where(order))
+            for learner in learners:
+                learner.release()
+        return _Batch(episodes=EpisodeTable.joined(tables), trace=_trace(ticks), pictures=pictures, maps=maps)
+
+    def _learners(self, scripts: Scripts) -> list[SlipLearner]:
+        """What is known of the friction in each episode, and learns; none where nothing is told or kept."""
+        if self.friction is None and not self.setup.same_object:
+            return []
+        told = [Friction(one) if isinstance(self.friction, str) else self.friction for one in scripts.friction.tolist()]
+        return [SlipLearner(one, same_object=self.setup.same_object) for one in told]
+
+    def _run(
+        self, scripts: Scripts, eyes: RenderedEyes | TableEyes, *, known: bool, on_tick: Callable[[Tick], None] | None
+    ) -> EpisodeTable:
         setup, chosen = self.setup, self.controller
         if isinstance(chosen, str):
-            chosen = make_controller(chosen, setup.settings, told=self.friction is not None)
-        eyes = self._eyes(scripts, np.random.SeedSequence((setup.seed, number)))
-        plant = Plant(self.held, episodes=len(scripts))
-        loop = GripLoop(plant, eyes, chosen, latency_s=setup.latency_s, lift_s=LIFT_S)
-        ticks: list[Tick] = []
-        keep = setup.rendered or number == 0
-        table = run_scripts(loop, scripts, condition=setup.condition, on_tick=ticks.append if keep else None)
-        pictures, maps = np.zeros((0, 1, 1, 3), dtype=np.uint8), np.zeros((0, 1, 1), dtype=np.float32)
-        if isinstance(eyes, RenderedEyes):
-            frames = np.stack([tick.sight.frames for tick in ticks if tick.sight.frames is not None])
-            if folder is not None:
-                _save_trials(folder, eyes, ticks, frames, condition=setup.condition, number=number)
-            if self.method is not None and number == 0:
-                pictures = np.ascontiguousarray(frames[[round(at / PERIOD_S) for at in MOMENTS_S], 0])
-                why = explain(self.run, pictures, reference=eyes.references[0], method=self.method)
-                maps = why.relevance.cpu().numpy()
-        return _Batch(episodes=table, trace=_trace(ticks), pictures=pictures, maps=maps)
+            chosen = make_controller(chosen, setup.settings, told=known)
+        loop = GripLoop(Plant(self.held, episodes=len(scripts)), eyes, chosen, latency_s=setup.latency_s, lift_s=LIFT_S)
+        return run_scripts(loop, scripts, condition=setup.condition, on_tick=on_tick)
 
-    def _eyes(self, scripts: Scripts, seed: np.random.SeedSequence) -> RenderedEyes | TableEyes:
-        known = None
-        if self.friction is not None:
-            own = scripts.friction.tolist()
-            known = [Friction(one) if isinstance(self.friction, str) else self.friction for one in own]
+    def _eyes(
+        self, scripts: Scripts, learners: list[SlipLearner] | None, seed: np.random.SeedSequence
+    ) -> RenderedEyes | TableEyes:
         if self.setup.rendered:
-            frames = 2 * _TICKS * len(self.scripts)
             return RenderedEyes(
                 self.run,
                 seed=int(seed.generate_state(1)[0]),
-                frames=frames,
-                friction=None if known is None else known[0],
+                frames=2 * _TICKS * len(self.scripts) * self.setup.grasps,
+                learner=None if learners is None else learners[0],
+                sequence=self.setup.sequence,
             )
         assert self.readings is not None
         return TableEyes(
@@ -271,7 +317,7 @@ class _Job:
             fingertips=scripts.fingertips,
             rng=np.random.default_rng(seed),
             error_scale=self.error_scale,
-            friction=known,
+            learners=learners,
         )
 
 
@@ -319,7 +365,8 @@ def run_scripts(
     state = loop.plant.state
     names = np.broadcast_to(np.asarray(condition, dtype=str), count).copy()
     return EpisodeTable(
-        condition=names, mass_kg=scripts.mass_kg + scripts.water_kg, friction=friction,
+        condition=names, grasp=np.ones(count, dtype=np.int64), known_friction=np.full(count, np.nan),
+        mass_kg=scripts.mass_kg + scripts.water_kg, friction=friction,
         dropped=state.dropped, crushed=state.crushed, slip_m=state.slipped_m,
         mean_force_n=force / lasted, peak_force_n=peak, least_force_n=least / lasted, peak_least_force_n=peak_least,
         force_excess=force / least - 1, peak_excess=peak / peak_least - 1, under_20_s=under,

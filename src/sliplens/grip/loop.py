@@ -11,7 +11,7 @@ from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
+from sliplens.friction import SlipLearner
 from sliplens.grip.controllers import Controller, Observation
 from sliplens.grip.fingertip import Fingertip, mean_shear
 from sliplens.grip.plant import PERIOD_S, Episodes, Fingers, Plant, PlantState, World
@@ -52,11 +52,12 @@ class Eyes(Protocol):
 class TableEyes:
     """Readings looked up in what was measured of the network, with its noise.
 
-    Where friction is told, the margin is that of the closed form, 1 - ratio / mu, expected over what is known of mu.
+    Where friction is known, the margin is that of the closed form, 1 - ratio / mu, expected over what is known of mu.
 
     `fingertips`: which pair of the table's fingertips each episode holds with. `error_scale` makes the network worse on
-    purpose, or better: its errors, and the reach of its interval, times so much. `friction`: what is told, in each
-    episode; `InputError` where the network tells no F_t / F_n.
+    purpose, or better: its errors, and the reach of its interval, times so much. `learners`: what is known of the
+    friction in each episode, in all or in none, and what learns from its slips; `InputError` where the network tells no
+    F_t / F_n.
     """
 
     def __init__(
@@ -66,14 +67,16 @@ class TableEyes:
         fingertips: Float[np.ndarray, " episodes"],
         rng: np.random.Generator,
         error_scale: float = 1.0,
-        friction: Sequence[Friction] | None = None,
+        learners: Sequence[SlipLearner] | None = None,
     ) -> None:
         pair = fingertips.astype(np.int64) % (len(table) // 2)
         self._table, self._tips = table, 2 * pair[:, None] + np.arange(2)
         self._rng, self._scale = rng, error_scale
-        self._learners = None if friction is None else [SlipLearner(one) for one in friction]
-        if self._learners is not None and not table.ratio:
+        self._learners, known = learners, [one.friction is not None for one in learners or ()]
+        if learners is not None and not table.ratio:
             raise InputError("friction was told, but these readings are of the margin alone; measure a ratio network")
+        if any(known) and not all(known):
+            raise InputError("of some episodes the friction is known and of some it is not; run them apart")
 
     def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
         """Read both fingertips of every episode."""
@@ -84,15 +87,18 @@ class TableEyes:
         friction, table = state.holding_friction, self._table
         margin, low, high, shear, *ratio = table.read(self._tips, force, friction=friction, margins=known)
         noise = self._rng.standard_normal((2, *known.shape))
-        if self._learners is None:
-            change = (self._scale - 1) * (margin - known) + table.noise * self._scale * noise[0]
-            reach = [(self._scale - 1) * (end - margin) for end in (low, high)]
-            margin, low, high = margin + change, low + change + reach[0], high + change + reach[1]
-        else:
+        told = None
+        if self._learners is not None:
             sliding = np.where(state.sliding, state.kinetic_ratio[:, None], 1 - known)
             held = np.where(pressing, state.friction * sliding, 0.0)
-            error = self._scale * (ratio[0] - held + table.ratio_noise * noise[0])
-            margin, low, high = self._tell(held + error, self._scale * ratio[1], state.time_s, slipping_s)
+            pulled = held + self._scale * (ratio[0] - held + table.ratio_noise * noise[0])
+            self._learn(pulled, self._scale * ratio[1], state.time_s, slipping_s)
+            told = _told_margin(pulled, self._scale * ratio[1], self._learners)
+        if told is None:
+            change = (self._scale - 1) * (margin - known) + table.noise * self._scale * noise[0]
+            reach = [(self._scale - 1) * (end - margin) for end in (low, high)]
+            told = margin + change, low + change + reach[0], high + change + reach[1]
+        margin, low, high = told
         shear = np.copysign(shear, state.shear_n) if (state.shear_n < 0).any() else shear
         return Sight(
             margin=np.where(pressing, margin, 1.0),
@@ -101,23 +107,32 @@ class TableEyes:
             shear_px=np.where(pressing, shear, 0.0) + _SHEAR_NOISE_PX * noise[1],
         )
 
-    def _tell(self, ratio: Fingers, sigma: Fingers, time_s: float, slipping_s: Episodes) -> tuple[Fingers, ...]:
-        """Margin and the ends of its 90 % interval from F_t / F_n and what each episode knows of its friction."""
-        assert self._learners is not None
+    def _learn(self, ratio: Fingers, sigma: Fingers, time_s: float, slipping_s: Episodes) -> None:
+        """Have each episode learn from what both fingers read of F_t / F_n, and from its slip."""
         for learner, since_s, read, doubt in zip(
-            self._learners, slipping_s.tolist(), ratio.mean(axis=1).tolist(), sigma.mean(axis=1).tolist(), strict=True
+            self._learners or (),
+            slipping_s.tolist(),
+            ratio.mean(axis=1).tolist(),
+            sigma.mean(axis=1).tolist(),
+            strict=True,
         ):
             learner.update(time_s, slipping_s=None if math.isnan(since_s) else since_s)
             learner.note(read, sigma=doubt, time_s=time_s)
-        most = max(len(learner.friction.nodes[0]) for learner in self._learners)
-        values, weights = (np.stack([_fill(learner.friction.nodes[row], most) for learner in self._learners])
-                           for row in (0, 1))  # fmt: skip
-        values, weights = np.where(values > 0, values, 1.0)[:, None], weights[:, None]
-        margins = np.clip(1 - ratio[..., None] / values, 0, 1)
-        margin = (weights * margins).sum(axis=-1)
-        variance = (weights * ((margins - margin[..., None]) ** 2 + (sigma[..., None] / values) ** 2)).sum(axis=-1)
-        reach = _REACH_90 * np.sqrt(variance)
-        return margin, margin - reach, margin + reach
+
+
+def _told_margin(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLearner]) -> tuple[Fingers, ...] | None:
+    """Margin and the ends of its 90 % interval from F_t / F_n and the friction; None where nothing is known of that."""
+    nodes = [learner.friction.nodes for learner in learners if learner.friction is not None]
+    if not nodes:
+        return None
+    most = max(len(values) for values, _ in nodes)
+    values, weights = (np.stack([_fill(one[row], most) for one in nodes]) for row in (0, 1))
+    values, weights = np.where(values > 0, values, 1.0)[:, None], weights[:, None]
+    margins = np.clip(1 - ratio[..., None] / values, 0, 1)
+    margin = (weights * margins).sum(axis=-1)
+    variance = (weights * ((margins - margin[..., None]) ** 2 + (sigma[..., None] / values) ** 2)).sum(axis=-1)
+    reach = _REACH_90 * np.sqrt(variance)
+    return margin, margin - reach, margin + reach
 
 
 _REACH_90 = 1.645
@@ -133,6 +148,9 @@ class RenderedEyes:
 
     While the network reads one finger's frame, its markers are followed and the other finger's frame is drawn: each of
     the two by one thread, for threads that share their many short steps wait for each other.
+
+    `learner`: what is known of the friction, and what learns from slips. `sequence`: read each finger's frames in
+    order, as `predict` does; where the friction is known, each by itself.
     """
 
     def __init__(
@@ -142,7 +160,8 @@ class RenderedEyes:
         seed: int,
         engine: str | Engine = "auto",
         frames: int = 4000,
-        friction: FrictionLike | None = None,
+        learner: SlipLearner | None = None,
+        sequence: bool = False,
     ) -> None:
         first = Fingertip(seed=seed)
         self.fingertips = (first, Fingertip(seed=seed + 1, day=first.day))
@@ -152,9 +171,11 @@ class RenderedEyes:
                 engine = make_engine(engine, run, frames=frames, batch_size=1)
         self._engine = engine
         self._trackers = [Tracker(tip.reference) for tip in self.fingertips]
-        self._learner = None if friction is None else SlipLearner(as_friction(friction))
-        if self._learner is not None:
+        self._learner = learner
+        if learner is not None:
             run.require_ratio()
+        in_order = sequence and (learner is None or learner.friction is None)
+        self._followers = [run.follow() for _ in self.fingertips] if in_order else []
 
     @property
     def references(self) -> UInt8[np.ndarray, "2 height width 3"]:
@@ -193,9 +214,17 @@ class RenderedEyes:
             learner.note(
                 float(estimate.ratio.mean.mean()), sigma=float(estimate.ratio.sigma.mean()), time_s=state.time_s
             )
-        low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)
+        fingers, touches = [estimate], np.isfinite(state.margin[0])
+        if self._followers:
+            fingers = [
+                follower.update(estimate.at(np.array([row])), np.array([state.time_s]), touches[[row]])
+                for row, follower in enumerate(self._followers)
+            ]
+        margin = np.concatenate([one.margin for one in fingers])
+        ends = [one.interval(LEVEL) or (one.margin, one.margin) for one in fingers]
+        low, high = (np.concatenate(end) for end in zip(*ends, strict=True))
         return Sight(
-            margin=estimate.margin[None],
+            margin=margin[None],
             low=low[None],
             high=high[None],
             shear_px=np.array([shear_px]),

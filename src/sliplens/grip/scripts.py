@@ -10,6 +10,7 @@ from jaxtyping import Float
 from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.extras import Table
+from sliplens.friction import GRASP_SPREAD
 from sliplens.grip.plant import GRAVITY_M_S2, HeldObject, World, pick_object
 
 EPISODE_S = 6.0
@@ -197,6 +198,17 @@ def draw_scripts(
             bound = f"above {_BOUNDS[name]:g}" if name in _BOUNDS else "finite"
             raise InputError(f"{name} must be {bound}, got {value:g}")
     return replace(scripts, **{name: np.full(episodes, float(value)) for name, value in fixed.items()})
+
+
+def next_grasp(scripts: Scripts, *, rng: np.random.Generator) -> Scripts:
+    """Another grasp of the same objects, to which the same happens.
+
+    Friction differs from the object's by the share by which grasps do (`GRASP_SPREAD`), and other fingertips of those
+    that there are hold it: what a network reads wrong of one touch is not what it reads wrong of the next.
+    """
+    share = 1 + GRASP_SPREAD * rng.standard_normal(len(scripts))
+    pairs = rng.integers(int(scripts.fingertips.max(initial=0)) + 1, size=len(scripts))
+    return replace(scripts, friction=scripts.friction * share, fingertips=pairs.astype(np.float64))
 
 
 _BOUNDS = {"mass_kg": 0, "friction": 0, "kinetic_ratio": 0, "patch_factor": 0, "drift": -1, "water_kg": -1e-9}

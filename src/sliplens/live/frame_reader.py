@@ -123,6 +123,7 @@ class FrameReader:
         network: Run | None,
         *,
         friction: FrictionLike | None,
+        same_object: bool,
         sequence: bool,
         smoothing_s: float,
         health: Callable[[Frame, Run | None], HealthWatch] | None,
@@ -137,11 +138,9 @@ class FrameReader:
         """Set to have a new reference taken as soon as the picture is still."""
         self.markers_px: tuple[np.ndarray, np.ndarray] | None = None
         """Places (x, y) of the markers at rest and in the newest frame, in pixels; None where they are not followed."""
-        self._friction = None if friction is None else SlipLearner(as_friction(friction))
-        if self._friction is not None:
-            if network is None:
-                raise InputError("--friction makes a margin of what a network reads; name one with --network")
-            network.require_ratio()
+        self.learner: SlipLearner
+        """What is known of the friction, and what slips teach of it."""
+        self.begin_object(friction, same_object=same_object)
         if sequence and network is None:
             raise InputError("--sequence reads what a network says of several frames; name one with --network")
         self._follower = network.follow(friction=friction) if network is not None and sequence else None
@@ -156,6 +155,22 @@ class FrameReader:
         self._has_margin = False
         self._last: LiveFrame | None = None
         self._dropped = 0
+
+    def begin_object(self, friction: FrictionLike | None, *, same_object: bool) -> None:
+        """Take what is known of an object's friction; what was known or learnt of one before is dropped."""
+        network = self.network
+        if friction is not None or same_object:
+            if network is None:
+                option, does = ("--friction", "makes a margin") if friction is not None else ("--same-object", "learns")
+                raise InputError(f"{option} {does} of what a network reads; name one with --network")
+            if friction is None and network.manifest.traction is None:
+                raise InputError(
+                    "--same-object learns friction from F_t / F_n, and this network answers with the margin alone; "
+                    "leave it out, or teach it with `sliplens train DATA -o RUN --start-from NETWORK --recipe ratio`"
+                )
+            network.require_ratio()
+        # made anew, not emptied: what the reading thread is just learning goes with the object before
+        self.learner = SlipLearner(None if friction is None else as_friction(friction), same_object=same_object)
 
     def begin(self, engine: Engine | None, reference: Frame | None) -> None:
         """Take the source, which is open, as it is now, and an image of the untouched sensor if there is one."""
@@ -237,10 +252,9 @@ class FrameReader:
             withheld = withheld or (None if self.network is None else _NO_CONTACT)
         if self._follower is not None and reading.contact_state == ContactState.NO_CONTACT:
             self._follower.forget()
-        if self._friction is not None:
-            slipping_s = None if markers is None else markers.slipping_s
-            touches = reading.contact_state != ContactState.NO_CONTACT
-            self._friction.update(frame.time_s, slipping_s=slipping_s, touches=touches)
+        slipping_s = None if markers is None else markers.slipping_s
+        touches = reading.contact_state != ContactState.NO_CONTACT
+        self.learner.update(frame.time_s, slipping_s=slipping_s, touches=touches)
         return reading, withheld
 
     def _withhold(self, reading: Reading, frame: LiveFrame, why: str | None) -> Reading:
@@ -271,13 +285,14 @@ class FrameReader:
 
     def _estimate(self, reading: Reading, frame: LiveFrame, answers: _Answers) -> Reading:
         assert self.network is not None
-        friction = None if self._friction is None else self._friction.friction
+        friction = self.learner.friction
+        follower = self._follower if friction is None else None  # it looks for what is known then
         estimate = self.network.to_estimate(*answers.parts, friction=friction)
-        if self._follower is not None:
-            estimate = self._follower.update(estimate, np.array([frame.time_s]), np.array([True]))
+        if follower is not None:
+            estimate = follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
-        if self._friction is not None and ratio is not None and estimate.ratio is not None:
-            self._friction.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
+        if ratio is not None and estimate.ratio is not None:
+            self.learner.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
         interval = estimate.interval(LEVEL)
         values = [estimate.margin] if interval is None else [estimate.margin, *interval]
         values = self._smooth.update(np.clip(np.concatenate(values), 0, 1), frame.time_s)
@@ -291,7 +306,7 @@ class FrameReader:
             high=high,
             ratio=ratio,
             friction=None if friction is None else str(friction),
-            sequence=self._follower is not None and not self._follower.lost,
+            sequence=follower is not None and not follower.lost,
             risk=margin_risk(reading.health, float(estimate.beyond(OFF)[0])) if reading.health else None,
             contact_state=state,
             lag_s=self._smooth.time_constant_s,
@@ -321,6 +336,7 @@ class FrameReader:
     def _begin_anew(self) -> None:
         """Forget what came before, where frames no longer follow each other."""
         self._smooth.forget()
+        self.learner.release()
         if self._follower is not None:
             self._follower.forget()
         self.markers_px = None

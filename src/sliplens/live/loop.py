@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from sliplens.errors import InputError, RecordingError, SourceError
 from sliplens.extras import import_cv2, missing_packages
-from sliplens.friction import FrictionLike
+from sliplens.friction import Friction, FrictionLike
 from sliplens.images import read_image
 from sliplens.live.contract import LiveSource, SourceOptions
 from sliplens.live.frame_reader import FrameReader, HealthWatch, SlipWatch
@@ -32,6 +32,7 @@ from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import Images, ProfiledSource, open_live
 from sliplens.models.checkpoint import Run, load
 from sliplens.models.engines import Engine, make_engine
+from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import Dataset, keep_profile
 from sliplens.recordings.sensor import SensorProfile, load_profile
@@ -118,8 +119,12 @@ class LiveReader:
         Profile of the sensor that frames and reference go through, its file, or the name of one that comes along;
         where it names a network and `network` is None, that one is read by.
     friction
-        What is known of the coefficient of friction, as `predict` takes it, for a network that tells F_t / F_n. Slips
-        that the markers tell narrow a range down; `Reading.friction` says what was assumed.
+        What is known of the coefficient of friction, as `predict` takes it, for a network that tells F_t / F_n. A slip
+        that the markers tell narrows a range down, until the object is let go; `Reading.friction` says what was
+        assumed.
+    same_object
+        Whether every grasp is of one object, until `new_object`: what a slip taught of its friction then counts in the
+        grasps that follow. Left out, it does not: the next grasp may be of something else.
     sequence
         Whether what the frames of a contact so far tell counts too, as `predict` takes it.
     engine
@@ -168,6 +173,7 @@ class LiveReader:
         options: SourceOptions | None = None,
         sensor: SensorProfile | Path | str | None = None,
         friction: FrictionLike | None = None,
+        same_object: bool = False,
         sequence: bool = False,
         engine: str = "auto",
         device: str = "cpu",
@@ -208,6 +214,7 @@ class LiveReader:
             self.source,
             self.network,
             friction=friction,
+            same_object=same_object,
             sequence=sequence,
             smoothing_s=smoothing_s,
             health=health,
@@ -347,6 +354,38 @@ class LiveReader:
                 self._subscribers.remove(callback)
 
         return end
+
+    @property
+    def learnt(self) -> Friction | None:
+        """What slips taught of the friction of the object that slipped last, for a grasp to come; None before any."""
+        return self._reader.learner.learnt
+
+    @property
+    def lesson(self) -> str | None:
+        """The same in a sentence, with what to type the next time; None before any slip."""
+        learner = self._reader.learner
+        if learner.learnt is None:
+            return None
+        slips = number_of(learner.slips, "slip")
+        return (
+            f"the object that slipped: friction {learner.learnt.mean:.2f} +- {learner.learnt.sigma:.2f}, from {slips}; "
+            f"tell it when you hold the same again, with --friction {learner.learnt.text}"
+        )
+
+    def new_object(self, friction: FrictionLike | None = None) -> None:
+        """Say that another object is held from now on: what was told or learnt of the friction is dropped.
+
+        Parameters
+        ----------
+        friction
+            What is known of the new one's, as `LiveReader` takes it; nothing if None.
+
+        Raises
+        ------
+        InputError
+            If the friction is none, or the network cannot be told any.
+        """
+        self._reader.begin_object(friction, same_object=self._reader.learner.same_object)
 
     def take_reference(self) -> None:
         """Take a new reference as soon as the picture is still; the old one holds until then."""

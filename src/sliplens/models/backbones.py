@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -90,7 +90,7 @@ class HistogramRegressor(nn.Module):
     @property
     def centres(self) -> Float[Tensor, " bins"]:
         """Margins in the middle of the bins."""
-        return (self.edges[1:] + self.edges[:-1]) / 2
+        return bin_centres(self.edges)
 
     def forward(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, "batch 1"]:
         """Mean of the distribution: the safety margin."""
@@ -165,6 +165,14 @@ def ratio_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
     """Edges of the bins over F_t / F_n; None for a network that answers with the margin alone."""
     edges = model.ratio_edges if isinstance(model, HistogramRegressor) else None
     return None if edges is None else edges.double().cpu().numpy()
+
+
+_Edges = TypeVar("_Edges", Tensor, np.ndarray)
+
+
+def bin_centres(edges: _Edges) -> _Edges:
+    """Values in the middle of the bins of a histogram."""
+    return (edges[1:] + edges[:-1]) / 2
 
 
 def histogram_targets(values: Float[Tensor, " batch"], edges: Float[Tensor, " edges"]) -> Float[Tensor, "batch bins"]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sliplens.errors import ModelError
 from sliplens.friction import Friction
-from sliplens.models.backbones import histogram_targets
+from sliplens.models.backbones import bin_centres, histogram_targets
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Shares of the frames for which an interval is to hold."""
@@ -72,7 +72,7 @@ def spread(
     edges: Float[np.ndarray, " edges"],
 ) -> Float[np.ndarray, " frames"]:
     """Standard deviation of each distribution around a value, such as its mean."""
-    squares = ((edges[1:] + edges[:-1]) / 2 - values[:, None]) ** 2
+    squares = (bin_centres(edges) - values[:, None]) ** 2
     return np.sqrt((probabilities * squares).sum(axis=1))
 
 
@@ -151,7 +151,7 @@ def calibrate_histogram(
         temperature.fill_(fit_temperature(logits, histogram_targets(labels, edges.cpu())))
     probabilities = torch.softmax(logits / temperature.cpu(), dim=-1).double().numpy()
     numbers = edges.double().cpu().numpy()
-    values = probabilities @ ((numbers[1:] + numbers[:-1]) / 2)
+    values = probabilities @ bin_centres(numbers)
     kept = kept or conformal_calibration(values, probabilities, numbers, labels, temperature=float(temperature))
     return kept, probabilities
 
@@ -224,29 +224,27 @@ def _kernels(
     friction: Friction, edges: tuple[float, ...], ratio_edges: tuple[float, ...], trained_friction: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "ratio_bins bins"], Float[np.ndarray, "ratio_bins bins"]]:
     """What a ratio in each bin says of each margin where the margin's own answer counts too, and where it does not."""
-    centres, ratio_centres = _middles(np.array(edges)), _middles(np.array(ratio_edges))
+    centres, ratio_centres = bin_centres(np.array(edges)), bin_centres(np.array(ratio_edges))
     # labels at 0 and 1 reach into bins beyond them, which mean the ends
     left = 1 - np.clip(centres, 0, 1)
     values, weights = friction.nodes
-    fits, alone = np.zeros((len(ratio_centres), len(centres))), np.zeros((len(ratio_centres), len(centres)))
-    for value, weight, density in zip(values, weights, _density(values, np.array(trained_friction)), strict=True):
-        fits += weight / density * _between(value * left, ratio_centres).T
-        alone += weight * _between(np.clip(1 - ratio_centres / value, 0, 1), centres)
+    fits = _between(values[:, None] * left, ratio_centres, weights / _density(values, np.array(trained_friction))).T
+    alone = _between(np.clip(1 - ratio_centres / values[:, None], 0, 1), centres, weights)
     # a full stick leaves nothing to compare: half a bin keeps its Jacobian from being none
     fits *= np.maximum(left, (edges[1] - edges[0]) / 2) / (ratio_edges[1] - ratio_edges[0])
     return fits, alone
 
 
-def _middles(edges: Float[np.ndarray, " edges"]) -> Float[np.ndarray, " bins"]:
-    return (edges[1:] + edges[:-1]) / 2
-
-
 def _between(
-    values: Float[np.ndarray, " values"], centres: Float[np.ndarray, " bins"]
+    values: Float[np.ndarray, "draws values"], centres: Float[np.ndarray, " bins"], weights: Float[np.ndarray, " draws"]
 ) -> Float[np.ndarray, "values bins"]:
-    """Shares of the two bins whose middles a value lies between; of the last one beyond the ends."""
-    at = (np.clip(values, centres[0], centres[-1])[:, None] - centres) / (centres[1] - centres[0])
-    return np.clip(1 - np.abs(at), 0, None)
+    """Shares of the two bins whose middles a value lies between, of the last one beyond the ends; summed over draws."""
+    at = (np.clip(values, centres[0], centres[-1]) - centres[0]) / (centres[1] - centres[0])
+    below = np.minimum(at.astype(int), len(centres) - 2)
+    rows, table = len(centres) * np.arange(values.shape[1]), np.zeros(values.shape[1] * len(centres))
+    for place, share in ((below, 1 + below - at), (below + 1, at - below)):
+        table += np.bincount((rows + place).ravel(), (weights[:, None] * share).ravel(), minlength=len(table))
+    return table.reshape(-1, len(centres))
 
 
 def _density(

@@ -19,11 +19,12 @@ from sliplens.extras import require_device
 from sliplens.files import MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import MOST_PIXELS
-from sliplens.models.backbones import Answers, HistogramRegressor, bin_edges, build_model, ratio_edges
+from sliplens.models.backbones import Answers, HistogramRegressor, bin_centres, bin_edges, build_model, ratio_edges
 from sliplens.models.calibration import Calibration, Traction, raw_interval, spread, told_probabilities
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty, watch_features
 from sliplens.models.sequence import Follower, SequenceHead, SequenceManifest
+from sliplens.progress import number_of
 from sliplens.results.evaluation import Training
 
 WEIGHTS_FILE, SEQUENCE_FILE = "model.safetensors", "sequence.safetensors"
@@ -97,7 +98,7 @@ class Run:
             f"  reads {kept.input} images of {kept.sensor}, frames of {' x '.join(map(str, kept.frame_size))} px "
             f"at {kept.image_size} px",
             f"  tells {kept.target.replace('_', ' ')}, {intervals}",
-            f"  trained on {len(kept.trained_on)} trials, recipe {kept.recipe or 'not told'}",
+            f"  trained on {number_of(len(kept.trained_on), 'trial')}, recipe {kept.recipe or 'not told'}",
             *([f"  {', '.join(f'{name} {value:.3g}' for name, value in kept.metrics.items())}"] * bool(kept.metrics)),
         )
         return "\n".join(lines)
@@ -128,7 +129,7 @@ class Run:
                 )
         self.require_frame_size(frames.shape[1:3])
         size = self.manifest.image_size
-        if reference is None and self.encoding.colours > 3:
+        if reference is None and self.encoding.beside:
             raise InputError(
                 f"a network on {self.encoding.name} images sees the untouched sensor beside the frame; name its image "
                 "with --reference IMAGE, or a frame of it with --reference-frame N"
@@ -294,7 +295,7 @@ class Ratio:
     @property
     def mean(self) -> Float[np.ndarray, " frames"]:
         """Expected F_t / F_n; not clipped."""
-        return self.probabilities @ ((self.edges[1:] + self.edges[:-1]) / 2)
+        return self.probabilities @ bin_centres(self.edges)
 
     @property
     def sigma(self) -> Float[np.ndarray, " frames"]:
@@ -355,7 +356,7 @@ class Estimate:
             mse = self.calibration.mse if self.calibration else 0.0
             return np.full(len(self.margin), erfc(error / sqrt(2 * mse)) if mse > 0 else 0.0)
         # bins beyond 0 and 1 mean the ends
-        centres = np.clip((self.edges[1:] + self.edges[:-1]) / 2, 0, 1)
+        centres = np.clip(bin_centres(self.edges), 0, 1)
         far = np.abs(centres - np.clip(self.margin, 0, 1)[:, None]) > error
         return (self.probabilities * far).sum(axis=1)
 
@@ -391,7 +392,7 @@ class Estimate:
             trained_friction=trained_friction,
         )
         # bins beyond 0 and 1 mean the ends
-        margin = probabilities @ np.clip((self.edges[1:] + self.edges[:-1]) / 2, 0, 1)
+        margin = probabilities @ np.clip(bin_centres(self.edges), 0, 1)
         return replace(self, margin=margin, probabilities=probabilities, calibration=calibration, friction=friction)
 
 

@@ -22,7 +22,7 @@ from sliplens.models.engines import Engine, make_engine, one_thread
 from sliplens.models.novelty import read_features
 from sliplens.models.sequence import require_frequent
 from sliplens.parts import require_new_table
-from sliplens.progress import OnProgress, note, stage
+from sliplens.progress import OnProgress, note, number_of, stage
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE
@@ -115,7 +115,7 @@ class Predictions:
         return self.frames
 
     def __repr__(self) -> str:
-        told = f"Predictions of {self.frames} frames by {self.engine}"
+        told = f"Predictions of {number_of(self.frames, 'frame')} by {self.engine}"
         return f"{told}, in {self.path}" if self.rows is None else f"{told}\n{self.rows.to_string(preview_cols=3)}"
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:

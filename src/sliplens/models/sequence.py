@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import InputError
+from sliplens.models.backbones import bin_centres
 from sliplens.models.calibration import Calibration
 
 if TYPE_CHECKING:
@@ -67,25 +68,27 @@ class SequenceHead(nn.Module):
     """
 
     edges: Tensor
-    ratio_edges: Tensor
+    centres: Tensor
+    """Margins in the middle of the bins."""
+    ratio_centres: Tensor
+    near_zero: Tensor
+    """1 for each bin of the margin that lies near 0, else 0."""
 
     def __init__(
         self, edges: Float[Tensor, " edges"], ratio_edges: Float[Tensor, " ratio_edges"], *, dropout: float = 0.1
     ) -> None:
         super().__init__()
         self.register_buffer("edges", edges.clone(), persistent=False)
-        self.register_buffer("ratio_edges", ratio_edges.clone(), persistent=False)
+        # once, for a step is made of so little that each of these costs a twentieth of it
+        self.register_buffer("centres", bin_centres(edges), persistent=False)
+        self.register_buffer("ratio_centres", bin_centres(ratio_edges), persistent=False)
+        self.register_buffer("near_zero", (self.centres <= _NEAR_ZERO).float(), persistent=False)
         self.seen = nn.Linear(8, WIDTH)
         self.memory = nn.GRU(WIDTH, WIDTH, batch_first=True)
         self.correction = nn.Linear(2 * WIDTH, len(edges) - 1)
         self.dropout = nn.Dropout(dropout)
         nn.init.zeros_(self.correction.weight)
         nn.init.zeros_(self.correction.bias)
-
-    @property
-    def centres(self) -> Float[Tensor, " bins"]:
-        """Margins in the middle of the bins."""
-        return (self.edges[1:] + self.edges[:-1]) / 2
 
     def forward(
         self,
@@ -100,11 +103,11 @@ class SequenceHead(nn.Module):
         frames before these, None at the first of a contact.
         """
         values, spread = _moments(margin, self.centres)
-        pulled, pulled_spread = _moments(ratio, (self.ratio_edges[1:] + self.ratio_edges[:-1]) / 2)
+        pulled, pulled_spread = _moments(ratio, self.ratio_centres)
         peak = pulled.cummax(dim=1).values.clamp_min(_LEAST_PEAK)
         if state is not None:
             peak = torch.maximum(peak, state[1])
-        near_zero = margin[..., self.centres <= _NEAR_ZERO].sum(dim=-1)
+        near_zero = margin @ self.near_zero
         log_s = elapsed_s.clamp(STEP_S, LONGEST_S).log()
         told = (values, pulled, 4 * spread, 8 * pulled_spread, pulled / peak, peak, near_zero, log_s)
         seen = functional.gelu(self.seen(torch.stack(told, dim=-1)))

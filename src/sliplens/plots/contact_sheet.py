@@ -32,6 +32,7 @@ from sliplens.plots.style import (
     save_page,
     write_over,
 )
+from sliplens.progress import number_of
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
 
@@ -221,7 +222,7 @@ def _tell_trial(figure: Figure, recording: Recording, chosen: list[int], *, top:
     place_text(figure, _EDGE, top, name, fontsize=10, fontweight="bold", parse_math=False)
     top += 0.19 * len(name.splitlines()) + 0.05
     facts = (f"{recording.condition}, day {recording.day}", recording.sensor)
-    length = f"{len(recording)} frames in {np.ptp(recording.time_s):.1f} s"
+    length = f"{number_of(len(recording), 'frame')} in {np.ptp(recording.time_s):.1f} s"
     told = "\n".join(fill(fact, 20, max_lines=2, placeholder="…") for fact in (*facts, length))
     place_text(figure, _EDGE, top, told, fontsize=9.5, linespacing=1.5, parse_math=False)
     top += 0.205 * len(told.splitlines()) + 0.08

@@ -32,14 +32,15 @@ from sliplens.plots.style import (
     short_input_name,
     write_over,
 )
+from sliplens.progress import number_of
 from sliplens.results.evaluation import (
     BaselineScores,
     BinScore,
     Evaluation,
-    Predictions,
     RegressionScores,
     Reliability,
     RiskCoverage,
+    ScoredFrames,
     Training,
 )
 from sliplens.results.faithfulness import CHANCE, DeletionCurve
@@ -73,7 +74,7 @@ def _draw_bins(rows: Sequence[tuple[str, str, Sequence[BinScore]]], *, ax: Axes)
         ax.bar(at, heights, width=width, color=colour, label=name)
 
 
-def plot_predictions(predictions: Predictions, *, colour: str, ax: Axes) -> Axes:
+def plot_predictions(predictions: ScoredFrames, *, colour: str, ax: Axes) -> Axes:
     """Draw the answer against the label of every frame, in percent, with the line of perfect answers."""
     ax.plot([0, 100], [0, 100], color=BLACK, linewidth=1, linestyle="--", label="perfect", zorder=3)
     label, read = 100 * predictions.safety_margin, 100 * predictions.prediction
@@ -111,7 +112,7 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
     return ax
 
 
-def plot_margin_over_time(trials: Mapping[str, Predictions], *, ax: Axes) -> Axes:
+def plot_margin_over_time(trials: Mapping[str, ScoredFrames], *, ax: Axes) -> Axes:
     """Draw the label and each network's answer through one trial, its frames by input."""
     ordered = {name: trials[name].where(np.argsort(trials[name].time_s)) for name in inputs_in_order(trials)}
     label = next(iter(ordered.values()))
@@ -174,7 +175,7 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     save_page(figure, path)
 
 
-def plot_answers(predictions: Predictions, conditions: list[str], *, ax: Axes) -> None:
+def plot_answers(predictions: ScoredFrames, conditions: list[str], *, ax: Axes) -> None:
     """Draw the answer against the label of every frame, in percent, a colour a condition."""
     for name in conditions:
         rows = np.flatnonzero(predictions.condition == name)
@@ -187,7 +188,7 @@ def plot_answers(predictions: Predictions, conditions: list[str], *, ax: Axes) -
     ax.legend(markerscale=2, fontsize=8, loc="upper left")
 
 
-def _plot_trials(predictions: Predictions, conditions: list[str], *, ax: Axes) -> None:
+def _plot_trials(predictions: ScoredFrames, conditions: list[str], *, ax: Axes) -> None:
     for place, name in enumerate(conditions):
         shown = predictions.where(predictions.condition == name)
         error = 100 * (shown.prediction - shown.safety_margin)
@@ -228,7 +229,7 @@ def _plot_risk(risk: RiskCoverage | None, *, ax: Axes) -> None:
     ax.legend(fontsize=8)
 
 
-def _plot_typical(predictions: Predictions, trials: Mapping[str, RegressionScores], *, ax: Axes) -> None:
+def _plot_typical(predictions: ScoredFrames, trials: Mapping[str, RegressionScores], *, ax: Axes) -> None:
     ranked = sorted(trials, key=lambda name: trials[name].mse)
     trial = ranked[(len(ranked) - 1) // 2]
     rows = np.flatnonzero(predictions.trial == trial)
@@ -280,12 +281,14 @@ def _summary(evaluation: Evaluation, conditions: list[str]) -> str:
     for name in conditions:
         scores, lead = evaluation.conditions[name], evaluation.lead_times[name]
         r2 = "none" if scores.r2 is None else f"{scores.r2:.3f}"
-        words = f"{name}: {scores.frames:,} frames, MSE {scores.mse:.4f}, R² {r2}, MAE {100 * scores.mae:.1f} points"
+        words = f"{name}: {number_of(scores.frames, 'frame')}, MSE {scores.mse:.4f}, R² {r2}, "
+        words += f"MAE {100 * scores.mae:.1f} points"
+        slipping = f"{number_of(lead.trials, 'trial')} that slip"
         if lead.median_ms is not None:
-            words += f", warns in {lead.warned} of {lead.trials} trials that slip, {lead.median_ms:.0f} ms before"
+            words += f", warns in {lead.warned} of {slipping}, {lead.median_ms:.0f} ms before"
             words += f" (the true Γ: {lead.ideal_ms:.0f} ms)"
         elif lead.trials:
-            words += f", warns in none of {lead.trials} trials that slip"
+            words += f", warns in none of {slipping}"
         parts.append(f"{words}, {lead.false_per_minute:.1f} false alarms a minute")
     return "\n".join(parts)
 

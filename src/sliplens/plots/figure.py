@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
 from sliplens.markers.gel import SensorProposal
@@ -94,7 +93,7 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
 def _explanation(explanation: Any, ax: Axes, index: int) -> None:
     # tensors answer NumPy's protocol once they are on the CPU and carry no gradient
     image, relevance = (
-        _array(values)[_of(len(values), index)] for values in (explanation.images, explanation.relevance)
+        _array(values)[_of(len(values), index)] for values in (explanation.frames, explanation.relevance)
     )
     picture = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
     read, compared = (
@@ -177,11 +176,8 @@ def _study(study: Study, ax: Axes, index: int) -> None:
     _removal(study.faithfulness[sorted(study.faithfulness)[0]], ax, index)
 
 
-def _predictions(predictions: Any, ax: Axes, index: int) -> None:
-    # an evaluation's are columns
-    table = predictions.table() if isinstance(predictions, Columns) else predictions.frame()
-    shown = _rows_of_trial(table, index)
-    plot_margins(shown, ax=ax)
+def _margins(predictions: pa.Table, ax: Axes, index: int) -> None:
+    plot_margins(_rows_of_trial(predictions, index), ax=ax)
 
 
 def _tracking(tracking: Any, ax: Axes, index: int) -> None:
@@ -227,7 +223,8 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Study": _study,
     "Truth": _truth,
     "Diagnosis": _diagnosis,
-    "Predictions": _predictions,
+    "Predictions": lambda result, ax, index: _margins(result.frame(), ax, index),
+    "ScoredFrames": lambda result, ax, index: _margins(result.table(), ax, index),
     "Tracking": _tracking,
     "Grip": lambda result, ax, _: plot_grip_force(result.trace, ax=ax).set_title(result.setup.controller),
     "Hold": lambda result, ax, _: plot_hold(result.steps, ax=ax).set_title(result.controller),

@@ -30,8 +30,8 @@ GREY = "#6B7280"
 
 UNKNOWN = "\N{EN DASH}"
 """Stands for a number that is not there."""
-INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images"}
-INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE}
+INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images", "pair": "Image pairs"}
+INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE, "pair": GREEN}
 CONDITION_COLOURS = {"dry": ORANGE, "wet": BLUE}
 SOURCE_NAMES = {"simulated": "simulated touch", "real": "real touch"}
 
@@ -165,7 +165,7 @@ def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
 
 
 def inputs_in_order(names: Iterable[str]) -> list[str]:
-    """Raw before difference, as in the thesis."""
+    """Raw before difference, as in the thesis, then what it had not."""
     return in_order(set(names), INPUT_NAMES)
 
 

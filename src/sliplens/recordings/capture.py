@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
+from sliplens.progress import number_of
 from sliplens.recordings.labelling import Clip, ReferenceChoice
 from sliplens.recordings.trial import CLOCK_S, Labels, TrialFacts
 
@@ -82,7 +83,8 @@ class Capture(TrialFacts):
             _require_rising(self.frame_time_s, what=f"the frames of {self.source}")
         if self.labels is not None and len(self.labels.safety_margin) != len(self.frame_time_s):
             raise RecordingError(
-                f"{self.source} has {len(self.frame_time_s)} frames but {len(self.labels.safety_margin)} labels; "
+                f"{self.source} has {number_of(len(self.frame_time_s), 'frame')} but "
+                f"{number_of(len(self.labels.safety_margin), 'label')}; "
                 "give one a frame"
             )
         if self.reference is not None and self.reference.shape[:2] != self.frame_size:

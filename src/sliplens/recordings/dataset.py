@@ -150,7 +150,9 @@ def load_dataset(folder: Path | str) -> Dataset:
 
 def _read_table(folder: Path) -> _Table:
     path = folder / DATASET_FILE
-    values = read_json(path)
+    values = read_json(
+        path, missing=f"make a data set of recordings with `sliplens import {folder} -o DATA`, and name that"
+    )
     if not isinstance(values, dict) or values.get("schema_version") != SCHEMA_VERSION:
         raise RecordingError(
             f"{path} is not a sliplens data set of schema {SCHEMA_VERSION}; make it again with this version"

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from sliplens.errors import RecordingError
+from sliplens.progress import number_of
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.tables import trial_name
 
@@ -150,7 +151,8 @@ def _read_rows(path: Path, delimiter: str) -> Iterator[ManifestRow]:
                     continue
                 if len(cells) > len(names):
                     raise RecordingError(
-                        f"{path}, line {reader.line_num}: {len(cells)} cells but {len(names)} columns; mend the row"
+                        f"{path}, line {reader.line_num}: {number_of(len(cells), 'cell')} but "
+                        f"{number_of(len(names), 'column')}; mend the row"
                     )
                 said = {name: cell.strip() for name, cell in zip(names, cells, strict=False) if cell.strip()}
                 yield _row(said, path, f"{path}, line {reader.line_num}")

@@ -17,6 +17,7 @@ from PIL import Image
 from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2
 from sliplens.files import read_toml
+from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.options import LabelSettings, ReferenceMethod
 
@@ -169,8 +170,9 @@ class SensorProfile:
         index = capture.reference_index if named else self.reference_frame
         if index is not None and not 0 <= index < len(capture):
             raise InputError(
-                f"{capture.source} has {len(capture)} frames but the profile {self.name} takes frame {index} for the "
-                "untouched sensor; name one that is there with --reference-frame, or change reference_frame in its file"
+                f"{capture.source} has {number_of(len(capture), 'frame')} but the profile {self.name} takes frame "
+                f"{index} for the untouched sensor; name one that is there with --reference-frame, or change "
+                "reference_frame in its file"
             )
         return replace(
             capture,

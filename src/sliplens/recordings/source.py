@@ -14,6 +14,7 @@ from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.files import as_path, hash_file, hash_json, hash_tree
 from sliplens.images import list_images, read_image
 from sliplens.parts import Shard, shard
+from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
 from sliplens.recordings.formats import open_captures, recognise
@@ -240,7 +241,7 @@ def _require_usual(capture: Capture, allowed: Sequence[Budget]) -> None:
     height, width = capture.frame_size
     clocks = [time for time in (capture.time_s, capture.forces and capture.forces.time_s) if time is not None]
     sizes: dict[Budget, tuple[float, str]] = {
-        "frames": (len(capture), f"{len(capture):,} frames"),
+        "frames": (len(capture), number_of(len(capture), "frame")),
         "pixels": (height * width, f"frames of {height} x {width} pixels"),
         "samples": (samples := len(capture.forces.time_s) if capture.forces else 0, f"{samples:,} samples of forces"),
         "span": max(((float(time[-1] - time[0]), _span(time)) for time in clocks), default=(0.0, "")),

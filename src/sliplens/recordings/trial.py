@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.mechanics import stick_ratio
+from sliplens.progress import number_of
 from sliplens.recordings.labelling import Labelling
 
 OUTSIDE, SLIPS, STICKS = 0, 1, 2
@@ -164,7 +165,7 @@ class GroundTruth:
         for name in ("static_friction", "contact_radius_m", "stick_radius_m", "contact_map"):
             if len(getattr(self, name)) != count:
                 raise RecordingError(
-                    f"the truth has {count} frames of markers but {len(getattr(self, name))} of {name}; "
+                    f"the truth has {number_of(count, 'frame')} of markers but {len(getattr(self, name))} of {name}; "
                     "give one a frame"
                 )
         if self.marker_px.shape[1:] != self.marker_rest_px.shape:
@@ -206,7 +207,7 @@ class Recording(TrialFacts, Labels):
                 f"trial {self.trial} has frames of {self.frames.shape[1:3]} pixels but a reference of "
                 f"{self.reference.shape[:2]}; record both with the same camera settings"
             )
-        begin = f"trial {self.trial} has {count} frames but"
+        begin = f"trial {self.trial} has {number_of(count, 'frame')} but"
         self._require_one_each(count, begin, "time_s")
         if self.truth is not None and len(self.truth.marker_px) != count:
             raise RecordingError(f"{begin} the truth of {len(self.truth.marker_px)}; give the truth of every frame")

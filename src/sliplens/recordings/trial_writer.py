@@ -15,7 +15,7 @@ from sliplens.codec import RESULT_FILE, load_record, save_record
 from sliplens.errors import RecordingError, ShardError, SliplensError
 from sliplens.files import remove
 from sliplens.parts import Shard, shard
-from sliplens.progress import OnProgress, stage
+from sliplens.progress import OnProgress, number_of, stage
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import LeftOut, TrialInfo, trial_info, trial_path
 from sliplens.recordings.labelling import Edit, EditKind, Labelling, ReferenceChoice
@@ -235,7 +235,8 @@ def require_forces(capture: Capture) -> None:
     """Refuse a recording that has neither labels nor forces to find them from."""
     if capture.labels is None and capture.forces is None:
         raise RecordingError(
-            f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor"
+            f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor "
+            "with --forces FILE, or in a folder of recordings under the name of the recording"
         )
 
 
@@ -296,5 +297,5 @@ def _frames(capture: Capture) -> Iterator[Frame]:
         yield frame
     if read != len(capture):
         raise RecordingError(
-            f"{capture.source} promised {len(capture)} frames but gave {read}; copy or export it again"
+            f"{capture.source} promised {number_of(len(capture), 'frame')} but gave {read}; copy or export it again"
         )

@@ -172,7 +172,7 @@ def most_of(outcomes: Sequence[Outcome]) -> Outcome:
 def _of_each(
     results: Results, found: Mapping[str, Record], judge: Callable[[Record], Sequence[Answer]], *, why: str
 ) -> tuple[Answer, ...]:
-    """Answer for each network, difference before raw; one without a result stays open, and why."""
+    """Answer for each network, raw images last; one without a result stays open, and why."""
     names = inputs_in_order(results.study.inputs)[::-1]
     told = [judge(found[name]) if name in found else [_untested(input_name(name), why)] for name in names]
     return tuple(answer for own in told for answer in own)
@@ -240,7 +240,8 @@ def _beats_rivals(faithful: RemovalScores, results: Results, *, rng: np.random.G
 def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
     findings, by_setting, subject, found = [], {}, "Both networks", results.study.faithfulness
     if not {"difference", "raw"} <= set(found):
-        return _untested(subject, "the explanations of both networks are needed, and those of one are there")
+        scored = listed([input_name(name).lower() for name in inputs_in_order(found)] or ["none"])
+        return _untested(subject, f"it compares difference images with raw ones, and scored were {scored}")
     difference, raw = found["difference"], dict(removal_by_setting(found["raw"]))
     for where, curves in removal_by_setting(difference):
         methods = [one for one in (*_RIVALS, POLY_CAM) if one in curves and one in raw.get(where, {})]

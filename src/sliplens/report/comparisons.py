@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots import style
-from sliplens.results.evaluation import Predictions
+from sliplens.results.evaluation import ScoredFrames
 from sliplens.results.faithfulness import CHANCE, Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
 from sliplens.results.study import Choice, MarkerEffects, Roughness, Truth
 
@@ -62,7 +62,7 @@ SECONDS: dict[str, float] = {"grad-cam": 0.029, "integrated-gradients": 0.27, "p
 """Seconds an image, by method."""
 
 
-def compare_errors(first: Predictions, second: Predictions, *, rng: np.random.Generator) -> Difference | None:
+def compare_errors(first: ScoredFrames, second: ScoredFrames, *, rng: np.random.Generator) -> Difference | None:
     """Difference in MSE of two networks, over days and trials; None unless both answered the very same frames."""
     one, other = (own.where(np.lexsort((own.frame, own.trial))) for own in (first, second))
     if not len(one.trial) or any(

@@ -32,6 +32,7 @@ def plate_trace(grip: Grip) -> Plate:
     told = f"{float(first.mean_force_n[0]):.2f} N, {percent(float(first.force_excess[0]))} over the least that holds"
     setup = grip.setup
     how = "filmed and read by the network" if setup.rendered else "looked up in the network's measured errors"
+    how = f"{how}, in order" if setup.sequence else how
     friction = "" if setup.friction is None else f" The coefficient of friction was taken for {setup.friction}."
     return Plate(
         name="grip-episode",

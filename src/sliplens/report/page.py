@@ -1,6 +1,7 @@
 """The report: one page that needs nothing but itself, and its figures beside it."""
 
 import json
+import re
 from base64 import b64encode
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 from sliplens.errors import InputError
 from sliplens.plots.style import written_whole
@@ -122,9 +124,15 @@ def render_page(template: str, *, script: str = "", **values: Any) -> str:
     folder = files("sliplens.report") / "templates"
     inline = {"style": "report.css"} | ({"script": script} if script else {})
     texts = {kind: (folder / name).read_text(encoding="utf-8") for kind, name in inline.items()}
+    pages.filters["code"] = set_code
     allowed = [f"{kind}-src 'sha256-{_sha256(text)}'" for kind, text in texts.items()]
     policy = "; ".join(["default-src 'none'", "img-src data:", *allowed, "base-uri 'none'", "form-action 'none'"])
     return pages.get_template(template).render(policy=policy, **texts, **values)
+
+
+def set_code(text: str) -> Markup:
+    """Escape a text, and set what stands between backticks as code."""
+    return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
 
 
 def _sha256(text: str) -> str:

@@ -39,6 +39,7 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
+from sliplens.report.claims import POLY_CAM
 from sliplens.report.comparisons import tell_interval
 from sliplens.report.plates import (
     CELL_IN,
@@ -145,13 +146,20 @@ def plate_strip(strip: Strip) -> Plate:
     )
 
 
+def _poly_cam(explained: Explained | None) -> str | None:
+    """Poly-CAM of ours where it was run, else as the thesis ran it; None without a map of either."""
+    maps = () if explained is None else explained.saliency
+    return next((method for method in ("poly-cam", POLY_CAM) if method in maps), None)
+
+
 def plate_poly_cam(results: Results) -> Plate | None:
     """Draw Poly-CAM across the states on difference images (thesis, Fig. 11); None without its maps."""
     explained = explained_of(results, "difference")
-    if explained is None or "poly-cam" not in explained.saliency:
+    method = _poly_cam(explained)
+    if explained is None or method is None:
         return None
     name, what = "fig-11-poly-cam-difference", "Poly-CAM across the contact states, difference images"
-    return _plate(explained, shown_frames(results, explained), ["poly-cam"], name=name, what=what)
+    return _plate(explained, shown_frames(results, explained), [method], name=name, what=what)
 
 
 def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *, name: str, what: str) -> Plate | None:
@@ -324,7 +332,7 @@ def _illustrate(explained: Explained, scored: DeletionScores, method: str, index
 
 
 def _materials(results: Results) -> Iterator[tuple[Explained, DeletionScores, int]]:
-    """Maps, scores and the frame to show of each input that has all three, difference before raw."""
+    """Maps, scores and the frame to show of each input that has all three, raw images last."""
     for name in inputs_in_order(results.inputs)[::-1]:
         explained, scored = explained_of(results, name), results.scores.get((name, results.study.source))
         if explained is None or scored is None:
@@ -437,9 +445,13 @@ def plate_contact_states(states: States) -> Plate | None:
 
 
 def plate_fields_beside_saliency(results: Results) -> Plate | None:
-    """Draw raw frame, field and Poly-CAM side by side, a row a state (thesis, Fig. 12); None without all three."""
-    states, explained = results.study.states, explained_of(results, "raw")
-    if states is None or explained is None or "poly-cam" not in explained.saliency:
+    """Draw frame, field and Poly-CAM side by side, a row a state (thesis, Fig. 12); None without all three.
+
+    The network is one that sees the camera's frames: alone, or where none does, beside the untouched sensor.
+    """
+    states, explained = results.study.states, explained_of(results, "raw") or explained_of(results, "pair")
+    method = _poly_cam(explained)
+    if states is None or explained is None or method is None:
         return None
     known = {explained.frames[one.index].id: one for one in shown_frames(results, explained)}
     marked, rows = [], []
@@ -447,7 +459,7 @@ def plate_fields_beside_saliency(results: Results) -> Plate | None:
         field = _field(frame)
         if frame.id not in known or field is None:
             continue
-        fitted = _resized(explained.saliency["poly-cam"][known[frame.id].index], frame.raw.shape[:2])
+        fitted = _resized(explained.saliency[method][known[frame.id].index], frame.raw.shape[:2])
         title = f"Γ {percent(frame.safety_margin)}"
         marked.append(MarkedFrame(title=title, frame=frame.raw, field=field, saliency=fitted))
         rows.append((frame.id, frame.safety_margin, _longest(field), _share_on_moving(fitted, field)))
@@ -455,11 +467,12 @@ def plate_fields_beside_saliency(results: Results) -> Plate | None:
         return None
     shares = ", ".join(f"{percent(share)} at Γ {percent(margin)}" for _, margin, _, share in rows)
     return Plate(
-        name="fig-12-poly-cam-raw",
+        name="fig-12-poly-cam-raw" if explained.input == "raw" else f"poly-cam-{explained.input}",
         figure=draw_fields_beside_saliency(marked),
-        alt=f"Raw frame, displacement field and Poly-CAM map side by side at {listed([one.title for one in marked])}",
-        caption="Poly-CAM on raw images beside the displacement of the markers. Share of the saliency that lies where "
-        f"the skin moves by more than half of that frame's largest displacement: {shares}.",
+        alt=f"Camera frame, displacement field and Poly-CAM side by side at {listed([one.title for one in marked])}",
+        caption=f"{method_name(method)} on {input_name(explained.input).lower()} beside the displacement of the "
+        "markers. Share of the saliency that lies where the "
+        f"skin moves by more than half of that frame's largest displacement: {shares}.",
         numbers=named_columns(("frame_id", "safety_margin", "moves_px", "saliency_moves_share"), rows),
         pixels=True,
     )

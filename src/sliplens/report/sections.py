@@ -223,7 +223,7 @@ def _notes(title: str, sentences: Iterable[str], *, tone: Literal["plain", "caut
 
 
 def _names(found: Iterable[str]) -> list[str]:
-    """Difference before raw, as in the thesis's figures."""
+    """Difference before raw, as in the thesis's figures, and before both what it had not."""
     return inputs_in_order(found)[::-1]
 
 
@@ -243,7 +243,8 @@ SECTIONS: tuple[Section, ...] = (
         title="How well the safety margin is read",
         short_title="Accuracy",
         intro="The networks answer on trials they were not trained on (Table 1 and Fig. 7 of the thesis, for this "
-        "data). A raw image is the camera's frame; a difference image is that frame against the untouched sensor.",
+        "data). A raw image is the camera's frame; a difference image is that frame against the untouched sensor; "
+        "in an image pair both stand side by side.",
         build=_accuracy,
         needs=lambda results: results.evaluations,
     ),

@@ -23,6 +23,7 @@ from sliplens.plots.style import (
     methods_in_order,
     name_methods,
     percent,
+    short_input_name,
     signed,
     source_name,
 )
@@ -293,20 +294,22 @@ def _accuracy(results: Results) -> list[Statement]:
 
 
 def _winners(results: Results, *, rng: np.random.Generator) -> list[Statement]:
-    evaluations = results.evaluations
-    if not {"raw", "difference"} <= set(evaluations):
-        return []
-    statements = []
-    first, second = evaluations["difference"], evaluations["raw"]
-    for condition in conditions_in_order(set(first.conditions) & set(second.conditions)):
-        mse = {"difference": first.conditions[condition].mse, "raw": second.conditions[condition].mse}
+    evaluations, statements = results.evaluations, []
+    pairs = [
+        (condition, *names)
+        for names in combinations(inputs_in_order(evaluations), 2)
+        for condition in conditions_in_order(set.intersection(*(set(evaluations[one].conditions) for one in names)))
+    ]
+    for condition, *names in pairs:
+        both = {name: evaluations[name] for name in names}
+        mse = {name: one.conditions[condition].mse for name, one in both.items()}
         better, worse = sorted(mse, key=lambda name: mse[name])
         less = 1 - mse[better] / mse[worse] if mse[worse] > 0 else 0.0
         text = (
             f"On {condition} objects {input_name(better).lower()} have the lower error: MSE {mse[better]:.4f} against "
             f"{mse[worse]:.4f}, {percent(less)} less."
         )
-        shown = [one.predictions.where(one.predictions.condition == condition) for one in (first, second)]
+        shown = [one.predictions.where(one.predictions.condition == condition) for one in both.values()]
         gap = compare_errors(shown[0], shown[1], rng=rng)
         sure = gap is not None and gap.sure
         if gap is None:
@@ -318,7 +321,8 @@ def _winners(results: Results, *, rng: np.random.Generator) -> list[Statement]:
         else:
             text += f" The 95 % interval over {gap.over} does not rule out chance."
         tone: Tone = "good" if sure else "caution"
-        statements.append(Statement(topic=f"Raw or difference, {condition}", text=text, tone=tone))
+        first, second = map(short_input_name, names)
+        statements.append(Statement(topic=f"{first} or {second.lower()}, {condition}", text=text, tone=tone))
     if statements:
         seeds = "Each input stands for one trained network: another seed may change the order."
         statements[-1] = replace(statements[-1], text=f"{statements[-1].text} {seeds}")

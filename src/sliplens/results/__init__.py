@@ -9,9 +9,9 @@ from sliplens.results.evaluation import (
     Evaluation,
     LeadTimes,
     LearningCurve,
-    Predictions,
     RegressionScores,
     Reliability,
+    ScoredFrames,
     Simulation,
     SplitCount,
     Training,
@@ -25,7 +25,7 @@ from sliplens.results.study import Choice, MapQuality, PooledScores, Randomisati
 __all__ = [
     "BaselinePredictions", "BaselineScores", "Baselines", "BinScore", "Choice", "DeletionCurve", "DeletionScores",
     "Diagnosis", "EpisodeTable", "Evaluation", "Explained", "ExplainedFrame", "Grip", "GripTrace", "Hold",
-    "HoldSteps", "LeadTimes", "LearningCurve", "MapQuality", "PooledScores", "Predictions", "Randomisation",
-    "RegressionScores", "Reliability", "Remedies", "RemovalCurve", "RemovalScores", "Simulation", "SplitCount",
+    "HoldSteps", "LeadTimes", "LearningCurve", "MapQuality", "PooledScores", "Randomisation", "RegressionScores",
+    "Reliability", "Remedies", "RemovalCurve", "RemovalScores", "ScoredFrames", "Simulation", "SplitCount",
     "States", "Study", "Timing", "Training", "Truth", "describe_simulation", "load_explained",
 ]  # fmt: skip

@@ -175,7 +175,7 @@ class LeadTimes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Predictions(Columns):
+class ScoredFrames(Columns):
     """Label and answer of each labelled frame, in margin units; what the network does not tell is NaN."""
 
     trial: Shaped[np.ndarray, " frames"]
@@ -278,7 +278,7 @@ class Evaluation:
     """How often the uncertainty of a wet frame is above that of a dry one; None without both, or without a spread."""
     lead_times: dict[str, LeadTimes]
     """Warnings by condition."""
-    predictions: Predictions
+    predictions: ScoredFrames
     friction: str = ""
     """What the network was told of the coefficient of friction; empty where nothing was."""
     sequence: bool = False
@@ -298,7 +298,7 @@ class Evaluation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ErrorTable(Predictions):
+class ErrorTable(ScoredFrames):
     """Label and answer of frames, and what may have made the answer wrong; NaN where not known."""
 
     sensor: Shaped[np.ndarray, " frames"]

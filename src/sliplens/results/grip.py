@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 
 from sliplens.codec import UNKNOWN, Columns
 from sliplens.results.evaluation import AMOUNT, ANSWER, EXCESS, FORCE, FRICTION, MARGIN
@@ -16,6 +16,10 @@ class EpisodeTable(Columns):
     """Episodes, a row each; forces in newtons, lengths in metres, times in seconds."""
 
     condition: Shaped[np.ndarray, " episodes"]
+    grasp: Int64[np.ndarray, " episodes"]
+    """Which grasp of its object it is, counted from 1."""
+    known_friction: Annotated[Float64[np.ndarray, " episodes"], AMOUNT, UNKNOWN]
+    """Coefficient of friction that was told, or learnt in the grasps before, its mean; NaN where nothing was."""
     mass_kg: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
     friction: Annotated[Float64[np.ndarray, " episodes"], FRICTION]
     """Least static friction of the episode, mean of both fingers."""
@@ -73,6 +77,12 @@ class GripSetup:
     """First 12 hex digits of the hash of its weights."""
     friction: str | None
     """What was told of the friction, in words; None where nothing was."""
+    grasps: int
+    """How many times each object was gripped."""
+    same_object: bool
+    """Whether what a slip taught counted in the grasps that followed."""
+    sequence: bool
+    """Whether frames were read in order."""
     latency_s: float
     """From an image to the command that answers it."""
     rendered: bool

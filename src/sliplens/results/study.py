@@ -97,7 +97,7 @@ class MarkerTable(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MarkedFrame:
+class MarkerPlaces:
     """Places of a frame's markers in camera pixels, x and y; NaN for one that was not followed."""
 
     rest_px: Float64[np.ndarray, "markers 2"]
@@ -115,7 +115,7 @@ class ShownFrame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class StateFrame(ShownFrame, MarkedFrame):
+class StateFrame(ShownFrame, MarkerPlaces):
     """The same with its picture, its absolute difference from the untouched sensor, and its markers."""
 
     raw: UInt8[np.ndarray, "height width 3"]
@@ -148,18 +148,18 @@ class States:
     @cached_property
     def frames(self) -> tuple[StateFrame, ...]:
         """The frames that are shown, with their pictures and markers."""
-        none = MarkedFrame(rest_px=np.empty((0, 2)), now_px=np.empty((0, 2)))
+        none = MarkerPlaces(rest_px=np.empty((0, 2)), now_px=np.empty((0, 2)))
         return tuple(
             StateFrame(**vars(shown), **vars(self.markers.get(shown.id, none)), raw=raw, difference=difference)
             for shown, raw, difference in zip(self.shown, self.raw, self.difference, strict=True)
         )
 
     @cached_property
-    def markers(self) -> dict[str, MarkedFrame]:
+    def markers(self) -> dict[str, MarkerPlaces]:
         """Markers by frame, in the order of their numbers; frames in which none could be followed are absent."""
         rows = self.table.where(np.argsort(self.table.marker, kind="stable"))
         return {
-            frame: MarkedFrame(rest_px=np.c_[own.rest_x_px, own.rest_y_px], now_px=np.c_[own.x_px, own.y_px])
+            frame: MarkerPlaces(rest_px=np.c_[own.rest_x_px, own.rest_y_px], now_px=np.c_[own.x_px, own.y_px])
             for (frame,), own in rows.groups("frame_id").items()
         }
 

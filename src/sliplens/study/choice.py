@@ -22,7 +22,7 @@ from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.results.explanation import Explained
-from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkedFrame, MarkerTable, ShownFrame, States
+from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkerPlaces, MarkerTable, ShownFrame, States
 from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
 from sliplens.study.explaining import frames_at, nearest_frame, network_inputs, require_methods
 from sliplens.study.stages import Result, Stage
@@ -52,7 +52,7 @@ def choose_frames(
     Polak, section 4: 14 trials read within 3 %, 6 levels, 42 frames to score.
     """
     if not networks:
-        raise InputError("a study needs a network; name one for difference images, for raw ones, or both")
+        raise InputError("a study needs a network; name one at least")
     if trials < 1:
         raise InputError(f"a study of {trials} trials is impossible; ask for 1 or more")
     if not 0 <= tolerance <= 1:
@@ -141,7 +141,7 @@ def _look_at(info: TrialInfo, networks: Mapping[str, Run], data: Dataset, *, tol
 
 def _summarise(choice: Choice, trials: int) -> str:
     networks, taken, wanted = len(choice.inputs), choice.trials, choice.trials_wanted
-    who = "the network reads" if networks == 1 else "both networks read"
+    who = "the network reads" if networks == 1 else f"{'both' if networks == 2 else 'all'} networks read"
     summary = (
         f"Of {trials} {choice.condition} trials {choice.considered} have a frame near every level, and in "
         f"{choice.qualified} of those {who} every such frame within {choice.tolerance:.0%}."
@@ -215,7 +215,7 @@ def _table(frame_id: str, rest: Float[np.ndarray, "markers 2"], now: Float[np.nd
 
 
 def network_places(
-    marked: MarkedFrame, *, frame_size: tuple[int, int], image_size: int
+    marked: MarkerPlaces, *, frame_size: tuple[int, int], image_size: int
 ) -> tuple[Float[np.ndarray, "seen 2"], float]:
     """Where a network sees the markers (x, y), and how far each one's surroundings reach, in its own pixels.
 
@@ -310,7 +310,7 @@ class Material:
     references: Float[Tensor, "frames colours size size"]
     """The untouched sensor for each frame."""
     chosen: tuple[ChosenFrame, ...]
-    markers: Mapping[str, MarkedFrame]
+    markers: Mapping[str, MarkerPlaces]
     """By frame, in camera pixels; frames in which none could be followed are absent."""
     explainers: Mapping[str, Explainer]
     """By name, with the options that made the maps."""
@@ -401,7 +401,7 @@ def gather(
     data: Dataset,
     chosen: tuple[ChosenFrame, ...],
     *,
-    markers: Mapping[str, MarkedFrame],
+    markers: Mapping[str, MarkerPlaces],
     explainers: Mapping[str, Explainer],
 ) -> Material:
     """Gather what the scores need of the chosen frames, each of which is explained."""
@@ -421,7 +421,7 @@ def gather(
 
 
 def seen_places(
-    trained: Run, chosen: Sequence[ChosenFrame], markers: Mapping[str, MarkedFrame]
+    trained: Run, chosen: Sequence[ChosenFrame], markers: Mapping[str, MarkerPlaces]
 ) -> list[Float[Tensor, "_markers 2"]]:
     """Where the markers of each frame are, in the network's pixels; those that were not followed are left out."""
     now = [markers[frame.id].now_px for frame in chosen]

@@ -13,6 +13,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
+from sliplens.explainers.explanation import frame_of
 from sliplens.explainers.shapley import shapley_values
 from sliplens.extras import require_packages
 from sliplens.faithfulness.removal import answer_whole
@@ -32,7 +33,7 @@ from sliplens.results.evaluation import (
     ExplainedErrors,
     FrictionSlope,
     FrictionTable,
-    Predictions,
+    ScoredFrames,
 )
 from sliplens.results.explanation import Explained
 from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_limit, reading_slope
@@ -119,7 +120,7 @@ def diagnose(
 
 
 def _diagnose(
-    run: Run, data: Dataset, answers: Predictions, on_progress: OnProgress | None, parts: Path | None, *, trials: int,
+    run: Run, data: Dataset, answers: ScoredFrames, on_progress: OnProgress | None, parts: Path | None, *, trials: int,
     pairs: int, seed: int,
 ) -> Diagnosis:  # fmt: skip
     rng = np.random.default_rng(seed)
@@ -166,7 +167,7 @@ def _diagnose(
     )  # fmt: skip
 
 
-def tabulate_errors(data: Dataset, answers: Predictions, *, on_progress: OnProgress | None = None) -> ErrorTable:
+def tabulate_errors(data: Dataset, answers: ScoredFrames, *, on_progress: OnProgress | None = None) -> ErrorTable:
     """Put beside each answer what may have made it wrong."""
     pieces = []
     for (trial,), own in counted(answers.groups("trial").items(), on_progress):
@@ -382,7 +383,7 @@ def refilm(
         known = [film for film in films if np.isfinite(film.loading.safety_margin[at])]
         drawn = np.concatenate([film.film.draw(slice(at, at + 1)).numpy() for film in known])
         inputs = run.encode(drawn, frame.reference).to(run.device)
-        pictures[frame.id] = (255 * inputs[:, :3]).round().byte().permute(0, 2, 3, 1).cpu().numpy()
+        pictures[frame.id] = (255 * frame_of(inputs)).round().byte().permute(0, 2, 3, 1).cpu().numpy()
         for film, answer in zip(known, run.predict(inputs).tolist(), strict=True):
             truth = (film.loading.friction_coefficient[at], film.loading.safety_margin[at])
             rows.append((frame.id, frame.trial, condition, frame.day, *truth, answer, reading_slope(film, at)))

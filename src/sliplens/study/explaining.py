@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer
+from sliplens.explainers.explanation import frame_of
 from sliplens.explainers.table import network_images
 from sliplens.models import Run
 from sliplens.models.engines import expecting
@@ -273,7 +274,7 @@ class Explaining(Stage[Explained]):
 
     def pictures(self) -> UInt8[np.ndarray, "frames size size 3"]:
         """What of that a person sees."""
-        shown = (255 * self.inputs[:, :3]).round().to(torch.uint8).permute(0, 2, 3, 1)
+        shown = (255 * frame_of(self.inputs)).round().to(torch.uint8).permute(0, 2, 3, 1)
         return shown.contiguous().cpu().numpy()
 
     def join(self, pieces: Sequence[_Map]) -> Explained:

@@ -32,7 +32,7 @@ def pool_studies(studies: Sequence[Study], *, seed: int = 0) -> PooledScores:
     --------
     >>> from sliplens.study import pool_studies, run_study
     >>> seeds = [f"runs/mine/network-{seed}" for seed in range(3)]
-    >>> studies = [run_study("runs/mine/data", difference=run, raw=None) for run in seeds]  # doctest: +SKIP
+    >>> studies = [run_study("runs/mine/data", run) for run in seeds]  # doctest: +SKIP
     >>> pool_studies(studies).frame().to_pandas()  # doctest: +SKIP
     """
     inputs = set.intersection(*({*study.faithfulness} & {*study.explanations} for study in studies)) if studies else ()

@@ -12,11 +12,11 @@ from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import Explainer
 from sliplens.explainers.explanation import CLOSE
+from sliplens.explainers.table import open_run
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.files import hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Run
-from sliplens.models.checkpoint import load
 from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, load_dataset
@@ -84,9 +84,8 @@ TESTS = ("score", "remedies", "faithfulness", "randomisation", "map-quality", "t
 
 def run_study(
     data: Dataset | Path | str,
+    networks: Network | Sequence[Network] = "chromatouch-difference",
     *,
-    difference: Network | None = "chromatouch-difference",
-    raw: Network | None = None,
     out: Path | str | None = None,
     methods: Sequence[str] = STUDY_METHODS,
     split: str = "test",
@@ -114,9 +113,9 @@ def run_study(
 
     Parameters
     ----------
-    difference, raw
-        Networks on difference and on raw images, each as it was loaded, as its folder, or as the name of one that comes
-        with sliplens; None to leave it out.
+    networks
+        Network, or networks of different inputs, each as it was loaded, as its folder, or as the name of one that comes
+        with sliplens. Stages and tables are named by the input that a network reads: `difference`, `pair`, `raw`.
     out
         Folder of the study, a subfolder a stage; a temporary one that lives as long as the result if None.
     methods, budget
@@ -137,7 +136,7 @@ def run_study(
     Raises
     ------
     InputError
-        If a number is out of range, a method is unknown, or a network was trained on other images.
+        If a number is out of range, a method is unknown, or two networks read one input.
     RecordingError
         If no trial has a frame near every safety margin that is looked at.
     ShardError
@@ -146,8 +145,8 @@ def run_study(
     Examples
     --------
     >>> from sliplens import run_study, write_report
-    >>> study = run_study("runs/mine/data", out="runs/mine/study", trials=5)  # doctest: +SKIP
-    >>> study.faithfulness["raw"].scores[0].srg.estimate  # doctest: +SKIP
+    >>> study = run_study("runs/mine/data", "chromatouch-pair", out="runs/mine/study", trials=5)  # doctest: +SKIP
+    >>> study.faithfulness["pair"].scores[0].srg.estimate  # doctest: +SKIP
     0.031
     >>> page = write_report(study)  # doctest: +SKIP
     """
@@ -162,21 +161,18 @@ def run_study(
         these = f"{count} {split} trial{'s' if count > 1 else ''} of condition {condition}"
         cure = f"--trials is {trials}" if trials == count else "record more, or name another --split or --condition"
         note(on_progress, f"{these}: fewer than {FEWEST_UNITS} decide nothing, whatever the page then shows; {cure}")
-    given = {name: network for name, network in (("difference", difference), ("raw", raw)) if network is not None}
-    if not given:
-        raise InputError("a study needs a network; leave out --difference none or --raw none")
-    networks = {name: load_network(network, name, device=device) for name, network in given.items()}
+    runs = load_networks(networks, device=device)
     scratch = ExitStack()
     stages = _Stages(
         folder=scratch.enter_context(scratch_folder()) if out is None else Path(out),
         data=data,
-        networks=networks,
+        networks=runs,
         explainers=explainers,
         seed=seed,
         overwrite=overwrite,
         on_progress=on_progress,
     )
-    for name, run in networks.items():
+    for name, run in runs.items():
         folder = stages.folder / f"evaluate-{name}"
         evaluation = evaluate(run, stages.data, folder, overwrite=overwrite, on_progress=on_progress)
         stages.found[name] = {"evaluate": evaluation}
@@ -186,7 +182,7 @@ def run_study(
     judging = _Judging(
         folder=stages.folder,
         data=data,
-        networks=networks,
+        networks=runs,
         explainers=stages.explainers,
         settings=tuple(settings),
         random_orders=random_orders,
@@ -195,9 +191,9 @@ def run_study(
         redrawn="truth" in tests and stages.redrawn,
     )
     with Crew(judging, on=on, most=len(choice.frames)) as crew:
-        for name in networks:
+        for name in runs:
             stages.judge(name, judging, crew, tests=frozenset(tests), retry_failed=retry_failed)
-    for name in networks if "timing" in tests else ():  # while nothing else runs
+    for name in runs if "timing" in tests else ():  # while nothing else runs
         stages.time(name, judging)
     tables: dict[str, Any] = {
         table: {name: own[stage] for name, own in stages.found.items() if stage in own}
@@ -208,14 +204,18 @@ def run_study(
     return study
 
 
-def load_network(network: Network, name: str, *, device: str = "cpu") -> Run:
-    """Network of a study by what it reads."""
-    run = network if isinstance(network, Run) else load(str(network), device=device)
-    if run.manifest.input != name:
+def load_networks(networks: Network | Sequence[Network], *, device: str = "cpu") -> dict[str, Run]:
+    """Networks of a study by the input that each reads, in one order whatever order they were named in."""
+    several = [networks] if isinstance(networks, Run | Path | str) else networks
+    runs = [open_run(network, device=device) for network in several]
+    by_input = {run.encoding.name: run for run in runs}
+    if not by_input:
+        raise InputError("a study needs a network; name one at least")
+    if twice := [name for name in by_input if sum(run.encoding.name == name for run in runs) > 1]:
         raise InputError(
-            f"--{name} names a network on {run.manifest.input} images; give one that was trained on {name}"
+            f"two networks read the input {twice[0]}, and a study takes one network an input; study them one by one"
         )
-    return run
+    return dict(sorted(by_input.items()))
 
 
 _NEEDED_BY = {"score": {"score", "remedies"}, "control": {"faithfulness", "truth"}}

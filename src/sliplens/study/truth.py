@@ -11,6 +11,7 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from sliplens.errors import InputError
+from sliplens.explainers.explanation import change_of
 from sliplens.explainers.shapley import shapley_values
 from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.controls import lead_over_controls, relevance_mass, relevance_rank
@@ -118,8 +119,8 @@ def stage_frames(trained: Run, explained: Explained, data: Dataset) -> tuple[Sta
             if digits == name or not digits.isdecimal() or int(digits) >= len(recording.frames):
                 raise InputError(f"{name} does not name a frame of trial {trial}; explain frames of a data set")
             number = int(digits)
-            compared = trained.encoding.compare(recording.frames[number : number + 1], recording.reference)
-            image = trained.encoding.resize(compared, image_size=trained.manifest.image_size)[0].numpy()
+            frame, image_size = recording.frames[number : number + 1], trained.manifest.image_size
+            image = trained.encoding.compare_small(frame, recording.reference, image_size=image_size)[0].numpy()
             if np.abs(image.astype(np.int16) - explained.images[row].astype(np.int16)).max() > _ROUNDING:
                 raise InputError(f"{name} is not the frame of {data.folder} that was explained; explain it again")
             truth = recording.truth
@@ -386,7 +387,7 @@ class JudgingByTruth(Stage[Truth]):
             found = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
             shuffled = shuffle_half(found.values, rng=rng)
             empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
-            change = (inputs[index].cpu() - empty).abs().mean(dim=0).double().numpy()
+            change = change_of(inputs[index].cpu(), empty).double().numpy()
             oracles = [towards * found.values, towards * shuffled]
             known = [*oracles, unit_means(change, place.units)[:count], *map(np.abs, oracles)]
             orders = [

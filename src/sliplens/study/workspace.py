@@ -134,7 +134,8 @@ def explain_source(
         explainers = choose(methods=methods)
     own: dict[str, Any] = {"methods": methods, "explainers": explainers, "on": on, "retry_failed": retry_failed}
     explain = partial(explain_frames, trained, chosen, **own)
-    title = f"Explaining {len(chosen.ids)} frames ({trained.manifest.input}, {chosen.source})"
+    frames = "1 frame" if len(chosen.ids) == 1 else f"{len(chosen.ids)} frames"
+    title = f"Explaining {frames} ({trained.manifest.input}, {chosen.source})"
     if out is None:
         with stage(on_progress, title) as count:
             return explain(on_progress=count)
@@ -143,7 +144,8 @@ def explain_source(
     recipe: dict[str, Any] = {"weights_sha256": trained.manifest.weights_sha256, "input": trained.manifest.input}
     recipe |= {"source": chosen.source, "ids": chosen.ids, "images_sha256": images.hexdigest()}
     recipe |= {"method": tuple(methods), "budget": budget, "colours": colours}
-    what = f"{len(methods)} maps of each of {len(chosen.ids)} frames, panel.png"
+    maps = "a map" if len(methods) == 1 else f"{len(methods)} maps"
+    what = f"{maps} of {frames if len(chosen.ids) == 1 else f'each of {frames}'}, panel.png"
     with output_folder(out, stage="explain", config=recipe, overwrite=overwrite) as output:
         if not output.complete:
             with stage(on_progress, title) as count:
@@ -216,15 +218,24 @@ def score_explained(
     return load_result(out, DeletionScores, command="sliplens score")
 
 
+_WIDEST = 12
+"""Frames of a panel at most, which can still be seen on a screen."""
+
+
 def draw_explained(explained: Explained, folder: Path, *, colours: Literal["signed", "jet"]) -> None:
-    """Write an overlay of every map (`overlays/METHOD/FRAME.png`), and all of them side by side (`panel.png`)."""
-    rows = {"What the network saw": list(explained.pictures)}
+    """Write an overlay of every map (`overlays/METHOD/FRAME.png`), and of a few frames all side by side (`panel.png`).
+
+    These are all frames, or of many `_WIDEST`, spread evenly over them in their order.
+    """
+    count = len(explained.frames)
+    columns = np.linspace(0, count - 1, min(count, _WIDEST)).round().astype(int).tolist()
+    rows = {"What the network saw": [explained.pictures[column] for column in columns]}
     for method, maps in explained.saliency.items():
         (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
         points = _points(explained.relevance[method])
         limit = _common_scale(points)
         scale = f"\nfull colour: {limit:.2g} points" if colours == "signed" else ""
-        row = rows[f"{method_name(method)}{scale}"] = []
+        row = []
         for frame, picture, saliency, signed in zip(explained.frames, explained.pictures, maps, points, strict=True):
             # a map that holds NaN is named in the notes, and is not shown
             finite = bool(np.isfinite(signed).all())
@@ -232,11 +243,12 @@ def draw_explained(explained: Explained, folder: Path, *, colours: Literal["sign
             row.append(overlay_relevance(picture, signed / limit) if colours == "signed" and finite else lay)
             if row[-1] is not None:
                 write_png(overlays / f"{frame.id}.png", row[-1])
+        rows[f"{method_name(method)}{scale}"] = [row[column] for column in columns]
     titles = [
         # of recorded images the margin need not be known
         f"{_short(frame.id)}\nread {percent(frame.prediction)}"
         + ("" if frame.safety_margin is None else f", true {percent(frame.safety_margin)}")
-        for frame in explained.frames
+        for frame in (explained.frames[column] for column in columns)
     ]
     if colours == "jet":
         bar, words = (
@@ -247,6 +259,8 @@ def draw_explained(explained: Explained, folder: Path, *, colours: Literal["sign
         bar = ScalarMappable(Normalize(-1, 1), SIGN_COLOURS)
         words = "lowers the margin  |  raises it, in shares of the full colour\n"
         words += "(which is in points of margin per 1 % of the image)"
+    if len(columns) < count:
+        words += f"\n{len(columns)} of {count} frames, evenly spread; overlays/ has them all"
     with drawing_style():
         draw_panel(rows, titles=titles, bar=bar, bar_label=words).savefig(folder / "panel.png", bbox_inches="tight")
 

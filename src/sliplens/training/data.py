@@ -5,6 +5,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -222,15 +223,14 @@ def load_frames(
     for done, info in enumerate(trials, start=1):
         recording = data.load(info, truth=False)
         labelled = np.flatnonzero(recording.labelled)
-        compared = encoding.compare(recording.frames[labelled], recording.reference)
-        images[len(rows) : len(rows) + len(labelled)] = encoding.resize(compared, image_size=image_size)
+        compare = partial(encoding.compare_small, reference=recording.reference, image_size=image_size)
+        images[len(rows) : len(rows) + len(labelled)] = compare(recording.frames[labelled])
         labels.append(recording.safety_margin[labelled])
         ratios.append(_ratios(recording)[labelled])
         times.append(recording.time_s[labelled])
         rows += [(recording.trial, int(frame), recording.condition, recording.day) for frame in labelled]
         if copies := copies_of(len(labelled)):
-            compared = encoding.compare(recording.reference[None], recording.reference)
-            images[len(rows) : len(rows) + copies] = encoding.resize(compared, image_size=image_size)
+            images[len(rows) : len(rows) + copies] = compare(recording.reference[None])
             labels.append(np.ones(copies))
             ratios.append(np.zeros(copies))
             times.append(np.full(copies, recording.time_s[0]))

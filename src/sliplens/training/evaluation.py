@@ -30,9 +30,9 @@ from sliplens.results.evaluation import (
     Baselines,
     BaselineScores,
     Evaluation,
-    Predictions,
     RegressionScores,
     Reliability,
+    ScoredFrames,
 )
 from sliplens.training.data import FrameSet, load_frames
 from sliplens.training.metrics import auroc, coverage, find_lead_times, risk_coverage, score_predictions
@@ -75,7 +75,12 @@ def choose_training(trials: Sequence[TrialInfo], count: int) -> tuple[TrialInfo,
 
 
 def evaluate_baselines(
-    plan: BaselinePlan, data: Dataset, predictions: Predictions, *, folder: Path, on_progress: OnProgress | None = None
+    plan: BaselinePlan,
+    data: Dataset,
+    predictions: ScoredFrames,
+    *,
+    folder: Path,
+    on_progress: OnProgress | None = None,
 ) -> tuple[Baselines, BaselinePredictions]:
     """Follow markers, fit estimators on training trials, and score them on the very frames a network was scored on.
 
@@ -148,7 +153,7 @@ def _margins(data: Dataset, info: TrialInfo) -> Float[np.ndarray, " frames"]:
     return np.where(recording.labelled, recording.safety_margin, np.nan)
 
 
-def _score(answers: Predictions) -> BaselineScores:
+def _score(answers: ScoredFrames) -> BaselineScores:
     conditions = {name: rows for (name,), rows in sorted(answers.groups("condition").items())}
     return BaselineScores(
         conditions={name: score_predictions(rows) for name, rows in conditions.items()},
@@ -336,7 +341,7 @@ def evaluate_frames(
     intervals = {level: ends for level in levels if (ends := estimate.interval(float(level)))}
     unknown, sigma = np.full(len(frames), np.nan), estimate.sigma
     low_90, high_90 = intervals.get("0.9", (unknown, unknown))
-    predictions = Predictions(
+    predictions = ScoredFrames(
         trial=np.array(frames.trial),
         condition=np.array(frames.condition),
         day=np.array(frames.day),

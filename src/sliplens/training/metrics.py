@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import RecordingError
-from sliplens.results.evaluation import BinScore, LeadTimes, Predictions, RegressionScores, RiskCoverage
+from sliplens.results.evaluation import BinScore, LeadTimes, RegressionScores, RiskCoverage, ScoredFrames
 
 
 def coverage(
@@ -155,12 +155,12 @@ def regression_scores(
     )
 
 
-def score_predictions(predictions: Predictions) -> RegressionScores:
+def score_predictions(predictions: ScoredFrames) -> RegressionScores:
     """Errors of some predictions against their labels."""
     count = len(set(predictions.trial.tolist()))
     return regression_scores(predictions.safety_margin, predictions.prediction, trials=count)
 
 
-def find_lead_times(predictions: Predictions) -> LeadTimes:
+def find_lead_times(predictions: ScoredFrames) -> LeadTimes:
     """Warnings of some predictions, see `lead_times`."""
     return lead_times(predictions.trial.tolist(), predictions.time_s, predictions.safety_margin, predictions.prediction)

@@ -28,7 +28,7 @@ from torch.utils.data import DataLoader
 from torchmetrics import MeanSquaredError
 
 from sliplens.errors import InputError, ModelError
-from sliplens.models.backbones import BINS, Answers, last_layer, margin_loss, ratio_edges
+from sliplens.models.backbones import BINS, Answers, bin_centres, last_layer, margin_loss, ratio_edges
 from sliplens.progress import OnProgress
 from sliplens.results.evaluation import LearningCurve
 from sliplens.training.config import TrainConfig
@@ -70,7 +70,7 @@ class Regressor(lightning.LightningModule):
         self.train_mse = MeanSquaredError()
         self.validation_mse = MeanSquaredError()
         edges = ratio_edges(model)
-        centres = None if edges is None else torch.from_numpy((edges[1:] + edges[:-1]) / 2).float()
+        centres = None if edges is None else torch.from_numpy(bin_centres(edges)).float()
         self.register_buffer("ratio_centres", centres, persistent=False)
 
         if config.learns == "ratio":

@@ -2,9 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from readers import read_force_table
-
-from sliplens.errors import RecordingError
+from readers import read_force_table, refused
 
 TIME = [0.0, 0.01, 0.02]
 FORCE = [[0.5, -0.25, 2.0], [0.75, -0.5, 4.0], [1.0, -0.75, 6.0]]
@@ -171,19 +169,15 @@ def test_what_was_assumed_is_told(tmp_path: Path):
     ],
 )
 def test_a_table_that_cannot_be_trusted_is_refused(tmp_path: Path, text: str, message: str):
-    with pytest.raises(RecordingError, match=message):
-        read_force_table(write(tmp_path, text))
+    refused(read_force_table, write(tmp_path, text), message)
 
 
 def test_what_is_no_text_is_refused(tmp_path: Path, rng: np.random.Generator):
     path = tmp_path / "forces.csv"
     path.write_bytes(rng.bytes(5000))
-    with pytest.raises(RecordingError, match=r"forces\.csv is not a text file; export the table as CSV"):
-        read_force_table(path)
-    with pytest.raises(RecordingError, match="does not exist; check the path"):
-        read_force_table(tmp_path / "nothing.csv")
-    with pytest.raises(RecordingError, match="is a folder, not a file"):
-        read_force_table(tmp_path)
+    refused(read_force_table, path, r"forces\.csv is not a text file; export the table as CSV")
+    refused(read_force_table, tmp_path / "nothing.csv", "does not exist; check the path")
+    refused(read_force_table, tmp_path, "is a folder, not a file")
 
 
 @pytest.mark.parametrize(
@@ -198,5 +192,4 @@ def test_what_is_no_text_is_refused(tmp_path: Path, rng: np.random.Generator):
     ],
 )
 def test_a_declaration_that_fits_nothing_is_refused(tmp_path: Path, options: dict, message: str):
-    with pytest.raises(RecordingError, match=message):
-        read_force_table(write(tmp_path, table()), **options)
+    refused(read_force_table, write(tmp_path, table()), message, **options)

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from readers import read_image_folder
+from readers import read_image_folder, refused
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.images import write_png
@@ -88,12 +88,9 @@ def test_forces_lie_beside_the_frames(folder: Path, tmp_path: Path):
 
 
 def test_times_must_be_given_in_one_way(folder: Path):
-    with pytest.raises(RecordingError, match="trial 7 have no times; give exactly one of --times, --frame-rate and"):
-        read_image_folder(folder)
-    with pytest.raises(RecordingError, match="more than one source of times"):
-        read_image_folder(folder, frame_rate=30.0, name_unit="s")
-    with pytest.raises(RecordingError, match=r"a frame rate of 0\.0 frames/s cannot be"):
-        read_image_folder(folder, frame_rate=0.0)
+    refused(read_image_folder, folder, "trial 7 have no times; give exactly one of --times, --frame-rate and")
+    refused(read_image_folder, folder, "more than one source of times", frame_rate=30.0, name_unit="s")
+    refused(read_image_folder, folder, r"a frame rate of 0\.0 frames/s cannot be", frame_rate=0.0)
 
 
 @pytest.mark.parametrize(
@@ -109,14 +106,12 @@ def test_times_must_be_given_in_one_way(folder: Path):
 def test_a_table_of_times_that_cannot_be_trusted_is_refused(folder: Path, tmp_path: Path, text: str, message: str):
     table = tmp_path / "times.csv"
     table.write_text(text)
-    with pytest.raises(RecordingError, match=message):
-        read_image_folder(folder, times=table)
+    refused(read_image_folder, folder, message, times=table)
 
 
 def test_frames_of_two_sizes_are_refused(folder: Path, frames: np.ndarray):
     write_png(folder / "image_5.png", frames[0, :10])
-    with pytest.raises(RecordingError, match=r"image_5\.png is 30 x 10 pixels but image_1\.png is 30 x 20"):
-        read_image_folder(folder, frame_rate=30.0)
+    refused(read_image_folder, folder, r"image_5\.png is 30 x 10 pixels but image_1\.png is 30 x 20", frame_rate=30.0)
 
 
 @pytest.mark.parametrize(

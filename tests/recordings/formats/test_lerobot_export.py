@@ -11,7 +11,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from data_sets import save_dataset
+from labelled import LABELLING
 from readers import read_lerobot
+from there import there
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.images import decode_png
@@ -20,8 +23,6 @@ from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.formats.lerobot_export import DataFiles, number_stats, write_lerobot
 from sliplens.recordings.formats.stored import read_stored
-from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
-from sliplens.recordings.labels import FrictionEstimate
 from sliplens.recordings.store import forces_path, load_recording, save_forces, save_recording
 from sliplens.recordings.trial import Labels
 from sliplens.recordings.trial_writer import import_trial
@@ -56,38 +57,6 @@ def make_trial(trial: str, rng: np.random.Generator, *, count: int, **changes: A
     )
 
 
-LABELLING = Labelling(
-    source="Prüfstand ‰",
-    forces=None,
-    notes=("Grüße\u2028",),
-    reference=ReferenceChoice(index=4, method="named", contact_energy=0.1 + 0.2),
-    clip=Clip(slips=True, grasp="cup 1", stale_frames=3),
-    basis=LabelBasis(
-        axes=ForceAxes(
-            normal="z",
-            sign=-1,
-            tare_n=(0.1 + 0.2, -1e-300, 0.0),
-            noise_n=(0.1, 0.2, 0.3),
-            tare_sigma_n=(1 / 3, 0.0, 0.0),
-            still_until_s=None,
-            normal_found=Found.INFERRED,
-            sign_found=Found.DECLARED,
-            tare_found=Found.ASSUMED,
-        ),
-        friction=FrictionEstimate(mu=0.3, low=0.2, high=0.4),
-        friction_change=0.0,
-        slip_s=None,
-        lag=Lag(lag_s=0.1, sigma_s=1 / 3),
-        lag_applied=False,
-        contact_threshold_n=0.1,
-        window_s=0.04,
-        gap_s=0.01,
-        force_range_n=None,
-    ),
-)
-"""How labels were made, with all that can be told."""
-
-
 def save_found(folder: Path, trial: Recording, rng: np.random.Generator) -> None:
     """A trial as an import leaves it: doubted labels, what they rest on, and samples of the sensor on another clock."""
     found = replace(
@@ -112,14 +81,8 @@ def data(tmp_path: Path, rng: np.random.Generator) -> Dataset:
     folder = tmp_path / "data"
     unknown = np.full(LENGTHS["wet"], np.nan)
     blind = dict.fromkeys(("normal_force_n", "tangential_force_n", "friction_coefficient"), unknown)
-    save_recording(
-        make_trial("pressed", rng, count=LENGTHS["pressed"]),
-        trial_path(folder, "pressed"),
-    )
-    save_recording(
-        make_trial("wet", rng, count=LENGTHS["wet"], condition="wet", **blind),
-        trial_path(folder, "wet"),
-    )
+    save_recording(make_trial("pressed", rng, count=LENGTHS["pressed"]), trial_path(folder, "pressed"))
+    save_recording(make_trial("wet", rng, count=LENGTHS["wet"], condition="wet", **blind), trial_path(folder, "wet"))
     save_found(folder, make_trial("found", rng, count=LENGTHS["found"]), rng)
     splits = {"pressed": "train", "wet": "test", "found": "train"}
     table = [trial_info(trial_path(folder, name), split=split) for name, split in splits.items()]
@@ -153,9 +116,8 @@ def assert_same(first: Capture, second: Capture) -> None:
     facts = ("trial", "sensor", "day", "condition", "object", "split", "simulated")
     for name in ("frame_time_s", "frame_size", "reference", "notes", *facts):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
-    assert first.labels is not None
     for field in fields(Labels):
-        np.testing.assert_array_equal(getattr(first.labels, field.name), getattr(second.labels, field.name))
+        np.testing.assert_array_equal(getattr(there(first.labels), field.name), getattr(second.labels, field.name))
     assert (first.forces is None) == (second.forces is None)
     if first.forces is not None and second.forces is not None:
         assert first.forces.source == second.forces.source
@@ -168,8 +130,7 @@ def test_all_that_is_known_of_a_trial_comes_back(data, exported):
     found = back["found"]
     assert (found.sensor, found.day, found.condition, found.object) == ("dome", 3, "dry", "cup")
     assert (found.split, found.simulated) == ("train", False)
-    assert back["found"].forces is not None
-    assert len(back["found"].forces.time_s) == 500
+    assert len(there(back["found"].forces).time_s) == 500
     assert back["wet"].forces is None
     originals = read_stored(data.folder)
     assert len(back) == len(originals) == 3
@@ -259,8 +220,7 @@ def test_numbers_and_words_are_where_the_features_say(data, exported):
     rows, features = read_rows(exported), read_info(exported)["features"]
     (found,) = (capture for capture in read_stored(data.folder) if capture.trial == "found")
     own = rows.filter(pa.array(rows["episode_index"].to_numpy() == 1))
-    labels = found.labels
-    assert labels is not None
+    labels = there(found.labels)
     force = np.array(own["observation.force"].to_pylist())
     expected = np.stack([labels.tangential_force_n, np.zeros(len(force)), labels.normal_force_n], axis=1)
     np.testing.assert_array_equal(force, expected)
@@ -269,8 +229,7 @@ def test_numbers_and_words_are_where_the_features_say(data, exported):
     np.testing.assert_array_equal(own["observation.time_s"].to_numpy(), found.frame_time_s)
     for name, words in (("contact_state", labels.contact_state), ("invalid_reason", labels.reason)):
         values = features[f"observation.{name}"]["info"]["values"]
-        assert words is not None
-        assert [values[code] for code in own[f"observation.{name}"].to_pylist()] == [str(word) for word in words]
+        assert [values[code] for code in own[f"observation.{name}"].to_pylist()] == [str(word) for word in there(words)]
 
 
 def test_an_image_is_a_png_of_the_frame(data, exported):
@@ -334,10 +293,8 @@ def test_memory_does_not_grow_with_the_length_of_a_trial(tmp_path, rng):
     peaks = []
     for count in (64, 512):
         folder, out = tmp_path / f"{count}", tmp_path / f"{count}-out"
-        save_recording(make_trial("a", rng, count=count), trial_path(folder, "a"))
-        write_dataset_table(folder, [trial_info(trial_path(folder, "a"), split="train")])
+        data = save_dataset(folder, make_trial("a", rng, count=count))
         out.mkdir()
-        data = load_dataset(folder)
         tracemalloc.start()
         write_lerobot(data, out)
         peaks.append(tracemalloc.get_traced_memory()[1])
@@ -350,10 +307,9 @@ def test_memory_does_not_grow_with_the_length_of_a_trial(tmp_path, rng):
 def test_the_rate_is_the_median_and_whole_where_it_nearly_is(tmp_path, rng, rate, fps):
     time = np.arange(9) / rate
     time[5:] += 0.7 / rate  # a frame came late, and those after it
-    save_recording(make_trial("a", rng, count=9, time_s=time), trial_path(tmp_path / "data", "a"))
-    write_dataset_table(tmp_path / "data", [trial_info(trial_path(tmp_path / "data", "a"), split="train")])
+    data = save_dataset(tmp_path / "data", make_trial("a", rng, count=9, time_s=time))
     (tmp_path / "out").mkdir()
-    write_lerobot(load_dataset(tmp_path / "data"), tmp_path / "out")
+    write_lerobot(data, tmp_path / "out")
     # the median of steps is the reciprocal of the rate up to rounding
     assert read_info(tmp_path / "out")["fps"] == pytest.approx(fps, rel=1e-12)
     assert isinstance(read_info(tmp_path / "out")["fps"], type(fps))
@@ -361,10 +317,9 @@ def test_the_rate_is_the_median_and_whole_where_it_nearly_is(tmp_path, rng, rate
 
 
 def test_one_frame_alone_has_a_rate_too(tmp_path, rng):
-    save_recording(make_trial("a", rng, count=1), trial_path(tmp_path / "data", "a"))
-    write_dataset_table(tmp_path / "data", [trial_info(trial_path(tmp_path / "data", "a"), split="train")])
+    data = save_dataset(tmp_path / "data", make_trial("a", rng, count=1))
     (tmp_path / "out").mkdir()
-    write_lerobot(load_dataset(tmp_path / "data"), tmp_path / "out")
+    write_lerobot(data, tmp_path / "out")
     assert read_info(tmp_path / "out")["fps"] == 30
     assert len(list(read_lerobot(tmp_path / "out")[0].read_frames())) == 1
 
@@ -380,15 +335,11 @@ def test_one_frame_alone_has_a_rate_too(tmp_path, rng):
     ],
 )
 def test_trials_that_do_not_go_together_are_refused(tmp_path, rng, changes, message):
-    folder = tmp_path / "data"
-    table = []
-    for name, more in (("a", {}), ("c", {}), ("b", changes)):
-        save_recording(make_trial(name, rng, count=9, **more), trial_path(folder, name))
-        table.append(trial_info(trial_path(folder, name), split="train"))
-    write_dataset_table(folder, table)
+    made = [make_trial(name, rng, count=9, **more) for name, more in (("a", {}), ("c", {}), ("b", changes))]
+    data = save_dataset(tmp_path / "data", *made)
     (tmp_path / "out").mkdir()
     with pytest.raises(RecordingError, match=message):
-        write_lerobot(load_dataset(folder), tmp_path / "out")
+        write_lerobot(data, tmp_path / "out")
 
 
 def test_a_folder_that_cannot_take_it_is_refused(data, exported, tmp_path):

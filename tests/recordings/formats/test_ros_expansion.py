@@ -5,13 +5,13 @@ import struct
 import subprocess
 import sys
 import textwrap
-import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from memory import held_below
 
 from sliplens.errors import RecordingError
 
@@ -96,14 +96,8 @@ PACKERS: dict[str, tuple[str, Compress]] = {
 
 @contextmanager
 def refused_in(most_bytes: float, *, match: str) -> Iterator[None]:
-    tracemalloc.start()
-    try:
-        with pytest.raises(RecordingError, match=match):
-            yield
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert peak < most_bytes
+    with held_below(most_bytes), pytest.raises(RecordingError, match=match):
+        yield
 
 
 @pytest.fixture

@@ -2,7 +2,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from readers import read_thesis
+from readers import read_thesis, refused
+from there import there
 
 from sliplens.errors import ImageError, RecordingError
 from sliplens.images import write_png
@@ -44,8 +45,7 @@ MARGINS = ["1.0", "0.6", "0.2"]
 
 
 def margins_of(capture: Capture) -> np.ndarray:
-    assert capture.labels is not None
-    return capture.labels.safety_margin
+    return there(capture.labels).safety_margin
 
 
 @pytest.fixture
@@ -56,8 +56,7 @@ def data(tmp_path: Path, images: dict[str, np.ndarray]) -> Path:
 def test_the_lists_of_the_thesis_give_frames_reference_and_margins(data: Path, images: dict[str, np.ndarray]):
     (trial,) = read_thesis(write_lists(data, FRAMES, REFERENCE, MARGINS))
     np.testing.assert_array_equal(list(trial.read_frames()), [images[name] for name in FRAMES])
-    assert trial.reference is not None
-    np.testing.assert_array_equal(trial.reference, images[REFERENCE[0]])
+    np.testing.assert_array_equal(there(trial.reference), images[REFERENCE[0]])
     np.testing.assert_array_equal(margins_of(trial), [1, 0.6, 0.2])
     assert (trial.trial, len(trial), trial.frame_size) == ("train_dataset", 3, (16, 16))
     assert trial.notes[0] == "train_dataset_gamma.csv: safety margins were read as fractions (by their size)."
@@ -84,8 +83,7 @@ def test_relative_paths_start_at_the_list_and_stay_in_the_root(data: Path, tmp_p
     frames, references = ([f"../data/{name}" for name in names] for names in (FRAMES, REFERENCE))
     lists = write_lists(tmp_path / "lists", frames, references, MARGINS)
     assert len(read_thesis(lists, image_root=tmp_path)) == 1
-    with pytest.raises(RecordingError, match=r"line 1: '\.\./data/trial77/L/image_0\.tiff' leads out of .*lists; give"):
-        read_thesis(lists)
+    refused(read_thesis, lists, r"line 1: '\.\./data/trial77/L/image_0\.tiff' leads out of .*lists; give")
 
 
 def test_each_reference_frame_makes_a_trial(data: Path, images: dict[str, np.ndarray]):
@@ -96,8 +94,7 @@ def test_each_reference_frame_makes_a_trial(data: Path, images: dict[str, np.nda
     trials = read_thesis(write_lists(data, mixed, references, margins))
     assert [trial.trial for trial in trials] == ["train_dataset-1", "train_dataset-2"]
     for trial, place in zip(trials, ("trial83", "trial77"), strict=True):
-        assert trial.reference is not None
-        np.testing.assert_array_equal(trial.reference, images[f"{place}/L/image_0.tiff"])
+        np.testing.assert_array_equal(there(trial.reference), images[f"{place}/L/image_0.tiff"])
     np.testing.assert_array_equal(margins_of(trials[1]), [0.8, 0.6, 0.4])
 
 
@@ -182,8 +179,7 @@ def test_the_folder_of_one_list_is_enough(data: Path):
 def test_lists_that_do_not_fit_are_refused(
     data: Path, frames: list[str], references: list[str], margins: list[str], message: str
 ):
-    with pytest.raises(RecordingError, match=message):
-        read_thesis(write_lists(data, frames, references, margins))
+    refused(read_thesis, write_lists(data, frames, references, margins), message)
 
 
 def test_a_unit_of_no_margin_is_refused(data: Path):
@@ -198,11 +194,9 @@ def test_missing_and_binary_lists_are_refused(data: Path):
     with pytest.raises(RecordingError, match=r"is not a list of the thesis; name the file that ends in _images_L\.txt"):
         read_thesis(data / "train_dataset_gamma.csv")
     (data / "train_dataset_images_Lref.txt").unlink()
-    with pytest.raises(RecordingError, match=r"Lref\.txt does not exist; the lists of a set must lie in one folder"):
-        read_thesis(lists)
+    refused(read_thesis, lists, r"Lref\.txt does not exist; the lists of a set must lie in one folder")
     lists.write_bytes(b"\x00\xff\x00\xfe")
-    with pytest.raises(RecordingError, match="is not a text file"):
-        read_thesis(lists)
+    refused(read_thesis, lists, "is not a text file")
 
 
 def test_a_listed_file_that_is_no_image_is_refused(data: Path):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sliplens.errors import RecordingError
+from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.tables import open_table, trial_name
 from sliplens.recordings.formats.video import count_stale, least_contact, read_video, small_copies
@@ -34,7 +35,7 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     row, whole = rows[key], read_video(path, ReadOptions())
     if len(whole) != int(row["n_frames"]):
         raise RecordingError(
-            f"{path} has {len(whole)} frames but {table.name} says {row['n_frames']}; copy the clip again"
+            f"{path} has {number_of(len(whole), 'frame')} but {table.name} says {row['n_frames']}; copy the clip again"
         )
     copies = small_copies(whole.read_frames())
     stale = count_stale(copies)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import require_file
+from sliplens.progress import number_of
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels.axes import typical_step
 from sliplens.recordings.options import ReadOptions
@@ -67,7 +68,8 @@ class TextTable:
                 if self.separator == "," and len(fields) > len(self.header):
                     cure = "where decimals are commas, separate the columns by semicolons"
                 raise RecordingError(
-                    f"{self.path}, line {line} has {len(fields)} columns but the header {len(self.header)}; {cure}"
+                    f"{self.path}, line {line} has {number_of(len(fields), 'column')} but the header "
+                    f"{len(self.header)}; {cure}"
                 )
             yield line, fields
 

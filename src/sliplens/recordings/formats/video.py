@@ -17,7 +17,8 @@ from av.video.stream import VideoStream
 from jaxtyping import Float, Float32, Int64
 
 from sliplens.errors import RecordingError
-from sliplens.images import MOST_PIXELS
+from sliplens.images import MOST_PIXELS, is_image
+from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import evenly_spaced, place_on_clock, trial_name
 from sliplens.recordings.options import ReadOptions
@@ -145,6 +146,8 @@ def open_video(path: Path, *, missing: str = "name a video file") -> Iterator[tu
     """Container of a video, never a play list, and its first stream of moving pictures; tells what FFmpeg raises."""
     if not path.is_file():
         raise RecordingError(f"{path} {'is no file' if path.exists() else 'does not exist'}; {missing}")
+    if is_image(path):
+        raise RecordingError(f"{path} is an image and no video; name the folder that it lies in")
     try:
         # an absolute path cannot be taken for an address or a pattern of file names
         with av.open(str(path.absolute()), options=_OPTIONS, **_LENIENT) as container:
@@ -232,7 +235,7 @@ def decode_video(path: Path, file: VideoFile) -> Iterator[Frame]:
         except FFmpegError as error:
             raise RecordingError(_damaged(path, count, error.strerror)) from None
     if count < file.frames:
-        raise RecordingError(_damaged(path, count, f"the file has stamps of {file.frames} frames"))
+        raise RecordingError(_damaged(path, count, f"the file has stamps of {number_of(file.frames, 'frame')}"))
 
 
 def _damaged(path: Path, frame: int, reason: str | None) -> str:
@@ -260,7 +263,7 @@ def read_video(path: Path, options: ReadOptions) -> Capture:
     if options.skip_stale:
         skipped = max(skipped, count_stale(small_copies(decode_video(path, file))))
     if skipped >= file.frames:
-        raise RecordingError(f"{path} has {file.frames} frames, {skipped} were to be skipped; skip fewer")
+        raise RecordingError(f"{path} has {number_of(file.frames, 'frame')}, {skipped} were to be skipped; skip fewer")
     if skipped:
         notes.append(f"{path.name}: the first {skipped} of {file.frames} frames were left out.")
     return Capture(

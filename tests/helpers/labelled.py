@@ -1,0 +1,34 @@
+"""How labels were made, with all that can be told and numbers that no rounding keeps."""
+
+from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
+from sliplens.recordings.labels import FrictionEstimate
+
+LABELLING = Labelling(
+    source="Prüfstand ‰",
+    forces=None,
+    notes=("Grüße\u2028",),
+    reference=ReferenceChoice(index=4, method="named", contact_energy=0.1 + 0.2),
+    clip=Clip(slips=True, grasp="cup 1", stale_frames=3),
+    basis=LabelBasis(
+        axes=ForceAxes(
+            normal="z",
+            sign=-1,
+            tare_n=(0.1 + 0.2, -1e-300, 0.0),
+            noise_n=(0.1, 0.2, 0.3),
+            tare_sigma_n=(1 / 3, 0.0, 0.0),
+            still_until_s=None,
+            normal_found=Found.INFERRED,
+            sign_found=Found.DECLARED,
+            tare_found=Found.ASSUMED,
+        ),
+        friction=FrictionEstimate(mu=0.3, low=0.2, high=0.4),
+        friction_change=0.0,
+        slip_s=None,
+        lag=Lag(lag_s=0.1, sigma_s=1 / 3),
+        lag_applied=False,
+        contact_threshold_n=0.1,
+        window_s=0.04,
+        gap_s=0.01,
+        force_range_n=None,
+    ),
+)

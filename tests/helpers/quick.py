@@ -1,0 +1,18 @@
+"""Explainers with fewer passes than by default, for tests that ask for their laws and not for their precision."""
+
+import torch
+
+from sliplens.explainers import ExpectedGradients, IntegratedGradients, Occlusion, SmoothGrad
+from sliplens.explainers.shapley import Shapley
+
+SHORT = IntegratedGradients(steps=8, max_steps=40)
+MARKERS = torch.tensor([[10.0, 12.0], [40.0, 20.0], [25.0, 50.0]])
+QUICK = {
+    "integrated-gradients": SHORT,
+    "expected-gradients": ExpectedGradients(integrated=SHORT),
+    "smooth-grad": SmoothGrad(samples=2),
+    "occlusion": Occlusion(tile_px=32),
+    "occlusion-marker": Occlusion(markers_px=MARKERS),
+    "shapley": Shapley(tile_px=32),
+    "shapley-marker": Shapley(markers_px=MARKERS, pairs=8),
+}
