@@ -22,6 +22,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 
+from sliplens.files import DEFAULT_NETWORK
 from sliplens.friction import GRASP_SPREAD, Friction, SlipLearner
 from sliplens.grip import (
     CONDITIONS,
@@ -414,7 +415,7 @@ def compare_all(options: argparse.Namespace, rng: np.random.Generator) -> dict[s
     return found
 
 
-RUN = load("chromatouch-difference")
+RUN = load(DEFAULT_NETWORK)
 _TABLE = load_readings(RUN)
 assert _TABLE is not None  # it comes with the network
 READINGS = _TABLE.of(slice(CHOSEN, None))

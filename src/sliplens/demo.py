@@ -9,7 +9,7 @@ from pathlib import Path
 from sliplens.codec import load_record, load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import RECOMMENDED_METHOD
-from sliplens.files import output_folder, require_folder
+from sliplens.files import DIFFERENCE_NETWORK, output_folder, require_folder
 from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset
@@ -20,7 +20,7 @@ from sliplens.study import explain_source, explain_trial, run_study, score_expla
 from sliplens.study.scoring import STEPS, Setting
 from sliplens.training import evaluate, train
 
-NETWORKS = {"difference": "chromatouch-difference", "raw": "thesis-raw"}
+NETWORKS = {"difference": DIFFERENCE_NETWORK, "raw": "thesis-raw"}
 """Networks of the package that the demo reads with, by what they see."""
 INPUTS = tuple(NETWORKS)
 METHODS = ("grad-cam-thesis", "integrated-gradients-thesis", "poly-cam-thesis", RECOMMENDED_METHOD)

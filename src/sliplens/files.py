@@ -437,6 +437,10 @@ def require_folder(path: Path, *, what: str) -> Path:
 
 # the package is installed as files, never as an archive: its weights are mapped into memory from there
 _WEIGHTS = Path(str(files("sliplens"))) / "weights"
+DEFAULT_NETWORK = "chromatouch-pair"
+"""Network of the package that reads where none is named."""
+DIFFERENCE_NETWORK = "chromatouch-difference"
+"""The same for difference images, which show no frame."""
 
 
 def shipped_names() -> list[str]:

@@ -42,7 +42,7 @@ def test_the_overview_has_a_line_a_command(capsys: pytest.CaptureFixture[str], m
 def test_paragraphs_of_options_have_no_ragged_lines(capsys: pytest.CaptureFixture[str]):
     words = " ".join(told(capsys, "study").replace("\u2502", " ").split())
     assert "which takes" not in words
-    assert "If not given, chromatouch-difference, or with --preset thesis-difference and thesis-raw." in words
+    assert "If not given, chromatouch-pair, or with --preset thesis-difference and thesis-raw." in words
 
 
 @pytest.mark.parametrize("command", COMMANDS)

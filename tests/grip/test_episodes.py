@@ -12,6 +12,7 @@ import torch
 import sliplens as sl
 from sliplens.codec import load_result
 from sliplens.errors import InputError
+from sliplens.files import DEFAULT_NETWORK
 from sliplens.friction import GRASP_SPREAD, Friction, SlipLearner
 from sliplens.grip import (
     CONDITIONS,
@@ -39,7 +40,7 @@ from sliplens.results.grip import Grip
 
 @cache
 def shipped() -> Run:
-    return sl.load("chromatouch-difference")
+    return sl.load(DEFAULT_NETWORK)
 
 
 @pytest.fixture(scope="module")

@@ -174,7 +174,7 @@ def test_a_gripper_that_misbehaves_holds_a_cup_by_what_is_read_of_its_frames(gri
     page = (Path(__file__).parents[2] / "docs" / "grip.md").read_text(encoding="utf-8")
     [code] = re.findall(r"## Hold with my own gripper.*?^```python\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
     for old, new in (
-        ('"0", "chromatouch-difference"', 'source, "chromatouch-difference", seconds=1.8, **given'),
+        ('"0", "chromatouch-pair"', 'source, "chromatouch-pair", seconds=1.8, **given'),
         ('"tcp://gripper:5000"', "address"),
         ("ceiling_n=4.0", "ceiling_n=2.6"),
     ):

@@ -135,3 +135,6 @@ def test_the_network_may_be_left_out():
     alone, named = sliplens.predict(frames), sliplens.predict("chromatouch-difference", frames)
     assert pa.table(alone).equals(named.frame())
     assert len(alone) == 3
+    # camera frames, for whose reference somebody asks, go to the network that sees both
+    alone = sliplens.predict(frames + 90, reference=frames[0] + 90)
+    assert pa.table(alone).equals(sliplens.predict("chromatouch-pair", frames + 90, reference=frames[0] + 90).frame())

@@ -8,6 +8,7 @@ import tyro
 from sliplens.cli.command import Command, InOrder, Output, SameObject
 from sliplens.cli.console import print_table
 from sliplens.errors import InputError
+from sliplens.files import DEFAULT_NETWORK
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +32,7 @@ class Grip(Command):
     """How many, each drawn anew."""
     rendered: bool | None = None
     """Close the loop through pixels; if not given, for a single episode."""
-    network: str = "chromatouch-difference"
+    network: str = DEFAULT_NETWORK
     """Folder of a trained network, or the name of one that comes with sliplens."""
     set: tuple[str, ...] = ()
     """Constants of the controller to change, such as --set target=0.3 down_n_s=2."""

@@ -20,7 +20,7 @@ from sliplens.errors import InputError
 
 EXAMPLES = {
     "demo": "sliplens demo runs/demo",
-    "live": "sliplens live 0 --network chromatouch-difference --reference untouched.png",
+    "live": "sliplens live 0 --network chromatouch-pair --reference untouched.png",
     "sensor": "sliplens sensor new --from tip.mp4 -o tip.toml",
     "simulate": "sliplens simulate runs/mine/data --preset small",
     "import": "sliplens import cup.mp4 --forces cup.csv --sensor tip.toml -o runs/mine/data",
@@ -29,7 +29,7 @@ EXAMPLES = {
     "check": "sliplens check runs/mine/data",
     "view": "sliplens view runs/mine/data --trial cup --predictions margins.parquet --maps runs/mine/explain",
     "track": "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",
-    "train": "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-difference --epochs 5",
+    "train": "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-pair --epochs 5",
     "evaluate": "sliplens evaluate runs/mine/train runs/mine/data -o runs/mine/evaluate",
     "predict": "sliplens predict cup.mp4 --sensor tip.toml --plot margin.png -o margins.csv",
     "export": "sliplens export runs/mine/train --onnx -o tip.onnx",

@@ -13,7 +13,7 @@ from sliplens.cli.command import Command, Device, Friction, InOrder, SameObject
 from sliplens.cli.console import say, wrote
 from sliplens.cli.grip import constant
 from sliplens.errors import InputError, SliplensError
-from sliplens.files import to_builtins
+from sliplens.files import DEFAULT_NETWORK, to_builtins
 from sliplens.progress import number_of
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class Hold(Command):
     joint: str | None = None
     """Joint of a gripper of ROS 2 that tells width and force; the first if not given."""
     network: str | None = None
-    """Folder or name of a trained network. If not given, chromatouch-difference for what is simulated, else none."""
+    """Folder or name of a trained network. If not given, chromatouch-pair for what is simulated, else none."""
     reference: tuple[Path, ...] = ()
     """Image of each untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None
@@ -111,7 +111,7 @@ class Hold(Command):
         if self.reference and len(self.reference) != len(self.sources):
             raise InputError(f"--reference takes an image a source, {len(self.sources)}, got {len(self.reference)}")
         shipped = all(source.partition(":")[0] in {"grip", "simulated"} for source in self.sources)
-        name = self.network or ("chromatouch-difference" if shipped else None)
+        name = self.network or (DEFAULT_NETWORK if shipped else None)
         common = {
             name: getattr(self, name) for name in ("friction", "same_object", "sequence", "sensor", "engine", "device")
         }

@@ -12,6 +12,7 @@ import tyro
 
 from sliplens.cli.command import Device, Friction, InOrder, SameObject
 from sliplens.cli.console import print_table, say
+from sliplens.files import DEFAULT_NETWORK
 
 if TYPE_CHECKING:
     from sliplens.live import LiveReader
@@ -30,7 +31,7 @@ class Live:
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="[SOURCE]", help=_SOURCE)] = "simulated"
     network: str | None = None
-    """Folder or name of a trained network. If not given, that of the profile; chromatouch-difference for what is
+    """Folder or name of a trained network. If not given, that of the profile; chromatouch-pair for what is
     simulated, else none."""
     reference: Path | None = None
     """Image of the untouched sensor; taken when the picture is still at first if not given."""
@@ -90,7 +91,7 @@ class Live:
             self._list()
             return
         grips = self.source.partition(":")[0] == "grip"
-        shipped = "chromatouch-difference" if grips or self.source in {"simulated", "simulated:chromatouch"} else None
+        shipped = DEFAULT_NETWORK if grips or self.source in {"simulated", "simulated:chromatouch"} else None
         wishes = {name: getattr(self, name) for name in ("speed", "trial", "pixel_format")}
         options = SourceOptions(rate_hz=self.rate, size=parse_size(self.size), **wishes)
         names = ("reference", "engine", "device", "seconds", "forces", "friction", "same_object", "sequence")

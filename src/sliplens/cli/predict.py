@@ -10,13 +10,16 @@ import tyro
 from sliplens.cli.command import NETWORK_HELP, SOURCE_HELP, Device, Friction, InOrder, On, RetryFailed, SourceCommand
 from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
-from sliplens.files import require_new_file
+from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, require_new_file
 from sliplens.progress import number_of
 
 if TYPE_CHECKING:
     from sliplens.models.predictions import Predictions, TrialMargins
 
-_RUN = f"{NETWORK_HELP} If left out, the one that the sensor's profile names, else chromatouch-difference."
+_RUN = (
+    f"{NETWORK_HELP} If left out, the one that the sensor's profile names, else {DEFAULT_NETWORK}, or "
+    f"{DIFFERENCE_NETWORK} for difference images."
+)
 _FEW = 24
 """Frames of which each has a line on the terminal."""
 _TRIALS = 40

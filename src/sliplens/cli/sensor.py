@@ -9,6 +9,7 @@ import tyro
 from sliplens.cli.command import Command
 from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
+from sliplens.files import DEFAULT_NETWORK
 
 _TASK = "new makes a profile, list tells those that come with sliplens."
 
@@ -28,7 +29,7 @@ class Sensor(Command):
     """Profile to write; the picture stands beside it as PNG."""
     name: str | None = None
     """Name of the sensor; that of the file if not given."""
-    network: str = "chromatouch-difference"
+    network: str = DEFAULT_NETWORK
     """Network that is to read the frames: they are brought to the size it was trained on."""
     keep_size: bool = False
     """Leave the gel in the camera's resolution, to train a network of its own; no network is named then."""

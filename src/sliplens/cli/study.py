@@ -12,6 +12,7 @@ from sliplens.cli.report import Report
 from sliplens.cli.simulate import Simulate
 from sliplens.errors import InputError
 from sliplens.extras import require_device
+from sliplens.files import DEFAULT_NETWORK
 
 _PRESET_FRAMES = 80
 """Frames of each simulated trial; the thesis has about 800, which takes ten times as long and says the same."""
@@ -32,7 +33,7 @@ class Study(Command):
     """Folder to make, one subfolder a stage; the page is report.html in it."""
     network: tuple[str, ...] | None = None
     """Networks to explain, folders or names of those that come with sliplens, one an input. If not given,
-    chromatouch-difference, or with --preset thesis-difference and thesis-raw."""
+    chromatouch-pair, or with --preset thesis-difference and thesis-raw."""
     preset: Literal["thesis"] | None = None
     """Simulate the data set first: the days and trials of the thesis, 80 frames each, some 1.5 GB; and explain networks
     that were trained on its training trials with the recipe of the thesis."""
@@ -66,7 +67,7 @@ class Study(Command):
         if (self.data is None) == (self.preset is None):
             raise InputError("name a data set, or --preset thesis to simulate one")
         require_device(self.device)
-        own = ("thesis-difference", "thesis-raw") if self.preset else ("chromatouch-difference",)
+        own = ("thesis-difference", "thesis-raw") if self.preset else (DEFAULT_NETWORK,)
         # a mistake is told before a data set is simulated
         networks = load_networks(self.network or own, device=self.device)
         study_explainers(methods := self.method or STUDY_METHODS, budget=self.budget)

@@ -102,10 +102,6 @@ class MarginGrip(ABC):
     0.1 suit."""
     zero: float = 0.5
     """r_0 before any slip, a share: what may be read where the object already slides."""
-    trained_n: float = 2.25
-    """Normal force up to which the network reads as it was trained to; its training ended at 2 N."""
-    sag_per_n: float = 0.18
-    """Share of the margin by which it reads too low for each newton beyond (measured up to 4 N)."""
     start_n: float = 2.0
     """Force to lift with."""
     least_n: float = 0.5
@@ -140,7 +136,6 @@ class MarginGrip(ABC):
     def margin_of(self, seen: Observation) -> Float[np.ndarray, " episodes"]:
         """Margin to act on, a share; NaN where no finger reads."""
         margin = seen.margin - self.caution * (seen.margin - seen.low)
-        margin = margin / (1 - self.sag_per_n * np.maximum(seen.force_n - self.trained_n, 0))[:, None]
         reads = np.isfinite(margin)
         read = np.where(reads, margin, 0).sum(axis=1) / np.where(reads.any(axis=1), reads.sum(axis=1), np.nan)
         change = read - self._last

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import explain, get_explainer
-from sliplens.files import output_folder, remove, to_builtins
+from sliplens.files import DEFAULT_NETWORK, output_folder, remove, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import Controller, make_controller
 from sliplens.grip.loop import GripLoop, RenderedEyes, TableEyes, Tick
@@ -57,7 +57,7 @@ def run_episodes(
     *,
     condition: str = "dry",
     episodes: int = 1,
-    network: str | Path | Run = "chromatouch-difference",
+    network: str | Path | Run = DEFAULT_NETWORK,
     rendered: bool = False,
     readings: ReadingTable | None = None,
     error_scale: float = 1.0,

@@ -14,7 +14,7 @@ import numpy as np
 
 from sliplens.codec import save_result
 from sliplens.errors import InputError
-from sliplens.files import output_folder
+from sliplens.files import DEFAULT_NETWORK, output_folder
 from sliplens.grip.controllers import Answer, AssumedFriction, Controller, Holder, MarginGrip, Oracle, make_controller
 from sliplens.grip.gripper import DryRun, Gripper, GripperError, GuardedGripper, open_gripper
 from sliplens.grip.plant import PERIOD_S
@@ -122,7 +122,7 @@ def hold_grip(
     Examples
     --------
     >>> import sliplens as sl
-    >>> with sl.LiveReader("simulated", "chromatouch-difference", engine="eager") as reader:
+    >>> with sl.LiveReader("simulated", "chromatouch-pair", engine="eager") as reader:
     ...     hold = sl.hold_grip(reader, "dry-run", ceiling_n=3.0, seconds=0.2)
     >>> bool((hold.steps.command_n >= 2).all())  # lifted with 2 N, whatever is read
     True
@@ -302,7 +302,7 @@ def _readers(
         if isinstance(source, str) and source.partition(":")[0] == "grip":
             source = open_grip(source, SourceOptions())
         if network is None and isinstance(source, GripSource):
-            network = "chromatouch-difference"
+            network = DEFAULT_NETWORK
         return [stack.enter_context(LiveReader(source, network))]
     readers = [source] if isinstance(source, LiveReader) else list(source)
     if len(readers) not in {1, 2}:

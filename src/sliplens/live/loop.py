@@ -158,7 +158,7 @@ class LiveReader:
     >>> import numpy as np
     >>> import sliplens as sl
     >>> frames = np.full((20, 224, 224, 3), 128, dtype=np.uint8)
-    >>> with sl.LiveReader(frames, "chromatouch-difference", reference=frames[0], engine="eager") as reader:
+    >>> with sl.LiveReader(frames, "chromatouch-pair", reference=frames[0], engine="eager") as reader:
     ...     readings = list(reader.readings())
     >>> readings[-1].number
     19

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from sliplens.codec import load_record, load_result, save_record
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
-from sliplens.files import MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
+from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import MOST_PIXELS
 from sliplens.models.backbones import Answers, HistogramRegressor, bin_centres, bin_edges, build_model, ratio_edges
@@ -157,7 +157,7 @@ class Run:
         if kind == "raw" and level < _DARKEST_FRAME and frame.any():
             raise ImageError(
                 f"{what} is as dark as a difference image (median {level:.0f} of 255 grey levels), and this network "
-                "reads camera frames; give those, or a network on difference images such as chromatouch-difference"
+                f"reads camera frames; give those, or a network on difference images such as {DIFFERENCE_NETWORK}"
             )
         if self.encoding.empty_is_black and level > _BRIGHTEST_DIFFERENCE:
             raise ImageError(
@@ -497,7 +497,7 @@ def load(run: str | Path, *, device: str = "cpu") -> Run:
     Parameters
     ----------
     run
-        One of `shipped_names`, such as `chromatouch-difference`, or a folder that training wrote.
+        One of `shipped_names`, such as `chromatouch-pair`, or a folder that training wrote.
     device
         Where to put it: cpu, cuda or cuda:1.
 
@@ -511,9 +511,9 @@ def load(run: str | Path, *, device: str = "cpu") -> Run:
     Examples
     --------
     >>> import sliplens as sl
-    >>> network = sl.load("chromatouch-difference")
+    >>> network = sl.load("chromatouch-pair")
     >>> network.manifest.input, network.manifest.image_size
-    ('difference', 224)
+    ('pair', 112)
     """
     require_device(device)
     return load_checkpoint(find_run(Path(run)), device=device)

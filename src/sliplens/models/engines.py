@@ -240,7 +240,7 @@ def make_engine(
     >>> import torch
     >>> import sliplens as sl
     >>> from sliplens.models.engines import make_engine
-    >>> network = sl.load("chromatouch-difference")
+    >>> network = sl.load("chromatouch-pair")
     >>> engine = make_engine("folded", network, batch_size=2)
     >>> engine.estimate(network, torch.zeros(3, 3, 224, 224)).margin.shape
     (3,)

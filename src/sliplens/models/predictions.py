@@ -15,7 +15,7 @@ from torch import Tensor
 from sliplens._version import __version__
 from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
-from sliplens.files import as_path, hash_file, hash_json
+from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_file, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
 from sliplens.models.engines import Engine, make_engine, one_thread
@@ -163,9 +163,6 @@ class Predictions:
         return found
 
 
-_SHIPPED = "chromatouch-difference"
-
-
 def predict(
     run: Run | Path | str | Frames | Dataset | Sequence[Capture],
     source: Path | str | Frames | Dataset | Sequence[Capture] | None = None,
@@ -194,7 +191,8 @@ def predict(
     ----------
     run
         Network, its folder, or the name of one that comes with sliplens. It may be left out: `predict("cup.mp4")` reads
-        the source with the network that its sensor's profile names, else with `chromatouch-difference`.
+        the source with the network that its sensor's profile names, else with `chromatouch-pair`, or
+        `chromatouch-difference` where it is difference images.
     source
         Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or what `open_source` gave.
         Images without a reference are taken for difference images, compared before.
@@ -251,21 +249,14 @@ def predict(
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
     if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
         raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
-    if source is None:
-        if isinstance(run, Run):
-            raise InputError("name what to read: a data set, a folder of images, a video, or frames")
-        source = run
-        run, named_by = _find_network(source, sensor)
-        note(on_progress, f"no network was named, so {run} reads it, {named_by}")
-    if not isinstance(run, Run | Path | str):
-        raise InputError(f"{type(run).__name__} is no network; give a network, its folder or its name first")
-    trained = run if isinstance(run, Run) else load(run, device=device)
+    trained = None if source is None else _load(run, device)
+    read = run if source is None else source
+    if isinstance(read, Run):
+        raise InputError("name what to read: a data set, a folder of images, a video, or frames")
     known = None if friction is None else as_friction(friction)
-    if known is not None:
-        trained.require_ratio()
     with stage(on_progress, "Opening the source"):
         trials = open_trials(
-            source,
+            read,
             on=on,
             resumable=path is not None,
             reference=reference,
@@ -275,6 +266,12 @@ def predict(
             options=options,
             sensor=None if sensor is None else load_profile(sensor),
         )
+    if trained is None:
+        name, named_by = _find_network(trials, sensor)
+        note(on_progress, f"no network was named, so {name} reads it, {named_by}")
+        trained = _load(name, device)
+    if known is not None:
+        trained.require_ratio()
     kinds = [_assume_reference(trained, one) for one in trials.kinds]
     if sequence:
         _require_order(trained, kinds, friction=known)
@@ -314,16 +311,24 @@ def predict(
     return Predictions(frames=trials.frames, engine=name, path=path, rows=rows, schema=path and written, notes=notes)
 
 
-def _find_network(source: object, sensor: SensorProfile | Path | str | None) -> tuple[str, str]:
+def _load(run: object, device: str) -> Run:
+    if not isinstance(run, Run | Path | str):
+        raise InputError(f"{type(run).__name__} is no network; give a network, its folder or its name first")
+    return run if isinstance(run, Run) else load(run, device=device)
+
+
+def _find_network(trials: Trials, sensor: SensorProfile | Path | str | None) -> tuple[str, str]:
     """Network for a source where none is named, and who names it."""
-    profile = None if sensor is None else load_profile(sensor)
-    if profile is None and isinstance(source, Path | str) and (as_path(source) / DATASET_FILE).is_file():
+    source, profile = trials.source, None if sensor is None else load_profile(sensor)
+    if profile is None and isinstance(source, Path) and (source / DATASET_FILE).is_file():
         source = load_dataset(source)
     if profile is None and isinstance(source, Dataset):
         profile = source.profile(source.trials[0].sensor)
     if profile is not None and profile.network is not None:
         return profile.network, f"which the profile {profile.name} names"
-    return _SHIPPED, "which comes with sliplens"
+    if any(one.read_reference is None and not _is_recorded(one) for one in trials.kinds):
+        return DIFFERENCE_NETWORK, "which comes with sliplens for difference images"
+    return DEFAULT_NETWORK, "which comes with sliplens"
 
 
 def _require_order(trained: Run, trials: Sequence[Capture], *, friction: Friction | None) -> None:

@@ -143,7 +143,7 @@ class Follower:
     --------
     >>> import numpy as np
     >>> import sliplens as sl
-    >>> network = sl.load("chromatouch-difference")
+    >>> network = sl.load("chromatouch-pair")
     >>> follower = network.follow()
     >>> touch = np.zeros((2, 224, 224, 3), dtype=np.uint8)  # difference images: nothing has moved
     >>> one_by_one = network.estimate(network.encode(touch, None))

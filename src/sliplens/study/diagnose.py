@@ -94,7 +94,7 @@ def diagnose(
     Examples
     --------
     >>> import sliplens as sl
-    >>> diagnosis = sl.diagnose("chromatouch-difference", "runs/mine/data", "runs/mine")  # doctest: +SKIP
+    >>> diagnosis = sl.diagnose("chromatouch-pair", "runs/mine/data", "runs/mine")  # doctest: +SKIP
     >>> [one.name for one in diagnosis.slices if one.holds]  # doctest: +SKIP
     ['normal force above 0.493 N, friction up to 0.242']
     """

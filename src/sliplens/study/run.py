@@ -14,7 +14,7 @@ from sliplens.explainers import Explainer
 from sliplens.explainers.explanation import CLOSE
 from sliplens.explainers.table import open_run
 from sliplens.faithfulness.removal import Faithfulness
-from sliplens.files import hash_json, output_folder, remove, scratch_folder
+from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Run
 from sliplens.models.engines import counting_passes
@@ -84,7 +84,7 @@ TESTS = ("score", "remedies", "faithfulness", "randomisation", "map-quality", "t
 
 def run_study(
     data: Dataset | Path | str,
-    networks: Network | Sequence[Network] = "chromatouch-difference",
+    networks: Network | Sequence[Network] = DEFAULT_NETWORK,
     *,
     out: Path | str | None = None,
     methods: Sequence[str] = STUDY_METHODS,
