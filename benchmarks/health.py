@@ -29,6 +29,7 @@ import torch
 from scipy.optimize import minimize
 
 from sliplens.codec import load_record, save_record
+from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import Check, HealthMonitor, LiveFrame
 from sliplens.live.health import OFF, margin_risk, severity
 from sliplens.markers import Tracker
@@ -332,7 +333,7 @@ def fit(folders: list[Path], *, trials: int, data: Path | None) -> None:
 def main() -> None:
     """Print what health told, as a table or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--network", default="chromatouch-difference", help="name or folder of a network")
+    parser.add_argument("--network", default=DEFAULT_NETWORK, help="name or folder of a network")
     parser.add_argument("--trials", type=int, default=8, help="one a day")
     parser.add_argument("--frames", type=int, default=5, help="of each trial")
     parser.add_argument("--choose", action="store_true", help="print what limits and risk are chosen from")

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import sliplens as sl
+from sliplens.files import DEFAULT_NETWORK
 from sliplens.plots.margins import column
 from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import BLACK, BLUE, GREY, drawing_style
@@ -22,7 +23,7 @@ from sliplens.simulation import make_recipe, plan_trials, simulate_trial
 
 METHOD = "shapley-marker"
 SHOWN_A_SECOND = 4
-_NETWORK = "chromatouch-difference"
+_NETWORK = DEFAULT_NETWORK
 
 
 def draw_pictures(recording: Recording) -> Iterator[Image.Image]:

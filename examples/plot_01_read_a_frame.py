@@ -19,7 +19,7 @@ trial.frames.shape, trial.reference.shape
 
 # %%
 # One call reads them, by the name of a network that comes with the package.
-readings = sl.predict("chromatouch-difference", trial.frames, reference=trial.reference)
+readings = sl.predict("chromatouch-pair", trial.frames, reference=trial.reference)
 table = readings.frame()
 table.column_names
 

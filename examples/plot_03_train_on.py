@@ -15,12 +15,12 @@ import sliplens as sl
 # Another sensor than the networks know: a flat gel, lit from three sides. The last day tests, the one before
 # validates.
 data = sl.simulate(sensor="flat-gel", dry_trials=12, wet_trials=2, days=4, frames_per_trial=24)
-before = sl.evaluate("chromatouch-difference", data)
+before = sl.evaluate("chromatouch-pair", data)
 
 # %%
 # The recipe ``adapt`` is made for a few trials of your own. Leave out what follows it: those shorten it.
 network = sl.train(
-    data, recipe="adapt", start_from="chromatouch-difference", image_size=96, epochs=3, epoch_frames=160, batch_size=16
+    data, recipe="adapt", start_from="chromatouch-pair", image_size=96, epochs=3, epoch_frames=160, batch_size=16
 )
 after = sl.evaluate(network, data)
 

@@ -24,7 +24,7 @@ told = {
     f"told {friction:.2f}": sl.Friction(friction),
 }
 tables = {
-    name: sl.predict("chromatouch-difference", trial.frames, reference=trial.reference, friction=known).frame()
+    name: sl.predict("chromatouch-pair", trial.frames, reference=trial.reference, friction=known).frame()
     for name, known in told.items()
 }
 

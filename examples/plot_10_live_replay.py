@@ -20,7 +20,7 @@ data = sl.simulate(folder, dry_trials=4, wet_trials=1, days=4, frames_per_trial=
 # %%
 # ``sl.read_live(0, network)`` reads the first camera; a number, a network stream, a growing folder, a bag or a data
 # set all go in as the source. Reading stops by itself when the trial ends, or after ``seconds``.
-readings = list(sl.read_live(folder, "chromatouch-difference", seconds=9.0))
+readings = list(sl.read_live(folder, "chromatouch-pair", seconds=9.0))
 shown = [reading for reading in readings if reading.margin is not None]
 print(f"{len(readings)} readings, {len(shown)} with a margin")
 print(f"from capture to margin: {np.median([reading.latency.total_ms for reading in shown]):.0f} ms (median)")

@@ -278,12 +278,12 @@ def severity(check: Check) -> float:
 OFF = 0.2
 """Error from which on a margin is off."""
 _HARM: dict[str, tuple[float, float]] = {
-    "repeated": (0.98, 0.12), "saturation": (0.25, 0.08), "exposure": (0.43, 0.23), "focus": (0.29, 0.07),
-    "light": (0.17, 0.64), "camera": (0.62, 0.75), "markers": (0.33, 2.22), "touch": (0.97, 1.30),
-    "novelty": (0.41, 0.41),
+    "repeated": (0.98, 0.14), "saturation": (0.18, 0.06), "exposure": (0.69, 0.17), "focus": (0.28, 0.08),
+    "light": (0.26, 0.07), "camera": (0.61, 0.86), "markers": (0.27, 1.20), "touch": (0.97, 1.20),
+    "novelty": (0.20, 0.55),
 }  # fmt: skip
 """Chance that a fault puts the margin off however strong it is, and its growth with severity, by check."""
-_SPREAD = -0.59, 0.58
+_SPREAD = -0.83, 0.57
 """Offset and slope of the logit of what the network itself gives for an error above `OFF`."""
 
 
@@ -299,8 +299,8 @@ def margin_risk(
     Each fault, and the network's own doubt, is taken for a cause that puts the margin off by itself (a noisy or):
     1 - P = (1 - P_network) * product of (1 - a (1 - exp(-(b s)^2))) over the checks, s their severity. The numbers a
     and b, and the offset and slope of P_network's logit, are those of greatest likelihood on simulated frames with
-    faults of graded strength, read by `chromatouch-difference` (`benchmarks/health.py --choose`); on frames of other
-    days and sensors such a chance came true as often as it says.
+    faults of graded strength, read by `chromatouch-pair` (`benchmarks/health.py --choose`); on frames of other days and
+    sensors such a chance came true as often as it says.
 
     Parameters
     ----------
