@@ -40,10 +40,11 @@ def test_a_folder_is_hashed_only_where_its_parts_are_kept(folder):
     assert open_trials(path).rows != (("frames", 3, kept),)
 
 
-def test_images_have_times_where_their_rate_is_told(folder):
-    (trial,) = open_source(folder[0], options=ReadOptions(frame_rate=4.0))
-    np.testing.assert_allclose(there(trial.time_s), [0, 0.25, 0.5])
-    assert trial.frame_rate_hz == pytest.approx(4.0)
+def test_images_and_frames_in_memory_have_times_where_their_rate_is_told(folder):
+    for source in folder:
+        (trial,) = open_source(source, options=ReadOptions(frame_rate=4.0))
+        np.testing.assert_allclose(there(trial.time_s), [0, 0.25, 0.5])
+        assert trial.frame_rate_hz == pytest.approx(4.0)
 
 
 def test_a_data_set_brings_references_times_and_trusted_labels(small_dataset: Dataset):
@@ -68,5 +69,7 @@ def test_what_does_not_fit_is_told(folder, small_dataset: Dataset):
         open_source(frames, reference_frame=3)
     with pytest.raises(InputError, match="there is no frame; give one or more"):
         open_source(frames[:0])
+    with pytest.raises(InputError, match="frames in memory do not take --skip-frames; leave it out"):
+        open_source(frames, options=ReadOptions(frame_rate=4.0, skip_frames=1))
     with pytest.raises(InputError, match=r"has no trial nothing; choose one such as"):
         open_source(small_dataset, trial="nothing")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.files import as_path, hash_file, hash_json, hash_tree
@@ -230,7 +230,7 @@ def open_trials(
 
 def _open(source: Path | Frames, format: str | None, options: ReadOptions, *, whole: bool) -> Sequence[Capture]:
     if not isinstance(source, Path):
-        return [_array(source)]
+        return [_array(source, options)]
     if not whole and set(options.given()) <= {"frame_rate"} and (format or recognise(source)) == "images":
         return [_images(source, options.frame_rate)]
     return open_captures(source, format=format, options=options)
@@ -273,13 +273,15 @@ def _words(source: Path | Frames) -> str:
     return str(source) if isinstance(source, Path) else Capture.opened
 
 
-def _array(frames: Frames) -> Capture:
+def _array(frames: Frames, options: ReadOptions) -> Capture:
     if not len(frames):
         raise InputError("there is no frame; give one or more")
+    if strange := [option for option in options.given() if option != "frame_rate"]:
+        raise InputError(f"{Capture.opened} do not take {spoken(strange)}; leave it out")
     return Capture(
         trial="frames",
         source=Capture.opened,
-        frame_time_s=np.full(len(frames), np.nan),
+        frame_time_s=_frame_times(len(frames), options.frame_rate),
         frame_size=frames.shape[1:3],
         read_frames=lambda: iter(frames),
     )
@@ -292,11 +294,16 @@ def _images(folder: Path, frame_rate: float | None) -> Capture:
     return Capture(
         trial=trial_name(folder.resolve().name),
         source=str(folder),
-        frame_time_s=np.full(count, np.nan) if frame_rate is None else evenly_spaced(count, frame_rate=frame_rate),
+        frame_time_s=_frame_times(count, frame_rate),
         frame_size=size,
         read_frames=lambda: (read_frame(path, size=size) for path in paths),
         files=tuple(path.name for path in paths),
     )
+
+
+def _frame_times(count: int, frame_rate: float | None) -> Float[np.ndarray, " frames"]:
+    """Times of frames, NaN where their rate is not told."""
+    return np.full(count, np.nan) if frame_rate is None else evenly_spaced(count, frame_rate=frame_rate)
 
 
 def _with_reference(trial: Capture, image: Path | str | Frame | None, number: int | None) -> Capture:
