@@ -214,3 +214,20 @@ def test_a_normal_force_that_mostly_pulls_is_flagged(trial: Trial):
     settings = LabelSettings(normal_axis="x", normal_sign=1, mu=STATIC)
     labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=np.random.default_rng(2))
     assert any("the normal force is negative in" in flag for flag in labels.basis.flags)
+
+
+@pytest.mark.parametrize("speed", [0.5, 4])
+def test_frames_by_a_clock_of_another_speed_than_the_forces_are_flagged(trial: Trial, speed: float):
+    forces = trial.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
+    labels = label(replace(trial, frame_time_s=trial.frame_time_s / speed), forces)
+    (flag,) = [flag for flag in labels.basis.flags if flag.startswith("the frames last")]
+    assert f"the frames last {np.ptp(trial.frame_time_s) / speed:.2f} s and the forces 5.50 s" in flag
+    assert "--frame-rate" in flag
+
+
+def test_frames_of_a_part_of_the_forces_are_in_no_doubt_where_they_fit(trial: Trial):
+    forces = trial.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
+    part = slice(np.searchsorted(trial.frame_time_s, 2.5))
+    assert not label(
+        replace(trial, frame_time_s=trial.frame_time_s[part], motion=trial.motion[part]), forces
+    ).basis.flags

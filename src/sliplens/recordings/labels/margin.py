@@ -344,7 +344,7 @@ def _label_screened(
         lag=lag,
         settings=settings,
         screened=screened,
-        doubts=_find_doubts(contact, friction, threshold),
+        doubts=(*_find_doubts(contact, friction, threshold), *_doubt_clocks(frame_time_s, screened.recorded, lag)),
     )
 
 
@@ -373,3 +373,21 @@ def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n:
             "give its sign with --normal-sign"
         )
     return tuple(doubts)
+
+
+# half way, by ratio, from equal lengths to one that is half the other: a rate is usually wrong by two or more
+_LIKE_SPANS = 0.7
+_NEAR_LAG_S = 0.12  # clocks that run alike fit best within some frames; others, if at all, far off
+
+
+def _doubt_clocks(frame_time_s: Frames, forces: Forces, lag: Lag) -> tuple[str, ...]:
+    """Tell of frames and forces of different lengths, unless the image moves as the force changes: then one ran on."""
+    frames_s, forces_s = float(np.ptp(frame_time_s)), float(np.ptp(forces.time_s))
+    fits = not lag.doubt and lag.correlation is not None and abs(lag.lag_s) <= _NEAR_LAG_S
+    if fits or min(frames_s, forces_s) >= _LIKE_SPANS * max(frames_s, forces_s):
+        return ()
+    return (
+        f"the frames last {frames_s:.2f} s and the forces {forces_s:.2f} s, and nothing shows that the images move as "
+        "the forces change; if a clock runs wrong, import it again with the rate of the frames (--frame-rate) or the "
+        "unit of the forces' times (--time-unit)",
+    )
