@@ -45,6 +45,16 @@ def telling_damage(words: str, cure: str, *, kind: type[InputError] = ImageError
         raise kind(f"{words} ({error}); {cure}") from None
 
 
+_LEAST_COLOUR = 16
+"""Grey levels by which channels of a colour differ: those of a colour camera's noise on grey things differ by less."""
+
+
+def has_colour(image: UInt8[np.ndarray, "height width 3"]) -> bool:
+    """Whether a hundredth of an image or more has a colour; of a camera without colours the channels are equal."""
+    spread = image.max(axis=-1) - image.min(axis=-1)
+    return bool(np.mean(spread >= _LEAST_COLOUR) >= 0.01)
+
+
 def require_image(path: Path) -> None:
     """Check that a path is a file that can be opened, as `require_file` does, in the words of images."""
     try:

@@ -172,6 +172,17 @@ def test_without_a_reference_the_first_still_picture_is_taken(recording: Recordi
     np.testing.assert_array_equal(reader.reference, still[0])
 
 
+def test_a_grey_camera_puts_a_network_that_learned_from_colours_in_doubt(recording: Recording, raw_run: Path):
+    trained = sl.load(raw_run)
+    trained = replace(trained, manifest=replace(trained.manifest, colour=True))
+    grey = np.repeat(recording.reference[..., :1], 3, axis=-1)
+    for untouched, doubts in ((grey, 1), (recording.reference, 0)):
+        reader = plain_reader(recording.frames[:1], trained, reference=untouched, engine="eager")
+        assert not reader.doubts
+        with reader:
+            assert len(reader.doubts) == doubts
+
+
 def test_a_black_picture_is_no_reference(recording: Recording):
     with plain_reader(Burst(np.zeros_like(recording.frames), list(range(12)), wait_s=0.005)) as reader:
         list(reader.readings())

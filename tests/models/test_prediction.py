@@ -204,6 +204,19 @@ def test_what_the_images_were_taken_for_is_noted(trained: Run, wet: Recording, t
     assert assumed.frame()["prediction"] == named.frame()["prediction"]
 
 
+@pytest.mark.parametrize("kind", ["difference", "raw"])
+def test_grey_frames_are_noted_where_the_network_learned_from_colours(
+    difference_run: Path, raw_run: Path, wet: Recording, kind: str
+):
+    trained = load_checkpoint({"difference": difference_run, "raw": raw_run}[kind])
+    untouched = None if kind == "raw" else 0
+    grey = np.repeat(wet.frames[..., :1], 3, axis=-1)
+    for learned, frames, noted in ((True, grey, 1), (True, wet.frames, 0), (False, grey, 0), (None, grey, 0)):
+        run = replace(trained, manifest=replace(trained.manifest, colour=learned))
+        notes = predict_source(run, frames, reference_frame=untouched).notes
+        assert sum("the frames are grey, and the network was trained on colours" in one for one in notes) == noted
+
+
 def refused(source: Path, trained: Run, kind: type[Exception], message: str, **options: object) -> None:
     with pytest.raises(kind, match=message):
         predict_source(trained, source, **options)  # pyright: ignore[reportArgumentType]

@@ -52,6 +52,7 @@ def test_a_network_may_stay_in_memory(small_dataset: Dataset):
     squares = (np.array(table["prediction"]) - np.array(table["safety_margin"])) ** 2
     dry = np.array(table["condition"]) == "dry"
     assert evaluation.conditions["dry"].mse == pytest.approx(squares[dry].mean())
+    assert run.manifest.colour
     assert evaluation.known_trials == 0
     assert sl.evaluate(run, small_dataset, split="train").known_trials == 4
 

@@ -103,8 +103,6 @@ class Live:
         with ExitStack() as stack:
             network = self.network or (profile.network if profile else shipped)
             reader = stack.enter_context(closing(LiveReader(network=network, **named)))
-            if reader.doubt is not None:
-                say(reader.doubt, aside=True)
             reader.send_to(*self.sink)
             if self.record is not None:
                 reader.record(self.record, facts=facts)
@@ -136,9 +134,9 @@ class Live:
                 told_s = time.monotonic()
                 for error in () if self.page else (sender.error for sender in reader.senders if sender.error):
                     raise error
-                for trouble in set(reader.troubles) - told:
-                    told.add(trouble)
-                    say(trouble, aside=True)
+                for words in {*reader.doubts, *reader.troubles} - told:
+                    told.add(words)
+                    say(words, aside=True)
                 if not self.sink:
                     say(str(reading))
 

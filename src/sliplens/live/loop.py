@@ -192,8 +192,6 @@ class LiveReader:
         if network is None and profile is not None:
             network = profile.network
         self.network = load(network, device=device) if isinstance(network, Path | str) else network
-        self.doubt = None if self.network is None or profile is None else self.network.doubt(profile.name)
-        """That the sensor is another than the network's; None where it is not, or nobody names it."""
         options = options or SourceOptions()
         if self.network is not None and profile is None:
             options = replace(options, fit_size=self.network.manifest.frame_size)
@@ -254,6 +252,16 @@ class LiveReader:
         """How far the recording is, the last one where none goes on, and each sink."""
         recorder = self._recorded
         return (*(() if recorder is None else (recorder.state,)), *(sender.state for sender in self.senders))
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the network was not made for, a sentence each: another sensor, and grey frames once one was compared."""
+        network, profile, untouched = self.network, self._profile, self.reference
+        if network is None:
+            return ()
+        sensor = None if profile is None else network.doubt(profile.name)
+        grey = None if untouched is None else network.doubt_colour(untouched)
+        return tuple(doubt for doubt in (sensor, grey) if doubt is not None)
 
     @property
     def troubles(self) -> tuple[str, ...]:

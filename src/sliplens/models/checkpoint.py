@@ -18,7 +18,7 @@ from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
 from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import Friction, FrictionLike, as_friction
-from sliplens.images import MOST_PIXELS
+from sliplens.images import MOST_PIXELS, has_colour
 from sliplens.models.backbones import Answers, HistogramRegressor, bin_centres, bin_edges, build_model, ratio_edges
 from sliplens.models.calibration import Calibration, Traction, raw_interval, spread, told_probabilities
 from sliplens.models.encodings import ENCODINGS, Encoding
@@ -42,6 +42,8 @@ class Manifest:
     frame_size: tuple[int, int]
     sensor: str
     data_hash: str
+    colour: bool | None = None
+    """Whether the frames it was trained on have colours; None where that is not told."""
     head: str = "point"
     recipe: str = ""
     target: str = "safety_margin"
@@ -178,6 +180,15 @@ class Run:
             f"the network was trained on {own} and reads frames of {sensor}: its intervals were not measured on that "
             "sensor, so take the margins for a trend until trials with forces say how far they can be trusted "
             "(`sliplens import`, then `sliplens evaluate`)"
+        )
+
+    def doubt_colour(self, frame: UInt8[np.ndarray, "height width 3"]) -> str | None:
+        """Say that a frame is grey where the network was trained on colours; None where it is not, or nobody knows."""
+        if not self.manifest.colour or has_colour(frame):
+            return None
+        return (
+            "the frames are grey, and the network was trained on colours: its intervals were not measured on such "
+            "frames, so read those of a colour camera, or train it on frames of this one (`sliplens train`)"
         )
 
     @torch.no_grad()

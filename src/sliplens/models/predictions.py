@@ -366,9 +366,14 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
     doubt = trained.doubt(trial.sensor)
     if doubt is not None:
         yield doubt + _compare_markers(trained, trial)
-    if trial.read_reference is None and not _is_recorded(trial):
+    untouched = trial.read_reference
+    if untouched is not None or encoding.name == "raw":  # difference images are black where nothing moved
+        grey = trained.doubt_colour(next(trial.read_frames()) if untouched is None else untouched())
+        if grey is not None:
+            yield grey
+    if untouched is None and not _is_recorded(trial):
         trained.require_kind(next(trial.read_frames()), what=trial.files[0] if trial.files else "the first frame")
-    if trial.read_reference is not None or encoding.name == "raw":
+    if untouched is not None or encoding.name == "raw":
         return
     if not encoding.empty_is_black:
         raise InputError(

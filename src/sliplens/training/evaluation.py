@@ -22,7 +22,7 @@ from sliplens.models import Run
 from sliplens.models.checkpoint import Estimate, load, tell_each
 from sliplens.models.sequence import require_frequent
 from sliplens.progress import OnProgress, counted, note, stage, wrote
-from sliplens.recordings import Dataset, TrialInfo
+from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.recordings.dataset import load_dataset, trial_path
 from sliplens.recordings.store import load_recording, stream_frames
 from sliplens.results.evaluation import (
@@ -148,8 +148,12 @@ def _follow(data: Dataset, info: TrialInfo, kind: str) -> _Followed:
     )
 
 
+def _load_labels(data: Dataset, info: TrialInfo) -> Recording:
+    return load_recording(trial_path(data.folder, info.trial), truth=False, pixels=False)
+
+
 def _margins(data: Dataset, info: TrialInfo) -> Float[np.ndarray, " frames"]:
-    recording = load_recording(trial_path(data.folder, info.trial), truth=False, pixels=False)
+    recording = _load_labels(data, info)
     return np.where(recording.labelled, recording.safety_margin, np.nan)
 
 
@@ -221,9 +225,10 @@ def evaluate(
     trials = data.select(split=split)
     for trial in trials:
         run.require_frame_size((trial.height, trial.width))
-    for words in dict.fromkeys(run.doubt(trial.sensor) for trial in trials):
-        if words is not None:
-            note(on_progress, words)
+    firsts = {trial.sensor: _load_labels(data, trial) for trial in reversed(trials)}
+    doubts = [words for one in firsts.values() for words in (run.doubt(one.sensor), run.doubt_colour(one.reference))]
+    for words in dict.fromkeys(filter(None, doubts)):
+        note(on_progress, words)
     plan = _plan_baselines(baselines, data, trials, count=baseline_trials, markers=markers) if baselines else None
     asked: dict[str, Any] = {"split": split, "friction": told, "sequence": sequence}
     if out is None:

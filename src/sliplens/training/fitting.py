@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
 from sliplens.files import output_folder, partial_folder, scratch_folder, versions
+from sliplens.images import has_colour
 from sliplens.models import Manifest, Run, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import (
     REFERENCE_SIGNS,
@@ -35,7 +36,8 @@ from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty, fit_novelty
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
-from sliplens.recordings.dataset import load_dataset
+from sliplens.recordings.dataset import load_dataset, trial_path
+from sliplens.recordings.store import load_recording
 from sliplens.results.evaluation import Training
 from sliplens.training.config import TrainConfig, get_recipe, open_logger
 from sliplens.training.data import (
@@ -158,6 +160,7 @@ def train(
             folder,
             frame_size=(info.height, info.width),
             sensor=info.sensor,
+            colour=has_colour(load_recording(trial_path(data.folder, info.trial), truth=False, pixels=False).reference),
             data_hash=data.hash,
             trained_on=[trial.sha256[:12] for some in trials for trial in some],
             start=start,
@@ -332,6 +335,7 @@ def fit(
     frame_size: tuple[int, int],
     sensor: str,
     data_hash: str,
+    colour: bool | None = None,
     trained_on: Sequence[str] = (),
     start: Run | None = None,
     trainer: lightning.Trainer | None = None,
@@ -350,8 +354,9 @@ def fit(
     folder
         Gets `model.safetensors`, `manifest.json` and `metrics.csv`; while training runs also checkpoints, from which a
         call with the same folder goes on. All processes must see it.
-    frame_size, sensor, data_hash, trained_on
-        Kept in the manifest: height and width of the sensor's frames, its name, hashes of the data set and the trials.
+    frame_size, sensor, data_hash, colour, trained_on
+        Kept in the manifest: height and width of the sensor's frames, its name, hash of the data set, whether its
+        frames have colours, and hashes of the trials.
     start
         Network whose weights it starts from, instead of random ones; it is left as it is.
     trainer
@@ -391,6 +396,7 @@ def fit(
         frame_size=frame_size,
         sensor=sensor,
         data_hash=data_hash,
+        colour=colour,
         trained_on=(*trained_on, *(start.manifest.trained_on if start else ())),
         started_from=start.manifest.weights_sha256 if start else "",
         versions=versions(),
