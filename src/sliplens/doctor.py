@@ -106,7 +106,7 @@ def _store() -> str:
         size, back = (folder / "trial.parquet").stat().st_size, load_recording(folder / "trial.parquet")
     if not np.array_equal(back.frames, trial.frames):
         raise InputError("frames come back from disk as others; install the pinned versions of pyarrow and numpy")
-    return f"{len(trial)} frames came back to the bit from {size:,} bytes"
+    return f"{number_of(len(trial), 'frame')} came back to the bit from {size:,} bytes"
 
 
 def _graphics_card() -> str:

@@ -296,7 +296,7 @@ def test_command_says_what_it_wrote(pristine_study, tmp_path, capsys):
     assert run("report", tmp_path) == 0
 
     told = capsys.readouterr().out
-    assert f"{tmp_path / 'figures'}  1 figures as PDF, their numbers as CSV" in told
+    assert f"{tmp_path / 'figures'}  1 figure as PDF, their numbers as CSV" in told
     assert f"{tmp_path / 'report.html'}  open it in a browser" in told
     # a half-written file has a name that begins with a point
     assert not list(tmp_path.rglob(".*"))

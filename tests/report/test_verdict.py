@@ -204,7 +204,7 @@ def test_real_frames_without_labels_carry_no_claim(workspace, verdict):
 
     edit(workspace / "maps-raw-real" / "result.json", unlabel)
 
-    assert "have no label, so nothing can be said" in verdict()["Real touch, raw images"].text
+    assert "no label is known, so nothing can be said" in verdict()["Real touch, raw images"].text
 
 
 def test_the_reduced_image_is_told(verdict):

@@ -7,6 +7,7 @@ from typing import Annotated
 import tyro
 
 from sliplens.cli.console import wrote
+from sliplens.progress import number_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,5 +28,8 @@ class Report:
 
         written = write_report(self.workspace, self.output)
         if written.figures:
-            wrote(written.figures[0].parent, f"{len(written.figures) // 2} figures as PDF, their numbers as CSV")
+            wrote(
+                written.figures[0].parent,
+                f"{number_of(len(written.figures) // 2, 'figure')} as PDF, their numbers as CSV",
+            )
         wrote(written.page, "open it in a browser")

@@ -102,8 +102,8 @@ class Recorder:
         outlet, trouble = self._outlet, None
         if outlet.error is not None:
             trouble = (
-                f"recording into {self.folder} stopped after {outlet.sent} frames ({outlet.reason}); make room, and "
-                "record again: what is there stays"
+                f"recording into {self.folder} stopped after {number_of(outlet.sent, 'frame')} "
+                f"({outlet.reason}); make room, and record again: what is there stays"
             )
         return RecordingState(
             folder=self.folder, frames=outlet.sent, seconds=self._seconds, lost=outlet.lost, trouble=trouble

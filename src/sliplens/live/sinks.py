@@ -23,6 +23,7 @@ from sliplens.files import to_builtins
 from sliplens.images import encode_jpeg
 from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import LiveFrame, Reading
+from sliplens.progress import number_of
 from sliplens.recordings.capture import Frame
 
 
@@ -488,7 +489,7 @@ class SinkState:
     def __str__(self) -> str:
         lost = f", {self.lost:,} lost" if self.lost else ""
         trouble = f"; {self.trouble}" if self.trouble else ""
-        return f"{self.name}: {self.sent:,} readings sent{lost}{trouble}"
+        return f"{self.name}: {number_of(self.sent, 'reading')} sent{lost}{trouble}"
 
 
 class Sender:
@@ -511,7 +512,10 @@ class Sender:
         """How far it is now."""
         outlet, trouble = self._outlet, None
         if outlet.error is not None:
-            trouble = f"--sink {self._name} broke off after {outlet.sent} readings ({outlet.reason}); begin it anew"
+            trouble = (
+                f"--sink {self._name} broke off after {number_of(outlet.sent, 'reading')} "
+                f"({outlet.reason}); begin it anew"
+            )
         return SinkState(name=self._name, sent=outlet.sent, lost=outlet.lost, trouble=trouble)
 
     @property

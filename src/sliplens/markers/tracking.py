@@ -19,7 +19,7 @@ from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
 from sliplens.parts import require_new_table
-from sliplens.progress import OnProgress, note
+from sliplens.progress import OnProgress, note, number_of
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
@@ -57,7 +57,7 @@ class TrialTracking:
     """Frames in which no marker could be told from the next."""
 
     def __str__(self) -> str:
-        lost = f", lost in {self.lost_frames} frames" if self.lost_frames else ""
+        lost = f", lost in {number_of(self.lost_frames, 'frame')}" if self.lost_frames else ""
         return f"{self.trial}: {self.markers} markers, {100 * self.followed_share:.1f} % followed while in view{lost}"
 
 

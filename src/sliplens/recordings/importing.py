@@ -539,7 +539,8 @@ def _deal(
     training = count - validation - test
     if training < 0:
         raise InputError(
-            f"{validation} trials to validate and {test} to test are more than the {count} there are; give fewer"
+            f"{number_of(validation, 'trial')} to validate and {test} to test are more than the {count} there "
+            "are; give fewer"
         )
     return [*kept, *["train"] * training, *["validation"] * validation, *["test"] * test], None
 

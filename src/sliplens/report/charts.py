@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sliplens.plots import errors, style
+from sliplens.progress import number_of
 from sliplens.report.comparisons import settings
 from sliplens.report.plates import Plate, named_columns, rows_of
 from sliplens.report.results import Results
@@ -186,7 +187,8 @@ def plate_each_frame(scored: DeletionScores) -> Plate:
         name=_EACH_FIGURES.get(scored.input, f"faithfulness-{scored.input}"),
         figure=figure,
         alt=f"Deletion score D of every frame, {name}: {'; '.join(told)}",
-        caption=f"Deletion score D of each of {frames} frames ({name}), in black their mean. Score: {'; '.join(told)}.",
+        caption=f"Deletion score D of each of {number_of(frames, 'frame')} ({name}), in black their mean. "
+        f"Score: {'; '.join(told)}.",
         numbers=_deletion_numbers({scored.input: scored}),
     )
 
@@ -232,7 +234,7 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
         caption=f"{style.input_name(faithful.input)}: how much of the answer's change from the untouched sensor is "
         "lost while parts go, most supporting first, "
         f"least supporting first, and in {faithful.random_orders} random orders; the band holds the middle half of "
-        f"{faithful.frames} frames. The area between the first two is the symmetric gain. "
+        f"{number_of(faithful.frames, 'frame')}. The area between the first two is the symmetric gain. "
         f"{_tell_gains(faithful, methods)}",
         numbers=named_columns(("fill", "unit", "method", "area", "most_first", "least_first", "random"), numbers),
     )

@@ -22,6 +22,7 @@ from sliplens.plots.style import (
     percent,
     tell_ends,
 )
+from sliplens.progress import number_of
 from sliplens.report.comparisons import (
     AS_RUN,
     compare_deletion,
@@ -249,7 +250,7 @@ def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
             pairs = {one: (curves[one], raw[where][one]) for one in methods}
             gap = compare_gain(*pairs.values(), rng=rng)
             by_setting[where] = judge_gap(gap)
-            findings += _judged(where, {f"SRG, mean of {len(pairs)} methods, difference less raw": gap})
+            findings += _judged(where, {f"SRG, mean of {number_of(len(pairs), 'method')}, difference less raw": gap})
             for one, pair in pairs.items():
                 compared = f"SRG of {method_name(one)}, difference less raw"
                 findings.append(Finding(where=where, compared=compared, gap=compare_gain(pair, rng=rng)))

@@ -17,6 +17,7 @@ from jaxtyping import Float64
 
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots import style
+from sliplens.progress import number_of
 from sliplens.results.evaluation import ScoredFrames
 from sliplens.results.faithfulness import CHANCE, Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
 from sliplens.results.study import Choice, MarkerEffects, Roughness, Truth
@@ -185,7 +186,7 @@ def tell_sample(choice: Choice, name: str = "") -> str:
     told = f", {style.listed(alone)} alone" if len(choice.inputs) > 1 else ""
     return (
         f"The sample explains answers that are off by {style.listed(errors)} on average; {choice.qualified} of "
-        f"{choice.considered} trials qualify at ±{100 * choice.tolerance:g} points{told}."
+        f"{number_of(choice.considered, 'trial')} qualified at ±{100 * choice.tolerance:g} points{told}."
     )
 
 

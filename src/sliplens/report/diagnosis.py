@@ -19,6 +19,7 @@ from sliplens.plots.style import (
     signed,
     tell_ends,
 )
+from sliplens.progress import number_of
 from sliplens.report.charts import make_charts
 from sliplens.report.plates import Cell, Plate, draw_grid, named_columns, picture_brightness, rows_of
 from sliplens.report.tables import Table, make_table
@@ -125,7 +126,7 @@ def plate_kinds(diagnosis: Diagnosis) -> Plate:
             picture = pictures[example]
             painted = overlay_relevance(picture, maps[example] / top)
             cells += [Cell(picture=picture, words=words), Cell(picture=painted, words=condition)]
-        shown.append((f"Kind {kind + 1}: {len(own)} frames, off by {100 * means[0]:.1f} points", cells))
+        shown.append((f"Kind {kind + 1}: {number_of(len(own), 'frame')}, off by {100 * means[0]:.1f} points", cells))
     heads = [name, "parts"] * (max(len(cells) for _, cells in shown) // 2)
     grid = draw_grid(shown, heads=heads, below_in=0.6)
     with drawing_style():

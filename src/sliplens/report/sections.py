@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sliplens.plots.style import input_name, inputs_in_order
+from sliplens.progress import number_of
 from sliplens.report import charts, pictures, tables
 from sliplens.report.claims import Claim, judge_claims
 from sliplens.report.comparisons import tell_sample
@@ -197,9 +198,12 @@ def _recipe(results: Results, absent: list[str]) -> Section:
     )
     if simulation is not None:
         counts = "; ".join(
-            f"{name} {count.trials} trials, {count.frames} frames" for name, count in simulation.by_split.items()
+            f"{name} {number_of(count.trials, 'trial')}, {number_of(count.frames, 'frame')}"
+            for name, count in simulation.by_split.items()
         )
-        intro += f" Simulated: {simulation.trials} trials, {simulation.frames} frames ({counts})."
+        intro += (
+            f" Simulated: {number_of(simulation.trials, 'trial')}, {number_of(simulation.frames, 'frame')} ({counts})."
+        )
         intro += f" Objects: {', '.join(simulation.conditions)}."
     return Section(
         id="recipe",

@@ -24,6 +24,7 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
+from sliplens.progress import number_of
 from sliplens.report.comparisons import (
     ACCURACY,
     DELETION,
@@ -194,7 +195,7 @@ def table_real(results: Results) -> Table:
     frames = {frame.id: frame for name in names for frame in explained[name].frames}
     answers = {frame: [read.get((name, frame)) for name in names] for frame in frames}
     return make_table(
-        f"{len(frames)} real frames: the recorded safety margin, and what each network reads.",
+        f"{number_of(len(frames), 'real frame')}: the recorded safety margin, and what each network reads.",
         ("Frame", "Objects", "True Γ", *(f"Read from {input_name(name).lower()}" for name in names)),
         [
             (one.id, one.condition.capitalize(), *(percent(value) for value in (one.safety_margin, *answers[one.id])))
@@ -348,8 +349,9 @@ def table_remedies(remedies: Remedies, scored: DeletionScores | None) -> Table:
 def table_looks(looks: Mapping[str, MapQuality]) -> Table:
     """Tabulate what the eye judges of maps."""
     return make_table(
-        f"Looks of the maps, means over {max(one.frames for one in looks.values())} frames. Resolution: depth of the "
-        "valley between neighbouring markers (1 = told apart). Total variation: mean step between pixels over the "
+        f"Looks of the maps, means over {number_of(max(one.frames for one in looks.values()), 'frame')}. "
+        "Resolution: depth of the valley between neighbouring markers (1 = told apart). Total variation: mean step "
+        "between pixels over the "
         "map's range (noise has 1/3). Gini: 1 = one pixel has all. Stability: correlation of the map with that of the "
         "frame under other sensor noise, and with that of the next frame.",
         ("Input", "Method", *(_LOOK_NAMES[measure] for measure in MAP_MEASURES)),
@@ -390,7 +392,7 @@ def table_times(timing: Mapping[str, Timing]) -> Table:
     for method in methods_in_order(methods):
         cells = []
         for whole, one in ((timing[name].frames, timing[name].methods.get(method)) for name in names):
-            part = f" on {one.frames} frames" if one is not None and one.frames < whole else ""
+            part = f" on {number_of(one.frames, 'frame')}" if one is not None and one.frames < whole else ""
             spread = "" if one is None else f" ({_seconds(one.low)} to {_seconds(one.high)}{part})"
             cells.append(UNKNOWN if one is None else f"{_seconds(one.seconds)}{spread}")
             cells.append(_seconds(None if one is None else one.seconds_without_forward))
@@ -398,7 +400,7 @@ def table_times(timing: Mapping[str, Timing]) -> Table:
     told = "; ".join(
         f"{input_name(name).lower()}: {one.device}"
         f"{f' with {one.threads} threads' if one.threads and one.device == 'cpu' else ''}, "
-        f"{one.frames} frames, a forward pass takes {_seconds(one.forward_seconds)} s"
+        f"{number_of(one.frames, 'frame')}, a forward pass takes {_seconds(one.forward_seconds)} s"
         for name in names
         for one in [timing[name]]
     )
@@ -417,8 +419,9 @@ def table_trials(choice: Choice) -> Table:
     """Tabulate the trials of the study, and how far each network was off at worst."""
     names = inputs_in_order({*choice.inputs, *(name for one in choice.trials for name in one.worst_error)})
     return make_table(
-        f"The {len(choice.trials)} trials of the study ({choice.condition}): the worst error of each network at the "
-        f"chosen margins, in percentage points; within {percent(choice.tolerance)} at all of them it qualifies.",
+        f"The {number_of(len(choice.trials), 'trial')} of the study ({choice.condition}): the worst error of "
+        f"each network at the chosen margins, in percentage points; within {percent(choice.tolerance)} at all of "
+        "them it qualifies.",
         ("Trial", "Qualified", *(f"Worst error, {short_input_name(name).lower()}" for name in names), "Frames scored"),
         [
             (
@@ -446,8 +449,9 @@ def table_localisation(truth: Truth) -> Table:
         rows.append((title, *shares, *map(_interval, gaps)))
     nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), *4 * ["0"])
     return make_table(
-        f"{input_name(truth.input)}, {truth.frames} simulated frames: share of the relevance, and of the strongest "
-        "pixels, in three regions; and Spearman's correlation, signed, of the map's mean on each marker with its "
+        f"{input_name(truth.input)}, {number_of(truth.frames, 'simulated frame')}: share of the relevance, and "
+        "of the strongest pixels, in three regions; and Spearman's correlation, signed, of the map's mean on each "
+        "marker with its "
         "Shapley value in the network's answer, with what putting it back alone changes there, and with the same of "
         "the best reading of the margin (95 % interval over "
         f"{tell_over(one.shapley for one in truth.methods.values())}). Lead: the first of these less that of the "

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from sliplens.plots.style import UNKNOWN, decimals, percent, written_whole
+from sliplens.progress import number_of
 from sliplens.recordings.capture import Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.store import load_recording, read_frames
@@ -70,7 +71,7 @@ def write_trials_page(data: Dataset | Path | str, out: Path | str | None = None)
         rows=[_row(data, info) for info in data.trials],
         objects=any(info.object for info in data.trials),
         left_out=data.left_out,
-        frames=f"{data.frames:,}",
+        counts=f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}",
         curve=_CURVE,
     )
     with written_whole(page) as part:

@@ -27,6 +27,7 @@ from sliplens.plots.style import (
     signed,
     source_name,
 )
+from sliplens.progress import number_of
 from sliplens.report.claims import POLY_CAM, Claim
 from sliplens.report.comparisons import (
     NETWORK_PIXELS,
@@ -126,7 +127,7 @@ def tell_too_few(results: Results) -> str:
     if trials >= FEWEST_UNITS:
         return ""
     return (
-        f"This study explains {trials} {'trial' if trials == 1 else 'trials'}, and fewer than {FEWEST_UNITS} decide "
+        f"This study explains {number_of(trials, 'trial')}, and fewer than {FEWEST_UNITS} decide "
         "nothing: below is how explanations are judged, not yet which one to believe."
     )
 
@@ -188,7 +189,10 @@ def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: Rem
         f"{tell_interval(best.lead.gap, digits=2)}"
     )
     if best.shown:
-        text = f"Believe {name}: of {len(over) + 1} methods its map tells best what each marker adds to this answer. "
+        text = (
+            f"Believe {name}: of {number_of(len(over) + 1, 'method')} its map tells best what each marker "
+            "adds to this answer. "
+        )
         text += sentence(f"{evidence}, {ahead}")
         if over:
             near = min(over, key=lambda one: over[one].estimate)
@@ -281,7 +285,7 @@ def _accuracy(results: Results) -> list[Statement]:
         trials, days = (len(np.unique(labels)) for labels in (asked.trial, asked.day))
         text = (
             f"The network reads the safety margin with R² {listed(r2)} objects of test trials; on average it is off by "
-            f"{listed(mae)} percentage points. That is of one network, over {trials} trials of "
+            f"{listed(mae)} percentage points. That is of one network, over {number_of(trials, 'trial')} of "
             f"{'one day' if days == 1 else f'{days} days'}."
         )
         # of labels that do not vary there is no R²
@@ -315,7 +319,7 @@ def _winners(results: Results, *, rng: np.random.Generator) -> list[Statement]:
         if gap is None:
             text += " The two networks did not answer the same frames, so whether that is chance was not tested."
         elif gap.units < FEWEST_UNITS:
-            text += f" With {gap.units} test trials, that can be chance."
+            text += f" With {number_of(gap.units, 'test trial')}, that can be chance."
         elif sure:
             text += f" That holds beyond the 95 % interval over {gap.over}."
         else:
@@ -376,7 +380,10 @@ def _real_touch(explained: Explained) -> Statement:
     labelled = [(one.safety_margin, one.prediction) for one in explained.frames if one.safety_margin is not None]
     trials = len({one.trial for one in explained.frames if one.safety_margin is not None})
     if not labelled:
-        text = f"The {len(explained.frames)} real frames have no label, so nothing can be said of the answers on them."
+        text = (
+            f"Of {number_of(len(explained.frames), 'real frame')} no label is known, so nothing can be said "
+            "of the answers on them."
+        )
         return Statement(topic=topic, text=text, tone="caution")
     labels, answers = np.array(labelled, dtype=np.float64).T
     error = np.abs(answers - labels).mean()
@@ -384,8 +391,9 @@ def _real_touch(explained: Explained) -> Statement:
     constant = np.abs(labels - np.median(labels)).mean()
     useful = error < constant
     text = (
-        f"On {len(labels)} frames of {'one trial' if trials == 1 else f'{trials} trials'} of real touch the network is "
-        f"off by {100 * error:.0f} percentage points on average; the best constant answer would be off by "
+        f"On {number_of(len(labels), 'frame')} of {'one trial' if trials == 1 else f'{trials} trials'} of real "
+        f"touch the network is off by {100 * error:.0f} percentage points on average; the best constant answer "
+        "would be off by "
         f"{100 * constant:.0f}."
     )
     # frames with equal labels have no order
@@ -393,7 +401,7 @@ def _real_touch(explained: Explained) -> Statement:
     right = sum((first[0] - second[0]) * (first[1] - second[1]) > 0 for first, second in pairs)
     if pairs:
         chance = "all of them" if right == len(pairs) else "chance gives half"
-        text += f" It puts {right} of {len(pairs)} pairs of frames in the right order ({chance})."
+        text += f" It puts {right} of {number_of(len(pairs), 'pair')} of frames in the right order ({chance})."
     if not useful:
         text += " So its values do not carry over to real touch."
     return Statement(topic=topic, text=text, tone="plain" if useful else "caution")
@@ -405,7 +413,8 @@ def _tell_scale(results: Results) -> list[Statement]:
         return []
     trainings = [results.trainings[name] for name in inputs_in_order(results.trainings)]
     told = [
-        f"{one.train_frames} frames for {decimals(one.minutes, 1)} minutes ({input_name(one.input).lower()})"
+        f"{number_of(one.train_frames, 'frame')} for {decimals(one.minutes, 1)} minutes "
+        f"({input_name(one.input).lower()})"
         for one in trainings
     ]
     one = trainings[-1]

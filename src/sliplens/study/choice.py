@@ -19,7 +19,7 @@ from sliplens.images import absolute_difference
 from sliplens.markers import track_markers
 from sliplens.models import Run
 from sliplens.parts import Shard, shard
-from sliplens.progress import OnProgress, counted
+from sliplens.progress import OnProgress, counted, number_of
 from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.results.explanation import Explained
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkerPlaces, MarkerTable, ShownFrame, States
@@ -62,8 +62,9 @@ def choose_frames(
     candidates = [one for one in looked if one is not None]
     if not candidates:
         raise RecordingError(
-            f"none of the {len(infos)} {condition} trials of split {split!r} has a labelled frame within {_REACH:.0%} "
-            f"of each of {', '.join(f'{level:.0%}' for level in LEVELS)}; choose another split or condition, or trials "
+            f"none of the {number_of(len(infos), f'{condition} trial')} of split {split!r} has a labelled frame "
+            f"within {_REACH:.0%} of each of {', '.join(f'{level:.0%}' for level in LEVELS)}; choose another split "
+            "or condition, or trials "
             "with more frames from full stick to full slip"
         )
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
@@ -143,8 +144,8 @@ def _summarise(choice: Choice, trials: int) -> str:
     networks, taken, wanted = len(choice.inputs), choice.trials, choice.trials_wanted
     who = "the network reads" if networks == 1 else f"{'both' if networks == 2 else 'all'} networks read"
     summary = (
-        f"Of {trials} {choice.condition} trials {choice.considered} have a frame near every level, and in "
-        f"{choice.qualified} of those {who} every such frame within {choice.tolerance:.0%}."
+        f"Of {number_of(trials, f'{choice.condition} trial')} {choice.considered} had a frame near every "
+        f"level, and in {choice.qualified} of those {who} every such frame within {choice.tolerance:.0%}."
     )
     others = [trial for trial in taken if not trial.qualified]
     if others:

@@ -23,7 +23,7 @@ from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_d
 from sliplens.models import Run
 from sliplens.models.checkpoint import load, tell_each
 from sliplens.plots.style import decimals, signed, tell_ends
-from sliplens.progress import OnProgress, counted, note, stage, wrote
+from sliplens.progress import OnProgress, counted, note, number_of, stage, wrote
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import (
@@ -456,7 +456,7 @@ def _gap(gap: Difference, *, points: bool = False) -> str:
 
 def _frames(table: ErrorTable) -> str:
     trials = len(np.unique(table.trial))
-    return f"{len(table):,} frames of {'one trial' if trials == 1 else f'{trials} trials'}"
+    return f"{number_of(len(table), 'frame')} of {'one trial' if trials == 1 else f'{trials} trials'}"
 
 
 def _off(table: ErrorTable) -> str:
@@ -496,8 +496,9 @@ def say_slices(slices: Sequence[ErrorSlice]) -> str:
         return f"Where the error is larger is not known: no slice has the {FEWEST_UNITS} held-out trials to test it on."
     held = [one for one in tested if one.holds]
     texts = [
-        f"{one.name}: off by {100 * one.error:.1f} ({signed(100 * one.bias, 1)} mean) in {one.frames} frames of "
-        f"{one.trials} trials, against elsewhere {_gap(one.excess, points=True)}"
+        f"{one.name}: off by {100 * one.error:.1f} ({signed(100 * one.bias, 1)} mean) in "
+        f"{number_of(one.frames, 'frame')} of {number_of(one.trials, 'trial')}, against elsewhere "
+        f"{_gap(one.excess, points=True)}"
         for one in held or tested[:1]
     ]
     if not held:

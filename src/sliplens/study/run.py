@@ -18,7 +18,7 @@ from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, sc
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Run
 from sliplens.models.engines import counting_passes
-from sliplens.progress import OnProgress, note, stage, wrote
+from sliplens.progress import OnProgress, note, number_of, stage, wrote
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explained
 from sliplens.results.faithfulness import NEW_WEIGHTS, DeletionScores
@@ -399,7 +399,7 @@ class _Stages:
         if unknown := [frame.id for frame in choice.frames if frame.id not in states.markers]:
             named, self.explainers = list(self.explainers), without_markers(self.explainers)
             if named != list(self.explainers):
-                what = f"the markers of {len(unknown)} frames are not known"
+                what = f"the markers of {number_of(len(unknown), 'frame')} are not known"
                 note(self.on_progress, f"{what}, so that tiles are asked instead")
         return choice, states
 

@@ -24,7 +24,7 @@ from sliplens.images import write_png
 from sliplens.models import Run
 from sliplens.plots.saliency import SIGN_COLOURS, draw_panel, full_colour, overlay_jet, overlay_relevance
 from sliplens.plots.style import drawing_style, method_name, percent
-from sliplens.progress import OnProgress, note, stage, wrote
+from sliplens.progress import OnProgress, note, number_of, stage, wrote
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile, load_profile
@@ -134,7 +134,7 @@ def explain_source(
         explainers = choose(methods=methods)
     own: dict[str, Any] = {"methods": methods, "explainers": explainers, "on": on, "retry_failed": retry_failed}
     explain = partial(explain_frames, trained, chosen, **own)
-    frames = "1 frame" if len(chosen.ids) == 1 else f"{len(chosen.ids)} frames"
+    frames = number_of(len(chosen.ids), "frame")
     title = f"Explaining {frames} ({trained.manifest.input}, {chosen.source})"
     if out is None:
         with stage(on_progress, title) as count:
@@ -144,7 +144,7 @@ def explain_source(
     recipe: dict[str, Any] = {"weights_sha256": trained.manifest.weights_sha256, "input": trained.manifest.input}
     recipe |= {"source": chosen.source, "ids": chosen.ids, "images_sha256": images.hexdigest()}
     recipe |= {"method": tuple(methods), "budget": budget, "colours": colours}
-    maps = "a map" if len(methods) == 1 else f"{len(methods)} maps"
+    maps = "a map" if len(methods) == 1 else number_of(len(methods), "map")
     what = f"{maps} of {frames if len(chosen.ids) == 1 else f'each of {frames}'}, panel.png"
     with output_folder(out, stage="explain", config=recipe, overwrite=overwrite) as output:
         if not output.complete:
