@@ -40,6 +40,7 @@ from PIL import Image
 
 import sliplens as sl
 from sliplens.app import LivePage
+from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import LiveFrame, LiveSource, Reading, ReplaySource
 from sliplens.models import Run
 from sliplens.recordings.source import open_source
@@ -144,7 +145,7 @@ class Pauses:
 
 def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown: bool, maps: bool) -> Latencies:
     """Read a repeated grip for a while, with a page or without, and maps on it or not."""
-    network = sl.load("chromatouch-difference")
+    network = sl.load(DEFAULT_NETWORK)
     network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
     source = ReplaySource(open_source(frames)[0], rate_hz=RATE_HZ, repeat=True)
     # made beforehand, so that what is kept here does not look like memory that grows
