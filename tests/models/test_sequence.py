@@ -116,12 +116,24 @@ def test_a_head_that_learnt_nothing_leaves_answers_as_they_are(run: Run):
     np.testing.assert_allclose(follow(untaught, estimate), estimate.margin, atol=1e-4)
 
 
+def test_frames_are_read_as_the_head_was_taught(run: Run):
+    """Training has whole contacts at once, in torch; reading has one frame after another, in numpy."""
+    estimate, head = answers(12), there(run.sequence)
+    margin, ratio = (there(one.probabilities).astype("f4") for one in (estimate, there(estimate.ratio)))
+    elapsed_s = np.array([1.0, *np.full(11, 0.1)])
+    with torch.no_grad():
+        logits = head(torch.from_numpy(head.summarize(margin, ratio, elapsed_s))[None], torch.from_numpy(margin)[None])
+    read = run.follow().update(estimate, np.arange(12) / 10, np.ones(12, dtype=bool))
+    # floats have 24 bits, and sums of up to 80 of them are added in another order
+    np.testing.assert_allclose(read.margin, logits[0].softmax(-1).numpy() @ head.centres, atol=1e-5)
+
+
 def test_the_gradient_of_a_fresh_head_points_from_the_answer_to_the_label():
     head = SequenceHead(EDGES, RATIO_EDGES, dropout=0.0)
     estimate = answers(8)
-    margin, ratio = (torch.from_numpy(one.probabilities).float()[None] for one in (estimate, there(estimate.ratio)))
+    margin = torch.from_numpy(estimate.probabilities).float()[None]
     label = torch.full((8,), 20)
-    logits, _ = head(margin, ratio, torch.full((1, 8), 0.1))
+    logits = head(torch.ones(1, 8, 8), margin)
     torch.nn.functional.cross_entropy(logits[0], label).backward()
     expected = margin[0].clamp_min(1e-6)
     expected = (expected / expected.sum(-1, keepdim=True)).mean(0) - torch.eye(60)[20]

@@ -466,7 +466,7 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
         sequence = SequenceHead(model.edges, model.ratio_edges)
         hashed = manifest.sequence.weights_sha256
         _load_weights(folder / SEQUENCE_FILE, sequence, what="a head of several frames", sha256=hashed)
-        sequence = sequence.to(device).eval()
+        sequence.eval()
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
     # the networks of the package come without their learning curve

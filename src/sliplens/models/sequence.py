@@ -1,11 +1,12 @@
 """Several frames: what the frames before one tell of its margin, read one after another."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from math import isnan
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -26,6 +27,8 @@ frame that makes one may come a frame later, which for the shipped head is 0.17 
 better with steps of up to 0.6 s than frame by frame, or as well; wet ones worse with 1 to 1.5 s (R2 0.70 for 0.77)."""
 _LEAST_PEAK = 0.02
 """Traction ratio below which nothing is pulled."""
+_PEAK = 5
+"""Which number of `summarize` is the largest ratio so far."""
 ROUNDING_S = 1e-6
 """By which times that are multiples of a step may miss it."""
 _NEAR_ZERO = 0.1
@@ -44,18 +47,11 @@ class SequenceManifest:
     weights_sha256: str = ""
 
 
-State: TypeAlias = tuple[Tensor, Tensor]
-"""What is remembered of each contact: (1, batch, WIDTH), and the largest ratio F_t / F_n so far, (batch, 1)."""
-
-
 class SequenceHead(nn.Module):
     """Recurrent head over what a network answers frame by frame; it corrects the distribution over the margin.
 
-    It is causal: an answer depends on the frames so far. It sees no image but, of each frame, eight numbers: mean and
-    spread of the margin and of F_t / F_n, that ratio over the largest so far (friction falls as a contact begins to
-    slide) and the largest itself, how likely the margin is near 0, and the time since memory took its last step. Eight
-    because whole distributions let it learn its training trials by heart. At first its correction is none, and the
-    answer that of one frame.
+    It is causal: an answer depends on the frames so far. It sees no image but what `summarize` tells of each frame. At
+    first its correction is none, and the answer that of one frame. `Follower` takes its steps one at a time.
 
     Cho et al., *Learning Phrase Representations using RNN Encoder-Decoder* (2014), for the gated recurrent unit.
 
@@ -68,21 +64,16 @@ class SequenceHead(nn.Module):
     """
 
     edges: Tensor
-    centres: Tensor
-    """Margins in the middle of the bins."""
-    ratio_centres: Tensor
-    near_zero: Tensor
-    """1 for each bin of the margin that lies near 0, else 0."""
 
     def __init__(
         self, edges: Float[Tensor, " edges"], ratio_edges: Float[Tensor, " ratio_edges"], *, dropout: float = 0.1
     ) -> None:
         super().__init__()
         self.register_buffer("edges", edges.clone(), persistent=False)
-        # once, for a step is made of so little that each of these costs a twentieth of it
-        self.register_buffer("centres", bin_centres(edges), persistent=False)
-        self.register_buffer("ratio_centres", bin_centres(ratio_edges), persistent=False)
-        self.register_buffer("near_zero", (self.centres <= _NEAR_ZERO).float(), persistent=False)
+        self.centres = bin_centres(edges).numpy()
+        """Margins in the middle of the bins."""
+        self._ratio_centres = bin_centres(ratio_edges).numpy()
+        self._near_zero = (self.centres <= _NEAR_ZERO).astype(np.float32)
         self.seen = nn.Linear(8, WIDTH)
         self.memory = nn.GRU(WIDTH, WIDTH, batch_first=True)
         self.correction = nn.Linear(2 * WIDTH, len(edges) - 1)
@@ -90,36 +81,47 @@ class SequenceHead(nn.Module):
         nn.init.zeros_(self.correction.weight)
         nn.init.zeros_(self.correction.bias)
 
-    def forward(
+    def summarize(
         self,
-        margin: Float[Tensor, "batch frames bins"],
-        ratio: Float[Tensor, "batch frames ratio_bins"],
-        elapsed_s: Float[Tensor, "batch frames"],
-        state: State | None = None,
-    ) -> tuple[Float[Tensor, "batch frames bins"], State]:
-        """Logits over the margin, and what is remembered after the last frame.
+        margin: Float32[np.ndarray, "frames bins"],
+        ratio: Float32[np.ndarray, "frames ratio_bins"],
+        elapsed_s: Float[np.ndarray, " frames"],
+        *,
+        peak: float = _LEAST_PEAK,
+    ) -> Float32[np.ndarray, "frames 8"]:
+        """What the head is told of each frame, one after another.
 
-        `margin`, `ratio`: probabilities of each frame; `elapsed_s`: since memory took its last step; `state`: of the
-        frames before these, None at the first of a contact.
+        Mean and spread of the margin and of F_t / F_n, that ratio over the largest so far (friction falls as a contact
+        begins to slide) and the largest itself, how likely the margin is near 0, and the time since memory took its
+        last step. Eight numbers because whole distributions let it learn its training trials by heart.
+
+        `margin`, `ratio`: probabilities of each frame; `elapsed_s`: since memory took its last step; `peak`: largest
+        F_t / F_n of the frames before these.
         """
         values, spread = _moments(margin, self.centres)
-        pulled, pulled_spread = _moments(ratio, self.ratio_centres)
-        peak = pulled.cummax(dim=1).values.clamp_min(_LEAST_PEAK)
-        if state is not None:
-            peak = torch.maximum(peak, state[1])
-        near_zero = margin @ self.near_zero
-        log_s = elapsed_s.clamp(STEP_S, LONGEST_S).log()
-        told = (values, pulled, 4 * spread, 8 * pulled_spread, pulled / peak, peak, near_zero, log_s)
-        seen = functional.gelu(self.seen(torch.stack(told, dim=-1)))
-        remembered, last = self.memory(self.dropout(seen), None if state is None else state[0])
+        pulled, pulled_spread = _moments(ratio, self._ratio_centres)
+        peaks = np.maximum(np.maximum.accumulate(pulled), peak)
+        near_zero = margin @ self._near_zero
+        log_s = np.log(np.minimum(np.maximum(elapsed_s, STEP_S), LONGEST_S))
+        told = (values, pulled, 4 * spread, 8 * pulled_spread, pulled / peaks, peaks, near_zero, log_s)
+        return np.array(told, dtype=np.float32).T
+
+    def forward(
+        self, told: Float[Tensor, "batch frames 8"], margin: Float[Tensor, "batch frames bins"]
+    ) -> Float[Tensor, "batch frames bins"]:
+        """Logits over the margin in whole contacts, of what `summarize` told and the probabilities of each frame."""
+        seen = functional.gelu(self.seen(told))
+        remembered, _ = self.memory(self.dropout(seen))
         correction = self.correction(torch.cat([self.dropout(remembered), seen], dim=-1))
-        return margin.clamp_min(_LEAST).log() + correction, (last, peak[:, -1:])
+        return margin.clamp_min(_LEAST).log() + correction
 
 
-def _moments(probabilities: Float[Tensor, "*frames bins"], centres: Float[Tensor, " bins"]) -> tuple[Tensor, Tensor]:
+def _moments(
+    probabilities: Float[np.ndarray, "frames bins"], centres: Float[np.ndarray, " bins"]
+) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
     """Mean and standard deviation of each distribution."""
     mean = probabilities @ centres
-    return mean, (probabilities * (centres - mean[..., None]) ** 2).sum(dim=-1).sqrt()
+    return mean, np.sqrt((probabilities * (centres - mean[:, None]) ** 2).sum(axis=-1))
 
 
 def require_frequent(time_s: Float[np.ndarray, " frames"], *, what: str) -> None:
@@ -153,16 +155,17 @@ class Follower:
 
     def __init__(self, head: SequenceHead, sequence: SequenceManifest) -> None:
         self._head, self._sequence = head, sequence
+        self._weights = [values.numpy() for values in head.state_dict().values()]
+        self._centres = head.centres.astype(np.float64)
         self.forget()
 
     def forget(self) -> None:
         """Begin anew with the next contact."""
-        self._state: State | None = None
+        self._memory, self._peak = np.zeros(WIDTH, dtype=np.float32), _LEAST_PEAK
         self._time_s = np.nan
         self.lost = False
         """Whether there was a gap in this contact, so that its frames are read by themselves."""
 
-    @torch.inference_mode()
     def update(
         self, estimate: "Estimate", time_s: Float[np.ndarray, " frames"], touches: Bool[np.ndarray, " frames"]
     ) -> "Estimate":
@@ -175,24 +178,41 @@ class Follower:
         """
         assert estimate.probabilities is not None
         assert estimate.ratio is not None
-        device = self._head.edges.device
-        margin, ratio = (
-            torch.from_numpy(values).float().to(device)[:, None, None]
-            for values in (estimate.probabilities, estimate.ratio.probabilities)
-        )
-        read, probabilities = estimate.margin.copy(), estimate.probabilities.copy()
-        centres, temperature = self._head.centres.double().cpu().numpy(), self._sequence.calibration.temperature
+        margin, ratio = (values.astype(np.float32) for values in (estimate.probabilities, estimate.ratio.probabilities))
+        correction, followed = np.zeros_like(margin), np.zeros(len(margin), dtype=bool)
         for row, (now_s, touched) in enumerate(zip(time_s.tolist(), touches.tolist(), strict=True)):
             if not touched or now_s < self._time_s:
                 self.forget()
             self.lost |= now_s - self._time_s > GAP_S + ROUNDING_S
             if not touched or self.lost:
                 continue
-            elapsed_s = LONGEST_S if self._state is None else now_s - self._time_s
-            since = torch.tensor([[elapsed_s]], device=device)
-            logits, state = self._head(margin[row], ratio[row], since, self._state)
+            elapsed_s = LONGEST_S if isnan(self._time_s) else now_s - self._time_s
+            one = slice(row, row + 1)  # by itself: products of many rows are added in another order
+            [told] = self._head.summarize(margin[one], ratio[one], np.array([elapsed_s]), peak=self._peak)
+            correction[row], memory = self._step(told)
+            followed[row] = True
             if elapsed_s >= STEP_S - ROUNDING_S:
-                self._state, self._time_s = state, now_s
-            probabilities[row] = torch.softmax(logits[0, 0].double() / temperature, dim=-1).cpu().numpy()
-            read[row] = probabilities[row] @ centres  # each by itself: sums of many rows are added in another order
-        return replace(estimate, margin=read, probabilities=probabilities, calibration=self._sequence.calibration)
+                self._memory, self._peak, self._time_s = memory, float(told[_PEAK]), now_s
+        calibration = self._sequence.calibration
+        logits = (np.log(np.maximum(margin, _LEAST)) + correction) / calibration.temperature
+        likely = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64)
+        likely /= likely.sum(axis=1, keepdims=True)
+        read = np.where(followed, (likely * self._centres).sum(axis=1), estimate.margin)
+        probabilities = np.where(followed[:, None], likely, estimate.probabilities)
+        return replace(estimate, margin=read, probabilities=probabilities, calibration=calibration)
+
+    def _step(
+        self, told: Float32[np.ndarray, " 8"]
+    ) -> tuple[Float32[np.ndarray, " bins"], Float32[np.ndarray, " width"]]:
+        """Correction of a frame, and what is remembered then, as `SequenceHead.forward` has them.
+
+        In numpy: to torch each call costs more than what it computes here.
+        """
+        seen_by, seen_bias, by_seen, by_memory, bias, memory_bias, correct_by, correct_bias = self._weights
+        seen = functional.gelu(torch.from_numpy(seen_by @ told + seen_bias)).numpy()
+        added, kept = by_seen @ seen + bias, by_memory @ self._memory + memory_bias
+        gates = (1 + np.tanh((added + kept)[: 2 * WIDTH] / 2)) / 2  # the logistic function
+        reset, held = gates[:WIDTH], gates[WIDTH:]
+        fresh = np.tanh(added[2 * WIDTH :] + reset * kept[2 * WIDTH :])
+        memory = fresh + held * (self._memory - fresh)
+        return correct_by @ np.concatenate([memory, seen]) + correct_bias, memory

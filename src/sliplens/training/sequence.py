@@ -16,7 +16,7 @@ from torch.nn.utils.rnn import pad_sequence
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import versions, whole_file
 from sliplens.models import Run, make_engine, save_checkpoint
-from sliplens.models.backbones import HistogramRegressor, histogram_targets
+from sliplens.models.backbones import HistogramRegressor, bin_centres, histogram_targets
 from sliplens.models.calibration import calibrate_histogram
 from sliplens.models.sequence import (
     GAP_S,
@@ -118,7 +118,7 @@ def fit_sequence(
         _fit(head, config, train, validation, clock=clock)
     labels, temperature = _labels(validation), torch.tensor(1.0)
     calibration, _ = calibrate_histogram(_logits(head, validation), head.edges, temperature, labels)
-    alone = torch.from_numpy(np.concatenate([one.margin for one in validation])) @ head.centres
+    alone = torch.from_numpy(np.concatenate([one.margin @ head.centres for one in validation]))
     kept = SequenceManifest(calibration=calibration, mse_one=float(((alone - labels) ** 2).mean()))
     manifest = replace(
         start.manifest,
@@ -203,16 +203,18 @@ def _fit(
     optimizer = torch.optim.AdamW(head.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, max_lr=config.learning_rate, total_steps=steps)
     labels, best, best_mse = _labels(validation), head.state_dict(), np.inf
+    centres = bin_centres(head.edges)
     for epoch in range(1, config.epochs + 1):
         head.train()
         order, squares, frames = rng.permutation(len(train)), 0.0, 0
         for first in range(0, len(train) // batch * batch, batch):
             some = [train[row].some(rng) for row in order[first : first + batch]]
-            margin, ratio, label, elapsed_s = (
-                pad_sequence([values[name] for values in map(_tensors, some)], batch_first=True) for name in _NAMES
+            told, margin, label = (
+                pad_sequence(list(values), batch_first=True)
+                for values in zip(*(_tensors(head, one) for one in some), strict=True)
             )
             known = pad_sequence([torch.ones(len(one.label), dtype=torch.bool) for one in some], batch_first=True)
-            logits, _ = head(margin, ratio, elapsed_s)
+            logits = head(told, margin)
             loss = functional.cross_entropy(logits[known], histogram_targets(label[known], head.edges))
             optimizer.zero_grad()
             loss.backward()
@@ -220,10 +222,10 @@ def _fit(
             optimizer.step()
             schedule.step()
             with torch.no_grad():
-                squares += float(((torch.softmax(logits[known], dim=-1) @ head.centres - label[known]) ** 2).sum())
+                squares += float(((torch.softmax(logits[known], dim=-1) @ centres - label[known]) ** 2).sum())
             frames += int(known.sum())
         probabilities = torch.softmax(_logits(head, validation), dim=-1)
-        mse = float(((probabilities @ head.centres - labels) ** 2).mean())
+        mse = float(((probabilities @ centres - labels) ** 2).mean())
         clock.add_row(float(epoch), squares / frames, mse)
         if clock.on_progress is not None:
             clock.on_progress(epoch, config.epochs)
@@ -237,17 +239,15 @@ def _fit(
 def _logits(head: SequenceHead, trials: Sequence[AnsweredTrial]) -> Float[Tensor, "frames bins"]:
     """Logits over the margin of all frames, trial by trial, each trial a contact."""
     head.eval()
-    tensors = map(_tensors, trials)
-    return torch.cat([head(one["margin"][None], one["ratio"][None], one["elapsed_s"][None])[0][0] for one in tensors])
+    tensors = (_tensors(head, one) for one in trials)
+    return torch.cat([head(told[None], margin[None])[0] for told, margin, _ in tensors])
 
 
-_NAMES = ("margin", "ratio", "label", "elapsed_s")
-
-
-def _tensors(trial: AnsweredTrial) -> dict[str, Tensor]:
+def _tensors(head: SequenceHead, trial: AnsweredTrial) -> tuple[Tensor, ...]:
+    """What the head is told of each frame, probabilities of its margin, and its label."""
     elapsed_s = np.diff(trial.time_s, prepend=trial.time_s[0] - LONGEST_S)
-    values = {"margin": trial.margin, "ratio": trial.ratio, "label": trial.label, "elapsed_s": elapsed_s}
-    return {name: torch.from_numpy(one.astype(np.float32)) for name, one in values.items()}
+    told = head.summarize(trial.margin, trial.ratio, elapsed_s)
+    return tuple(torch.from_numpy(values) for values in (told, trial.margin, trial.label.astype(np.float32)))
 
 
 def _labels(trials: Sequence[AnsweredTrial]) -> Float[Tensor, " frames"]:
