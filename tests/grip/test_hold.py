@@ -128,6 +128,18 @@ def test_laws_aim_at_the_margin_itself_as_soon_as_readings_know_the_friction():
     assert f"aims at {TOLD['target']:.0%}" in holder.answer(now_s, 2.0).why
 
 
+def test_what_a_slip_teaches_of_the_friction_makes_no_law_forget_the_slip():
+    holder, now_s = holder_of("margin")
+    holder.hear(told(0.5, slip=SlipState.SLIP), taken_s=now_s)
+    pressed = holder.answer(now_s, 2.0)
+    assert pressed.slip
+    loosened = {}
+    for after_s in (0.1, MarginLaw.calm_s + 0.1):
+        holder.hear(told(0.95, friction="0.6"), taken_s=now_s + after_s)
+        loosened[after_s] = holder.answer(now_s + after_s, 2.0).command_n < pressed.command_n
+    assert list(loosened.values()) == [False, True]
+
+
 @pytest.mark.parametrize(
     ("forces", "taken_s", "counts"),
     [

@@ -354,13 +354,23 @@ class Holder:
                 self._told[finger] = reading.friction is not None
                 if self._knows_friction != all(self._told):
                     self._knows_friction = not self._knows_friction
-                    self.choose(self._chosen)
+                    self._suit()
             closed = self._touched_s is not None and taken_s - self._touched_s > _CLOSING_S
             slips = reading.slip is SlipState.SLIP and closed
             if slips and not self._slipping[finger]:
                 (force_n, _), (earlier_n, _) = self._measured(taken_s), self._measured(taken_s - _SPRINGS_BACK_S)
                 self._slip |= not force_n < 0.99 * earlier_n
             self._slipping[finger], self._heard[finger] = slips, (reading, taken_s)
+
+    def _suit(self) -> None:
+        """Take the constants that suit what the readings now know of the friction; the grip goes on where it was."""
+        before = self._controller
+        if not (isinstance(self._chosen, str) and isinstance(before, MarginGrip)):
+            return  # no other controller asks for the friction
+        self.choose(self._chosen)
+        for one in fields(before):
+            if not one.init and one.name != "_zero":  # r_0 is of readings that knew as much
+                setattr(self._controller, one.name, getattr(before, one.name))
 
     def answer(self, time_s: float, force_n: float, *, load_n: float = np.nan) -> Answer:
         """Grip force to command at a time, from the force measured now; NaN where nothing is measured."""
