@@ -154,8 +154,8 @@ def test_claims_without_results_stay_undecided_and_say_so(judged, tmp_path, rng)
 def test_one_network_alone_is_judged_alone(judged):
     answers = judged(thesis(inputs=("raw",)))
 
-    assert {subject for _, subject in answers} == {RAW, BOTH}
-    assert "scored were raw images" in answers["difference", BOTH].text
+    assert {subject for _, subject in answers} == {RAW}
+    assert "scored were raw images" in answers["difference", RAW].text
 
 
 def test_every_interval_of_a_claim_is_told_with_its_setting(judged):

@@ -239,7 +239,9 @@ def _beats_rivals(faithful: RemovalScores, results: Results, *, rng: np.random.G
 
 
 def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
-    findings, by_setting, subject, found = [], {}, "Both networks", results.study.faithfulness
+    findings, by_setting, found = [], {}, results.study.faithfulness
+    names = inputs_in_order(results.study.inputs)
+    subject = input_name(names[0]) if len(names) == 1 else "Both networks"
     if not {"difference", "raw"} <= set(found):
         scored = listed([input_name(name).lower() for name in inputs_in_order(found)] or ["none"])
         return _untested(subject, f"it compares difference images with raw ones, and scored were {scored}")
