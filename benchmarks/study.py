@@ -19,6 +19,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # the study inherits it
 
 import torch
 
+from sliplens.files import DEFAULT_NETWORK
 from sliplens.models.checkpoint import load
 from sliplens.models.engines import prepare
 
@@ -41,8 +42,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         output = options.keep or Path(scratch) / "study"
         data = ["--preset", "thesis"] if options.data is None else [str(options.data)]
+        networks = ["thesis-difference", "thesis-raw"] if options.data is None else [DEFAULT_NETWORK]
         words = [sys.executable, "-m", "sliplens", "study", *data, "-o", str(output), "--trials", str(options.trials)]
-        passes_per_s = measure_passes()
+        words += ["--network", *networks]
+        passes_per_s = measure_passes(networks[0])  # both are of one backbone and size
         started = time.perf_counter()
         stopped = run_until(words, output, ".faithfulness-*.partial/parts/*")
         before = written(output)
@@ -71,11 +74,11 @@ def main() -> None:
     print(f"{minutes:.1f} minutes, {'went on where it stopped' if told['resumed_ok'] else 'did NOT resume'}")
 
 
-def measure_passes(count: int = 1000) -> float:
-    """Forward passes a second of the difference network, by the engine that the study uses."""
-    trained = load("chromatouch-difference")
-    size = trained.manifest.image_size
-    images = torch.rand(16, 3, size, size, generator=torch.Generator().manual_seed(0))
+def measure_passes(network: str, count: int = 1000) -> float:
+    """Forward passes a second of a network that the study explains, by the engine that it uses."""
+    trained = load(network)
+    shape = (16, trained.encoding.colours, *2 * (trained.manifest.image_size,))
+    images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         passes = prepare(trained.model, images, trained.model(images).reshape(-1), passes=10_000)
     batch = images[: passes.batch_size]
