@@ -5,6 +5,7 @@ import os
 import socket
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +31,14 @@ def fake():
     gripper = FakeGripper()
     yield gripper
     gripper.close()
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Time of the guard, which goes on only when a test says so."""
+    clock = SimpleNamespace(now_s=0.0)
+    monkeypatch.setattr("sliplens.grip.gripper.time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    return clock
 
 
 def wait_until(true) -> None:
@@ -63,7 +72,7 @@ def test_a_force_a_width_and_a_question_are_lines(fake):
 )
 def test_a_wrong_answer_is_told_in_a_sentence(fake, answer, told):
     fake.answer = answer
-    gripper = open_gripper(fake.address, timeout_s=0.1)
+    gripper = open_gripper(fake.address, timeout_s=0.1 if answer is None else 10.0)
     with pytest.raises(GripperError, match=told):
         gripper.set_force(1.0)
     gripper.close()
@@ -75,6 +84,7 @@ def test_a_late_answer_is_forgotten_and_the_next_one_counts(fake):
     assert isinstance(gripper, LineGripper)
     with pytest.raises(GripperError, match="did not answer"):
         gripper.set_force(1.0)
+    wait_until(lambda: fake.heard)
     fake.send(b"ERR too late\n")
     fake.answer = b"OK 2.000 0.0300\n"
     wait_until(lambda: gripper._ready(0.0))
@@ -143,11 +153,14 @@ def test_a_force_that_is_no_number_holds():
     assert set(dry.sent) == {"F 2.000"}
 
 
-def test_a_reader_that_stops_makes_the_gripper_hold_and_not_open():
+def test_a_reader_that_stops_makes_the_gripper_hold_and_not_open(clock):
     dry = DryRun()
     with GuardedGripper(dry, watchdog_s=SOON_S) as gripper:
         gripper.set_force(2.0)
-        wait_until(lambda: gripper.holding)
+        assert not gripper.holding
+        clock.now_s += 2 * SOON_S
+        wait_until(lambda: len(dry.sent) > 1)
+        assert gripper.holding
         assert set(dry.sent) == {"F 2.000"}
         with pytest.raises(GripperError, match="opens nothing"):
             gripper.set_width(0.08)
@@ -192,23 +205,25 @@ def test_whatever_a_driver_raises_the_watchdog_lives_and_holds():
     assert set(driver.sent) == {"F 1.500"}
 
 
-def test_a_gripper_that_fails_to_open_goes_on_holding():
+def test_a_gripper_that_fails_to_open_goes_on_holding(clock):
     driver = Broken()
     driver.broken = False
     with GuardedGripper(driver, watchdog_s=SOON_S) as gripper:
         gripper.set_force(1.5)
         with pytest.raises(RuntimeError):
             gripper.set_width(0.08)
+        clock.now_s += 2 * SOON_S
         wait_until(lambda: len(driver.sent) > 2)
     assert set(driver.sent) == {"F 1.500"}
 
 
-def test_an_open_gripper_holds_nothing_and_may_be_opened_further():
+def test_an_open_gripper_holds_nothing_and_may_be_opened_further(clock):
     dry = DryRun()
     with GuardedGripper(dry, watchdog_s=SOON_S) as gripper:
         gripper.set_force(1.0)
         gripper.set_width(0.04)
-        time.sleep(2 * SOON_S)
+        clock.now_s += 2 * SOON_S
+        time.sleep(SOON_S)  # the watchdog looks four times
         assert not gripper.holding
         gripper.set_width(0.08)
     assert dry.sent == ["F 1.000", "W 0.0400", "W 0.0800"]
@@ -256,8 +271,8 @@ class FakeRosGripper:
 
     def _tell(self) -> None:
         while not self._stop.wait(0.005):
-            if self.state is not None:
-                self._session.put("hand/joint_states", self.state)
+            if (state := self.state) is not None:  # which a test may change meanwhile
+                self._session.put("hand/joint_states", state)
 
     def close(self) -> None:
         self._stop.set()

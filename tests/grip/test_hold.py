@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import pytest
@@ -216,28 +217,29 @@ def test_a_gripper_that_misbehaves_holds_a_cup_by_what_is_read_of_its_frames(gri
 
 
 class Frames(LiveSource):
-    """Frames of noise, until somebody ends them."""
+    """Frames of noise, until somebody ends them; a few end once a step was told."""
 
     name, rate_hz, size = "a finger", 100.0, (64, 64)
 
-    def __init__(self, *, frames: int = 10**6, then: Callable[[], None] = lambda: None) -> None:
-        self._frames, self._then, self._closed = frames, then, False
+    def __init__(self, *, frames: int = 10**6, then: Callable[[Event], object] = lambda _: None) -> None:
+        self._frames, self._then, self._closed, self.held = frames, then, Event(), Event()
         self.reference = self._image = np.zeros((64, 64, 3), dtype=np.uint8)
 
     def frames(self) -> Iterator[LiveFrame]:
         for number in range(self._frames):
-            time.sleep(0.01)
-            if self._closed:
+            if self._closed.wait(0.01):
                 return
             now_s = time.monotonic()
             yield LiveFrame(image=self._image, number=number, time_s=now_s, captured_s=now_s)
-        self._then()
+        self.held.wait(10)  # however late it begins to hold
+        self._then(self._closed)
 
     def close(self) -> None:
-        self._closed = True
+        self._closed.set()
+        self.held.set()
 
 
-def lose() -> None:
+def lose(_: Event) -> None:
     raise SourceError("the cable was pulled; put it back")
 
 
@@ -251,7 +253,7 @@ def interrupt(step: HoldStep) -> None:
     [
         (Frames(frames=5), {}, "source", "a finger has ended"),
         (Frames(frames=5, then=lose), {}, "failed", "the cable was pulled; put it back"),
-        (Frames(frames=5, then=lambda: time.sleep(0.2)), {"seconds": 0.15}, "time", "the time is over"),
+        (Frames(frames=5, then=lambda closed: closed.wait(10)), {"seconds": 0.15}, "time", "the time is over"),
         (Frames(), {"on_step": interrupt}, "interrupted", "interrupted"),
     ],
     ids=["ends", "fails", "stalls", "ctrl-c"],
@@ -260,6 +262,7 @@ def test_however_it_ends_the_gripper_keeps_what_it_holds_with(source, given, end
     hand = DryRun()
     hand.set_force(3.0)  # it holds something already
     with plain_reader(source) as reader:
+        given = {"on_step": lambda _: source.held.set()} | given
         hold = sl.hold_grip(reader, hand, controller=Says(force_n=1.0), **given)
     assert (hold.ended, hold.why) == (ended, f"{why}; the gripper keeps the 3.00 N that it was told last")
     assert set(hand.sent) == {"F 3.000"}
@@ -295,8 +298,15 @@ def test_a_force_that_was_told_is_noted_though_ctrl_c_comes_before_its_answer():
 
 
 def test_one_of_two_readers_suffices():
-    with plain_reader(Frames(frames=2)) as one, plain_reader(Frames(frames=12)) as other:
-        hold = sl.hold_grip([one, other], "dry-run", controller="fixed")
+    few, more = Frames(frames=2), Frames(frames=12)
+
+    def end(_: HoldStep) -> None:
+        few.held.set()
+        if one.ended is not None:  # it held with the other alone
+            more.held.set()
+
+    with plain_reader(few) as one, plain_reader(more) as other:
+        hold = sl.hold_grip([one, other], "dry-run", controller="fixed", on_step=end)
         assert other.ended is not None
     assert hold.ended == "source"
     assert hold.why == "a finger has ended, a finger has ended; nothing was sent"

@@ -24,8 +24,8 @@ class FakeGripper:
                 # whoever hangs up in the middle of an answer resets the connection
                 with suppress(ConnectionError), self._connection, self._connection.makefile("rwb") as stream:
                     for line in stream:
+                        told = self.answer  # first: another one may be set once it has heard
                         self.heard.append(line.decode().strip())
-                        told = self.answer
                         answer = told(self.heard[-1]) if callable(told) else told
                         if answer is not None:
                             stream.write(answer)

@@ -46,6 +46,11 @@ def lost(source: "Wicked") -> None:
     raise SourceError(f"{source.name} was unplugged; plug it in again")
 
 
+def lost_once_read(source: "Wicked") -> None:
+    assert source.read.wait(timeout=10)
+    lost(source)
+
+
 def damaged(source: "Wicked") -> None:
     raise RecordingError(f"{source.name} is damaged; copy it again")
 
@@ -108,9 +113,12 @@ def test_a_source_that_is_lost_is_opened_again_until_it_is_back():
     assert readings[-1].withheld is None
 
 
-def test_while_a_source_is_away_readings_say_so(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(loop, "_RETRY_S", 0.15)
-    readings = readings_of(Wicked(frame(3), lost, frame(4)), stall_s=0.05)
+def test_while_a_source_is_away_readings_say_so():
+    def back(source: Wicked) -> LiveFrame | None:
+        source.read.clear()  # only once somebody was told that it was away
+        return frame(4)(source)
+
+    readings = readings_of(Wicked(frame(3), lost_once_read, back), stall_s=0.05)
     sentences = [reading.withheld for reading in readings if reading.number == 3]
     assert sentences[0] is None
     assert "the fake was unplugged; plug it in again" in sentences
@@ -205,7 +213,8 @@ def test_a_folder_without_an_image_is_refused_with_what_to_wait_for(tmp_path: Pa
         FolderSource(tmp_path).__enter__()
 
 
-def test_an_image_that_is_half_written_is_waited_for(tmp_path: Path):
+def test_an_image_that_is_half_written_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sources, "_WRITTEN_S", 60.0)  # however late the rest comes
     write_png(tmp_path / "1.png", IMAGE)
     whole = (tmp_path / "1.png").read_bytes()
     with FolderSource(tmp_path) as source:

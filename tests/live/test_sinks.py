@@ -222,10 +222,11 @@ def test_a_sink_that_breaks_off_says_so_and_the_reading_goes_on(slow: Slow):
     frames = np.full((6, 8, 8, 3), 128, dtype=np.uint8)
     slow.go.set()
     source = ReplaySource(open_source(frames)[0], rate_hz=500.0)
-    with sl.LiveReader(source, reference=frames[0], health=None, slip=None) as reader:
-        reader.send_to("slow")
-        reader.senders[0].put(replace(READING, number=99), None)
-        assert slow.began.wait(10)  # else the readings that follow may push it out before it is sent
+    reader = sl.LiveReader(source, reference=frames[0], health=None, slip=None)
+    reader.send_to("slow")
+    reader.senders[0].put(replace(READING, number=99), None)
+    assert slow.began.wait(10)  # before any other reading, which might push it out unsent
+    with reader:
         numbers = [reading.number for reading in reader.readings()]
     assert numbers[-1] == 5
     assert slow.closed

@@ -211,7 +211,8 @@ class ForceStream:
     def __enter__(self) -> "ForceStream":
         if not self.path.exists():
             raise RecordingError(f"{self.path} does not exist; begin to write the forces, then record")
-        Thread(target=self._follow, daemon=True).start()
+        begin = self.path.stat().st_size  # not when the thread gets to it: what is written meanwhile counts
+        Thread(target=self._follow, args=(begin,), daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -235,12 +236,12 @@ class ForceStream:
             return frame
         return replace(frame, forces=Forces(time_s=time_s[kept], force_n=force_n[kept], source=str(self.path)))
 
-    def _follow(self) -> None:
+    def _follow(self, begin: int) -> None:
         try:
             with self.path.open(encoding="utf-8") as file:
                 parse = _LineParser(self.path, self._next_line(file))
                 if file.seekable():
-                    file.seek(0, 2)
+                    file.seek(max(begin, file.tell()))  # past the names, if those came later
                 while not self._closed.is_set():
                     line = self._next_line(file)
                     if line:
