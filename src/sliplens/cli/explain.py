@@ -27,7 +27,8 @@ class Explain(Command):
     output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None
     """Folder to make: maps, inputs, table, pictures."""
     frames: Path | None = None
-    """Folder of 8-bit RGB images: difference images, or camera frames together with --reference."""
+    """Folder of 8-bit RGB images: camera frames together with --reference, or difference images for a network on
+    differences, such as chromatouch-difference."""
     reference: Path | None = None
     """Image of the untouched sensor, for camera frames in --frames."""
     sensor: Path | None = None

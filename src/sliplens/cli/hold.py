@@ -48,7 +48,8 @@ class Hold(Command):
     joint: str | None = None
     """Joint of a gripper of ROS 2 that tells width and force; the first if not given."""
     network: str | None = None
-    """Folder or name of a trained network. If not given, chromatouch-pair for what is simulated, else none."""
+    """Folder or name of a trained network. If not given, chromatouch-pair for what is simulated, else that
+    of the profile."""
     reference: tuple[Path, ...] = ()
     """Image of each untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None

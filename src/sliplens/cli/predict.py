@@ -32,7 +32,8 @@ class Predict(SourceCommand):
     """Read the safety margin of every frame: of a data set, a folder of images, a video, or any recording.
 
     Shows the margin with its 90 % interval: frame by frame where there are few, else the course of each trial and its
-    lowest point. Images of a folder are taken for difference images if no reference is named.
+    lowest point. Images of a folder are taken for difference images if no reference is named, which
+    networks on differences alone read.
     """
 
     model: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="[RUN]", help=_RUN)] = None

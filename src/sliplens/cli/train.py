@@ -10,7 +10,7 @@ from sliplens.cli.console import Terminal
 
 @dataclass(frozen=True, kw_only=True)
 class Train(Command):
-    """Train a network to read the safety margin from raw frames or from difference images.
+    """Train a network to read the safety margin from camera frames, with or without the untouched sensor.
 
     Interrupted, it goes on after the last whole epoch when the same command is given again.
     """

@@ -155,8 +155,8 @@ class Run:
 
         A difference image is black but where something moved, a camera's is not.
         """
-        level, kind = float(np.median(frame)), self.encoding.name
-        if kind == "raw" and level < _DARKEST_FRAME and frame.any():
+        level = float(np.median(frame))
+        if not self.encoding.empty_is_black and level < _DARKEST_FRAME and frame.any():
             raise ImageError(
                 f"{what} is as dark as a difference image (median {level:.0f} of 255 grey levels), and this network "
                 f"reads camera frames; give those, or a network on difference images such as {DIFFERENCE_NETWORK}"

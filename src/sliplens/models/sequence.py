@@ -147,8 +147,8 @@ class Follower:
     >>> import sliplens as sl
     >>> network = sl.load("chromatouch-pair")
     >>> follower = network.follow()
-    >>> touch = np.zeros((2, 224, 224, 3), dtype=np.uint8)  # difference images: nothing has moved
-    >>> one_by_one = network.estimate(network.encode(touch, None))
+    >>> frames = np.full((2, 224, 224, 3), 128, dtype=np.uint8)  # as the untouched sensor: nothing has moved
+    >>> one_by_one = network.estimate(network.encode(frames, frames[0]))
     >>> follower.update(one_by_one, np.array([0.0, 0.1]), np.array([True, True])).margin.shape
     (2,)
     """
