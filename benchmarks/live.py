@@ -29,6 +29,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -143,9 +144,10 @@ class Pauses:
             self.longest_ms = max(self.longest_ms, 1e3 * (time.perf_counter() - self._begun))
 
 
-def measure(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown: bool, maps: bool) -> Latencies:
+def measure(
+    frames: np.ndarray, untouched: np.ndarray, *, network: Run, seconds: float, shown: bool, maps: bool
+) -> Latencies:
     """Read a repeated grip for a while, with a page or without, and maps on it or not."""
-    network = sl.load(DEFAULT_NETWORK)
     network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
     source = ReplaySource(open_source(frames)[0], rate_hz=RATE_HZ, repeat=True)
     # made beforehand, so that what is kept here does not look like memory that grows
@@ -306,11 +308,14 @@ def slowest_parts_ms(latencies: Latencies) -> dict[str, float]:
     return {name: round(float(value), 1) for name, value in zip(PARTS, means, strict=True)}
 
 
-def measure_pace(frames: np.ndarray, untouched: np.ndarray, *, seconds: float, shown: bool) -> dict[str, object]:
+def measure_pace(
+    frames: np.ndarray, untouched: np.ndarray, *, network: Run, seconds: float, shown: bool
+) -> dict[str, object]:
     """Latencies at the camera's pace, with a page open or not."""
     begun = time.monotonic()
-    alone = measure(frames, untouched, seconds=seconds, shown=shown, maps=False)
-    beside = measure(frames, untouched, seconds=max(5.0, seconds / 10), shown=shown, maps=True) if shown else None
+    measured = partial(measure, frames, untouched, network=network, shown=shown)
+    alone = measured(seconds=seconds, maps=False)
+    beside = measured(seconds=max(5.0, seconds / 10), maps=True) if shown else None
     median_ms = np.median(alone.parts_ms, axis=0)
     return {
         "p50_ms": round(float(np.median(alone.total_ms)), 2),
@@ -338,6 +343,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0, help="length of the run without maps")
+    parser.add_argument("--network", default=DEFAULT_NETWORK, help="name or folder of a network, but for --ratios")
     parser.add_argument("--page", choices=("browser", "none"), default="browser", help="what looks at the page")
     parser.add_argument("--ratios", action="store_true", help="compare ways to read in place of that")
     parser.add_argument("--rounds", type=int, default=1200, help="frames that each way reads, for --ratios")
@@ -347,7 +353,8 @@ def main() -> None:
     if options.ratios:
         result = compare_ways(frames, untouched, rounds=options.rounds)
     else:
-        result = measure_pace(frames, untouched, seconds=60 * options.minutes, shown=options.page == "browser")
+        network, shown = sl.load(options.network), options.page == "browser"
+        result = measure_pace(frames, untouched, network=network, seconds=60 * options.minutes, shown=shown)
     result["load"] = round(os.getloadavg()[0], 1)
     if options.json:
         print(json.dumps(result))
