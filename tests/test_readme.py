@@ -10,6 +10,7 @@ import pytest
 import torch
 from own_recording import write_forces, write_video
 
+from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import LiveReader
 from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.recordings import Dataset, Recording
@@ -40,21 +41,19 @@ def folder(
     (tmp_path / "grips").symlink_to(fine_dataset.folder)
     write_forces(grip, tmp_path / "cup.csv")
     write_video(grip, tmp_path / "cup.mp4")  # Matroska, whatever its name: FFmpeg looks inside
-    for kind in ("difference", "raw"):
-        manifest = Manifest(
-            backbone="shufflenet_v2_x1_0",
-            head="histogram",
-            input=kind,
-            image_size=IMAGE_SIZE,
-            frame_size=(small_dataset.trials[0].height, small_dataset.trials[0].width),
-            sensor="test-sensor",
-            data_hash="none",
-        )
-        run = tmp_path / f"chromatouch-{kind}"
-        run.mkdir()
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            save_checkpoint(run, build_model(head="histogram").eval(), manifest)
+    manifest = Manifest(
+        backbone="shufflenet_v2_x1_0",
+        head="histogram",
+        input="pair",
+        image_size=IMAGE_SIZE,
+        frame_size=(small_dataset.trials[0].height, small_dataset.trials[0].width),
+        sensor="test-sensor",
+        data_hash="none",
+    )
+    (tmp_path / DEFAULT_NETWORK).mkdir()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        save_checkpoint(tmp_path / DEFAULT_NETWORK, build_model(head="histogram", colours=6).eval(), manifest)
     small = replace(RECIPES["default"], image_size=IMAGE_SIZE, batch_size=16)
     monkeypatch.setitem(RECIPES._rows, "default", small)
     for option in ("random_orders", "trials"):
@@ -77,7 +76,7 @@ def hurry(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
 def test_what_the_readme_shows_runs(block: str, folder: Path, small_dataset: Dataset, hurry: None):
     if "simulated" in block:  # its frames are of the real size, and so is the network of the package
-        (folder / "chromatouch-difference").rename(folder / "other")
+        (folder / DEFAULT_NETWORK).rename(folder / "other")
     recording = small_dataset.load(small_dataset.trials[0])
     given = {"frames": recording.frames[6:7], "untouched": recording.reference}
     exec(compile(block, "README.md", "exec"), given)
