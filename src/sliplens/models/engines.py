@@ -242,7 +242,7 @@ def make_engine(
     >>> from sliplens.models.engines import make_engine
     >>> network = sl.load("chromatouch-pair")
     >>> engine = make_engine("folded", network, batch_size=2)
-    >>> engine.estimate(network, torch.zeros(3, 3, 224, 224)).margin.shape
+    >>> engine.estimate(network, torch.zeros(3, 6, 112, 112)).margin.shape
     (3,)
     """
     if onnx_file is not None:
