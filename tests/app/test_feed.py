@@ -3,6 +3,7 @@
 import asyncio
 import json
 import threading
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -12,6 +13,7 @@ import sliplens as sl
 from sliplens.app.feed import Feed, Picture, Viewer
 from sliplens.live import SimulatedSource
 from sliplens.live.reading import LiveFrame, Reading
+from sliplens.recordings.sensor import SensorProfile
 
 
 class Wire:
@@ -50,12 +52,12 @@ def picture(number: int) -> Picture:
     )
 
 
-def with_viewer(act) -> None:
+def with_viewer(act, **reader) -> None:
     """Let a viewer be served while something is done."""
 
     async def run() -> None:
         # nothing happens in it by itself: it was not started
-        feed, wire = Feed(sl.LiveReader("simulated")), Wire()
+        feed, wire = Feed(sl.LiveReader("simulated", **reader)), Wire()
         viewer = Viewer(feed)
         served = asyncio.create_task(viewer.serve(cast("Any", wire)))
         await act(feed, wire, viewer)
@@ -177,3 +179,11 @@ def test_its_threads_have_ended_when_it_is_closed():
             return [thread.name for thread in begun if thread.is_alive() and thread.daemon]
 
     assert asyncio.run(run()) == []
+
+
+def test_a_viewer_is_told_what_the_network_was_not_made_for(difference_run: Path):
+    async def act(_: Feed, wire: Wire, __: Viewer) -> None:
+        [doubt] = (await wire.next())["troubles"]
+        assert "reads frames of another" in doubt
+
+    with_viewer(act, network=difference_run, sensor=SensorProfile(name="another"))

@@ -24,6 +24,21 @@ def test_a_line_of_json_a_command_and_a_table_of_all(small_dataset: Dataset, tmp
     assert hold.steps.time_s.tolist() == [step["time_s"] for step in steps]
 
 
+def test_the_network_is_that_of_the_profile(tmp_path: Path, capsys):
+    profile = tmp_path / "tip.toml"
+    profile.write_text('name = "tip"\nnetwork = "trained-elsewhere"\n', encoding="utf-8")
+    told = refused(capsys, "hold", "simulated", "--dry-run", "--sensor", profile)
+    assert "the run trained-elsewhere does not exist" in told
+
+
+def test_frames_of_another_sensor_are_told_once(small_dataset: Dataset, difference_run: Path, tmp_path: Path, capsys):
+    profile = tmp_path / "tip.toml"
+    profile.write_text('name = "another"\n', encoding="utf-8")
+    words = ("hold", small_dataset.folder, "--network", difference_run, "--engine", "eager", "--sensor", profile)
+    assert run(*words, "--dry-run", "--controller", "fixed") == 0
+    assert " ".join(capsys.readouterr().err.split()).count("reads frames of another") == 1
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

@@ -29,7 +29,7 @@ def test_a_line_of_json_a_reading(small_dataset: Dataset, difference_run: Path, 
 def test_a_line_for_people(small_dataset: Dataset, capsys: pytest.CaptureFixture[str]):
     assert main(["live", str(small_dataset.folder), "--speed", "4", "--no-page"]) == 0
     # a frame is not healthy, or there is no network
-    assert re.search("no network|no margin: .*; ", capsys.readouterr().out)
+    assert re.search("name one with --network|no margin: .*; ", capsys.readouterr().out)
 
 
 def test_the_network_is_that_of_the_profile(small_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
+from sliplens.files import DEFAULT_NETWORK
 from sliplens.grip.controllers import MarginLaw
-from sliplens.grip.source import GripSource, Held, open_grip
+from sliplens.grip.source import GripSource, Held, open_grip, usual_network
 from sliplens.live.contract import Pace, SourceOptions
 from sliplens.live.reading import Reading, SlipState
+from sliplens.recordings.sensor import SensorProfile
 
 RATE_HZ = 30.0
 
@@ -100,8 +102,27 @@ def test_what_cannot_be_done_is_refused(source: GripSource, told):
 
 
 def test_a_gripper_is_named_with_what_it_holds():
-    assert open_grip("grip:egg", SourceOptions(rate_hz=10.0)).name == "a simulated gripper (egg)"
+    gripper = open_grip("grip:egg", SourceOptions(rate_hz=10.0))
+    assert gripper is not None
+    assert gripper.name == "a simulated gripper (egg)"
+    assert open_grip("gripper.mp4", SourceOptions(speed=2.0)) is None
     with pytest.raises(InputError, match="there is no object named 'anvil'"):
         open_grip("grip:anvil", SourceOptions())
     with pytest.raises(InputError, match="the simulated gripper takes no --speed"):
         open_grip("grip", SourceOptions(speed=2.0))
+
+
+@pytest.mark.parametrize(
+    ("source", "profile", "network"),
+    [
+        ("simulated", None, DEFAULT_NETWORK),
+        (GripSource(), None, DEFAULT_NETWORK),
+        ("simulated:flat-gel", None, None),
+        ("0", None, None),
+        ("0", SensorProfile(name="tip", network="own"), "own"),
+        ("simulated", SensorProfile(name="tip", network="own"), "own"),
+        ("simulated", SensorProfile(name="tip"), None),
+    ],
+)
+def test_where_no_network_is_named_the_profile_goes_before_what_is_simulated(source, profile, network):
+    assert usual_network(source, profile) == network

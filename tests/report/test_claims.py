@@ -61,7 +61,7 @@ def judged(tmp_path, rng):
     return judge
 
 
-DIFFERENCE, RAW, BOTH = "Difference images", "Raw images", "Both networks"
+DIFFERENCE, RAW, BOTH = "Difference images", "Raw images", "Difference images and raw images"
 
 
 @pytest.mark.parametrize(

@@ -210,7 +210,8 @@ def test_real_frames_without_labels_carry_no_claim(workspace, verdict):
 def test_the_reduced_image_is_told(verdict):
     text = verdict()["What this run is"].text
 
-    assert "images of 24 px, shrunk from the camera's 224 x 224 (the thesis: 224 px)" in text
+    assert text.count("frames of 24 px, shrunk from 224 x 224, for") == 2
+    assert "the thesis took images of 224 px" in text
 
 
 def test_a_statement_begins_with_its_finding():

@@ -155,7 +155,7 @@ class Update:
     recording: RecordingState | None
     sinks: tuple[SinkState, ...]
     troubles: tuple[str, ...]
-    """What has ended beside the reading, with the cure."""
+    """What the network was not made for, and what has ended beside the reading, with the cure."""
     frozen: Reading | None
     """Reading of the picture, where it is frozen."""
     has_map: bool
@@ -519,7 +519,7 @@ class Viewer:
             ended=feed.ended,
             recording=None if (recorder := reader.recorder) is None else recorder.state,
             sinks=tuple(sender.state for sender in reader.senders),
-            troubles=reader.troubles,
+            troubles=(*reader.doubts, *reader.troubles),
             frozen=None if self.frozen is None else self.frozen.reading,
             has_map=overlay is not None,
             picture=_picture_facts(picture, arrows=self.shows_arrows) if picture is not None and jpeg else None,

@@ -60,7 +60,7 @@ export default {
     raises: String,
     methods: Object,
     recommended: String,
-    network: Boolean,
+    noNetwork: String,
     grips: Boolean,
   },
   mounted() {
@@ -327,7 +327,7 @@ export default {
       if (!reading) return this.withdraw(ended ?? "waiting for the first frame");
       const margin = reading.margin;
       if (margin === null) {
-        this.withdraw(reading.withheld ?? (this.network ? "no margin" : "no network, so no margin is read; start with --network"));
+        this.withdraw(reading.withheld ?? this.noNetwork);
       } else {
         const [least, most] = this.target;
         const state = margin < least ? "low" : margin > most ? "high" : "in";

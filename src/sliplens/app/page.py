@@ -14,6 +14,7 @@ from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
 from sliplens.grip.controllers import CONTROLLERS
 from sliplens.grip.source import GripSource
+from sliplens.live.reading import NO_NETWORK
 from sliplens.live.sources import SimulatedSource
 from sliplens.plots.saliency import LOWERS, RAISES
 from sliplens.plots.style import BLUE, METHOD_NAMES
@@ -32,7 +33,6 @@ class LiveView(ui.element, component="live_view.js"):
 
     def __init__(self, page: "LivePage", name: str) -> None:
         super().__init__()
-        network = page.reader.network
         self._props.update({
             "path": f"/frames/{name}",
             "chart-s": CHART_S,
@@ -41,7 +41,7 @@ class LiveView(ui.element, component="live_view.js"):
             "raises": RAISES,
             "methods": METHOD_NAMES,
             "recommended": RECOMMENDED_METHOD,
-            "network": network is not None,
+            "no-network": NO_NETWORK,
             "grips": isinstance(page.reader.source, GripSource),
         })  # fmt: skip
 
@@ -88,7 +88,7 @@ class _Acts:
     async def explain(self) -> None:
         """Keep the picture and say why."""
         if self._reader.network is None:
-            raise InputError("there is no network to explain; start with --network")
+            raise InputError(NO_NETWORK)
         viewer, method = self.viewer, self.method
         picture = viewer.freeze()
         self._name_freezing()

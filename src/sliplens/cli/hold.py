@@ -1,6 +1,7 @@
 """`sliplens hold`."""
 
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from sliplens.cli.command import Command, Device, Friction, InOrder, SameObject
 from sliplens.cli.console import say, wrote
 from sliplens.cli.grip import constant
 from sliplens.errors import InputError, SliplensError
-from sliplens.files import DEFAULT_NETWORK, to_builtins
+from sliplens.files import to_builtins
 from sliplens.progress import number_of
 
 if TYPE_CHECKING:
@@ -48,8 +49,8 @@ class Hold(Command):
     joint: str | None = None
     """Joint of a gripper of ROS 2 that tells width and force; the first if not given."""
     network: str | None = None
-    """Folder or name of a trained network. If not given, chromatouch-pair for what is simulated, else that
-    of the profile."""
+    """Folder or name of a trained network. If not given, that of the profile; chromatouch-pair for what is
+    simulated, else none."""
     reference: tuple[Path, ...] = ()
     """Image of each untouched sensor; taken when the picture is still at first if not given."""
     friction: Friction = None
@@ -92,7 +93,7 @@ class Hold(Command):
                 ceiling_n=self.ceiling,
                 watchdog_s=self.watchdog,
                 out=self.output,
-                on_step=_Steps(json=self.json),
+                on_step=_Steps(readers, json=self.json),
             )
         say(hold.why, aside=True)
         for source, reader in zip(self.sources, readers, strict=True):
@@ -104,39 +105,37 @@ class Hold(Command):
             raise SliplensError(hold.why)
 
     def _readers(self) -> "list[LiveReader]":
-        from sliplens.grip.source import open_grip
+        from sliplens.grip.source import open_grip, usual_network
         from sliplens.live import LiveReader
         from sliplens.live.contract import SourceOptions
         from sliplens.models import load
+        from sliplens.recordings.sensor import load_profile
 
         if self.reference and len(self.reference) != len(self.sources):
             raise InputError(f"--reference takes an image a source, {len(self.sources)}, got {len(self.reference)}")
-        shipped = all(source.partition(":")[0] in {"grip", "simulated"} for source in self.sources)
-        name = self.network or (DEFAULT_NETWORK if shipped else None)
-        common = {
-            name: getattr(self, name) for name in ("friction", "same_object", "sequence", "sensor", "engine", "device")
-        }
-        common["network"] = None if name is None else load(name, device=self.device)
+        common = {name: getattr(self, name) for name in ("friction", "same_object", "sequence", "engine")}
+        profile = common["sensor"] = None if self.sensor is None else load_profile(self.sensor)
+        sources = [open_grip(source, SourceOptions()) or source for source in self.sources]
+        names = [self.network or usual_network(source, profile) for source in sources]
+        networks = {name: load(name, device=self.device) for name in dict.fromkeys(names) if name is not None}
+        references = self.reference or [None] * len(sources)
         return [
-            LiveReader(
-                open_grip(source, SourceOptions()) if source.partition(":")[0] == "grip" else source,
-                reference=reference,
-                **common,
-            )
-            for source, reference in zip(self.sources, self.reference or [None] * len(self.sources), strict=True)
+            LiveReader(source, None if name is None else networks[name], reference=reference, **common)
+            for source, name, reference in zip(sources, names, references, strict=True)
         ]
 
 
 class _Steps:
-    """Prints each command as a line of JSON, or one a second, and each trouble once."""
+    """Prints each command as a line of JSON, or one a second, and each trouble and doubt once."""
 
-    def __init__(self, *, json: bool) -> None:
-        self._json, self._told_s, self._told = json, -1.0, set[str]()
+    def __init__(self, readers: "Sequence[LiveReader]", *, json: bool) -> None:
+        self._readers, self._json, self._told_s, self._told = readers, json, -1.0, set[str]()
 
     def __call__(self, step: "HoldStep") -> None:
-        if step.trouble is not None and step.trouble not in self._told:
-            self._told.add(step.trouble)
-            say(step.trouble, aside=True)
+        for words in (step.trouble, *(doubt for reader in self._readers for doubt in reader.doubts)):
+            if words is not None and words not in self._told:
+                self._told.add(words)
+                say(words, aside=True)
         if self._json:
             print(msgspec.json.encode(to_builtins(step)).decode(), flush=True)
         elif time.monotonic() - self._told_s >= 1:

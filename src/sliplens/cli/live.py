@@ -12,7 +12,6 @@ import tyro
 
 from sliplens.cli.command import Device, Friction, InOrder, SameObject
 from sliplens.cli.console import print_table, say
-from sliplens.files import DEFAULT_NETWORK
 
 if TYPE_CHECKING:
     from sliplens.live import LiveReader
@@ -81,7 +80,7 @@ class Live:
 
     def run(self) -> None:
         """Read until the source ends."""
-        from sliplens.grip.source import open_grip
+        from sliplens.grip.source import open_grip, usual_network
         from sliplens.live import LiveReader
         from sliplens.live.contract import SourceOptions, parse_size
         from sliplens.recordings import TrialFacts
@@ -90,18 +89,17 @@ class Live:
         if self.list:
             self._list()
             return
-        grips = self.source.partition(":")[0] == "grip"
-        shipped = DEFAULT_NETWORK if grips or self.source in {"simulated", "simulated:chromatouch"} else None
         wishes = {name: getattr(self, name) for name in ("speed", "trial", "pixel_format")}
         options = SourceOptions(rate_hz=self.rate, size=parse_size(self.size), **wishes)
         names = ("reference", "engine", "device", "seconds", "forces", "friction", "same_object", "sequence")
         named = {name: getattr(self, name) for name in names} | {"smoothing_s": self.smoothing, "options": options}
         profile = named["sensor"] = load_profile(self.sensor) if is_profile(self.sensor) else None
-        named |= {"source": open_grip(self.source, options), "options": None} if grips else {"source": self.source}
+        grip = open_grip(self.source, options)
+        named |= {"source": self.source} if grip is None else {"source": grip, "options": None}
         told = {name: getattr(self, name) for name in ("sensor", "object", "condition", "day")}
         facts = TrialFacts(trial="live", **told)
         with ExitStack() as stack:
-            network = self.network or (profile.network if profile else shipped)
+            network = self.network or usual_network(named["source"], profile)
             reader = stack.enter_context(closing(LiveReader(network=network, **named)))
             reader.send_to(*self.sink)
             if self.record is not None:

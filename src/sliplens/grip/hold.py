@@ -14,11 +14,11 @@ import numpy as np
 
 from sliplens.codec import save_result
 from sliplens.errors import InputError
-from sliplens.files import DEFAULT_NETWORK, output_folder
+from sliplens.files import output_folder
 from sliplens.grip.controllers import Answer, AssumedFriction, Controller, Holder, MarginGrip, Oracle, make_controller
 from sliplens.grip.gripper import DryRun, Gripper, GripperError, GuardedGripper, open_gripper
 from sliplens.grip.plant import PERIOD_S
-from sliplens.grip.source import GripSource, open_grip
+from sliplens.grip.source import GripSource, open_grip, usual_network
 from sliplens.live.contract import LiveSource, Pace, SourceOptions
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading
@@ -93,7 +93,7 @@ def hold_grip(
         Gripper, or an address as `open_gripper` takes it, whose connection is closed at the end; `simulated` for the
         gripper of the source `grip`; `dry-run` to note what would be sent, as if it were obeyed at once.
     network
-        Network that reads a source; for `grip` that of the package if None.
+        Network that reads a source; for `grip` and `simulated` that of the package if None.
     controller
         Row of `CONTROLLERS`, or anything with `command(observation)`.
     settings
@@ -299,11 +299,9 @@ def _readers(
 ) -> list[LiveReader]:
     """Readers of the fingertips; one that is made here reads until the stack is left."""
     if isinstance(source, LiveSource | Path | str):
-        if isinstance(source, str) and source.partition(":")[0] == "grip":
-            source = open_grip(source, SourceOptions())
-        if network is None and isinstance(source, GripSource):
-            network = DEFAULT_NETWORK
-        return [stack.enter_context(LiveReader(source, network))]
+        if isinstance(source, str):
+            source = open_grip(source, SourceOptions()) or source
+        return [stack.enter_context(LiveReader(source, network or usual_network(source, None)))]
     readers = [source] if isinstance(source, LiveReader) else list(source)
     if len(readers) not in {1, 2}:
         raise InputError(f"a gripper has one or two fingertips that are read, got {len(readers)}")

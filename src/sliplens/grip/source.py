@@ -3,11 +3,13 @@
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from threading import Event, Lock
 
 import numpy as np
 
 from sliplens.errors import InputError
+from sliplens.files import DEFAULT_NETWORK
 from sliplens.grip.controllers import Holder
 from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.gripper import GripperError, GripperState
@@ -16,6 +18,7 @@ from sliplens.grip.scripts import LIFT_S, hand_motion
 from sliplens.live.contract import LiveSource, Pace, SourceOptions
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Forces
+from sliplens.recordings.sensor import SensorProfile
 
 OPEN_S = 1.5
 """Time that the fingers stay open before they close, so that the sensor is seen untouched, and after a drop."""
@@ -257,11 +260,21 @@ def _towards(value: float, wanted: float, step: float) -> float:
     return value + min(max(wanted - value, -step), step)
 
 
-def open_grip(name: str, options: SourceOptions) -> GripSource:
-    """Gripper of a name such as `grip` or `grip:egg`."""
+def open_grip(name: str, options: SourceOptions) -> GripSource | None:
+    """Gripper of a name such as `grip` or `grip:egg`; None where it is that of another source."""
+    kind, _, held = name.partition(":")
+    if kind != "grip":
+        return None
     options.require_only("rate_hz", what="the simulated gripper")
-    _, _, held = name.partition(":")
     return GripSource(held or "cup", rate_hz=options.rate_hz or 30.0)
 
 
-__all__ = ["GripSource", "Held", "open_grip"]
+def usual_network(source: LiveSource | Path | str, profile: SensorProfile | None) -> str | None:
+    """Network for a source where none is named: the profile's, else the package's for the sensor it was trained on."""
+    if profile is not None:
+        return profile.network
+    own = isinstance(source, GripSource) or source in {"simulated", "simulated:chromatouch"}
+    return DEFAULT_NETWORK if own else None
+
+
+__all__ = ["GripSource", "Held", "open_grip", "usual_network"]

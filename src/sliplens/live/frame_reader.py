@@ -134,6 +134,8 @@ class FrameReader:
         """What runs the network; known once it has begun."""
         self.reference: Frame | None = None
         """The sensor untouched, as the next frame is compared with it."""
+        self.doubt: str | None = None
+        """That its colours are not those that the network was made for; None where they are, or there is none."""
         self.asked = Event()
         """Set to have a new reference taken as soon as the picture is still."""
         self.markers_px: tuple[np.ndarray, np.ndarray] | None = None
@@ -328,6 +330,7 @@ class FrameReader:
 
     def _set_reference(self, image: Frame) -> None:
         self.reference = image
+        self.doubt = None if self.network is None else self.network.doubt_colour(image)
         self._health = None if self._make_health is None else self._make_health(image, self.network)
         if isinstance(self._health, HealthMonitor):
             self._health.beside = self._beside

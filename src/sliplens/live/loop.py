@@ -256,12 +256,9 @@ class LiveReader:
     @property
     def doubts(self) -> tuple[str, ...]:
         """What the network was not made for, a sentence each: another sensor, and grey frames once one was compared."""
-        network, profile, untouched = self.network, self._profile, self.reference
-        if network is None:
-            return ()
-        sensor = None if profile is None else network.doubt(profile.name)
-        grey = None if untouched is None else network.doubt_colour(untouched)
-        return tuple(doubt for doubt in (sensor, grey) if doubt is not None)
+        network, profile = self.network, self._profile
+        sensor = None if network is None or profile is None else network.doubt(profile.name)
+        return tuple(doubt for doubt in (sensor, self._reader.doubt) if doubt is not None)
 
     @property
     def troubles(self) -> tuple[str, ...]:

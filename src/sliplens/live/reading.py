@@ -108,6 +108,10 @@ class MarkerReading:
     """Time since the slip began, as the markers tell it afterwards; None where there is none."""
 
 
+NO_NETWORK = "no network, so no margin is read; name one with --network"
+"""What is told where no network reads."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reading:
     """What a running sensor tells at one frame; margins are from 0 to 1, 1 sticks fully, 0 slips.
@@ -146,7 +150,7 @@ class Reading:
     health: tuple[Check, ...] = ()
     """Checks of the frame; empty where health is not watched."""
     withheld: str | None = None
-    """Why there is no margin, with the cure; None where there is one."""
+    """Why a network tells no margin, with the cure; None where it tells one, or there is no network."""
     latency: Latency = Latency()
     dropped: int = 0
     """Frames since the start that were captured, or counted by the source, and never read."""
@@ -154,7 +158,7 @@ class Reading:
     """Where the source knows it, to compare with."""
 
     def __str__(self) -> str:
-        told = "no network" if self.withheld is None else f"no margin: {self.withheld}"
+        told = NO_NETWORK if self.withheld is None else f"no margin: {self.withheld}"
         if self.margin is not None:
             told = f"margin {self.margin:4.0%}"
             if self.low is not None and self.high is not None:

@@ -66,7 +66,7 @@ class Finding:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What one network, or both together, say of a claim."""
+    """What one network, or two together, say of a claim."""
 
     subject: str
     outcome: Outcome
@@ -90,11 +90,11 @@ def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Claim, 
     """Test every claim; where the results it needs are not there, it stays undecided and says why."""
     study = results.study
 
-    def against_rivals(faithful: RemovalScores) -> list[Answer]:
-        return [_beats_rivals(faithful, results, rng=rng)]
+    def against_rivals(faithful: RemovalScores) -> Answer:
+        return _beats_rivals(faithful, results, rng=rng)
 
-    def against_chance(faithful: RemovalScores) -> list[Answer]:
-        return [_no_better(faithful, study.truth.get(faithful.input), rng=rng)]
+    def against_chance(faithful: RemovalScores) -> Answer:
+        return _no_better(faithful, study.truth.get(faithful.input), rng=rng)
 
     return (
         Claim(
@@ -127,7 +127,7 @@ def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Claim, 
             answers=_of_each(
                 results,
                 study.map_quality,
-                lambda looks: [_noisiest(looks)],
+                _noisiest,
                 why="the looks of the maps were not measured; `sliplens study` does that",
             ),
         ),
@@ -140,7 +140,7 @@ def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Claim, 
             answers=_of_each(
                 results,
                 study.truth,
-                lambda truth: [_looks_at_two(truth, rng=rng)],
+                lambda truth: _looks_at_two(truth, rng=rng),
                 why="only simulated touch tells what each marker does, and no such result is here",
             ),
         ),
@@ -171,12 +171,11 @@ def most_of(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def _of_each(
-    results: Results, found: Mapping[str, Record], judge: Callable[[Record], Sequence[Answer]], *, why: str
+    results: Results, found: Mapping[str, Record], judge: Callable[[Record], Answer], *, why: str
 ) -> tuple[Answer, ...]:
     """Answer for each network, raw images last; one without a result stays open, and why."""
     names = inputs_in_order(results.study.inputs)[::-1]
-    told = [judge(found[name]) if name in found else [_untested(input_name(name), why)] for name in names]
-    return tuple(answer for own in told for answer in own)
+    return tuple(judge(found[name]) if name in found else _untested(input_name(name), why) for name in names)
 
 
 def _untested(subject: str, why: str) -> Answer:
@@ -240,8 +239,9 @@ def _beats_rivals(faithful: RemovalScores, results: Results, *, rng: np.random.G
 
 def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
     findings, by_setting, found = [], {}, results.study.faithfulness
-    names = inputs_in_order(results.study.inputs)
-    subject = input_name(names[0]) if len(names) == 1 else "Both networks"
+    studied = results.study.inputs
+    names = [name for name in ("difference", "raw") if name in studied] or inputs_in_order(studied)
+    subject = listed([input_name(name).lower() for name in names]).capitalize()
     if not {"difference", "raw"} <= set(found):
         scored = listed([input_name(name).lower() for name in inputs_in_order(found)] or ["none"])
         return _untested(subject, f"it compares difference images with raw ones, and scored were {scored}")

@@ -246,7 +246,7 @@ SECTIONS: tuple[Section, ...] = (
         id="accuracy",
         title="How well the safety margin is read",
         short_title="Accuracy",
-        intro="The networks answer on trials they were not trained on (Table 1 and Fig. 7 of the thesis, for this "
+        intro="Each network answers on trials it was not trained on (Table 1 and Fig. 7 of the thesis, for this "
         "data). A raw image is the camera's frame; a difference image is that frame against the untouched sensor; "
         "in an image pair both stand side by side.",
         build=_accuracy,
@@ -316,7 +316,7 @@ SECTIONS: tuple[Section, ...] = (
     Section(
         id="maps",
         of_sample=True,
-        title="Where the networks look, and what the maps look like",
+        title="Where each network looks, and what the maps look like",
         short_title="Saliency maps",
         intro="From full stick (Γ 100 %) to the onset of full slip (Γ 0 %): what each method holds to speak for the "
         "answer, rather than for that on the untouched sensor. The thesis judged the maps by eye; a study measures "
@@ -328,7 +328,7 @@ SECTIONS: tuple[Section, ...] = (
         id="real",
         title="Real touch",
         short_title="Real touch",
-        intro="Frames of a real sensor, shown to the same networks.",
+        intro="Frames of a real sensor, shown to each network.",
         apart=True,
         build=_real,
         # real frames may exist as difference images only, so one input is enough

@@ -220,7 +220,7 @@ def table_training(results: Results) -> Table:
         ("Parameters", *(_whole(one.parameters) for one in runs)),
         ("Seed", *(str(one.seed) for one in runs)),
     )
-    return make_table("How the networks were trained.", ("", *(input_name(one.input) for one in runs)), rows)
+    return make_table("How each network was trained.", ("", *(input_name(one.input) for one in runs)), rows)
 
 
 def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Table:

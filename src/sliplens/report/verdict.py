@@ -408,21 +408,18 @@ def _real_touch(explained: Explained) -> Statement:
 
 
 def _tell_scale(results: Results) -> list[Statement]:
-    """State how little or much the networks were trained on."""
+    """State how little or much each network was trained on."""
     if not results.trainings:
         return []
-    trainings = [results.trainings[name] for name in inputs_in_order(results.trainings)]
-    told = [
-        f"{number_of(one.train_frames, 'frame')} for {decimals(one.minutes, 1)} minutes "
-        f"({input_name(one.input).lower()})"
-        for one in trainings
-    ]
-    one = trainings[-1]
-    text = f"Trained on {listed(told)}, on images of {one.image_size} px"
-    if max(one.frame_size) > one.image_size:
-        text += f", shrunk from the camera's {' x '.join(map(str, one.frame_size))}"
-    if one.image_size != NETWORK_PIXELS:
-        text += f" (the thesis: {NETWORK_PIXELS} px)"
+    told = []
+    for one in (results.trainings[name] for name in inputs_in_order(results.trainings)):
+        told.append(f"{number_of(one.train_frames, 'frame')} of {one.image_size} px")
+        if max(one.frame_size) > one.image_size:
+            told[-1] += f", shrunk from {one.frame_size[0]} x {one.frame_size[1]},"
+        told[-1] += f" for {decimals(one.minutes, 1)} minutes ({input_name(one.input).lower()})"
+    text = f"Trained on {listed(told)}"
+    if any(one.image_size != NETWORK_PIXELS for one in results.trainings.values()):
+        text += f"; the thesis took images of {NETWORK_PIXELS} px"
     text += (
         ". The thesis measured a real sensor, so its figures beside these show the scale of such errors, not a contest."
     )
