@@ -92,6 +92,25 @@ def test_a_knock_that_the_image_does_not_see_is_no_slip(trial: Trial, rng: np.ra
     assert friction.image_sigmas > 5
 
 
+def test_letting_go_is_no_slip(trial: Trial, trial_without_slip: Trial):
+    slipped, held = (
+        replace(one, contact_n=one.contact_n * np.clip((5.3 - one.time_s) / 0.3, 0, 1)[:, None])
+        for one in (trial, trial_without_slip)
+    )
+    # the fingertip springs back, and the slip itself is not seen
+    motion = np.where(np.abs(trial.frame_time_s - 5.2) < 0.15, 3.0, 0.7) + np.random.default_rng(0).normal(
+        0, 0.05, len(trial.motion)
+    )
+    seen = ImageMotion(time_s=trial.frame_time_s, motion=motion)
+    for number in range(8):
+        rng = np.random.default_rng(number)
+        options = {"contact_threshold_n": THRESHOLD_N, "rng": rng, "image": seen, "draws": 20}
+        friction = estimate_friction(slipped.contact(noise_n=0.05, rng=rng), **options)
+        assert friction.onset_s == pytest.approx(SLIP_S, abs=0.05)
+        with pytest.raises(RecordingError, match="never slips"):
+            estimate_friction(held.contact(noise_n=0.05, rng=rng), **options)
+
+
 def test_a_trial_that_never_slips_is_refused(trial_without_slip: Trial, rng: np.random.Generator):
     # the pull ends half a second early: 0.6 * 2.5 / 3
     with pytest.raises(RecordingError, match=r"never slips \(F_t / F_n reaches 0\.50 without .*--mu"):

@@ -131,6 +131,7 @@ _PULLED_SHARE = 0.5  # a slip is looked for where the ratio is this share of its
 # and where the normal force is this share of its largest: in a light touch the ratio is all noise
 _PRESSED_SHARE = 0.25
 _STEP_S = 0.06  # time over which the ratio before and after a fall is compared to place it
+_HELD_SHARE = 0.5  # a fall across which less than this share of the normal force stays is letting go, not slip
 _BEFORE_S, _AFTER_S = 0.6, 0.2  # what of the ratio is fitted, before and after its break
 _BEFORE_STEPS, _AFTER_STEPS = 12, 6  # and of slow samples at least so many
 _BAND = (0.16, 0.84)  # quantiles that hold 68 %
@@ -158,7 +159,7 @@ def estimate_friction(
 ) -> FrictionEstimate:
     """Estimate static friction at the onset of gross slip, with a bootstrap interval.
 
-    The slip is the first sudden fall of F_t / F_n from its height so far. About it the ratio is fitted by a line that
+    The slip is the first sudden fall of F_t / F_n from its height so far while the normal force stays. About it the ratio is fitted by a line that
     breaks off: rising until the onset, falling after it; mu_s is its value at the break. Where several falls compete,
     the one that the image moves at wins. Below `contact_threshold_n`, a normal force in newtons, the ratio means
     nothing. A trial that never slips is a `RecordingError`: its friction is larger than all that was seen, no more.
@@ -243,7 +244,9 @@ def _find_falls(forces: ContactForces, *, window_s: float, contact_threshold_n: 
     steep = earlier - later
     # a stretch begins before its fall by the time that a fall may take, and may end as it begins
     tops = [start + int(np.argmax(steep[start : end + count + 1])) for start, end in zip(starts, ends, strict=True)]
-    return sorted({float(time[top]) for top in tops}), highest
+    at = np.unique(time[np.array(tops, dtype=int)])
+    before, after = (mean_force(time, normal, at + way, window_s=_STEP_S) for way in (-_STEP_S, _STEP_S))
+    return at[after > _HELD_SHARE * before].tolist(), highest
 
 
 def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float | None:
