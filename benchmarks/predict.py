@@ -5,9 +5,10 @@ Decoding is left out; encoding (compare, resize, normalise) is reported apart. T
 with those of `eager`.
 
 `fps_ratios` compares whole calls of `predict` by each engine, in turn too: frames a second of `chromatouch-pair` over
-those of `chromatouch-difference`, as they come (112 and 224 px) and both at 224 px, and of frames in order over frames
-one by one. `python benchmarks/predict.py --engines eager folded onnxruntime openvino --rounds 100 --json` takes two
-minutes. With `--json` the last line is one JSON object.
+those of `chromatouch-difference`, as they come (112 and 224 px) and both at 224 px, of frames in order over frames
+one by one, and of `chromatouch-pair` over the same network without its `novelty`, which tells no `known`.
+`python benchmarks/predict.py --engines eager folded onnxruntime openvino --rounds 100 --json` takes two minutes. With
+`--json` the last line is one JSON object.
 """
 
 import argparse
@@ -123,6 +124,7 @@ RATIOS = {
     "pair_at_224": ("pair_at_224", "difference"),
     "sequence_of_difference": ("difference_sequence", "difference"),
     "sequence_of_pair": ("pair_sequence", "pair"),
+    "known_of_pair": ("pair", "pair_without_known"),
 }
 """Ways to read that are compared, the one over the other."""
 
@@ -132,9 +134,10 @@ def whole_calls(engine: str, *, frames: int) -> dict[str, Callable[[], object]]:
     grip = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=frames))
     trials = [replace(open_source(grip.frames, reference=grip.reference)[0], frame_time_s=grip.time_s)]
     # each of its own: an engine is kept for the last size of images that a network was asked for
-    difference, pair, enlarged = (sl.load(f"chromatouch-{name}") for name in ("difference", "pair", "pair"))
+    difference, pair, enlarged, plain = (sl.load(f"chromatouch-{name}") for name in ("difference", *3 * ("pair",)))
     enlarged = replace(enlarged, manifest=replace(enlarged.manifest, image_size=difference.manifest.image_size))
-    networks = {"difference": difference, "pair": pair, "pair_at_224": enlarged}
+    plain = replace(plain, manifest=replace(plain.manifest, novelty=None))
+    networks = {"difference": difference, "pair": pair, "pair_at_224": enlarged, "pair_without_known": plain}
     one_by_one = {name: partial(sl.predict, network, trials, engine=engine) for name, network in networks.items()}
     in_order = {f"{name}_sequence": partial(one_by_one[name], sequence=True) for name in ("difference", "pair")}
     return {**one_by_one, **in_order}

@@ -15,8 +15,10 @@ from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
 from sliplens.models import Manifest, Run, load
-from sliplens.models.backbones import HistogramRegressor
+from sliplens.models.backbones import Answers, HistogramRegressor, answer_names
 from sliplens.models.engines import ENGINES, fold_batch_norm, make_engine
+from sliplens.models.novelty import read_features
+from sliplens.models.onnx import export_onnx
 
 ATOL = 1e-4  # float32 sums in another order, through some 60 layers
 
@@ -116,6 +118,20 @@ def test_folding_leaves_no_batch_normalisation_and_the_network_as_it_was(network
             assert torch.equal(value, before[name])
 
 
+def test_features_come_with_the_answers_by_every_engine():
+    trained = load("chromatouch-pair")
+    novelty = there(trained.novelty)
+    images = torch.rand(5, 6, 112, 112, generator=torch.Generator().manual_seed(0))
+    features = read_features(trained.model, novelty.layer, images)
+    folded = fold_batch_norm(Answers(trained.model, novelty.layer))
+    assert not [one for one in folded.get_submodule("watched").modules() if isinstance(one, nn.BatchNorm2d)]
+    for name in ("eager", "folded", "onnxruntime", "openvino"):
+        if ENGINES[name].obstacle(torch.device("cpu")) is None:
+            [answers] = make_engine(name, trained, batch_size=8).answers([images])
+            assert len(answers) == len(answer_names(trained.model, novelty.layer)) == 4
+            np.testing.assert_allclose(answers[-1], features, atol=ATOL)
+
+
 def test_a_network_that_cannot_be_traced_is_run_as_it_is(images: Tensor):
     class Branches(nn.Module):
         def __init__(self) -> None:
@@ -171,6 +187,17 @@ def test_a_missing_compiler_is_told(networks: dict[str, Run], monkeypatch: pytes
 def test_a_file_of_another_network_is_refused(networks: dict[str, Run], onnx_files: dict[str, Path]):
     with pytest.raises(InputError, match="holds another network"):
         make_engine("onnxruntime", networks["point"], onnx_file=onnx_files["histogram"])
+
+
+def test_a_file_that_tells_less_than_the_network_is_refused(tmp_path: Path):
+    onnx = pytest.importorskip("onnx")
+    trained = load("chromatouch-pair")
+    model = onnx.load(export_onnx(trained, tmp_path / "a.onnx"))
+    assert [one.name for one in model.graph.output] == ["margin", "probabilities", "ratio_probabilities", "features"]
+    del model.graph.output[-1]
+    onnx.save(model, tmp_path / "b.onnx")
+    with pytest.raises(InputError, match=r"b\.onnx does not tell features, as an older export; export the run again$"):
+        make_engine("onnxruntime", trained, onnx_file=tmp_path / "b.onnx")
 
 
 def test_a_damaged_file_is_told(networks: dict[str, Run], onnx_files: dict[str, Path], tmp_path: Path):

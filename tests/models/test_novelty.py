@@ -10,7 +10,8 @@ from there import there
 from torch import nn
 
 from sliplens.models import build_model
-from sliplens.models.novelty import Novelty, find_layer, fit_novelty, read_features, watch_features
+from sliplens.models.backbones import watch_features
+from sliplens.models.novelty import Novelty, find_layer, fit_novelty, read_features
 
 
 def test_the_layer_answers_with_an_eighth_of_the_side_whatever_the_backbone():

@@ -360,7 +360,7 @@ def _propagate(model: nn.Module, images: Tensor) -> Tensor:
     images = images.clone().requires_grad_()
     with composite.context(model) as changed:
         if isinstance(changed, HistogramRegressor):
-            logits, _ = changed.logits(images)
+            logits, _ = changed.split(changed.backbone(images))
             free = logits.detach().requires_grad_()
             mean = torch.softmax(free / changed.temperature, dim=-1) @ changed.centres
             (slopes,) = torch.autograd.grad(mean.sum(), free)

@@ -2,8 +2,10 @@
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from importlib import import_module
+from threading import get_ident
 from types import ModuleType
 from typing import Any, TypeVar
 
@@ -96,16 +98,16 @@ class HistogramRegressor(nn.Module):
         """Mean of the distribution: the safety margin."""
         return (self.probabilities(images) @ self.centres)[:, None]
 
-    def logits(
-        self, images: Float[Tensor, "batch *input"]
+    def split(
+        self, logits: Float[Tensor, "batch all_bins"]
     ) -> tuple[Float[Tensor, "batch bins"], Float[Tensor, "batch ratio_bins"]]:
         """Logits over the margin and over the ratio; of a network with one answer the second has no columns."""
-        logits, bins = self.backbone(images), len(self.edges) - 1
+        bins = len(self.edges) - 1
         return logits[:, :bins], logits[:, bins:]
 
     def probabilities(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, "batch bins"]:
         """Distribution over the bins, at the temperature that was fitted."""
-        return torch.softmax(self.logits(images)[0] / self.temperature, dim=-1)
+        return torch.softmax(self.split(self.backbone(images))[0] / self.temperature, dim=-1)
 
     def loss(
         self,
@@ -117,7 +119,7 @@ class HistogramRegressor(nn.Module):
 
         `ratios`: F_t / F_n of the frames; those whose forces are not known (NaN) teach the margin alone.
         """
-        logits, ratio_logits = (part.float() for part in self.logits(images))
+        logits, ratio_logits = (part.float() for part in self.split(self.backbone(images)))
         loss = functional.cross_entropy(logits, histogram_targets(labels, self.edges))
         if self.ratio_edges is not None and ratios is not None and (known := torch.isfinite(ratios)).any():
             targets = histogram_targets(ratios[known], self.ratio_edges)
@@ -125,35 +127,80 @@ class HistogramRegressor(nn.Module):
         return loss, torch.softmax(logits / self.temperature, dim=-1) @ self.centres
 
 
-class Answers(nn.Module):
-    """A network that returns all it answers: margins, and the probabilities behind them where it has histograms."""
+@contextmanager
+def watch_features(
+    model: nn.Module, layer: str, then: Callable[[], None] = lambda: None
+) -> Iterator[list[Float[Tensor, "batch features"]]]:
+    """Keep the mean over the image of each channel of a layer, batch by batch, while the model is run by this thread.
 
-    def __init__(self, model: nn.Module) -> None:
+    `then` is called after each batch.
+    """
+    kept: list[Tensor] = []
+    own = get_ident()
+
+    def keep(_: nn.Module, __: object, output: Any) -> None:  # no tensor while torch traces it
+        if get_ident() == own:  # a running sensor's network is explained by another thread meanwhile
+            kept.append(output.mean(dim=(2, 3)))
+            then()
+
+    handle = model.get_submodule(layer).register_forward_hook(keep)
+    try:
+        yield kept
+    finally:
+        handle.remove()
+
+
+class _Watched(nn.Module):
+    """A backbone, and the features of one of its layers in the same pass."""
+
+    def __init__(self, backbone: nn.Module, layer: str | None) -> None:
+        super().__init__()
+        self.backbone, self.layer = backbone, layer
+
+    def forward(self, image: Any) -> tuple[Any, ...]:  # nor here
+        if self.layer is None:
+            return (self.backbone(image),)
+        with watch_features(self.backbone, self.layer) as features:
+            answer = self.backbone(image)
+        return answer, *features
+
+
+class Answers(nn.Module):
+    """A network that returns all it answers: margins, and the probabilities behind them where it has histograms.
+
+    With `layer`, a module of the network, the features by which it tells how far it knows a frame come last
+    (`Novelty`), in the same pass.
+    """
+
+    def __init__(self, model: nn.Module, layer: str | None = None) -> None:
         super().__init__()
         self.model = model
+        if isinstance(model, HistogramRegressor):
+            self.watched = _Watched(model.backbone, layer and layer.removeprefix("backbone."))
+        else:
+            self.watched = _Watched(model, layer)
 
-    def forward(
-        self, image: Float[Tensor, "batch *input"]
-    ) -> (
-        tuple[Float[Tensor, " batch"]]
-        | tuple[Float[Tensor, " batch"], Float[Tensor, "batch bins"]]
-        | tuple[Float[Tensor, " batch"], Float[Tensor, "batch bins"], Float[Tensor, "batch ratio_bins"]]
-    ):
-        """Margins (batch,), and of histograms probabilities (batch, bins): of the margin, then of the ratio if any."""
+    def forward(self, image: Float[Tensor, "batch *input"]) -> tuple[Any, ...]:
+        """Margins (batch,); of histograms probabilities (batch, bins), of the margin, then of the ratio if any.
+
+        Then features (batch, channels of `layer`), where there is a layer.
+        """
+        answer, *features = self.watched(image)
         if not isinstance(self.model, HistogramRegressor):
-            return (self.model(image).flatten(),)
-        logits, ratio_logits = self.model.logits(image)
+            return answer.flatten(), *features
+        logits, ratio_logits = self.model.split(answer)
         probabilities = torch.softmax(logits / self.model.temperature, dim=-1)
         margins = probabilities @ self.model.centres
         if self.model.ratio_temperature is None:
-            return margins, probabilities
-        return margins, probabilities, torch.softmax(ratio_logits / self.model.ratio_temperature, dim=-1)
+            return margins, probabilities, *features
+        return margins, probabilities, torch.softmax(ratio_logits / self.model.ratio_temperature, dim=-1), *features
 
 
-def answer_names(model: nn.Module) -> tuple[str, ...]:
+def answer_names(model: nn.Module, layer: str | None = None) -> tuple[str, ...]:
     """Names of what `Answers` returns, in its order."""
     names = ("margin", "probabilities", "ratio_probabilities")
-    return names[: 1 if not isinstance(model, HistogramRegressor) else 2 if model.ratio_edges is None else 3]
+    names = names[: 1 if not isinstance(model, HistogramRegressor) else 2 if model.ratio_edges is None else 3]
+    return names if layer is None else (*names, "features")
 
 
 def bin_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:

@@ -19,10 +19,18 @@ from sliplens.extras import require_device
 from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import MOST_PIXELS, has_colour
-from sliplens.models.backbones import Answers, HistogramRegressor, bin_centres, bin_edges, build_model, ratio_edges
+from sliplens.models.backbones import (
+    Answers,
+    HistogramRegressor,
+    answer_names,
+    bin_centres,
+    bin_edges,
+    build_model,
+    ratio_edges,
+)
 from sliplens.models.calibration import Calibration, Traction, raw_interval, spread, told_probabilities
 from sliplens.models.encodings import ENCODINGS, Encoding
-from sliplens.models.novelty import Novelty, watch_features
+from sliplens.models.novelty import Novelty
 from sliplens.models.sequence import Follower, SequenceHead, SequenceManifest
 from sliplens.progress import number_of
 from sliplens.results.evaluation import Training
@@ -194,7 +202,7 @@ class Run:
     @torch.no_grad()
     def answers(self, batches: Iterable[Tensor]) -> tuple[Tensor, ...]:
         """What the network answers (`Answers`) to batches of encoded frames, on its device."""
-        network = Answers(self.model)
+        network = Answers(self.model, self.feature_layer)
         parts = [network(batch.to(self.device)) for batch in batches]
         return tuple(torch.cat(answers) for answers in zip(*parts, strict=True))
 
@@ -219,11 +227,7 @@ class Run:
 
     def estimate_batches(self, batches: Iterable[Tensor], *, friction: FrictionLike | None = None) -> "Estimate":
         """Safety margins as `estimate` tells them, of batches of encoded frames."""
-        if (novelty := self.novelty) is None:
-            return self.to_estimate(*self.answers(batches), friction=friction)
-        with watch_features(self.model, novelty.layer) as features:
-            answers = self.answers(batches)
-        return self.to_estimate(*answers, friction=friction, features=np.concatenate(features))
+        return self.to_estimate(*self.answers(batches), friction=friction)
 
     @property
     def novelty(self) -> Novelty | None:
@@ -231,35 +235,31 @@ class Run:
         novelty = self.manifest.novelty
         return novelty if novelty is not None and novelty.strangeness else None
 
-    def to_estimate(
-        self,
-        margin: Float[Tensor, " batch"],
-        probabilities: Float[Tensor, "batch bins"] | None = None,
-        ratio: Float[Tensor, "batch ratio_bins"] | None = None,
-        *,
-        friction: FrictionLike | None = None,
-        features: Float[np.ndarray, "batch features"] | None = None,
-    ) -> "Estimate":
-        """Estimate from what the network answered (`Answers`), and from friction where it is told.
+    @property
+    def feature_layer(self) -> str | None:
+        """Layer whose features are told beside the answers (`Answers`), for `novelty`."""
+        return None if self.novelty is None else self.novelty.layer
 
-        `features`: what `read_features` gives of the layer of `novelty`, to tell how far it knows the frames.
-        """
+    def to_estimate(self, *answers: Tensor, friction: FrictionLike | None = None) -> "Estimate":
+        """Estimate from what the network answered (`Answers`), and from friction where it is told."""
+        names = answer_names(self.model, self.feature_layer)
+        values = {name: answer.double().cpu().numpy() for name, answer in zip(names, answers, strict=True)}
         traction, of_ratio = self.manifest.traction, ratio_edges(self.model)
         estimate = Estimate(
-            margin=margin.double().cpu().numpy(),
-            probabilities=None if probabilities is None else probabilities.double().cpu().numpy(),
+            margin=values["margin"],
+            probabilities=values.get("probabilities"),
             edges=bin_edges(self.model),
             calibration=self.manifest.calibration,
             ratio=None
-            if ratio is None or of_ratio is None
+            if of_ratio is None
             else Ratio(
-                probabilities=ratio.double().cpu().numpy(),
+                probabilities=values["ratio_probabilities"],
                 edges=of_ratio,
                 calibration=None if traction is None else traction.calibration,
             ),
         )
-        if features is not None and self.novelty is not None:  # before friction narrows the answer
-            estimate = replace(estimate, known=self.novelty.known(features, estimate.sigma))
+        if self.novelty is not None:  # before friction narrows the answer
+            estimate = replace(estimate, known=self.novelty.known(values["features"], estimate.sigma))
         if friction is None:
             return estimate
         traction = self.require_ratio()

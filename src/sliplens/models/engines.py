@@ -74,6 +74,8 @@ class EngineJob:
     batch_size: int
     streams: int
     """Batches that are worked on at once, by one thread each; with 1, all threads work on one batch."""
+    layer: str | None = None
+    """As `Answers` takes it."""
     onnx_file: Path | None = None
     """The network as `export_onnx` wrote it, if there is such a file."""
 
@@ -104,6 +106,7 @@ def prepare(
     engine: str = "auto",
     batch_size: int | None = None,
     streams: int | None = None,
+    layer: str | None = None,
     onnx_file: Path | None = None,
 ) -> Engine:
     """Make a network ready for many passes without gradients, and check that it answers as before.
@@ -125,6 +128,8 @@ def prepare(
         Batches that are worked on at once, by one thread each; None for one a thread, which is fastest for many
         passes: threads that share a batch wait for each other in every layer. With 1 all threads work on one batch,
         which answers soonest.
+    layer
+        Of the network, whose features are told last (`Answers`).
     onnx_file
         The network as `export_onnx` wrote it, for `onnxruntime` and `openvino`; converted here if None.
 
@@ -154,6 +159,7 @@ def prepare(
             images=images,
             batch_size=batch_size or kind.batch_size(images),
             streams=streams or torch.get_num_threads(),
+            layer=layer,
             onnx_file=onnx_file,
         )
         try:
@@ -257,6 +263,7 @@ def make_engine(
             engine=name,
             batch_size=batch_size,
             streams=streams,
+            layer=trained.feature_layer,
             onnx_file=onnx_file,
         )
 
@@ -273,6 +280,9 @@ def fold_batch_norm(model: nn.Module) -> nn.Module:
     copied = deepcopy(model)
     if isinstance(copied, HistogramRegressor):
         copied.backbone = fold_batch_norm(copied.backbone)
+        return copied
+    if isinstance(copied, Answers):
+        copied.watched = fold_batch_norm(copied.watched)  # pyright: ignore[reportAttributeAccessIssue]
         return copied
     try:
         with _TRACING:
@@ -298,9 +308,13 @@ class _Tracer(fx.Tracer):
         self, m: nn.Module, forward: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> Any:
         """Note the call of a module of this thread, and let any other be."""
-        return (
-            super().call_module(m, forward, args, kwargs) if get_ident() == self._thread else forward(*args, **kwargs)
-        )
+        if get_ident() != self._thread:
+            return forward(*args, **kwargs)
+        answer = super().call_module(m, forward, args, kwargs)
+        if self.is_leaf_module(m, self.path_of_module(m)):  # it is not called, and so its hooks are not either
+            for hook in m._forward_hooks.values():
+                hook(m, args, answer)
+        return answer
 
 
 def _obstacle(name: str, kind: EngineKind, model: nn.Module, images: Tensor) -> str | None:
@@ -315,7 +329,8 @@ def _build(name: str, kind: EngineKind, model: nn.Module, job: EngineJob) -> Run
     if name == "eager":
         return kind.build(model, job)
     shape, threads = tuple(job.images.shape[1:]), torch.get_num_threads()
-    key = (name, shape, job.images.device, job.batch_size, job.streams, threads, job.onnx_file, _hash_weights(model))
+    own = (job.batch_size, job.streams, job.layer, job.onnx_file)
+    key = (name, shape, job.images.device, threads, *own, _hash_weights(model))
     known = _BUILT.get(model)
     if known is None or known[0] != key:
         _BUILT[model] = known = (key, kind.build(model, job))
@@ -372,9 +387,9 @@ def _needs(*packages: str, extra: str) -> Callable[[torch.device], str | None]:
     return obstacle
 
 
-def _torch(change: Callable[[nn.Module], Callable[..., Any]]) -> Callable[[nn.Module, EngineJob], RunBatches]:
+def _torch(change: Callable[[Answers], Callable[..., Any]]) -> Callable[[nn.Module, EngineJob], RunBatches]:
     def build(model: nn.Module, job: EngineJob) -> RunBatches:
-        network, device = change(model), job.images.device
+        network, device = change(Answers(model, job.layer)), job.images.device
 
         def run(batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, ...]]:
             for batch in batches:
@@ -405,7 +420,7 @@ def _run_in_streams(submit: Callable[[Tensor], Callable[[], tuple[Tensor, ...]]]
 
 
 def _folded(model: nn.Module, job: EngineJob) -> RunBatches:
-    run = _torch(lambda model: Answers(fold_batch_norm(model)))(model, job)
+    run = _torch(fold_batch_norm)(model, job)
     if job.streams == 1 or job.images.device.type != "cpu":
         return run
     # a sum that threads share is added in another order by each number of them: one thread a batch gives the same
@@ -434,9 +449,16 @@ def _onnxruntime(model: nn.Module, job: EngineJob) -> RunBatches:
     options.intra_op_num_threads = torch.get_num_threads() if job.streams == 1 else 1
     # threads that spin while they wait take the cores from those that decode and encode
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    source = convert_network(model, job.images).SerializeToString() if job.onnx_file is None else str(job.onnx_file)
+    source = (
+        convert_network(model, job.images, layer=job.layer).SerializeToString()
+        if job.onnx_file is None
+        else str(job.onnx_file)
+    )
     session = runtime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
-    names, workers = list(answer_names(model)), ThreadPoolExecutor(job.streams, thread_name_prefix="onnxruntime")
+    names, workers = (
+        list(answer_names(model, job.layer)),
+        ThreadPoolExecutor(job.streams, thread_name_prefix="onnxruntime"),
+    )
 
     def answer(batch: Tensor) -> tuple[Tensor, ...]:
         return tuple(map(torch.from_numpy, session.run(names, {INPUT: batch.contiguous().numpy()})))
@@ -456,7 +478,7 @@ def _openvino(model: nn.Module, job: EngineJob) -> RunBatches:
             warnings.simplefilter("ignore")  # of torch and OpenVINO about each other; the answers are checked
             example = job.images.new_zeros(tuple(int(length) for length in shape.to_shape()))
             converted = openvino.convert_model(
-                Answers(fold_batch_norm(model)).eval(), example_input=example, input=[shape]
+                fold_batch_norm(Answers(model, job.layer).eval()), example_input=example, input=[shape]
             )
     settings = {
         "NUM_STREAMS": job.streams,
@@ -467,7 +489,7 @@ def _openvino(model: nn.Module, job: EngineJob) -> RunBatches:
     }
     network = core.compile_model(converted, "CPU", settings)
     idle = [network.create_infer_request() for _ in range(2 * job.streams)]
-    outputs = len(answer_names(model))
+    outputs = len(answer_names(model, job.layer))
 
     def submit(batch: Tensor) -> Callable[[], tuple[Tensor, ...]]:
         missing = job.batch_size - len(batch)
@@ -496,7 +518,7 @@ def _batch_in_cache(images: Tensor) -> int:
 _CONVERTED = ("onnxruntime", "openvino")
 _ROWS = {
     # torch as it is, its batch normalisation folded into the convolutions, and torch.compile of that
-    "eager": EngineKind(pays_after=0, build=_torch(Answers)),
+    "eager": EngineKind(pays_after=0, build=_torch(lambda network: network)),
     # it takes as long as 20 passes
     "folded": EngineKind(
         pays_after=100,
@@ -507,7 +529,7 @@ _ROWS = {
     "compiled": EngineKind(
         pays_after=None,  # it takes minutes
         obstacle=_compiler_obstacle,
-        build=_torch(lambda model: torch.compile(Answers(fold_batch_norm(model)))),
+        build=_torch(lambda network: torch.compile(fold_batch_norm(network))),
     ),
     "onnxruntime": EngineKind(
         pays_after=4000,  # it takes some 10 s, and saves 2 to 9 ms a pass

@@ -1,8 +1,7 @@
 """How far a network knows its input: the distance of its features from the training's, and the spread of its answer."""
 
-import threading
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
-from sliplens.models.backbones import Answers, bin_edges
+from sliplens.models.backbones import Answers, bin_edges, watch_features
 from sliplens.models.calibration import spread
 
 _STRIDE = 8
@@ -103,29 +102,6 @@ class _Enough(Exception):  # noqa: N818 (no error: it ends a pass early)
     """The layer that was waited for has answered."""
 
 
-@contextmanager
-def watch_features(
-    model: nn.Module, layer: str, then: Callable[[], None] = lambda: None
-) -> Iterator[list[Float[np.ndarray, "batch features"]]]:
-    """Keep the mean over the image of each channel of a layer, batch by batch, while the model is run by this thread.
-
-    `then` is called after each batch.
-    """
-    kept: list[np.ndarray] = []
-    own = threading.get_ident()
-
-    def keep(_: nn.Module, __: object, output: Tensor) -> None:
-        if threading.get_ident() == own:  # a running sensor's network is explained by another thread meanwhile
-            kept.append(output.detach().mean(dim=(2, 3)).double().cpu().numpy())
-            then()
-
-    handle = model.get_submodule(layer).register_forward_hook(keep)
-    try:
-        yield kept
-    finally:
-        handle.remove()
-
-
 @torch.no_grad()
 def read_features(
     model: nn.Module, layer: str, images: Float[Tensor, "batch colours height width"]
@@ -137,7 +113,7 @@ def read_features(
 
     with watch_features(model, layer, stop) as kept, suppress(_Enough):
         model(images.to(next(model.parameters()).device))
-    return kept[0]
+    return kept[0].double().cpu().numpy()
 
 
 @torch.no_grad()

@@ -48,8 +48,9 @@ def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = Fal
     """Write a network as an ONNX file, which appears once ONNX Runtime gives the same answers as the network.
 
     Input `image` is float32 (batch, 3, size, size), of a `pair` network (batch, 6, size, size), encoded and normalised;
-    outputs are `margin` (batch,), for a histogram `probabilities` (batch, bins), and `ratio_probabilities` of a network
-    that tells F_t / F_n. The batch may be of any size. Properties of the model, as JSON: `sliplens.manifest`,
+    outputs are `margin` (batch,), for a histogram `probabilities` (batch, bins), `ratio_probabilities` of a network
+    that tells F_t / F_n, and `features` (batch, channels) of one that tells how far it knows a frame (`Novelty`). The
+    batch may be of any size. Properties of the model, as JSON: `sliplens.manifest`,
     `sliplens.input` (how frames become an input) and `sliplens.output` (edges of the bins).
 
     Parameters
@@ -71,7 +72,8 @@ def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = Fal
     require_packages(*ONNX_PACKAGES, extra="onnx", purpose="an ONNX file")
     trained = run if isinstance(run, Run) else load(run)
     size = trained.manifest.image_size
-    proto = convert_network(trained.model, torch.zeros(1, trained.encoding.colours, size, size))
+    images = torch.zeros(1, trained.encoding.colours, size, size)
+    proto = convert_network(trained.model, images, layer=trained.feature_layer)
     _describe(proto, trained)
     with whole_file(path) as part:
         part.write_bytes(proto.SerializeToString())
@@ -79,10 +81,12 @@ def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = Fal
     return path
 
 
-def convert_network(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> "ModelProto":
+def convert_network(
+    model: nn.Module, images: Float[Tensor, "batch colours height width"], *, layer: str | None = None
+) -> "ModelProto":
     """A network as ONNX holds it: input `image`, outputs named by `answer_names`, a batch of any size.
 
-    `model`: in evaluation mode, one number an image; it stays as it is.
+    `model`: in evaluation mode, one number an image; it stays as it is. `layer`: as `Answers` takes it.
     """
     copied = deepcopy(model).to("cpu", memory_format=torch.contiguous_format)  # pyright: ignore[reportCallIssue]
     # two images: torch takes a batch of one for a constant
@@ -92,11 +96,11 @@ def convert_network(model: nn.Module, images: Float[Tensor, "batch colours heigh
         warnings.simplefilter("ignore")
         try:
             program = torch.onnx.export(
-                Answers(copied).eval(),
+                Answers(copied, layer).eval(),
                 (example,),
                 dynamo=True,
                 input_names=[INPUT],
-                output_names=list(answer_names(model)),
+                output_names=list(answer_names(model, layer)),
                 dynamic_shapes={INPUT: {0: torch.export.Dim("batch", min=1)}},
                 opset_version=OPSET,
                 external_data=False,
@@ -146,8 +150,8 @@ def _describe(proto: "ModelProto", trained: Run) -> None:
 @torch.no_grad()
 def check_parity(path: Path, trained: Run) -> None:
     """Check that ONNX Runtime answers as the network does, on black, white and noise, alone and in a batch."""
-    runtime, network = import_onnxruntime(), Answers(trained.model)
-    names, differences = list(answer_names(trained.model)), []
+    runtime, network = import_onnxruntime(), Answers(trained.model, trained.feature_layer)
+    names, differences = list(answer_names(trained.model, trained.feature_layer)), []
     try:
         session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
         for inputs in trial_inputs(trained):
@@ -190,7 +194,8 @@ def require_file_of(path: Path, trained: Run) -> None:
 
     try:
         # the weights stand in the file itself
-        properties = {item.key: item.value for item in onnx.load(path, load_external_data=False).metadata_props}
+        proto = onnx.load(path, load_external_data=False)
+        properties = {item.key: item.value for item in proto.metadata_props}
         weights = json.loads(properties[MANIFEST])["weights_sha256"]
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; make it with `sliplens export RUN -o {path} --onnx`") from None
@@ -198,3 +203,6 @@ def require_file_of(path: Path, trained: Run) -> None:
         raise InputError(f"{path} is not an ONNX file of sliplens; make it with `sliplens export --onnx`") from None
     if weights != trained.manifest.weights_sha256:
         raise InputError(f"{path} holds another network than the run; export the run again")
+    wanted = answer_names(trained.model, trained.feature_layer)
+    if missing := [name for name in wanted if name not in {output.name for output in proto.graph.output}]:
+        raise InputError(f"{path} does not tell {' and '.join(missing)}, as an older export; export the run again")

@@ -18,8 +18,7 @@ from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_file, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
-from sliplens.models.engines import Engine, make_engine, one_thread
-from sliplens.models.novelty import read_features
+from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
 from sliplens.parts import require_new_table
 from sliplens.progress import OnProgress, note, number_of, stage
@@ -462,9 +461,8 @@ class _Reading(Work):
         capture = _assume_reference(self.trained, capture)
         reference = None if capture.read_reference is None else capture.read_reference()
         untouched, states = None if reference is None else soften(reference), _states(capture)
-        # batches are encoded while the ones before are under way; first frame of each, which touch, and features
-        encoded: deque[tuple[int, list[bool], np.ndarray | None]] = deque()
-        novelty = self.trained.novelty
+        # batches are encoded while the ones before are under way; first frame of each, and which touch
+        encoded: deque[tuple[int, list[bool]]] = deque()
         follower = self.trained.follow() if self.sequence else None
 
         def encode() -> Iterator[Tensor]:
@@ -476,15 +474,12 @@ class _Reading(Work):
                     touches = [picture_change(soften(frame), untouched) >= LEAST_TOUCH for frame in images]
                 else:
                     touches = [True] * len(batch)
-                inputs = self.trained.encode(np.stack(images), reference)
-                with one_thread():  # as the engines answer, which tell no features
-                    features = None if novelty is None else read_features(self.trained.model, novelty.layer, inputs)
-                encoded.append((first, touches, features))
-                yield inputs
+                encoded.append((first, touches))
+                yield self.trained.encode(np.stack(images), reference)
 
         for answers in engine.answers(encode()):
-            first, touches, features = encoded.popleft()
-            estimate = self.trained.to_estimate(*answers, friction=self.friction, features=features)
+            first, touches = encoded.popleft()
+            estimate = self.trained.to_estimate(*answers, friction=self.friction)
             if follower is not None:
                 assert capture.time_s is not None  # `_require_order`
                 times = capture.time_s[first : first + len(touches)]
