@@ -98,7 +98,8 @@ class Friction:
         """Friction of a mean and a standard deviation, normal in the logarithm, where none becomes negative."""
         if not (0 < mean <= MOST_FRICTION and 0 < sigma < mean):
             raise InputError(
-                f"friction about a mean has a positive standard deviation that is less than it, got {mean:g}+-{sigma:g}"
+                "mean and standard deviation of friction are positive, the mean the larger and at most "
+                f"{MOST_FRICTION:g}, got {mean:g}+-{sigma:g}; give such as 0.58+-0.05, or the mean alone"
             )
         spread = math.sqrt(math.log1p((sigma / mean) ** 2))
         steps = np.linspace(-_REACH, _REACH, values)

@@ -31,6 +31,7 @@ from sliplens.grip import (
     run_episodes,
 )
 from sliplens.grip import episodes as episodes_module
+from sliplens.grip.controllers import Controller, MarginLaw
 from sliplens.grip.fingertip import draw_film, mean_shear
 from sliplens.grip.readings import FORCES_N, FRICTIONS, MARGINS
 from sliplens.grip.scripts import EPISODE_S, hand_motion
@@ -55,7 +56,7 @@ def table(network) -> ReadingTable:
     return found
 
 
-def few(controller: str, condition: str = "dry", **options: Any) -> Grip:
+def few(controller: str | Controller, condition: str = "dry", **options: Any) -> Grip:
     asked: dict[str, Any] = {"episodes": 40, "seed": 7, "network": shipped(), **options}
     return run_episodes("cup", controller, condition=condition, **asked)
 
@@ -334,6 +335,11 @@ def test_a_row_of_grasps_has_the_same_objects_at_a_friction_of_their_own():
         # a standard deviation of 200 normal numbers is off by 5 %
         assert np.std(later.friction / first.friction) == pytest.approx(GRASP_SPREAD, rel=0.2)
     assert np.isnan(grip.episodes.known_friction).all()
+
+
+def test_a_controller_of_one_s_own_begins_each_grasp_anew():
+    own, named = (few(law, "jolt", grasps=2, episodes=8).episodes for law in (MarginLaw(), "margin"))
+    np.testing.assert_array_equal(own.mean_force_n, named.mean_force_n)
 
 
 def test_what_slips_taught_counts_in_the_grasps_that_follow_only_of_the_same_object():

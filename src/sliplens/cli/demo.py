@@ -9,6 +9,7 @@ import tyro
 
 from sliplens.cli.console import Terminal, say
 from sliplens.errors import InputError
+from sliplens.progress import number_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +60,7 @@ class Demo:
             seed=DEMO_SEED if self.seed is None else self.seed,
         )
         if terminal.notes:
-            say(f"{len(terminal.notes)} note{'s' * (len(terminal.notes) > 1)} on what to be careful with: see the page")
+            say(f"{number_of(len(terminal.notes), 'note')} on what to be careful with: see the page")
         say(f"the demo took {(time.perf_counter() - started) / 60:.1f} minutes")
         say(f"open {page.resolve()}")
 

@@ -46,7 +46,7 @@ class Observation:
 
 @runtime_checkable
 class Controller(Protocol):
-    """Tells a grip force, one command an image; made anew for each batch of episodes, it may remember."""
+    """Tells a grip force, one command an image; made anew for each batch of episodes and grasp, it may remember."""
 
     def command(self, seen: Observation) -> Float[np.ndarray, " episodes"]:
         """Grip force to press with, in newtons."""

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -85,8 +86,8 @@ def run_episodes(
     object
         Row of `OBJECTS`.
     controller
-        Row of `CONTROLLERS`, or anything with `command(observation)`; one of your own is kept over all episodes, so
-        run those in which it remembers one at a time.
+        Row of `CONTROLLERS`, or anything with `command(observation)`, of which each batch of episodes, and each of
+        their grasps, gets a copy: it may remember.
     condition
         Row of `CONDITIONS`, from which the episodes are drawn.
     episodes, seed
@@ -259,8 +260,7 @@ class _Job:
         for grasp in range(self.setup.grasps):
             seed = np.random.SeedSequence((self.setup.seed, number, *((grasp,) if grasp else ())))
             held = next_grasp(scripts, rng=np.random.default_rng(seed.spawn(1)[0])) if grasp else scripts
-            told = np.array([one.friction.mean if one.friction is not None else np.nan for one in learners])
-            told = told if learners else np.full(len(held), np.nan)
+            told = np.array([one.friction.mean if one.friction else np.nan for one in learners] or [np.nan] * len(held))
             parts: list[tuple[np.ndarray, EpisodeTable]] = []
             for known in (True, False):
                 rows = np.flatnonzero(np.isfinite(told) == known)
@@ -295,8 +295,9 @@ class _Job:
         self, scripts: Scripts, eyes: RenderedEyes | TableEyes, *, known: bool, on_tick: Callable[[Tick], None] | None
     ) -> EpisodeTable:
         setup, chosen = self.setup, self.controller
-        if isinstance(chosen, str):
-            chosen = make_controller(chosen, setup.settings, told=known)
+        # one of the caller's own is copied: what it remembers is of the grasp before
+        own = not isinstance(chosen, str)
+        chosen = deepcopy(chosen) if own else make_controller(chosen, setup.settings, told=known)
         loop = GripLoop(Plant(self.held, episodes=len(scripts)), eyes, chosen, latency_s=setup.latency_s, lift_s=LIFT_S)
         return run_scripts(loop, scripts, condition=setup.condition, on_tick=on_tick)
 

@@ -13,7 +13,6 @@ from sliplens.extras import Table
 from sliplens.images import absolute_difference, require_same_size, signed_difference
 
 Frames = UInt8[np.ndarray, "batch height width 3"]
-Compared = UInt8[np.ndarray, "batch height width 3"]
 Reference = UInt8[np.ndarray, "_ _ 3"]
 
 
@@ -27,7 +26,7 @@ class Encoding:
     """
 
     name: str
-    compare: Callable[[Frames, Reference], Compared]
+    compare: Callable[[Frames, Reference], Frames]
     empty_is_black: bool
     """Whether an untouched sensor is a black image, so that no reference frame is needed to explain."""
     own_maximum: bool = True
@@ -42,7 +41,7 @@ class Encoding:
         """Channels of the input: those of the frame, then those of the reference where it stands beside."""
         return 6 if self.beside else 3
 
-    def resize(self, compared: Compared, *, image_size: int) -> UInt8[Tensor, "batch 3 size size"]:
+    def resize(self, compared: Frames, *, image_size: int) -> UInt8[Tensor, "batch 3 size size"]:
         """Bring compared frames to the network's square size, in 8 bits.
 
         Bilinear with antialiasing: the noise of neighbouring pixels averages out instead of aliasing. Its weights are

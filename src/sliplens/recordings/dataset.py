@@ -14,7 +14,7 @@ from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, JournalLock, 
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
 from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header, require_stored
-from sliplens.recordings.trial import Labels, Recording, TrialFacts
+from sliplens.recordings.trial import Recording, TrialFacts
 
 DATASET_FILE = "dataset.json"
 
@@ -119,8 +119,8 @@ class Dataset:
         kept = (self.folder / SENSORS_FOLDER).glob("*.toml")
         return next((load_profile(path) for path in kept if path.stem == sensor), None)
 
-    def read_labels(self, info: TrialInfo) -> Labels:
-        """Labels of one trial, without its frames."""
+    def read_labels(self, info: TrialInfo) -> Recording:
+        """Labels of one trial, with its reference and without its frames."""
         return load_recording(trial_path(self.folder, info.trial), pixels=False)
 
 

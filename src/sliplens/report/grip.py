@@ -7,6 +7,7 @@ import numpy as np
 from sliplens.plots.margins import plot_grip
 from sliplens.plots.saliency import overlay_relevance
 from sliplens.plots.style import drawing_style, percent
+from sliplens.progress import number_of
 from sliplens.report.charts import make_charts
 from sliplens.report.plates import Cell, Plate, draw_grid, named_columns, rows_of
 from sliplens.report.tables import Table, make_table
@@ -73,7 +74,7 @@ def table_episodes(grip: Grip) -> Table:
     table, setup = grip.episodes, grip.setup
     quartiles = np.quantile(table.force_excess, (0.25, 0.5, 0.75))
     return make_table(
-        f"What became of {len(table):,} episode{'s' * (len(table) > 1)}: {setup.object}, {setup.condition}, controller "
+        f"What became of {number_of(len(table), 'episode')}: {setup.object}, {setup.condition}, controller "
         f"{setup.controller}.",
         ("Episodes", "Dropped", "Crushed", "Slip, median", "Mean force", "Over the least (quartiles)", "Under 20 %"),
         [

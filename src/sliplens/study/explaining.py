@@ -21,7 +21,7 @@ from sliplens.models import Run
 from sliplens.models.engines import expecting
 from sliplens.parts import Shard, shard
 from sliplens.plots.saliency import NOMINAL_MARGINS
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, number_of
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile
@@ -364,7 +364,7 @@ _NAMED = 3
 def _of_all(names: Sequence[str], count: int) -> str:
     """Frames that a warning is of, against how many were explained."""
     more = ", \N{HORIZONTAL ELLIPSIS}" if len(names) > _NAMED else ""
-    return f"{len(names)} of {count} frame{'s' if count > 1 else ''} ({', '.join(names[:_NAMED])}{more})"
+    return f"{len(names)} of {number_of(count, 'frame')} ({', '.join(names[:_NAMED])}{more})"
 
 
 def network_inputs(trained: Run, explained: Explained) -> Float[Tensor, "frames colours size size"]:

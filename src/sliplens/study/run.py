@@ -158,7 +158,7 @@ def run_study(
     explainers = study_explainers(methods, budget=budget)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     if (count := min(trials, len(data.select(split=split, condition=condition)))) < FEWEST_UNITS:
-        these = f"{count} {split} trial{'s' if count > 1 else ''} of condition {condition}"
+        these = f"{number_of(count, f'{split} trial')} of condition {condition}"
         cure = f"--trials is {trials}" if trials == count else "record more, or name another --split or --condition"
         note(on_progress, f"{these}: fewer than {FEWEST_UNITS} decide nothing, whatever the page then shows; {cure}")
     runs = load_networks(networks, device=device)
@@ -209,8 +209,6 @@ def load_networks(networks: Network | Sequence[Network], *, device: str = "cpu")
     several = [networks] if isinstance(networks, Run | Path | str) else networks
     runs = [open_run(network, device=device) for network in several]
     by_input = {run.encoding.name: run for run in runs}
-    if not by_input:
-        raise InputError("a study needs a network; name one at least")
     if twice := [name for name in by_input if sum(run.encoding.name == name for run in runs) > 1]:
         raise InputError(
             f"two networks read the input {twice[0]}, and a study takes one network an input; study them one by one"

@@ -22,9 +22,9 @@ from sliplens.models import Run
 from sliplens.models.checkpoint import Estimate, load, tell_each
 from sliplens.models.sequence import require_frequent
 from sliplens.progress import OnProgress, counted, note, stage, wrote
-from sliplens.recordings import Dataset, Recording, TrialInfo
+from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset, trial_path
-from sliplens.recordings.store import load_recording, stream_frames
+from sliplens.recordings.store import stream_frames
 from sliplens.results.evaluation import (
     BaselinePredictions,
     Baselines,
@@ -137,9 +137,8 @@ def evaluate_baselines(
 
 
 def _follow(data: Dataset, info: TrialInfo, kind: str) -> _Followed:
-    path = trial_path(data.folder, info.trial)
-    reference = load_recording(path, truth=False, pixels=False).reference
-    tracks = track_markers(stream_frames(path), reference, kind)
+    reference = data.read_labels(info).reference
+    tracks = track_markers(stream_frames(trial_path(data.folder, info.trial)), reference, kind)
     known = tracks.from_reference
     return _Followed(
         **vars(field_trial(tracks)),
@@ -148,12 +147,8 @@ def _follow(data: Dataset, info: TrialInfo, kind: str) -> _Followed:
     )
 
 
-def _load_labels(data: Dataset, info: TrialInfo) -> Recording:
-    return load_recording(trial_path(data.folder, info.trial), truth=False, pixels=False)
-
-
 def _margins(data: Dataset, info: TrialInfo) -> Float[np.ndarray, " frames"]:
-    recording = _load_labels(data, info)
+    recording = data.read_labels(info)
     return np.where(recording.labelled, recording.safety_margin, np.nan)
 
 
@@ -225,8 +220,8 @@ def evaluate(
     trials = data.select(split=split)
     for trial in trials:
         run.require_frame_size((trial.height, trial.width))
-    firsts = {trial.sensor: _load_labels(data, trial) for trial in reversed(trials)}
-    doubts = [words for one in firsts.values() for words in (run.doubt(one.sensor), run.doubt_colour(one.reference))]
+    firsts = map(data.read_labels, {trial.sensor: trial for trial in reversed(trials)}.values())
+    doubts = [words for one in firsts for words in (run.doubt(one.sensor), run.doubt_colour(one.reference))]
     for words in dict.fromkeys(filter(None, doubts)):
         note(on_progress, words)
     plan = _plan_baselines(baselines, data, trials, count=baseline_trials, markers=markers) if baselines else None

@@ -36,8 +36,7 @@ from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty, fit_novelty
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
-from sliplens.recordings.dataset import load_dataset, trial_path
-from sliplens.recordings.store import load_recording
+from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import Training
 from sliplens.training.config import TrainConfig, get_recipe, open_logger
 from sliplens.training.data import (
@@ -160,7 +159,7 @@ def train(
             folder,
             frame_size=(info.height, info.width),
             sensor=info.sensor,
-            colour=has_colour(load_recording(trial_path(data.folder, info.trial), truth=False, pixels=False).reference),
+            colour=has_colour(data.read_labels(info).reference),
             data_hash=data.hash,
             trained_on=[trial.sha256[:12] for some in trials for trial in some],
             start=start,
