@@ -159,10 +159,11 @@ def estimate_friction(
 ) -> FrictionEstimate:
     """Estimate static friction at the onset of gross slip, with a bootstrap interval.
 
-    The slip is the first sudden fall of F_t / F_n from its height so far while the normal force stays. About it the ratio is fitted by a line that
-    breaks off: rising until the onset, falling after it; mu_s is its value at the break. Where several falls compete,
-    the one that the image moves at wins. Below `contact_threshold_n`, a normal force in newtons, the ratio means
-    nothing. A trial that never slips is a `RecordingError`: its friction is larger than all that was seen, no more.
+    The slip is the first sudden fall of F_t / F_n from its height so far while the normal force stays. About it the
+    ratio is fitted by a line that breaks off: rising until the onset, falling after it; mu_s is its value at the break.
+    Where several falls compete, the one that the image moves at wins. Below `contact_threshold_n`, a normal force in
+    newtons, the ratio means nothing. A trial that never slips is a `RecordingError`: its friction is larger than all
+    that was seen, no more.
     Where somebody knows the onset, `slip_s`, the ratio breaks off there.
     """
     candidates, highest = [slip_s] if slip_s is not None else [], 0.0
