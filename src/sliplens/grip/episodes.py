@@ -102,11 +102,10 @@ def run_episodes(
         Ratio by which the network's errors are made worse, or better; only where they are looked up.
     friction
         What is told of the coefficient of friction, as `predict` takes it, for a network that tells F_t / F_n; `each`
-        tells each episode its own, as it begins. Slips that the markers tell narrow a range down.
+        tells each episode its own, as its first grasp begins. Slips that the markers tell narrow a range down.
     grasps
         How many times each object is gripped, one grasp after another, each with other fingertips and a friction within
-        some percent of the object's (`GRASP_SPREAD`). The table has a row a grasp, first
-        those of all first ones.
+        some percent of the object's (`GRASP_SPREAD`). The table has a row a grasp, first those of all first ones.
     same_object
         Whether what a slip taught counts in the grasps that follow, as `LiveReader` takes it, for a network that tells
         F_t / F_n.
@@ -141,7 +140,7 @@ def run_episodes(
     if grasps < 1:
         raise InputError(f"{grasps} grasps of an object cannot be run; ask for 1 or more")
     if sequence and not rendered:
-        raise InputError("readings that are looked up have no order; grip through pixels (rendered), or one by one")
+        raise InputError("readings that are looked up have no order; add --rendered, or leave out --sequence")
     held = pick_object(object)
     if isinstance(controller, str):
         make_controller(controller, settings)  # mistakes are told before anything is measured

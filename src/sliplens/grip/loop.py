@@ -126,7 +126,7 @@ def _told_margin(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLearner]
     if not nodes:
         return None
     most = max(len(values) for values, _ in nodes)
-    values, weights = (np.stack([_fill(one[row], most) for one in nodes]) for row in (0, 1))
+    values, weights = (np.stack([np.pad(one[row], (0, most - len(one[row]))) for one in nodes]) for row in (0, 1))
     values, weights = np.where(values > 0, values, 1.0)[:, None], weights[:, None]
     margins = np.clip(1 - ratio[..., None] / values, 0, 1)
     margin = (weights * margins).sum(axis=-1)
@@ -137,10 +137,6 @@ def _told_margin(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLearner]
 
 _REACH_90 = 1.645
 """Standard deviations to either side that hold 90 % of a Gaussian."""
-
-
-def _fill(values: np.ndarray, count: int) -> np.ndarray:
-    return np.pad(values, (0, count - len(values)))
 
 
 class RenderedEyes:

@@ -70,18 +70,23 @@ def plate_moments(grip: Grip) -> Plate:
 
 
 def table_episodes(grip: Grip) -> Table:
-    """Sum up all episodes."""
+    """Sum up all episodes, a row a grasp."""
     table, setup = grip.episodes, grip.setup
-    quartiles = np.quantile(table.force_excess, (0.25, 0.5, 0.75))
+    kept = " What a slip taught of the friction counts in the grasps that follow." if setup.same_object else ""
     return make_table(
         f"What became of {number_of(len(table), 'episode')}: {setup.object}, {setup.condition}, controller "
-        f"{setup.controller}.",
-        ("Episodes", "Dropped", "Crushed", "Slip, median", "Mean force", "Over the least (quartiles)", "Under 20 %"),
+        f"{setup.controller}.{kept}",
+        ("Grasp", "Episodes", "Friction known", "Dropped", "Crushed", "Slip, median", "Mean force",
+         "Over the least (quartiles)", "Under 20 %"),
         [
             (
-                f"{len(table):,}", percent(grip.drop_rate, digits=1), percent(float(table.crushed.mean()), digits=1),
-                f"{1e3 * float(np.median(table.slip_m)):.1f} mm", f"{float(table.mean_force_n.mean()):.2f} N",
-                " / ".join(percent(float(one)) for one in quartiles), f"{float(table.under_20_s.mean()):.2f} s",
+                f"{grasp}", f"{len(own):,}", f"{int((own.known_friction > 0).sum()):,}",
+                *(percent(float(share.mean()), digits=1) for share in (own.dropped, own.crushed)),
+                f"{1e3 * float(np.median(own.slip_m)):.1f} mm", f"{float(own.mean_force_n.mean()):.2f} N",
+                " / ".join(percent(float(one)) for one in np.quantile(own.force_excess, (0.25, 0.5, 0.75))),
+                f"{float(own.under_20_s.mean()):.2f} s",
             )
+            for grasp in range(1, setup.grasps + 1)
+            for own in [table.where(table.grasp == grasp)]
         ],
     )  # fmt: skip

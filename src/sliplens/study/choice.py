@@ -19,6 +19,7 @@ from sliplens.images import absolute_difference
 from sliplens.markers import track_markers
 from sliplens.models import Run
 from sliplens.parts import Shard, shard
+from sliplens.plots.style import input_name, listed
 from sliplens.progress import OnProgress, counted, number_of
 from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.results.explanation import Explained
@@ -156,8 +157,8 @@ def _summarise(choice: Choice, trials: int) -> str:
         )
     elif choice.qualified > wanted:
         summary += f" The first {wanted} were taken."
-    errors = " and ".join(f"{100 * error:.0f} points ({name} images)" for name, error in choice.mean_error.items())
-    summary += f" The answers on the frames to score are off by {errors} on average."
+    errors = [f"{100 * error:.0f} points ({input_name(name).lower()})" for name, error in choice.mean_error.items()]
+    summary += f" The answers on the frames to score are off by {listed(errors)} on average."
     if len(taken) < wanted:
         summary += f" There were no more: {len(taken)} instead of {wanted}."
     return summary
