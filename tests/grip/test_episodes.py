@@ -379,7 +379,8 @@ def test_frames_of_a_grip_are_read_in_order_through_pixels(network: Run):
         ({"grasps": 0}, "0 grasps of an object cannot be run"),
         ({"sequence": True}, "looked up have no order"),
         ({"sequence": True, "rendered": True, "friction": 0.6}, "leave out one of them"),
-        ({"same_object": True, "network": "thesis-raw"}, "answers with the margin alone"),
+        ({"same_object": True}, "1 grasp of an object .* --same-object, .*; add --grasps 2"),
+        ({"same_object": True, "grasps": 2, "network": "thesis-raw"}, "--same-object learns friction .* margin alone"),
     ],
 )
 def test_what_cannot_be_learnt_or_followed_is_refused(options: dict[str, Any], told: str):

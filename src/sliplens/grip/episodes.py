@@ -137,8 +137,11 @@ def run_episodes(
     """
     if error_scale < 0 or latency_s < 0:
         raise InputError("latency and error scale must not be negative; give 0 or more")
-    if grasps < 1:
-        raise InputError(f"{grasps} grasps of an object cannot be run; ask for 1 or more")
+    if grasps < (fewest := 1 + same_object):
+        taught = " by --same-object, which teaches the grasps that follow" * same_object
+        raise InputError(
+            f"{number_of(grasps, 'grasp')} of an object cannot be run{taught}; add --grasps {fewest} or more"
+        )
     if sequence and not rendered:
         raise InputError("readings that are looked up have no order; add --rendered, or leave out --sequence")
     held = pick_object(object)
@@ -154,7 +157,7 @@ def run_episodes(
     run = network if isinstance(network, Run) else load(network)
     require_calibration(run)
     if told is not None or same_object:
-        run.require_ratio()
+        run.require_ratio(learns=told is None)
     if sequence:
         run.follow(friction=told)
     if not rendered and readings is None:

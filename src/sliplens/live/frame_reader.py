@@ -165,12 +165,7 @@ class FrameReader:
             if network is None:
                 option, does = ("--friction", "makes a margin") if friction is not None else ("--same-object", "learns")
                 raise InputError(f"{option} {does} of what a network reads; name one with --network")
-            if friction is None and network.manifest.traction is None:
-                raise InputError(
-                    "--same-object learns friction from F_t / F_n, and this network answers with the margin alone; "
-                    "leave it out, or teach it with `sliplens train DATA -o RUN --start-from NETWORK --recipe ratio`"
-                )
-            network.require_ratio()
+            network.require_ratio(learns=friction is None)
         # made anew, not emptied: what the reading thread is just learning goes with the object before
         self.learner = SlipLearner(None if friction is None else as_friction(friction), same_object=same_object)
 

@@ -284,12 +284,16 @@ class Run:
             )
         return Follower(self.sequence, kept)
 
-    def require_ratio(self) -> Traction:
-        """What the second answer is; `InputError` for a network that answers with the margin alone."""
+    def require_ratio(self, *, learns: bool = False) -> Traction:
+        """What the second answer is; `InputError` for a network that answers with the margin alone.
+
+        `learns`: it is not told friction, but is to learn it from slips.
+        """
         if self.manifest.traction is None:
+            why = "--same-object learns friction from F_t / F_n" if learns else "friction was told"
             raise InputError(
-                "friction was told, but this network answers with the margin alone and cannot use it; leave it out, or "
-                "teach the network F_t / F_n with `sliplens train DATA -o RUN --start-from NETWORK --recipe ratio`"
+                f"{why}, but this network answers with the margin alone and cannot use it; leave it out, or teach the "
+                "network F_t / F_n with `sliplens train DATA -o RUN --start-from NETWORK --recipe ratio`"
             )
         return self.manifest.traction
 
