@@ -11,6 +11,7 @@ import torch
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.files import hash_file
 from sliplens.models import load_checkpoint, save_checkpoint
+from sliplens.models.checkpoint import open_run
 
 
 @pytest.fixture
@@ -127,3 +128,8 @@ def test_frames_of_another_sensor_are_told_those_of_another_piece_are_not(run: P
     assert told is not None
     assert "chromatouch-1" in told
     assert "tip" in told
+
+
+def test_what_is_no_network_is_refused():
+    with pytest.raises(InputError, match="int is no network; give a network, its folder or its name"):
+        open_run(7)

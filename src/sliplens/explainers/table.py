@@ -19,7 +19,7 @@ from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
 from sliplens.extras import Table
 from sliplens.models import Run
-from sliplens.models.checkpoint import load
+from sliplens.models.checkpoint import open_run
 from sliplens.progress import OnProgress
 
 _ROWS: dict[str, Explainer] = {
@@ -114,11 +114,6 @@ def explain(
             explainer, warnings = replace(explainer, markers_px=None), (f"tiles, not markers: {error}",)
     explanation = explainer(trained.model, inputs, reference=empty, on_progress=on_progress)
     return replace(explanation, warnings=(*warnings, *explanation.warnings))
-
-
-def open_run(run: Run | Path | str, *, device: str = "cpu") -> Run:
-    """Network that a caller named: itself, its folder, or the name of one that comes with sliplens."""
-    return run if isinstance(run, Run) else load(run, device=device)
 
 
 def get_explainer(method: str, **options: Any) -> Explainer:

@@ -16,7 +16,7 @@ from torch import Tensor
 from sliplens.errors import InputError, SaliencyError
 from sliplens.explainers import Explanation
 from sliplens.explainers.explanation import CLOSE
-from sliplens.explainers.table import network_inputs, open_run
+from sliplens.explainers.table import network_inputs
 from sliplens.faithfulness.controls import control_maps
 from sliplens.faithfulness.fills import Fill, get_fill
 from sliplens.faithfulness.removal import (
@@ -29,6 +29,7 @@ from sliplens.faithfulness.removal import (
     tile_units,
 )
 from sliplens.models import Run
+from sliplens.models.checkpoint import open_run
 from sliplens.models.engines import Engine, counting_passes, prepare
 from sliplens.progress import OnProgress
 from sliplens.results.explanation import require_saliency

@@ -22,7 +22,8 @@ from sliplens.grip.plant import PERIOD_S, Episodes, HeldObject, Plant, least_for
 from sliplens.grip.readings import ReadingTable, load_readings, measure_readings, require_calibration
 from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion, next_grasp
 from sliplens.mechanics import stick_ratio
-from sliplens.models import Run, load
+from sliplens.models import Run
+from sliplens.models.checkpoint import open_run
 from sliplens.plots.clip import write_clip
 from sliplens.progress import OnProgress, note, number_of, stage, wrote
 from sliplens.recordings import Recording
@@ -154,7 +155,7 @@ def run_episodes(
     own = isinstance(friction, str) and friction == "each"
     told = None if friction is None else "each" if own else as_friction(friction)
     scripts = draw_scripts(held, condition, episodes=episodes, seed=seed, script=script)
-    run = network if isinstance(network, Run) else load(network)
+    run = open_run(network)
     require_calibration(run)
     if told is not None or same_object:
         run.require_ratio(learns=told is None)

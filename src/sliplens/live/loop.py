@@ -30,7 +30,7 @@ from sliplens.live.recorder import ForceStream, Recorder, RecordingState
 from sliplens.live.sinks import Sender, SinkState
 from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import Images, ProfiledSource, open_live
-from sliplens.models.checkpoint import Run, load
+from sliplens.models.checkpoint import Run, open_run
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
@@ -191,7 +191,7 @@ class LiveReader:
         profile = None if sensor is None else load_profile(sensor)
         if network is None and profile is not None:
             network = profile.network
-        self.network = load(network, device=device) if isinstance(network, Path | str) else network
+        self.network = None if network is None else open_run(network, device=device)
         options = options or SourceOptions()
         if self.network is not None and profile is None:
             options = replace(options, fit_size=self.network.manifest.frame_size)

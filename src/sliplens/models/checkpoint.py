@@ -532,3 +532,10 @@ def load(run: str | Path, *, device: str = "cpu") -> Run:
     """
     require_device(device)
     return load_checkpoint(find_run(Path(run)), device=device)
+
+
+def open_run(run: object, *, device: str = "cpu") -> Run:
+    """Network that a caller named: itself, its folder, or the name of one that comes with sliplens."""
+    if not isinstance(run, Run | Path | str):
+        raise InputError(f"{type(run).__name__} is no network; give a network, its folder or its name first")
+    return run if isinstance(run, Run) else load(run, device=device)

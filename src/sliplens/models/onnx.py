@@ -18,7 +18,7 @@ from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
 from sliplens.files import require_new_file, to_builtins, whole_file
 from sliplens.models.backbones import Answers, answer_names, bin_edges, ratio_edges
-from sliplens.models.checkpoint import Run, load
+from sliplens.models.checkpoint import Run, open_run
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -70,7 +70,7 @@ def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = Fal
     path = Path(out)
     require_new_file(path, suffix=".onnx", overwrite=overwrite)
     require_packages(*ONNX_PACKAGES, extra="onnx", purpose="an ONNX file")
-    trained = run if isinstance(run, Run) else load(run)
+    trained = open_run(run)
     size = trained.manifest.image_size
     images = torch.zeros(1, trained.encoding.colours, size, size)
     proto = convert_network(trained.model, images, layer=trained.feature_layer)

@@ -17,7 +17,7 @@ from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_file, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
-from sliplens.models.checkpoint import Estimate, Run, load, sensor_kind
+from sliplens.models.checkpoint import Estimate, Run, open_run, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
 from sliplens.parts import require_new_table
@@ -248,7 +248,7 @@ def predict(
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
     if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
         raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
-    trained = None if source is None else _load(run, device)
+    trained = None if source is None else open_run(run, device=device)
     read = run if source is None else source
     if isinstance(read, Run):
         raise InputError("name what to read: a data set, a folder of images, a video, or frames")
@@ -268,7 +268,7 @@ def predict(
     if trained is None:
         name, named_by = _find_network(trials, sensor)
         note(on_progress, f"no network was named, so {name} reads it, {named_by}")
-        trained = _load(name, device)
+        trained = open_run(name, device=device)
     if known is not None:
         trained.require_ratio()
     kinds = [_assume_reference(trained, one) for one in trials.kinds]
@@ -308,12 +308,6 @@ def predict(
     )
     name = (written.metadata or {})[b"sliplens.engine"].decode()
     return Predictions(frames=trials.frames, engine=name, path=path, rows=rows, schema=path and written, notes=notes)
-
-
-def _load(run: object, device: str) -> Run:
-    if not isinstance(run, Run | Path | str):
-        raise InputError(f"{type(run).__name__} is no network; give a network, its folder or its name first")
-    return run if isinstance(run, Run) else load(run, device=device)
 
 
 def _find_network(trials: Trials, sensor: SensorProfile | Path | str | None) -> tuple[str, str]:

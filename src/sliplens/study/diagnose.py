@@ -21,7 +21,7 @@ from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.files import output_folder, remove
 from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_difference
 from sliplens.models import Run
-from sliplens.models.checkpoint import load, tell_each
+from sliplens.models.checkpoint import open_run, tell_each
 from sliplens.plots.style import decimals, signed, tell_ends
 from sliplens.progress import OnProgress, counted, note, number_of, stage, wrote
 from sliplens.recordings import Dataset
@@ -101,7 +101,7 @@ def diagnose(
     require_packages("sklearn", extra="diagnose", purpose="finding where a network fails")
     if trials < 1:
         raise InputError(f"--trials must be at least 1, got {trials}")
-    run = run if isinstance(run, Run) else load(run)
+    run = open_run(run)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     name, weights = run.manifest.input, run.manifest.weights_sha256
     kept = None if out is None else Path(out) / f"evaluate-{name}"

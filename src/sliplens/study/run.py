@@ -12,11 +12,11 @@ from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.explainers import Explainer
 from sliplens.explainers.explanation import CLOSE
-from sliplens.explainers.table import open_run
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Run
+from sliplens.models.checkpoint import open_run
 from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress, note, number_of, stage, wrote
 from sliplens.recordings import Dataset, load_dataset

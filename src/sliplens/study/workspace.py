@@ -17,11 +17,11 @@ from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers import EXPLAINERS, RECOMMENDED_METHOD, ExpectedGradients, Explainer, get_explainer
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
-from sliplens.explainers.table import open_run
 from sliplens.faithfulness import get_fill
 from sliplens.files import as_path, output_folder, remove
 from sliplens.images import write_png
 from sliplens.models import Run
+from sliplens.models.checkpoint import open_run
 from sliplens.plots.saliency import SIGN_COLOURS, draw_panel, full_colour, overlay_jet, overlay_relevance
 from sliplens.plots.style import drawing_style, method_name, percent
 from sliplens.progress import OnProgress, note, number_of, stage, wrote

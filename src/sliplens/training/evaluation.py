@@ -19,7 +19,7 @@ from sliplens.friction import FrictionLike, as_friction
 from sliplens.markers import KINDS, MarkerStatus, track_markers
 from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get_estimator
 from sliplens.models import Run
-from sliplens.models.checkpoint import Estimate, load, tell_each
+from sliplens.models.checkpoint import Estimate, open_run, tell_each
 from sliplens.models.sequence import require_frequent
 from sliplens.progress import OnProgress, counted, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
@@ -210,7 +210,7 @@ def evaluate(
     RecordingError
         If no frame has a label.
     """
-    run = run if isinstance(run, Run) else load(run)
+    run = open_run(run)
     told = friction if friction is None or friction == EACH else as_friction(friction)
     if told is not None:
         run.require_ratio()
