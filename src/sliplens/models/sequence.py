@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
+from scipy.special import erf
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -27,8 +28,8 @@ frame that makes one may come a frame later, which for the shipped head is 0.17 
 better with steps of up to 0.6 s than frame by frame, or as well; wet ones worse with 1 to 1.5 s (R2 0.70 for 0.77)."""
 _LEAST_PEAK = 0.02
 """Traction ratio below which nothing is pulled."""
-_PEAK = 5
-"""Which number of `summarize` is the largest ratio so far."""
+_RATIO, _PEAK = 1, 5
+"""Which numbers of `SequenceHead.tell` are the ratio and the largest so far."""
 ROUNDING_S = 1e-6
 """By which times that are multiples of a step may miss it."""
 _NEAR_ZERO = 0.1
@@ -50,8 +51,8 @@ class SequenceManifest:
 class SequenceHead(nn.Module):
     """Recurrent head over what a network answers frame by frame; it corrects the distribution over the margin.
 
-    It is causal: an answer depends on the frames so far. It sees no image but what `summarize` tells of each frame. At
-    first its correction is none, and the answer that of one frame. `Follower` takes its steps one at a time.
+    It is causal: an answer depends on the frames so far. It sees no image, only what `tell` gives. At first its
+    correction is none, and the answer that of one frame. `Follower` takes its steps one at a time.
 
     Cho et al., *Learning Phrase Representations using RNN Encoder-Decoder* (2014), for the gated recurrent unit.
 
@@ -82,34 +83,40 @@ class SequenceHead(nn.Module):
         nn.init.zeros_(self.correction.bias)
 
     def summarize(
-        self,
-        margin: Float32[np.ndarray, "frames bins"],
-        ratio: Float32[np.ndarray, "frames ratio_bins"],
-        elapsed_s: Float[np.ndarray, " frames"],
-        *,
-        peak: float = _LEAST_PEAK,
-    ) -> Float32[np.ndarray, "frames 8"]:
-        """What the head is told of each frame, one after another.
+        self, margin: Float32[np.ndarray, "frames bins"], ratio: Float32[np.ndarray, "frames ratio_bins"]
+    ) -> Float32[np.ndarray, "frames 5"]:
+        """What each frame tells by itself, of its probabilities.
 
-        Mean and spread of the margin and of F_t / F_n, that ratio over the largest so far (friction falls as a contact
-        begins to slide) and the largest itself, how likely the margin is near 0, and the time since memory took its
-        last step. Eight numbers because whole distributions let it learn its training trials by heart.
-
-        `margin`, `ratio`: probabilities of each frame; `elapsed_s`: since memory took its last step; `peak`: largest
-        F_t / F_n of the frames before these.
+        Mean and spread of the margin and of F_t / F_n, and how likely the margin is near 0. So few numbers because
+        whole distributions let the head learn its training trials by heart.
         """
         values, spread = _moments(margin, self.centres)
         pulled, pulled_spread = _moments(ratio, self._ratio_centres)
-        peaks = np.maximum(np.maximum.accumulate(pulled), peak)
-        near_zero = margin @ self._near_zero
-        log_s = np.log(np.minimum(np.maximum(elapsed_s, STEP_S), LONGEST_S))
-        told = (values, pulled, 4 * spread, 8 * pulled_spread, pulled / peaks, peaks, near_zero, log_s)
-        return np.array(told, dtype=np.float32).T
+        near_zero = (margin * self._near_zero).sum(axis=-1)
+        return np.stack([values, pulled, 4 * spread, 8 * pulled_spread, near_zero], axis=1)
+
+    @staticmethod
+    def tell(
+        summary: Float32[np.ndarray, "frames 5"], elapsed_s: Float[np.ndarray, " frames"], *, peak: float = _LEAST_PEAK
+    ) -> Float32[np.ndarray, "frames 8"]:
+        """What the head is told of each frame, one after another.
+
+        Beside what `summarize` gives: that ratio over the largest so far (friction falls as a contact begins to slide),
+        the largest itself, and the time since memory took its last step.
+
+        `elapsed_s`: that time; `peak`: largest F_t / F_n of the frames before these.
+        """
+        told = np.empty((len(summary), 8), dtype=np.float32)
+        told[:, :4], told[:, 6] = summary[:, :4], summary[:, 4]
+        np.maximum(np.maximum.accumulate(told[:, _RATIO]), peak, out=told[:, _PEAK])
+        told[:, 4] = told[:, _RATIO] / told[:, _PEAK]
+        told[:, 7] = np.log(np.minimum(np.maximum(elapsed_s, STEP_S), LONGEST_S))
+        return told
 
     def forward(
         self, told: Float[Tensor, "batch frames 8"], margin: Float[Tensor, "batch frames bins"]
     ) -> Float[Tensor, "batch frames bins"]:
-        """Logits over the margin in whole contacts, of what `summarize` told and the probabilities of each frame."""
+        """Logits over the margin in whole contacts, of what `tell` gives and the probabilities of each frame."""
         seen = functional.gelu(self.seen(told))
         remembered, _ = self.memory(self.dropout(seen))
         correction = self.correction(torch.cat([self.dropout(remembered), seen], dim=-1))
@@ -119,8 +126,11 @@ class SequenceHead(nn.Module):
 def _moments(
     probabilities: Float[np.ndarray, "frames bins"], centres: Float[np.ndarray, " bins"]
 ) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
-    """Mean and standard deviation of each distribution."""
-    mean = probabilities @ centres
+    """Mean and standard deviation of each distribution, the same to the bit however many there are.
+
+    Hence no product of matrices, which adds in another order for many rows than for one.
+    """
+    mean = (probabilities * centres).sum(axis=-1)
     return mean, np.sqrt((probabilities * (centres - mean[:, None]) ** 2).sum(axis=-1))
 
 
@@ -179,6 +189,7 @@ class Follower:
         assert estimate.probabilities is not None
         assert estimate.ratio is not None
         margin, ratio = (values.astype(np.float32) for values in (estimate.probabilities, estimate.ratio.probabilities))
+        summary = self._head.summarize(margin, ratio)
         correction, followed = np.zeros_like(margin), np.zeros(len(margin), dtype=bool)
         for row, (now_s, touched) in enumerate(zip(time_s.tolist(), touches.tolist(), strict=True)):
             if not touched or now_s < self._time_s:
@@ -187,8 +198,7 @@ class Follower:
             if not touched or self.lost:
                 continue
             elapsed_s = LONGEST_S if isnan(self._time_s) else now_s - self._time_s
-            one = slice(row, row + 1)  # by itself: products of many rows are added in another order
-            [told] = self._head.summarize(margin[one], ratio[one], np.array([elapsed_s]), peak=self._peak)
+            [told] = self._head.tell(summary[row : row + 1], np.array([elapsed_s]), peak=self._peak)
             correction[row], memory = self._step(told)
             followed[row] = True
             if elapsed_s >= STEP_S - ROUNDING_S:
@@ -209,7 +219,8 @@ class Follower:
         In numpy: to torch each call costs more than what it computes here.
         """
         seen_by, seen_bias, by_seen, by_memory, bias, memory_bias, correct_by, correct_bias = self._weights
-        seen = functional.gelu(torch.from_numpy(seen_by @ told + seen_bias)).numpy()
+        seen = seen_by @ told + seen_bias
+        seen = seen * (1 + erf(seen * np.float32(0.5**0.5))) / 2  # the Gaussian error linear unit
         added, kept = by_seen @ seen + bias, by_memory @ self._memory + memory_bias
         gates = (1 + np.tanh((added + kept)[: 2 * WIDTH] / 2)) / 2  # the logistic function
         reset, held = gates[:WIDTH], gates[WIDTH:]

@@ -246,7 +246,7 @@ def _logits(head: SequenceHead, trials: Sequence[AnsweredTrial]) -> Float[Tensor
 def _tensors(head: SequenceHead, trial: AnsweredTrial) -> tuple[Tensor, ...]:
     """What the head is told of each frame, probabilities of its margin, and its label."""
     elapsed_s = np.diff(trial.time_s, prepend=trial.time_s[0] - LONGEST_S)
-    told = head.summarize(trial.margin, trial.ratio, elapsed_s)
+    told = head.tell(head.summarize(trial.margin, trial.ratio), elapsed_s)
     return tuple(torch.from_numpy(values) for values in (told, trial.margin, trial.label.astype(np.float32)))
 
 
