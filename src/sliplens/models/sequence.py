@@ -1,13 +1,12 @@
 """Several frames: what the frames before one tell of its margin, read one after another."""
 
 from dataclasses import dataclass, replace
-from math import isnan
+from math import erf, isnan, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
-from scipy.special import erf
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -220,7 +219,8 @@ class Follower:
         """
         seen_by, seen_bias, by_seen, by_memory, bias, memory_bias, correct_by, correct_bias = self._weights
         seen = seen_by @ told + seen_bias
-        seen = seen * (1 + erf(seen * np.float32(0.5**0.5))) / 2  # the Gaussian error linear unit
+        # the Gaussian error linear unit
+        seen *= np.array([(1 + erf(value / sqrt(2))) / 2 for value in seen.tolist()], dtype=np.float32)
         added, kept = by_seen @ seen + bias, by_memory @ self._memory + memory_bias
         gates = (1 + np.tanh((added + kept)[: 2 * WIDTH] / 2)) / 2  # the logistic function
         reset, held = gates[:WIDTH], gates[WIDTH:]
