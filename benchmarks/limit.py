@@ -242,11 +242,13 @@ def _noisy(samples: Samples, rows: torch.Tensor, noise_px: float, generator: tor
     return (clean + noise_px * torch.randn(clean.shape, generator=generator)).flatten(1)
 
 
-def read(network: nn.Sequential, samples: Samples, rows: torch.Tensor, *, noise_px: float) -> torch.Tensor:
-    """Squared errors of a network on some samples."""
+def read(
+    network: nn.Sequential, samples: Samples, rows: torch.Tensor, *, noise_px: float
+) -> Float[np.ndarray, " samples"]:
+    """Margins that a network reads of some samples."""
     inputs = torch.cat([_noisy(samples, rows, noise_px, torch.Generator().manual_seed(1)), samples.known[rows]], dim=1)
     with torch.no_grad():
-        return (network(inputs).clamp(0, 1) - samples.margin[rows]) ** 2
+        return network(inputs).clamp(0, 1).double().numpy()
 
 
 @lru_cache
@@ -485,9 +487,9 @@ def reach(model: str, arguments: argparse.Namespace) -> tuple[list[dict[str, obj
             for test, (others, kept) in tests.items():
                 for condition in ("dry", "wet"):
                     rows = np.flatnonzero(kept & (others.wet == (condition == "wet")))
-                    errors = read(network, others, torch.from_numpy(rows), noise_px=noise_px).double().numpy()
-                    row = {"model": model, "frames": view, "training": name, "test": test, "condition": condition}
                     margin = others.margin.double().numpy()[rows]
+                    errors = (read(network, others, torch.from_numpy(rows), noise_px=noise_px) - margin) ** 2
+                    row = {"model": model, "frames": view, "training": name, "test": test, "condition": condition}
                     reached.append({**row, **score(errors, margin=margin, pull=others.pull[rows])})
                     print(*row.values(), f"MSE {reached[-1]['mse']:.4f} R2 {reached[-1]['r2']:.3f}", flush=True)
     rng, posterior = np.random.default_rng(seed), []

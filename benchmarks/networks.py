@@ -102,7 +102,7 @@ def test_plans(name: str, *, trials: int | None) -> list[TrialPlan]:
     return plans
 
 
-def require_disjoint(plans: list[TrialPlan]) -> None:
+def require_disjoint(plans: Sequence[TrialPlan]) -> None:
     """Check that no day, sensor or trial is among those of any training or of the other set."""
     seeds = {seed for plan in plans for seed in (plan.seed, plan.unit_seed, plan.day_seed)}
     varied = PRESETS["varied"]

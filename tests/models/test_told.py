@@ -1,5 +1,7 @@
 """The margin once friction is told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -102,3 +104,25 @@ def test_a_network_of_two_answers_takes_friction(networks: dict[str, Run], image
 def test_a_network_of_one_answer_refuses_friction(head: str, networks: dict[str, Run], images):
     with pytest.raises(InputError, match=r"friction was told, but this network answers with the margin alone .*ratio`"):
         networks[head].estimate(images, friction=0.6)
+
+
+@pytest.mark.parametrize(
+    ("friction", "doubted"),
+    [
+        (Friction(0.6), False),
+        (Friction(5.0), True),
+        (Friction(0.05), True),
+        (Friction.between(0.5, 1.5), False),
+        (Friction.between(0.5, 9.0), True),
+    ],
+)
+def test_friction_that_is_mostly_beyond_the_training_is_doubted(
+    friction: Friction, doubted: bool, networks: dict[str, Run]
+):
+    kept = networks["margin-and-ratio"].manifest
+    assert kept.traction is not None
+    manifest = replace(kept, traction=replace(kept.traction, friction=tuple(TRAINED)))
+    words = replace(networks["margin-and-ratio"], manifest=manifest).doubt_friction(friction)
+    assert (words is not None) == doubted
+    assert words is None or "0.15 to 1.2" in words
+    assert networks["histogram"].doubt_friction(friction) is None

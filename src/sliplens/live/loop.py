@@ -255,10 +255,15 @@ class LiveReader:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What the network was not made for, a sentence each: another sensor, and grey frames once one was compared."""
-        network, profile = self.network, self._profile
-        sensor = None if network is None or profile is None else network.doubt(profile.name)
-        return tuple(doubt for doubt in (sensor, self._reader.doubt) if doubt is not None)
+        """What the network was not made for, a sentence each.
+
+        Another sensor, friction that it was not trained on, and grey frames once one was compared.
+        """
+        network, profile, doubts = self.network, self._profile, [self._reader.doubt]
+        if network is not None:
+            doubts.append(None if profile is None else network.doubt(profile.name))
+            doubts.append(network.doubt_friction(self._reader.learner.friction))
+        return tuple(doubt for doubt in doubts if doubt is not None)
 
     @property
     def troubles(self) -> tuple[str, ...]:

@@ -199,6 +199,19 @@ class Run:
             "frames, so read those of a colour camera, or train it on frames of this one (`sliplens train`)"
         )
 
+    def doubt_friction(self, friction: Friction | None) -> str | None:
+        """Say that friction is told which it was not trained on; None where most of what is held possible was."""
+        if friction is None or self.manifest.traction is None:
+            return None
+        low, high = self.manifest.traction.friction[0], self.manifest.traction.friction[-1]
+        values, weights = friction.nodes
+        if weights[(low <= values) & (values <= high)].sum() >= 0.5:
+            return None
+        return (
+            f"the friction told ({friction.mean:.3g}) lies outside that of the network's training, {low:.2g} to "
+            f"{high:.2g}: its intervals were not measured there, so check --friction, or take the margins for a trend"
+        )
+
     @torch.no_grad()
     def answers(self, batches: Iterable[Tensor]) -> tuple[Tensor, ...]:
         """What the network answers (`Answers`) to batches of encoded frames, on its device."""

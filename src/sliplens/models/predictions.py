@@ -281,7 +281,8 @@ def predict(
         "sliplens.weights_sha256": trained.manifest.weights_sha256,
     }
     if known is not None:
-        notes = (*notes, f"The coefficient of friction is taken for {known}.")
+        doubt = trained.doubt_friction(known)
+        notes = (*notes, f"The coefficient of friction is taken for {known}.", *([] if doubt is None else [doubt]))
         metadata["sliplens.friction"] = str(known)
     if sequence:
         assert trained.manifest.sequence is not None  # `_require_order`

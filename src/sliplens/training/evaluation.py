@@ -15,7 +15,7 @@ from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError, RecordingError
 from sliplens.extras import import_cv2
 from sliplens.files import output_folder, scratch_folder
-from sliplens.friction import FrictionLike, as_friction
+from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.markers import KINDS, MarkerStatus, track_markers
 from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get_estimator
 from sliplens.models import Run
@@ -222,6 +222,8 @@ def evaluate(
         run.require_frame_size((trial.height, trial.width))
     firsts = map(data.read_labels, {trial.sensor: trial for trial in reversed(trials)}.values())
     doubts = [words for one in firsts for words in (run.doubt(one.sensor), run.doubt_colour(one.reference))]
+    if isinstance(told, Friction):
+        doubts.append(run.doubt_friction(told))
     for words in dict.fromkeys(filter(None, doubts)):
         note(on_progress, words)
     plan = _plan_baselines(baselines, data, trials, count=baseline_trials, markers=markers) if baselines else None
