@@ -206,3 +206,33 @@ def test_without_a_reading_or_a_doubt_a_slip_teaches_nothing(friction: Friction 
     learner.update(2.0, slipping_s=None, touches=False)
     assert learner.friction is friction
     assert learner.learnt is None
+
+
+def test_friction_of_any_size_stays_in_the_next_grasp_but_for_its_spread():
+    for value in (0.02, 0.6, 3.0, 5.0):
+        after = Friction(value).next_grasp(0.06)
+        # a Gaussian share of 6 %, on a grid of steps of 2 % at most
+        assert after.mean == pytest.approx(value, rel=0.01)
+        assert after.sigma == pytest.approx(0.06 * value, rel=0.05)
+    # what holds is what slipped, however grippy: the prior is even in the logarithm, which takes off s^2 of it
+    learnt = Friction.from_slips([2.6], sigma=0.1)
+    assert learnt.mean == pytest.approx(2.6, rel=0.02)
+
+
+def test_a_ratio_from_long_before_the_slip_teaches_nothing():
+    stale, fresh = (SlipLearner(Friction.between(0.2, 1.0)) for _ in range(2))
+    for learner, read_s in ((stale, 0.4), (fresh, 9.7)):
+        learner.note(0.25, sigma=0.03, time_s=read_s)
+        learner.update(10.0, slipping_s=0.2)
+    assert stale.slips == 0
+    assert fresh.slips == 1
+
+
+def test_friction_that_reads_alike_is_told_apart_by_its_digest():
+    ends = 0.4 * 2**0.5
+    two = Friction(np.array([0.2, 1.0]))
+    three = Friction(np.array([0.6 - ends, 0.6, 0.6 + ends]), np.array([0.25, 0.5, 0.25]))
+    assert str(two) == str(three)
+    assert two.digest != three.digest
+    assert Friction(0.8246).digest != Friction(0.8254).digest
+    assert Friction(0.62).digest == Friction(np.array([0.62]), np.array([3.0])).digest

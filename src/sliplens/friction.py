@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.errors import InputError
+from sliplens.files import hash_json
 
 __all__ = ["Friction", "FrictionLike", "SlipLearner", "as_friction"]
 
@@ -132,8 +133,9 @@ class Friction:
         prior
             What was known of the object before; evenly anything (in the logarithm) if None.
         """
-        known = _anything() if prior is None else prior
-        for ratio in np.asarray(ratios, dtype=np.float64).tolist():
+        seen = np.asarray(ratios, dtype=np.float64)
+        known = _anything(seen) if prior is None else prior
+        for ratio in seen.tolist():
             known = known.update(ratio, math.hypot(sigma, grasp_spread * ratio))
         return known.next_grasp(grasp_spread)
 
@@ -159,7 +161,7 @@ class Friction:
             return self
         # in the logarithm, where no friction becomes negative
         values, weights = self.nodes
-        grid, _ = _anything().nodes
+        grid, _ = _anything(values, spread=spread).nodes
         share = np.exp(-0.5 * (np.log(grid / values[:, None]) / spread) ** 2)
         moved = weights @ (share / np.maximum(share.sum(axis=1, keepdims=True), 1e-300))
         return Friction(grid, moved, note=self.note)._without_negligible()
@@ -194,17 +196,24 @@ class Friction:
         """Mean and standard deviation as `as_friction` and `--friction` take them, such as 0.58+-0.05."""
         return f"{self.mean:.3g}+-{self.sigma:.2g}" if self.sigma > 0 else f"{self.mean:.6g}"
 
+    @property
+    def digest(self) -> str:
+        """Hash of all that is known, which `text` rounds: the same only for the same friction."""
+        return hash_json([part.tolist() for part in self.nodes])
+
     def __str__(self) -> str:
         if self.note.endswith("range"):
             return self.note
-        return f"{self.mean:.3g}{f' +- {self.sigma:.2g}' if len(self.nodes[0]) > 1 else ''}, {self.note}"
+        known = f"{self.mean:.3g} +- {self.sigma:.2g}" if len(self.nodes[0]) > 1 else f"{self.mean:.6g}"
+        return f"{known}, {self.note}"
 
 
 class SlipLearner:
     """Friction of what is held, as the first gross slip of each grasp teaches it.
 
     As a contact begins to slip, F_t / F_n is the static friction; what is read while it slides is less. So a slip is
-    told together with the time since it began, and the ratio that was read just before counts. Later slips of the
+    told together with the time since it began, and the ratio that was read last before counts, if that is at most
+    0.3 s older: with no such reading a slip teaches nothing. Later slips of the
     same contact teach nothing: what a network reads wrong of a contact it reads wrong alike at each of them, so that
     they would make it surer and no better.
 
@@ -251,7 +260,8 @@ class SlipLearner:
     def update(self, time_s: float, *, slipping_s: float | None, touches: bool = True) -> None:
         """Learn from whether the contact slips now, and since how many seconds; None where it holds."""
         if slipping_s is not None and not self._slipped:
-            before = [(ratio, sigma) for then_s, ratio, sigma in self._read if then_s <= time_s - slipping_s]
+            began_s = time_s - slipping_s
+            before = [(ratio, sigma) for then_s, ratio, sigma in self._read if 0 <= began_s - then_s <= _FRESH_S]
             known = _anything() if self.friction is None else self.friction
             if before and before[-1][0] > 0 and len(known.nodes[0]) > 1:
                 slipped, self._slipped = known.update(*before[-1]), True
@@ -271,6 +281,9 @@ class SlipLearner:
 
 _KEPT = 120
 """Readings that are kept: longer than any slip takes to be told."""
+_FRESH_S = 0.3
+"""Time before a slip within which a ratio is that of its beginning. Frames may be withheld while the pull grows, and
+an older ratio would teach too little friction."""
 
 
 FrictionLike: TypeAlias = Friction | float | tuple[float, float] | str
@@ -311,6 +324,10 @@ def as_friction(told: FrictionLike) -> Friction:
     return Friction.about(*numbers) if about else Friction.between(*numbers)
 
 
-def _anything() -> Friction:
-    """Friction of which nothing is known, evenly in the logarithm."""
-    return Friction(np.geomspace(LOWEST, HIGHEST, _NODES), note="not told")
+def _anything(near: Float[np.ndarray, " values"] | None = None, *, spread: float = GRASP_SPREAD) -> Friction:
+    """Friction of which nothing is known, evenly in the logarithm; also what lies within a spread of some values."""
+    low, high = LOWEST, HIGHEST
+    if near is not None and len(near) and np.all((near > 0) & np.isfinite(near)):
+        low = min(low, float(near.min()) * math.exp(-_REACH * spread))
+        high = min(MOST_FRICTION, max(high, float(near.max()) * math.exp(_REACH * spread)))
+    return Friction(np.geomspace(low, high, _NODES), note="not told")

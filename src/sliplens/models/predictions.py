@@ -295,6 +295,7 @@ def predict(
     make = partial(make_engine, engine, trained, **run_with)
     recipe = run_with | {"onnx_file": onnx_file and hash_file(onnx_file), "engine": engine, **metadata}
     recipe |= {"columns": schema.names, "device": str(trained.device), "source": trials.recipe}
+    recipe["friction"] = known and known.digest
     written, rows = make_table(
         _Reading(trained=trained, trials=trials, schema=schema, friction=known, sequence=sequence, make_engine=make),
         partial(trials.shards, recipe, longest=None if sequence else LONGEST),

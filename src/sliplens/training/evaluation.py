@@ -211,7 +211,7 @@ def evaluate(
         If no frame has a label.
     """
     run = open_run(run)
-    told = friction if friction is None or friction == EACH else as_friction(friction)
+    told = None if friction is None else EACH if friction == EACH else as_friction(friction)
     if told is not None:
         run.require_ratio()
     if sequence:
@@ -235,7 +235,7 @@ def evaluate(
     recipe: dict[str, Any] = {"weights_sha256": kept.weights_sha256, "data_hash": data.hash, "input": kept.input}
     recipe["split"] = split
     if told is not None:
-        recipe["friction"] = str(told)
+        recipe["friction"] = told if isinstance(told, str) else told.digest
     if sequence:
         recipe["sequence"] = kept.sequence
     if plan is not None:
