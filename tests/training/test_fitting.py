@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from sliplens.errors import InputError, ModelError
-from sliplens.models import load_checkpoint
+from sliplens.models import load_checkpoint, save_checkpoint
 from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import Dataset
 from sliplens.results.evaluation import Training
-from sliplens.training import TrainConfig, evaluate_frames, fit, get_recipe
+from sliplens.training import TrainConfig, evaluate_frames, fit, fitting, get_recipe
 from sliplens.training.data import EpochShuffle, FrameSet, load_frames
 from sliplens.training.fitting import require_same_kind
 
@@ -70,6 +70,39 @@ def test_an_interrupted_training_resumes_to_the_same_weights(
     metrics = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in metrics] == ["epoch", "1.000", "2.000", "3.000"]
     assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("where", ["in the last epoch", "after it"])
+def test_epochs_without_gain_are_not_trained_again(
+    where: str, tmp_path: Path, frames: tuple[FrameSet, FrameSet], monkeypatch: pytest.MonkeyPatch
+):
+    """Labels to validate by that are the opposite of those to learn: after the first epochs nothing is gained."""
+    train, validation = frames
+    turned = train, replace(validation, safety_margin=1 - validation.safety_margin)
+    patient = replace(CONFIG, epochs=40, patience=3, learning_rate=1e-3)
+    whole = run(tmp_path / "whole", turned, patient)
+    assert whole.stopped_by == "no gain"
+    steps, done = 4 * round(whole.epochs), []  # 4 batches of 11 are an epoch
+
+    def count(step: int, _: int) -> None:
+        done.append(step)
+        if where == "in the last epoch" and len(done) == steps - 2:
+            raise KeyboardInterrupt
+
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        if where == "after it":
+            patch.setattr(fitting, "calibrate", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path / "cut", turned, patient, on_progress=count)
+    again = run(tmp_path / "cut", turned, patient, on_progress=count)
+    # the two steps of the epoch that was cut come again, and nothing else
+    assert len(done) == steps + (2 if where == "in the last epoch" else 0)
+    assert (again.epochs, again.stopped_by) == (whole.epochs, "no gain")
+    first, second = ((tmp_path / name / "model.safetensors").read_bytes() for name in ("whole", "cut"))
+    assert first == second
 
 
 def test_training_leaves_the_callers_random_state_alone(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
@@ -188,6 +221,10 @@ def histogram_run(tmp_path_factory: pytest.TempPathFactory, frames: tuple[FrameS
     folder = tmp_path_factory.mktemp("histogram")
     # so long that its features tell frames apart
     run(folder, frames, replace(CONFIG, head="histogram", epochs=20))
+    kept = load_checkpoint(folder)
+    edges = kept.model.get_buffer("edges")
+    edges.copy_(edges.half())  # as those of networks of the package
+    save_checkpoint(folder, kept.model, kept.manifest)
     return folder
 
 

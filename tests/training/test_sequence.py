@@ -139,3 +139,17 @@ def test_what_cannot_be_taught_is_refused(small_dataset: Dataset, start: Path, d
         teach(small_dataset, start, max_minutes=1.0)
     with pytest.raises(InputError, match="--devices"):
         teach(replace(small_dataset), start, devices=2)
+    with pytest.raises(InputError, match="whose image_size is 32; leave out --image-size"):
+        teach(small_dataset, start, image_size=96)
+    with pytest.raises(InputError, match="takes no such thing; leave out --untouched-share"):
+        teach(small_dataset, start, untouched_share=0.2)
+    with pytest.raises(InputError, match="--logger tensorboard"):
+        teach(small_dataset, start, logger="tensorboard")
+    with pytest.raises(ModelError, match="has the input difference, and pair is to be trained"):
+        teach(small_dataset, start, input="pair")
+
+
+def test_a_second_answer_is_learnt_at_the_size_of_the_first(small_dataset: Dataset, start: Path):
+    """At another size the margin, which stays, would be read from images that it was not calibrated on."""
+    with pytest.raises(InputError, match=r"recipe ratio leaves .* whose image_size is 32; leave out --image-size"):
+        train(small_dataset, recipe="ratio", start_from=start, image_size=64)

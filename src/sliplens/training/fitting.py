@@ -13,7 +13,7 @@ import lightning
 import numpy as np
 import torch
 from jaxtyping import Float
-from lightning.pytorch.callbacks import EarlyStopping, ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import Logger
 from torch import Tensor, nn
 
@@ -48,7 +48,15 @@ from sliplens.training.data import (
     make_loaders,
     tells_ratio,
 )
-from sliplens.training.module import Clock, DivergedError, Regressor, make_trainer, run_trainer, share_of_batch
+from sliplens.training.module import (
+    Clock,
+    DivergedError,
+    Patience,
+    Regressor,
+    make_trainer,
+    run_trainer,
+    share_of_batch,
+)
 from sliplens.training.sequence import fit_sequence
 
 _ENOUGH_TRIALS, _FEW_TRIALS = 10, 30
@@ -61,6 +69,10 @@ _KIND = {
     "sequence": ("backbone", "head", "image_size"),
 }
 """What a network to start from keeps, by what is learnt."""
+_STAYS = {"ratio", "sequence"}
+"""What is learnt beside a network that answers as before."""
+_SEQUENCE_TAKES = {"epochs", "batch_size", "learning_rate", "weight_decay", "seed"}
+"""What of a recipe shapes a head of several frames."""
 _NOVELTY_FRAMES = 2000
 """Frames from which the place of healthy inputs in the features is told, at most."""
 
@@ -124,8 +136,8 @@ def train(
     share_of_batch(config.batch_size, trainer.world_size)
     if start is not None:
         require_same_kind(start, config, input)
-    if config.learns == "sequence" and trainer.world_size > 1:
-        raise InputError("a head of several frames is trained by one process; leave out --devices and --num-nodes")
+    if config.learns == "sequence":
+        _require_alone(trainer, logger)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = ENCODINGS.pick(input), _choose_trials(data, condition)
     _require_varied_labels(data, trials[0])
@@ -206,7 +218,24 @@ def _configure(recipe: str, changes: dict[str, Any], start: Run | None) -> Train
         if config.learns != "all":
             raise InputError(f"the recipe {recipe} teaches a network that is there; name it with --start-from")
         return config
-    return replace(config, **{name: getattr(start.manifest, name) for name in _KIND[config.learns]} | changes)
+    kept = {name: getattr(start.manifest, name) for name in _KIND[config.learns]}
+    for name in sorted(changes) if config.learns in _STAYS else ():
+        own = kept.get(name, changes[name])
+        if changes[name] != own or (config.learns == "sequence" and name not in _SEQUENCE_TAKES | kept.keys()):
+            why = f"whose {name} is {own}" if name in kept else "and takes no such thing"
+            raise InputError(
+                f"the recipe {recipe} leaves the network of --start-from as it is, {why}; leave out "
+                f"--{name.replace('_', '-')}"
+            )
+    return replace(config, **kept | changes)
+
+
+def _require_alone(trainer: lightning.Trainer, logger: str) -> None:
+    """Refuse what is not done for a head of several frames, whose training takes a minute."""
+    if trainer.world_size > 1:
+        raise InputError("a head of several frames is trained by one process; leave out --devices and --num-nodes")
+    if logger != "csv":
+        raise InputError(f"a head of several frames tells its epochs in metrics.csv alone; leave out --logger {logger}")
 
 
 def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]:
@@ -410,10 +439,12 @@ def fit(
         clock=clock,
         batch_rows=lambda epoch, batch: [train.name(row) for row in shuffle.batch(epoch, batch, size=share)],
     )
-    best = ModelCheckpoint(dirpath=folder / "checkpoints", filename="best", monitor="validation_mse", save_last=True)
-    # in this order: a checkpoint holds what the stopping has counted of the same epoch
-    early = EarlyStopping("validation_mse", patience=config.patience) if config.patience else None
-    trainer.callbacks += [clock, *filter(None, [early]), best]  # pyright: ignore[reportAttributeAccessIssue]
+    best = ModelCheckpoint(dirpath=folder / "checkpoints", filename="best", monitor="validation_mse")
+    # of every epoch: `save_last` writes one only where the best is written too
+    last = ModelCheckpoint(dirpath=folder / "checkpoints", filename="last", enable_version_counter=False)
+    # in this order: a checkpoint holds what the stopping has counted of the same epoch, and which was best so far
+    early = Patience("validation_mse", patience=config.patience) if config.patience else None
+    trainer.callbacks += [clock, *filter(None, [early]), best, last]  # pyright: ignore[reportAttributeAccessIssue]
     trainer.loggers = [logger] if logger is not None and first else []
     trainer.log_every_n_steps = min(50, per_epoch)  # pyright: ignore[reportAttributeAccessIssue]
     loaders = make_loaders(train, validation, shuffle=shuffle, batch_size=share)
@@ -506,7 +537,8 @@ def _last_layer_alone(
 ) -> tuple[HistogramRegressor, FrameSet, FrameSet]:
     """The last layer of a network of two answers as a network of its own, and training and validation frames for it."""
     alone, seen = HistogramRegressor(last_layer(model), ratio=True), []
-    alone.temperature.copy_(model.get_buffer("temperature"))
+    for name in ("temperature", "edges", "ratio_edges"):  # edges of a network of the package are rounded
+        alone.get_buffer(name).copy_(model.get_buffer(name))
     for some, what in zip(frames, ("training", "validation"), strict=True):
         with stage(report, f"Passing {what} frames through the network") as count:
             seen.append(extract_features(model, some, batch_size=config.batch_size, on_progress=count))
@@ -534,9 +566,10 @@ def _check_frames(config: TrainConfig, train: FrameSet, validation: FrameSet, pr
     if config.head == "margin-and-ratio":
         for what, frames in (("training", train), ("validation", validation)):
             if not (torch.isfinite(frames.traction_ratio).numpy() & np.isfinite(frames.friction)).any():
+                other = "" if config.learns == "ratio" else ", or choose another --head"
                 raise InputError(
                     f"no {what} frame tells its forces and its friction, from which F_t / F_n is learnt; import them "
-                    "with the forces, or choose another --head"
+                    f"with the forces{other}"
                 )
     if len(validation) < processes:
         raise InputError(f"{len(validation)} validation frames are too few for {processes} processes; lower --devices")
@@ -551,7 +584,7 @@ def require_same_kind(start: Run, config: TrainConfig, encoding: str) -> None:
         kept = getattr(start.manifest, name)
         # a second answer can be learnt beside the first or left out, and the reference be seen beside the frame; not
         # by a last layer alone: the first answer would stay as it was for other images
-        paired = value == "pair" and kept in REFERENCE_SIGNS and config.learns != "ratio"
+        paired = value == "pair" and kept in REFERENCE_SIGNS and config.learns not in _STAYS
         changed = {kept, value} == {"histogram", "margin-and-ratio"}
         if kept != value and not (paired or changed):
             raise ModelError(

@@ -21,7 +21,7 @@ from jaxtyping import Float
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, EarlyStopping
 from pytorch_optimizer import Ranger21
 from torch import Tensor, distributed, nn
 from torch.utils.data import DataLoader
@@ -245,6 +245,15 @@ class Clock(Callback):
             part = self.metrics_file.with_name(self.metrics_file.name + ".part")
             part.write_text("\n".join(lines) + "\n", encoding="utf-8")
             part.replace(self.metrics_file)
+
+
+class Patience(EarlyStopping):
+    """Early stopping that a resumed training does not forget: Lightning restores the count, not that it had ended."""
+
+    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
+        """End at once where the checkpoint had waited long enough."""
+        if self.wait_count >= self.patience:
+            trainer.should_stop = True
 
 
 def make_trainer(
