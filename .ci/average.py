@@ -2,7 +2,7 @@
 
 `python .ci/average.py DATA RUN RUN... -o OUT` takes the calibration, and what is usual among the features, from the
 validation trials of DATA and from a tenth of its training trials. The average often reads better than each of them, and
-an answer costs what it did: Wortsman et al., *Model soups* (2022).
+an answer costs what it did: Wortsman et al., *Model soups* (2022). Given again, the same average stays.
 """
 
 import argparse
@@ -14,10 +14,11 @@ from pathlib import Path
 import torch
 
 from sliplens.errors import SliplensError
-from sliplens.files import versions
-from sliplens.models import load, save_checkpoint
+from sliplens.files import output_folder, versions
+from sliplens.models import Run, load, save_checkpoint
+from sliplens.models.checkpoint import read_manifest
 from sliplens.models.novelty import fit_novelty
-from sliplens.recordings import load_dataset
+from sliplens.recordings import Dataset, load_dataset
 from sliplens.training.data import load_frames
 from sliplens.training.fitting import calibrate
 
@@ -28,15 +29,23 @@ SOME = 10
 
 def average(data: Path, folders: Sequence[Path], out: Path) -> float:
     """Write the average network, and give its mean squared error on the validation trials."""
-    first, *others = runs = [load(folder) for folder in folders]
+    _, *others = runs = [load(folder) for folder in folders]
     kind = [(run.manifest.input, run.manifest.backbone, run.manifest.head, run.manifest.image_size) for run in runs]
     begun = {run.manifest.started_from for run in runs}
     # of networks that began with random weights nothing tells whether these were the same
     if not others or len(set(kind)) > 1 or len(begun) > 1 or "" in begun:
         sys.exit("average.py: name two networks or more of one kind that were trained further from the same one")
-    if out.exists():
-        sys.exit(f"average.py: {out} exists; name another folder")
     dataset = load_dataset(data)
+    config = {"data_hash": dataset.hash, "networks": [run.manifest.weights_sha256 for run in runs]}
+    with output_folder(out, stage="average", config=config, overwrite=False) as output:
+        if not output.complete:
+            _average(runs, dataset, output.folder)
+    return read_manifest(out).metrics["validation_mse"]
+
+
+def _average(runs: Sequence[Run], dataset: Dataset, out: Path) -> None:
+    """Write the average of networks of one kind, calibrated on a data set."""
+    first = runs[0]
     validation, train = (
         load_frames(dataset, trials, encoding=first.encoding, image_size=first.manifest.image_size)
         for trials in (dataset.select(split="validation"), dataset.select(split="train")[::SOME])
@@ -57,9 +66,7 @@ def average(data: Path, folders: Sequence[Path], out: Path) -> float:
         sequence=None,
         versions=versions(),
     )
-    out.mkdir(parents=True)
     save_checkpoint(out, first.model, manifest)
-    return calibration.mse
 
 
 if __name__ == "__main__":

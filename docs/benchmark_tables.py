@@ -35,11 +35,13 @@ def meets(value: Decimal | int, goal: str) -> bool:
 
 
 def judge(row: dict[str, Any]) -> str:
-    """Say whether a row reaches its goal, and whether all of its interval does."""
+    """Say whether a row reaches its goal, and whether all of its interval does where that counts."""
     if "goal" not in row or row["value"] == "not measured":
         return ""
     if not meets(row["value"], row["goal"]):
         return "**missed**"
+    if row.get("judged") == "value":
+        return "reached"
     return "reached" if all(meets(row[end], row["goal"]) for end in ("low", "high") if end in row) else "not for sure"
 
 

@@ -33,7 +33,7 @@ def test_rows_are_whole(script: str):
 def check_row(section: dict[str, Any], row: dict[str, Any]) -> None:
     facts = section | row
     assert set(facts) <= {"script", "title", "rows", "command", "date", "machine"} | {
-        "figure", "value", "unit", "low", "high", "spread", "goal"
+        "figure", "value", "unit", "low", "high", "spread", "goal", "judged"
     }  # fmt: skip
     assert section["script"] in facts["command"] or facts["command"].startswith("make ")
     assert facts["machine"] in TABLES.MACHINES
@@ -44,6 +44,7 @@ def check_row(section: dict[str, Any], row: dict[str, Any]) -> None:
         assert re.fullmatch(r"20\d\d-\d\d(-\d\d)?", facts["date"])
         assert facts["machine"] != "gpu"
         assert row.get("low", row["value"]) <= row["value"] <= row.get("high", row["value"])
+    assert row.get("judged", "value") == "value"
     if "goal" in row:
         direction, bound = row["goal"].split()
         assert direction in {"<=", ">=", "="}

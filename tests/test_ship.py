@@ -9,7 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from data_sets import contents
 
+from sliplens.errors import InputError
 from sliplens.models import load, save_checkpoint
 from sliplens.recordings import Dataset
 
@@ -92,6 +94,15 @@ def test_each_weight_of_an_average_lies_halfway(two_runs: list[Path], small_data
     for name, value in states[2].items():
         if "temperature" not in name:  # which is fitted anew
             assert torch.allclose(2 * value.double(), states[0][name].double() + states[1][name].double(), rtol=1e-6)
+
+
+def test_an_average_is_made_once_of_the_same_networks(two_runs: list[Path], small_dataset: Dataset, tmp_path: Path):
+    error = AVERAGE.average(small_dataset.folder, two_runs, tmp_path / "average")
+    before = contents(tmp_path / "average")
+    assert AVERAGE.average(small_dataset.folder, two_runs, tmp_path / "average") == error
+    assert contents(tmp_path / "average") == before
+    with pytest.raises(InputError):
+        AVERAGE.average(small_dataset.folder, two_runs[::-1], tmp_path / "average")
 
 
 def test_networks_that_did_not_begin_alike_are_not_averaged(

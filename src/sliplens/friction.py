@@ -21,6 +21,8 @@ GRASP_SPREAD = 0.06
 day lie evenly within a tenth of its friction."""
 MOST_FRICTION = 20.0
 """Larger than the coefficient of anything that slides: beyond, something sticks, or the number is none."""
+LEARNT = "learnt from slips"
+"""Note of friction that slips told."""
 _REACH = 4.0
 """Standard deviations to either side within which friction of a mean and a spread is held possible."""
 _NODES = 400
@@ -151,7 +153,7 @@ class Friction:
         with np.errstate(divide="ignore"):
             posterior = np.log(weights) + exponent
         posterior = np.exp(posterior - posterior.max())
-        return Friction(values, posterior, note="learnt from slips")._without_negligible()
+        return Friction(values, posterior, note=LEARNT)._without_negligible()
 
     def next_grasp(self, spread: float = GRASP_SPREAD) -> "Friction":
         """Friction of another grasp of the same object, which differs by a Gaussian share of deviation `spread`."""

@@ -7,10 +7,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from data_sets import save_dataset
 from there import there
 
 import sliplens as sl
-from sliplens.errors import CheckpointError, InputError
+from sliplens.errors import CheckpointError, InputError, SliplensError
 from sliplens.live.contract import SourceOptions
 from sliplens.models import Run, load_checkpoint, save_checkpoint
 from sliplens.models.calibration import Calibration
@@ -99,6 +100,21 @@ def test_after_a_gap_the_rest_of_a_contact_is_read_frame_by_frame(run: Run):
     anew = run.follow().update(estimate.at(np.arange(12, 18)), times[12:], touches[12:]).margin
     np.testing.assert_allclose(read[12:], anew, atol=1e-6)
     assert not follower.lost
+
+
+def test_frames_read_one_by_one_after_a_gap_keep_their_own_intervals(run: Run):
+    kept, many = there(run.manifest.sequence), answers(12)
+    wide = replace(kept.calibration, offsets={"0.9": 0.2})
+    narrow = np.exp(-(((there(many.edges)[:-1] - np.linspace(0.3, 0.6, 12)[:, None]) / 0.05) ** 2))
+    estimate = replace(many, probabilities=narrow / narrow.sum(axis=1, keepdims=True))
+    follower = replace(run, manifest=replace(run.manifest, sequence=replace(kept, calibration=wide))).follow()
+    times, after = np.arange(12) / 10 + 30 * (np.arange(12) >= 5), np.arange(5, 12)
+    read = follower.update(estimate, times, np.ones(12, dtype=bool))
+    own, as_several = (there(one.interval(0.9)) for one in (estimate, replace(estimate, calibration=wide)))
+    for end, own_end, other_end in zip(there(read.interval(0.9)), own, as_several, strict=True):
+        assert np.array_equal(end[5:], own_end[5:])
+        assert not np.isclose(end[5:], other_end[5:]).any()
+    assert np.array_equal(there(read.at(after).interval(0.9))[0], own[0][5:])
 
 
 @pytest.mark.parametrize(("step_s", "lost"), [(0.5, False), (GAP_S, False), (GAP_S + 0.01, True)])
@@ -218,6 +234,13 @@ def test_frames_that_come_too_seldom_are_refused(run: Run, small_dataset: Datase
     reader = sl.LiveReader(seldom, run, options=slow, reference=reference, sequence=True, engine="eager")
     with pytest.raises(InputError, match="has a frame each 1 s"), reader:
         pass
+
+
+def test_each_trial_is_asked_whether_its_frames_come_often_enough(run: Run, small_dataset: Dataset, tmp_path: Path):
+    first, second = (small_dataset.load(info) for info in small_dataset.trials[:2])
+    data = save_dataset(tmp_path, first, replace(second, time_s=30 * second.time_s))
+    with pytest.raises(SliplensError, match=rf"{second.trial} has a frame each 1 s"):
+        sl.predict(run, data, sequence=True)
 
 
 def test_a_damaged_head_is_refused(run: Run, tmp_path: Path):

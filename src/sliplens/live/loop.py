@@ -126,7 +126,8 @@ class LiveReader:
         Whether every grasp is of one object, until `new_object`: what a slip taught of its friction then counts in the
         grasps that follow. Left out, it does not: the next grasp may be of something else.
     sequence
-        Whether what the frames of a contact so far tell counts too, as `predict` takes it.
+        Whether what the frames of a contact so far tell counts too, as `predict` takes it. Health and markers tell when
+        a contact ends: without both, all frames count as one.
     engine
         Row of `ENGINES`; `auto` for the fastest at hand that pays for `seconds`, or for hours where that is None, and
         that may take seconds to be made.

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from math import erfc, sqrt
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from sliplens.codec import load_record, load_result, save_record
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
 from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
-from sliplens.friction import Friction, FrictionLike, as_friction
+from sliplens.friction import LEARNT, Friction, FrictionLike, as_friction
 from sliplens.images import MOST_PIXELS, has_colour
 from sliplens.models.backbones import (
     Answers,
@@ -207,9 +208,11 @@ class Run:
         values, weights = friction.nodes
         if weights[(low <= values) & (values <= high)].sum() >= 0.5:
             return None
+        learnt = friction.note == LEARNT
+        known, cure = ("learnt from slips", "begin a new object") if learnt else ("told", "check --friction")
         return (
-            f"the friction told ({friction.mean:.3g}) lies outside that of the network's training, {low:.2g} to "
-            f"{high:.2g}: its intervals were not measured there, so check --friction, or take the margins for a trend"
+            f"the friction {known} ({friction.mean:.3g}) lies outside that of the network's training, {low:.2g} to "
+            f"{high:.2g}: its intervals were not measured there, so {cure}, or take the margins for a trend"
         )
 
     @torch.no_grad()
@@ -355,18 +358,22 @@ class Estimate:
     """What was told of the friction; None where nothing was."""
     known: Float[np.ndarray, " frames"] | None = None
     """How far the network knows such frames, from 0 to 1: the share of its validation frames that were as strange or
-    stranger, in its features or in the spread of its answer (`Novelty.known`). None of a network that does not tell,
-    and of an engine alone, which answers without its features.
+    stranger, in its features or in the spread of its answer (`Novelty.known`). None of a network that does not tell.
 
     An unknown friction is nothing strange: a network that was trained on frictions from 0.15 to 1.2 takes wet for one
     more of them, and no value of this warns of it."""
 
+    alone: tuple[Bool[np.ndarray, " frames"], Calibration | None] | None = None
+    """Which of the frames that were read in order keep the answers of one frame, and the calibration of those; None
+    where all have one calibration."""
+
     def at(self, rows: Int[np.ndarray, " rows"] | Bool[np.ndarray, " frames"]) -> "Estimate":
         """Some of the frames."""
         ratio = self.ratio and replace(self.ratio, probabilities=self.ratio.probabilities[rows])
+        alone = self.alone and (self.alone[0][rows], self.alone[1])
         parts = {name: getattr(self, name) for name in ("probabilities", "known")}
         parts = {name: None if values is None else values[rows] for name, values in parts.items()}
-        return replace(self, margin=self.margin[rows], ratio=ratio, **parts)
+        return replace(self, margin=self.margin[rows], ratio=ratio, alone=alone, **parts)
 
     @property
     def sigma(self) -> Float[np.ndarray, " frames"] | None:
@@ -392,7 +399,9 @@ class Estimate:
         """Margins between which each label lies with a level of confidence, within [0, 1]; None if not calibrated."""
         if self.calibration is None:
             return None
-        offset = self.calibration.offset(level)
+        offset: Any = self.calibration.offset(level)
+        if self.alone is not None and self.alone[1] is not None:
+            offset = np.where(self.alone[0], self.alone[1].offset(level), offset)
         low, high = raw_interval(self.margin, self.probabilities, self.edges, level)
         # a label lies in [0, 1], so cutting there loses none
         return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
@@ -421,7 +430,8 @@ class Estimate:
         )
         # bins beyond 0 and 1 mean the ends
         margin = probabilities @ np.clip(bin_centres(self.edges), 0, 1)
-        return replace(self, margin=margin, probabilities=probabilities, calibration=calibration, friction=friction)
+        told = {"calibration": calibration, "friction": friction, "alone": None}
+        return replace(self, margin=margin, probabilities=probabilities, **told)
 
 
 def tell_each(

@@ -460,6 +460,8 @@ class _Reading(Work):
         # batches are encoded while the ones before are under way; first frame of each, and which touch
         encoded: deque[tuple[int, list[bool]]] = deque()
         follower = self.trained.follow() if self.sequence else None
+        if follower is not None and capture.time_s is not None:
+            require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
 
         def encode() -> Iterator[Tensor]:
             while batch := list(islice(frames, engine.batch_size)):

@@ -208,7 +208,8 @@ class Follower:
         likely /= likely.sum(axis=1, keepdims=True)
         read = np.where(followed, (likely * self._centres).sum(axis=1), estimate.margin)
         probabilities = np.where(followed[:, None], likely, estimate.probabilities)
-        return replace(estimate, margin=read, probabilities=probabilities, calibration=calibration)
+        alone = None if followed.all() else (~followed, estimate.calibration)
+        return replace(estimate, margin=read, probabilities=probabilities, calibration=calibration, alone=alone)
 
     def _step(
         self, told: Float32[np.ndarray, " 8"]

@@ -413,14 +413,16 @@ def _follow_trials(
     """Read the frames of each trial in the order of their times (`Follower`); all of them touch."""
     assert estimate.probabilities is not None
     margin, probabilities = np.empty_like(estimate.margin), np.empty_like(estimate.probabilities)
-    names, calibration = np.array(trial), None
+    names, calibration, alone = np.array(trial), None, np.zeros(len(estimate.margin), dtype=bool)
     for name in dict.fromkeys(trial):
         rows = np.flatnonzero(names == name)
         rows = rows[np.argsort(time_s[rows], kind="stable")]
         read = run.follow().update(estimate.at(rows), time_s[rows], np.ones(len(rows), dtype=bool))
         assert read.probabilities is not None
         margin[rows], probabilities[rows], calibration = read.margin, read.probabilities, read.calibration
-    return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration)
+        alone[rows] = False if read.alone is None else read.alone[0]
+    kept = (alone, estimate.calibration) if alone.any() else None
+    return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration, alone=kept)
 
 
 def _ratio_r2(ratio: Float[np.ndarray, " frames"], frames: FrameSet) -> dict[str, float | None]:
