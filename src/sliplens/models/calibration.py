@@ -200,8 +200,8 @@ def told_probabilities(
         p(Gamma | x, q) ~ p(Gamma | x) * integral over mu of q(mu) / pi(mu) * p(rho = mu (1 - Gamma) | x) * (1 - Gamma),
 
     the Jacobian last. Told what the training had (q = pi) this is nearly p(Gamma | x); told all, what the ratio and
-    friction leave of it. Beside it stands the closed form alone, Gamma = 1 - rho / mu cut to [0, 1], for what does not fit together:
-    a ratio beyond what the friction that is told can hold is a margin of 0.
+    friction leave of it. Beside it stands the closed form alone, Gamma = 1 - rho / mu cut to [0, 1], for what does not
+    fit together: a ratio beyond what the friction that is told can hold is a margin of 0.
 
     Parameters
     ----------
