@@ -401,7 +401,8 @@ class Estimate:
             return None
         offset: Any = self.calibration.offset(level)
         if self.alone is not None and self.alone[1] is not None:
-            offset = np.where(self.alone[0], self.alone[1].offset(level), offset)
+            own = self.alone[1].offsets.get(str(level), offset)  # calibrations may have other levels
+            offset = np.where(self.alone[0], own, offset)
         low, high = raw_interval(self.margin, self.probabilities, self.edges, level)
         # a label lies in [0, 1], so cutting there loses none
         return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
