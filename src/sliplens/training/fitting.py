@@ -60,8 +60,8 @@ from sliplens.training.module import (
 from sliplens.training.sequence import fit_sequence
 
 _ENOUGH_TRIALS, _FEW_TRIALS = 10, 30
-"""Labelled trials with which adapting has about nine tenths of the R2 of a hundred, and up to which it beat a network
-that begins with nothing, both on dry objects and as far as was measured; of `benchmarks/adapt.py`."""
+"""Labelled trials with which adapting has about nine tenths of the R2 of a hundred, and of which a network that begins
+with nothing learns less or, on the flat gel, no more; both on dry objects, of `benchmarks/adapt.py`."""
 _KIND = {
     "all": ("backbone", "head"),
     "weights": ("backbone", "head", "image_size"),
