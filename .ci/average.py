@@ -29,11 +29,11 @@ SOME = 10
 
 def average(data: Path, folders: Sequence[Path], out: Path) -> float:
     """Write the average network, and give its mean squared error on the validation trials."""
-    _, *others = runs = [load(folder) for folder in folders]
+    runs = [load(folder) for folder in folders]
     kind = [(run.manifest.input, run.manifest.backbone, run.manifest.head, run.manifest.image_size) for run in runs]
     begun = {run.manifest.started_from for run in runs}
     # of networks that began with random weights nothing tells whether these were the same
-    if not others or len(set(kind)) > 1 or len(begun) > 1 or "" in begun:
+    if len(runs) < 2 or len(set(kind)) > 1 or len(begun) > 1 or "" in begun:
         sys.exit("average.py: name two networks or more of one kind that were trained further from the same one")
     dataset = load_dataset(data)
     config = {"data_hash": dataset.hash, "networks": [run.manifest.weights_sha256 for run in runs]}

@@ -215,9 +215,9 @@ class SlipLearner:
 
     As a contact begins to slip, F_t / F_n is the static friction; what is read while it slides is less. So a slip is
     told together with the time since it began, and the ratio that was read last before counts, if that is at most
-    0.3 s older: with no such reading a slip teaches nothing. Later slips of the
-    same contact teach nothing: what a network reads wrong of a contact it reads wrong alike at each of them, so that
-    they would make it surer and no better.
+    0.3 s older: with no such reading a slip teaches nothing. Later slips of the same contact teach nothing either: what
+    a network reads wrong of a contact it reads wrong alike at each of them, so that they would make it surer and no
+    better.
 
     Nobody sees whether the next grasp is of the same object. So what a slip taught ends with its grasp, unless it was
     said that the object stays the same: then it counts in the next ones, a little less surely. Where nothing was told,
