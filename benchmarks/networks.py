@@ -46,6 +46,7 @@ from sliplens.models.checkpoint import Ratio, load
 from sliplens.simulation import PRESETS, SimulationRecipe
 from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import Loading
+from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import PULLS, TrialPlan, plan_trials
 from sliplens.simulation.trials import prepare_trial
 from sliplens.training.metrics import auroc
@@ -89,7 +90,7 @@ def fresh_days(series: str, days: int) -> SimulationRecipe:
         test_days=days,
         dry_trials=TRIALS * (days + 1),
         wet_trials=TRIALS * days,
-        nuisances=PRESETS["thesis"].nuisances,
+        nuisances=Nuisances(),
     )
 
 
@@ -116,6 +117,7 @@ def require_disjoint(plans: Sequence[TrialPlan]) -> None:
             for dry, days, seed in ((1020, 340, 4), (2040, 680, 7))
         ),
         *(replace(varied, seed=seed, dry_trials=5100, days=1700, test_days=10, wet_trials=10) for seed in (5, 6)),
+        replace(varied, seed=11, dry_trials=3600, days=1200, test_days=10, wet_trials=10),
         PRESETS["thesis"],
         PRESETS["small"],
     ]

@@ -28,6 +28,7 @@ from sliplens.errors import SliplensError
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.simulation import PRESETS
+from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import TrialPlan, plan_trials
 from sliplens.simulation.trials import prepare_trial
 
@@ -62,7 +63,13 @@ class Seen:
 def training_plans(days: int) -> dict[str, tuple[TrialPlan, ...]]:
     """Trials to learn from, in series of their own."""
     as_network = replace(
-        PRESETS["varied"], series="one frame", dry_trials=3 * days, days=days, test_days=1, wet_trials=1
+        PRESETS["varied"],
+        series="one frame",
+        dry_trials=3 * days,
+        days=days,
+        test_days=1,
+        wet_trials=1,
+        nuisances=Nuisances(dry_friction=(0.15, 1.2)),
     )
     plans = {"perceptron": plan_trials(as_network), "as_tested": plan_trials(fresh_days("one frame, mixed", days // 2))}
     for some in plans.values():

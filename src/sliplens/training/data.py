@@ -90,13 +90,15 @@ class Augmentation:
 _AUGMENTATIONS = {
     "none": None,
     "thesis": Augmentation(shift=0.0, colour=0.0),
+    "noise": Augmentation(rotation_deg=0.0, shift=0.0, colour=0.0, blur_probability=0.0),
     "default": Augmentation(),
     # the corners of a turned square lie outside of it; mirrored skin is more like skin than its last pixel drawn out
     "all-directions": Augmentation(rotation_deg=180.0, zoom=0.03, mirror=True, padding="reflection"),
 }
 AUGMENTATIONS = Table("augmentation", "sliplens.augmentations", _AUGMENTATIONS)
-"""Augmentations by name. `thesis` has rotation, noise and blur, in amounts of ours; Polak gives none. `all-directions`
-turns images by any angle, mirrors and magnifies them, for networks that may be pulled in any direction."""
+"""Augmentations by name. `thesis` has rotation, noise and blur, in amounts of ours; Polak gives none. `noise` has noise
+alone. `all-directions` turns images by any angle, mirrors and magnifies them, for networks that may be pulled in any
+direction."""
 
 
 def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:
