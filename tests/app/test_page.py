@@ -13,6 +13,7 @@ from http.client import HTTPConnection
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from urllib.parse import urljoin, urlsplit
 
 import pytest
 from hostile_names import FILE_NAME, assert_inert, watch
@@ -225,6 +226,31 @@ def test_no_path_of_a_request_reaches_the_disk(page: Served, path: str):
     answer = connection.getresponse()
     assert answer.status in {400, 403, 404}
     assert b"root:" not in answer.read()
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "//evil.example/",
+        "//evil.example/?token=",
+        "/%2Fevil.example/",
+        "/%5Cevil.example/",
+        "https://evil.example/",
+        "/images//evil.example/",
+        "/images/trial/0/",
+        "/frames//evil.example/",
+        "/_nicegui//evil.example/",
+        "/_nicegui_ws//evil.example/",
+    ],
+)
+def test_no_answer_leads_to_another_site(page: Served, path: str):
+    own = page.address.removeprefix("http://").rstrip("/")
+    connection = HTTPConnection(own, timeout=60)
+    connection.request("GET", path)
+    answer = connection.getresponse()
+    place = urljoin(page.address, answer.getheader("location", "/"))
+    assert urlsplit(place).netloc == own
     connection.close()
 
 
