@@ -224,20 +224,21 @@ def describe_reading(reading: Reading) -> ReadingWords:
     if reading.margin is not None:
         margin = f"{100 * reading.margin:.0f} %"
         if reading.low is not None and reading.high is not None:
-            interval = f"{100 * reading.low:.0f} to {100 * reading.high:.0f} %"
-            if _zone(*_ends(reading)) is not _zone(reading.low, reading.high):
+            low, high = _ends(reading, risk=None)
+            interval = f"{100 * low:.0f} to {100 * high:.0f} %"
+            if _zone(low, high) is not _zone(*_ends(reading, risk=reading.risk)):
                 interval += f", but {100 * _OFF:.0f} points off with a chance of {100 * (reading.risk or 0):.0f} %"
     return ReadingWords(zone=zone, advice=advice, margin=margin, interval=interval, contact=_contact(reading, zone))
 
 
-def _ends(reading: Reading) -> tuple[float, float]:
-    """Ends of the interval, moved apart where the risk says that it is too narrow."""
+def _ends(reading: Reading, *, risk: float | None) -> tuple[float, float]:
+    """Ends of the interval in whole percents, as they are shown; moved apart where the risk is more than they say."""
     margin, low, high = reading.margin, reading.low, reading.high
     if margin is None or low is None or high is None:
         return 0.0, 1.0
-    if (reading.risk or 0) <= _RISK:
-        return low, high
-    return min(low, max(margin - _OFF, 0.0)), max(high, min(margin + _OFF, 1.0))
+    if risk is not None and risk > _RISK:
+        low, high = min(low, max(margin - _OFF, 0.0)), max(high, min(margin + _OFF, 1.0))
+    return round(low, 2), round(high, 2)
 
 
 def _zone(low: float, high: float) -> Zone:
@@ -252,7 +253,7 @@ def _zone(low: float, high: float) -> Zone:
 
 def _judge(reading: Reading) -> tuple[Zone, str]:
     """Zone of a reading, and what that means."""
-    zone, slips = _zone(*_ends(reading)), reading.slip is SlipState.SLIP
+    zone, slips = _zone(*_ends(reading, risk=reading.risk)), reading.slip is SlipState.SLIP
     rules = (
         (reading.withheld is not None, Zone.NONE, f"no margin: {reading.withheld}"),
         (slips and zone in {Zone.BELOW, Zone.UNCERTAIN}, Zone.BELOW, "slips, as the markers show: hold tighter"),
@@ -267,7 +268,7 @@ def _judge(reading: Reading) -> tuple[Zone, str]:
 
 def _contact(reading: Reading, zone: Zone) -> ContactState:
     """State of the contact as far as interval and markers agree."""
-    low, high = _ends(reading)
+    low, high = _ends(reading, risk=reading.risk)
     touches = reading.margin is not None or (reading.markers is not None and reading.markers.contact)
     if reading.contact_state == ContactState.NO_CONTACT:
         return ContactState.NO_CONTACT
