@@ -214,7 +214,6 @@ def describe_reading(reading: Reading) -> ReadingWords:
 
     Examples
     --------
-    >>> from sliplens.live.reading import Reading, describe_reading
     >>> reading = Reading(number=0, time_s=0.0, captured_s=0.0, margin=0.55, low=0.15, high=0.9)
     >>> print(describe_reading(reading))
     margin 55 % (15 to 90 %); cannot tell: may be close to slipping
