@@ -214,11 +214,22 @@ def describe_reading(reading: Reading) -> ReadingWords:
 
     Examples
     --------
+    >>> from sliplens.live.reading import Reading, describe_reading
     >>> reading = Reading(number=0, time_s=0.0, captured_s=0.0, margin=0.55, low=0.15, high=0.9)
     >>> print(describe_reading(reading))
     margin 55 % (15 to 90 %); cannot tell: may be close to slipping
     """
-    zone, advice = _judge(reading)
+    zone, slips = _zone(*_ends(reading, risk=reading.risk)), reading.slip is SlipState.SLIP
+    rules = (
+        (reading.withheld is not None, Zone.NONE, f"no margin: {reading.withheld}"),
+        (slips and zone in {Zone.BELOW, Zone.UNCERTAIN}, Zone.BELOW, "slips, as the markers show: hold tighter"),
+        (slips, Zone.UNCERTAIN, "cannot tell: the markers show a slip, the margin does not"),
+        (reading.margin is None, Zone.NONE, NO_NETWORK),
+        (reading.low is None, Zone.UNCERTAIN, "cannot tell: the network was never calibrated, and gives no interval"),
+        ((reading.risk or 0) > _DOUBT, Zone.UNCERTAIN, "cannot tell: the margin is more likely wrong than right"),
+        (True, zone, _ADVICE[zone]),
+    )
+    zone, advice = next((judged, words) for applies, judged, words in rules if applies)
     margin = interval = ""
     if reading.margin is not None:
         margin = f"{100 * reading.margin:.0f} %"
@@ -248,21 +259,6 @@ def _zone(low: float, high: float) -> Zone:
     if high > most:
         return Zone.ABOVE if low >= most else Zone.NOT_BELOW
     return Zone.WITHIN
-
-
-def _judge(reading: Reading) -> tuple[Zone, str]:
-    """Zone of a reading, and what that means."""
-    zone, slips = _zone(*_ends(reading, risk=reading.risk)), reading.slip is SlipState.SLIP
-    rules = (
-        (reading.withheld is not None, Zone.NONE, f"no margin: {reading.withheld}"),
-        (slips and zone in {Zone.BELOW, Zone.UNCERTAIN}, Zone.BELOW, "slips, as the markers show: hold tighter"),
-        (slips, Zone.UNCERTAIN, "cannot tell: the markers show a slip, the margin does not"),
-        (reading.margin is None, Zone.NONE, NO_NETWORK),
-        (reading.low is None, Zone.UNCERTAIN, "cannot tell: the network was never calibrated, and gives no interval"),
-        ((reading.risk or 0) > _DOUBT, Zone.UNCERTAIN, "cannot tell: the margin is more likely wrong than right"),
-        (True, zone, _ADVICE[zone]),
-    )
-    return next((judged, advice) for applies, judged, advice in rules if applies)
 
 
 def _contact(reading: Reading, zone: Zone) -> ContactState:
