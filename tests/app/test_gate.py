@@ -14,7 +14,9 @@ async def _inside(scope, receive, send) -> None:
     await send({"type": "http.response.body", "body": b"inside"})
 
 
-def visit(token: str | None = TOKEN, *, kind: str = "http", query: str = "", **headers: str) -> list[dict]:
+def visit(
+    token: str | None = TOKEN, *, kind: str = "http", path: str = "/", query: str = "", **headers: str
+) -> list[dict]:
     """What the gate sends to a visitor."""
     sent: list[dict] = []
 
@@ -25,7 +27,7 @@ def visit(token: str | None = TOKEN, *, kind: str = "http", query: str = "", **h
         return {}
 
     pairs = [(name.encode(), value.encode()) for name, value in ({"host": "robot:8090"} | headers).items()]
-    scope = {"type": kind, "path": "/", "query_string": query.encode(), "headers": pairs}
+    scope = {"type": kind, "path": path, "query_string": query.encode(), "headers": pairs}
     asyncio.run(Gate(_inside, token=token, port=8090)(scope, receive, send))
     return sent
 
@@ -39,6 +41,15 @@ def test_the_token_of_the_address_becomes_a_cookie_that_lets_in():
     assert "SameSite=Strict" in cookie
     [start, body] = visit(cookie=cookie.partition(";")[0])
     assert (start["status"], body["body"]) == (200, b"inside")
+
+
+@pytest.mark.parametrize(
+    "path", ["//evil.example/", "/\\evil.example/", "https://evil.example/", "/%2Fevil.example", "x"]
+)
+@pytest.mark.parametrize("token", [TOKEN, ""])
+def test_no_path_leads_elsewhere(path: str, token: str):
+    [start, _] = visit(path=path, query=f"token={token}")
+    assert dict(start["headers"]).get(b"location", b"/") == b"/"
 
 
 @pytest.mark.parametrize(

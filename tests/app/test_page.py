@@ -13,6 +13,7 @@ from http.client import HTTPConnection
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from urllib.parse import urljoin, urlsplit
 
 import pytest
 from hostile_names import FILE_NAME, assert_inert, watch
@@ -20,6 +21,7 @@ from hostile_names import FILE_NAME, assert_inert, watch
 import sliplens as sl
 from sliplens.app import LivePage
 from sliplens.app.server import is_loopback
+from sliplens.live.reading import Reading, describe_reading
 from sliplens.recordings.check import check_dataset
 
 pytest.importorskip("nicegui", reason="the page needs NiceGUI (extra live)")
@@ -94,6 +96,14 @@ def test_more_pull_means_less_margin_and_more_press_means_more(seen):
     slide(seen, "Press", "PageDown", f"{MARGIN} > 80")  # takes the fingertip in hand; whatever the step, it is pressed
     slide(seen, "Pull", "PageUp", f"{MARGIN} < 20")
     slide(seen, "Pull", "PageDown", f"{MARGIN} > 80")
+
+
+def test_the_page_has_the_words_of_the_terminal(seen):
+    texts = "['.sl-number', '.sl-band', '.sl-words'].map((name) => document.querySelector(name).textContent)"
+    number, band, words = seen.evaluate(texts)  # of one message: nothing is drawn in between
+    margin, low, high = (int(text) / 100 for text in re.findall(r"\d+", number + band.partition(":")[2]))
+    reading = Reading(number=0, time_s=0.0, captured_s=0.0, margin=margin, low=low, high=high)
+    assert words.endswith(describe_reading(reading).advice)
 
 
 def test_the_picture_is_frozen_and_explained_while_the_margin_runs_on(seen):
@@ -225,6 +235,31 @@ def test_no_path_of_a_request_reaches_the_disk(page: Served, path: str):
     answer = connection.getresponse()
     assert answer.status in {400, 403, 404}
     assert b"root:" not in answer.read()
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "//evil.example/",
+        "//evil.example/?token=",
+        "/%2Fevil.example/",
+        "/%5Cevil.example/",
+        "https://evil.example/",
+        "/images//evil.example/",
+        "/images/trial/0/",
+        "/frames//evil.example/",
+        "/_nicegui//evil.example/",
+        "/_nicegui_ws//evil.example/",
+    ],
+)
+def test_no_answer_leads_to_another_site(page: Served, path: str):
+    own = page.address.removeprefix("http://").rstrip("/")
+    connection = HTTPConnection(own, timeout=60)
+    connection.request("GET", path)
+    answer = connection.getresponse()
+    place = urljoin(page.address, answer.getheader("location", "/"))
+    assert urlsplit(place).netloc == own
     connection.close()
 
 

@@ -121,12 +121,13 @@ def test_a_force_grows_as_fast_at_any_rate_of_commands():
 
 def test_laws_aim_at_the_margin_itself_as_soon_as_readings_know_the_friction():
     holder, now_s = holder_of("margin")
-    for friction, target in (("0.6", TOLD["target"]), (None, MarginLaw.target)):
+    read = MarginLaw.zero + (1 - MarginLaw.zero) * MarginLaw.target  # of which MarginLaw.target is left beyond r_0
+    for friction, aim in (("0.6", TOLD["target"]), (None, read)):
         holder.hear(told(0.7, friction=friction), taken_s=now_s)
-        assert f"aims at {target:.0%}" in holder.answer(now_s, 2.0).why
+        assert f"aims at a margin of {100 * aim:.0f} %" in holder.answer(now_s, 2.0).why
     holder.hear(told(None, friction=None), taken_s=now_s)  # withheld, which says nothing of the friction
     holder.hear(told(0.7, friction="0.6"), taken_s=now_s)
-    assert f"aims at {TOLD['target']:.0%}" in holder.answer(now_s, 2.0).why
+    assert f"aims at a margin of {100 * TOLD['target']:.0f} %" in holder.answer(now_s, 2.0).why
 
 
 def test_what_a_slip_teaches_of_the_friction_makes_no_law_forget_the_slip():
@@ -199,7 +200,7 @@ def test_a_gripper_that_misbehaves_holds_a_cup_by_what_is_read_of_its_frames(gri
     assert held is not None
     assert isinstance(hold, Hold)
     assert hold.ended == "source"
-    assert "acts on a margin" in capsys.readouterr().out
+    assert "aims at a margin" in capsys.readouterr().out
     assert held.phase in {"lifting", "holding"}
     assert held.slip_m < 2e-3
     assert held.controller == "outside"

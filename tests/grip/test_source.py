@@ -51,7 +51,7 @@ def test_it_lifts_holds_at_the_margin_aimed_at_and_answers_more_weight(source: G
         aimed = max(held.least_force_n / (1 - MarginLaw.target), MarginLaw.least_n)
         assert held.force_n == pytest.approx(aimed, rel=0.08)
     assert heavy[-1].slip_m < 1e-3
-    assert "acts on a margin of" in heavy[-1].why
+    assert "aims at a margin" in heavy[-1].why
 
 
 def test_it_is_careful_where_it_hears_nothing(source: GripSource):

@@ -25,7 +25,7 @@ from sliplens.files import to_builtins
 from sliplens.grip.source import GripSource, Held
 from sliplens.images import encode_jpeg
 from sliplens.live.loop import LiveReader
-from sliplens.live.reading import LiveFrame, Reading
+from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
 from sliplens.live.recorder import RecordingState
 from sliplens.live.sinks import SinkState
 from sliplens.models.checkpoint import Run
@@ -139,6 +139,8 @@ class Update:
     now_s: float
     """When it was made, as `time.monotonic` counts."""
     reading: Reading | None
+    words: ReadingWords | None
+    """The reading in words, as the terminal has them."""
     held: Held | None
     """What a simulated gripper does, and why."""
     points: tuple[Point, ...]
@@ -156,8 +158,8 @@ class Update:
     sinks: tuple[SinkState, ...]
     troubles: tuple[str, ...]
     """What the network was not made for, and what has ended beside the reading, with the cure."""
-    frozen: Reading | None
-    """Reading of the picture, where it is frozen."""
+    frozen: str | None
+    """Frame and reading of the picture in words, where it is frozen."""
     has_map: bool
     """Whether a map lies over the picture: this one, or the one sent before."""
     picture: PictureFacts | None
@@ -305,7 +307,7 @@ class Feed:
         except Exception as error:  # whatever it was: who looks must not take the last margin for a new one
             self.ended = str(error) or type(error).__name__
         if self.reading is not None:
-            self.reading = replace(self.reading, margin=None, low=None, high=None, withheld=self.ended)
+            self.reading = replace(self.reading, margin=None, low=None, high=None, slip=None, withheld=self.ended)
         self._wake()
 
     @property
@@ -510,6 +512,7 @@ class Viewer:
             serial=self._serial,
             now_s=time.monotonic(),
             reading=feed.reading,
+            words=None if feed.reading is None else describe_reading(feed.reading),
             held=feed.held,
             points=points,
             rate_hz=feed.rate_hz,
@@ -520,7 +523,7 @@ class Viewer:
             recording=None if (recorder := reader.recorder) is None else recorder.state,
             sinks=tuple(sender.state for sender in reader.senders),
             troubles=(*reader.doubts, *reader.troubles),
-            frozen=None if self.frozen is None else self.frozen.reading,
+            frozen=None if self.frozen is None else _describe_picture(self.frozen),
             has_map=overlay is not None,
             picture=_picture_facts(picture, arrows=self.shows_arrows) if picture is not None and jpeg else None,
             picture_bytes=len(jpeg),
@@ -534,6 +537,10 @@ class Viewer:
         self._told_s = points[-1].at_s if points else self._told_s
         header = msgspec.json.encode(to_builtins(update))
         return b"".join([len(header).to_bytes(4, "little"), header, jpeg, cells])
+
+
+def _describe_picture(picture: Picture) -> str:
+    return f"frame {picture.frame.number}, {describe_reading(picture.reading)}"
 
 
 def _picture_facts(picture: Picture, *, arrows: bool) -> PictureFacts:

@@ -7,6 +7,8 @@
 const QUIET_MS = 3000; // without a message, after which nothing shown can be believed
 const RETRY_MS = 1000;
 const TOLD_MS = 200; // between two drawings of chart, lamps and facts: numbers that change faster nobody reads
+// Zones of sliplens/live/reading.py, each with a sign beside its colour.
+const SIGNS = { none: "", below: "▼", uncertain: "?", within: "●", "not below": "●", above: "▲" };
 
 export default {
   template: `
@@ -60,7 +62,6 @@ export default {
     raises: String,
     methods: Object,
     recommended: String,
-    noNetwork: String,
     grips: Boolean,
   },
   mounted() {
@@ -322,32 +323,23 @@ export default {
       context.fillText(note, right, 4);
     },
     tellMargin() {
-      const { reading, ended, waiting } = this.update;
+      const { reading, words: said, ended, waiting } = this.update;
       const { number, words, band, pointer, interval } = this.$refs;
       if (!reading) return this.withdraw(ended ?? "waiting for the first frame");
-      const margin = reading.margin;
-      if (margin === null) {
-        this.withdraw(reading.withheld ?? this.noNetwork);
+      if (!said.margin) {
+        this.withdraw(said.advice, said.zone);
       } else {
-        const [least, most] = this.target;
-        const state = margin < least ? "low" : margin > most ? "high" : "in";
-        number.textContent = `${Math.round(100 * margin)} %`;
-        this.$el.dataset.state = state;
-        words.textContent = {
-          low: "▼ close to slipping: hold tighter",
-          in: "● in the target zone",
-          high: "▲ holds tighter than it needs to",
-        }[state];
-        pointer.setAttribute("x", Math.max(0, Math.min(99, 100 * margin - 0.5)));
+        number.textContent = said.margin;
+        this.$el.dataset.zone = said.zone;
+        words.textContent = `${SIGNS[said.zone]} ${said.advice}`;
+        pointer.setAttribute("x", Math.max(0, Math.min(99, 100 * reading.margin - 0.5)));
         pointer.style.display = "";
-        const known = reading.low !== null && reading.high !== null;
-        interval.setAttribute("x", known ? 100 * reading.low : 0);
-        interval.setAttribute("width", known ? 100 * (reading.high - reading.low) : 0);
-        band.textContent = known
-          ? `true margin with 90 % confidence: ${Math.round(100 * reading.low)} to ${Math.round(100 * reading.high)} %`
-          : "no interval: the network was not calibrated";
+        const calibrated = Boolean(said.interval);
+        interval.setAttribute("x", calibrated ? 100 * reading.low : 0);
+        interval.setAttribute("width", calibrated ? 100 * (reading.high - reading.low) : 0);
+        band.textContent = calibrated ? `true margin with 90 % confidence: ${said.interval}` : "";
+        if (reading.lag_s) band.textContent += ` (smoothed: ${Math.round(1000 * reading.lag_s)} ms late)`;
       }
-      if (reading.lag_s) band.textContent += `, smoothed: ${Math.round(1000 * reading.lag_s)} ms late`;
       this.say();
       this.$refs.caption.textContent = this.describePicture(waiting);
       const map = this.mapFacts;
@@ -357,15 +349,12 @@ export default {
     describePicture(waiting) {
       const { frozen } = this.update, map = this.mapFacts;
       const parts = [];
-      if (frozen) {
-        const margin = frozen.margin === null ? "margin withheld" : `margin ${Math.round(100 * frozen.margin)} %`;
-        parts.push(`❄ frozen: frame ${frozen.number}, ${margin}`);
-      }
+      if (frozen) parts.push(`❄ frozen: ${frozen}`);
       if (map) {
-        const points = (value) => `${Math.round(100 * value)} %`;
-        if (map.alike) parts.push(`nothing to explain: ${points(map.prediction)}, as untouched`);
+        // the margin itself stands above, and of a frozen picture before this: not a second time, of another frame
+        if (map.alike) parts.push("nothing to explain: as untouched");
         else parts.push(
-          `why ${points(map.prediction)} rather than ${points(map.reference_prediction)} untouched: ` +
+          `why not ${Math.round(100 * map.reference_prediction)} %, as untouched: ` +
             `${this.methods[map.method] ?? map.method} of frame ${map.number}`,
           ...(frozen
             ? map.warnings.map((warning) => `▲ ${warning}`)
@@ -375,13 +364,13 @@ export default {
       if (waiting) parts.push(`⏳ ${waiting}`);
       return parts.join(" · ");
     },
-    withdraw(why) {
+    withdraw(why, zone = "none") {
       const { number, words, band, pointer, interval } = this.$refs;
       if (!number) return;
       number.textContent = "–";
-      words.textContent = why;
+      words.textContent = `${SIGNS[zone]} ${why}`.trim();
       band.textContent = "";
-      this.$el.dataset.state = "none";
+      this.$el.dataset.zone = zone;
       pointer.style.display = "none";
       interval.setAttribute("width", 0);
       this.say();
@@ -398,7 +387,7 @@ export default {
       const { reading } = this.update;
       const lamps = [];
       if (reading?.slip) {
-        const state = { slip: "bad", sticking: "good" }[reading.slip] ?? "unknown";
+        const state = { slip: "bad", "no full slip": "good" }[reading.slip] ?? "unknown";
         lamps.push({ name: "slip", state, value: reading.slip, sentence: `the markers tell: ${reading.slip}` });
       }
       for (const { name, value, limit, ok, sentence } of reading?.health ?? []) {
@@ -428,7 +417,7 @@ export default {
       else if (box.firstChild.nodeType === Node.TEXT_NODE) box.firstChild.remove();
     },
     tellFacts() {
-      const { reading, rate_hz, drawn_ms, viewers, recording, ended, sinks, troubles } = this.update;
+      const { reading, words, rate_hz, drawn_ms, viewers, recording, ended, sinks, troubles } = this.update;
       const ms = (value) => (value === null || value === undefined ? "–" : `${Math.round(value)} ms`);
       const latency = reading?.latency ?? {};
       const rows = {
@@ -439,7 +428,7 @@ export default {
         ...(reading?.friction ? { friction: `taken for ${reading.friction}` } : {}),
         ...(reading?.sequence ? { "read in order": "earlier frames of the contact count" } : {}),
         dropped: `${reading?.dropped ?? 0} frames`,
-        contact: `${reading?.contact_state ?? "unknown"}`,
+        contact: words?.contact ?? "unknown",
         viewers: `${viewers}`,
         ...(sinks.length ? { sent: sinks.map(({ name, sent, lost }) => `${name} ${sent}, ${lost} lost`).join("; ") } : {}),
       };

@@ -14,7 +14,7 @@ from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
 from sliplens.grip.controllers import CONTROLLERS
 from sliplens.grip.source import GripSource
-from sliplens.live.reading import NO_NETWORK
+from sliplens.live.reading import NO_NETWORK, TARGET
 from sliplens.live.sources import SimulatedSource
 from sliplens.plots.saliency import LOWERS, RAISES
 from sliplens.plots.style import BLUE, METHOD_NAMES
@@ -22,8 +22,6 @@ from sliplens.plots.style import BLUE, METHOD_NAMES
 if TYPE_CHECKING:
     from sliplens.app.server import LivePage
 
-TARGET = 0.2, 0.4
-"""Margins that people keep when they hold something."""
 _MOST_PRESS_N, _MOST_PULL_N = 3.0, 2.4
 _MOST_WATER_KG, _MOST_GRIP_PULL_N = 0.06, 0.6
 
@@ -41,7 +39,6 @@ class LiveView(ui.element, component="live_view.js"):
             "raises": RAISES,
             "methods": METHOD_NAMES,
             "recommended": RECOMMENDED_METHOD,
-            "no-network": NO_NETWORK,
             "grips": isinstance(page.reader.source, GripSource),
         })  # fmt: skip
 

@@ -15,7 +15,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, TypeVar
-from urllib.parse import parse_qs, quote
+from urllib.parse import parse_qs
 
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
@@ -32,7 +32,7 @@ _PORT = 8090
 _PATIENCE_S = 10.0
 _DAY_S = 24 * 3600
 _HOST = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[\w.-]+)(:\d+)?", re.ASCII)
-_MOST_BYTES = 2**18
+MOST_BYTES = 2**18
 """Of a message of a browser, and of what it posts."""
 _MESSAGES_A_SECOND = 200
 """Of a browser: it answers pictures, and tells where sliders are."""
@@ -233,18 +233,9 @@ def _serving(app: "ASGIApp", listening: socket.socket, page: Page) -> Iterator[N
     import nicegui  # noqa: PLC0415 (the extra)
     import uvicorn  # noqa: PLC0415 (comes with it)
 
-    config = uvicorn.Config(
-        app,
-        log_level="error",
-        access_log=False,
-        loop="asyncio",
-        lifespan="off",
-        ws="websockets-sansio",
-        ws_max_size=_MOST_BYTES,
-        ws_per_message_deflate=False,  # of a JPEG it leaves what it was
-        timeout_graceful_shutdown=1,
-    )
-    server = uvicorn.Server(config)
+    from sliplens.app.connections import server_config  # noqa: PLC0415 (needs it)
+
+    server = uvicorn.Server(server_config(app))
 
     async def serve() -> None:
         page.start(asyncio.get_running_loop())
@@ -297,21 +288,21 @@ def _listen(host: str, port: int | None) -> socket.socket:
     raise InputError(f"port {port} of {host} cannot be listened on ({reason}); name another with --port")
 
 
-class _Ration:
-    """Allowance that fills again with time: so many a second, and so many at once."""
+class Ration:
+    """Allowance that fills again with time: so much a second, and so much at once."""
 
     def __init__(self, a_second: int, *, at_once: int) -> None:
         self._a_second, self._most = a_second, at_once
         self._left, self._seen_s = float(at_once), time.monotonic()
 
-    def take(self) -> bool:
-        """Take one, where one is left."""
+    def take(self, amount: int = 1) -> bool:
+        """Take an amount, where so much is left."""
         now_s = time.monotonic()
         self._left = min(self._most, self._left + (now_s - self._seen_s) * self._a_second)
         self._seen_s = now_s
-        if self._left < 1:
+        if self._left < amount:
             return False
-        self._left -= 1
+        self._left -= amount
         return True
 
 
@@ -326,10 +317,10 @@ class Gate:
 
     def __init__(self, app: "ASGIApp", *, token: str | None, port: int) -> None:
         self.app, self._token, self._cookie = app, token, f"sliplens-{port}"
-        self._pages = _Ration(_PAGES_A_SECOND, at_once=_PAGES_AT_ONCE)
+        self._pages = Ration(_PAGES_A_SECOND, at_once=_PAGES_AT_ONCE)
 
     async def __call__(self, scope: "Scope", receive: "Receive", send: "Send") -> None:
-        """Pass on, send to the same address without its token, or refuse."""
+        """Pass on, send to the page without the token in its address, or refuse."""
         if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
@@ -345,7 +336,8 @@ class Gate:
                 await self.app(scope, _rationed(receive, send), send)
         elif scope["type"] == "http" and self._shows(_token_of(scope)):
             kept = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict; Max-Age={_DAY_S}"
-            await _answer(send, 303, [("location", quote(scope["path"])), ("set-cookie", kept)], "")
+            # whatever the path was: of //elsewhere/ a browser makes another host
+            await _answer(send, 303, [("location", "/"), ("set-cookie", kept)], "")
         else:
             await _refuse(scope, send, 401, "open the whole address that sliplens printed, with its token")
 
@@ -382,7 +374,7 @@ def _token_of(scope: "Scope") -> str:
 
 def _rationed(receive: "Receive", send: "Send") -> "Receive":
     """Take no long messages, nor many: whoever sends them is gone, as far as the page knows."""
-    ration, bytes_left = _Ration(_MESSAGES_A_SECOND, at_once=2 * _MESSAGES_A_SECOND), _MOST_BYTES
+    ration, bytes_left = Ration(_MESSAGES_A_SECOND, at_once=2 * _MESSAGES_A_SECOND), MOST_BYTES
 
     async def received() -> "Message":
         nonlocal bytes_left
@@ -392,7 +384,7 @@ def _rationed(receive: "Receive", send: "Send") -> "Receive":
             return message if bytes_left >= 0 else {"type": "http.disconnect"}
         if message["type"] == "websocket.receive":
             size = len(message.get("bytes") or b"") + len(message.get("text") or "")
-            if size > _MOST_BYTES or not ration.take():
+            if size > MOST_BYTES or not ration.take():
                 await send({"type": "websocket.close", "code": 1008, "reason": "too much was sent"})
                 return {"type": "websocket.disconnect", "code": 1008}
         return message

@@ -133,6 +133,11 @@ class MarginGrip(ABC):
     ) -> Float[np.ndarray, " episodes"]:
         """Grip force in newtons that a margin, a share, asks for."""
 
+    @property
+    def aim(self) -> Float[np.ndarray, " episodes"]:
+        """Margin read at which Gamma is the target: r_0 + (1 - r_0) Gamma*, a share."""
+        return self._zero + (1 - self._zero) * self.target
+
     def margin_of(self, seen: Observation) -> Float[np.ndarray, " episodes"]:
         """Margin to act on, a share; NaN where no finger reads."""
         margin = seen.margin - self.caution * (seen.margin - seen.low)
@@ -429,8 +434,8 @@ class Holder:
         if blind:
             return f"no margin is read: {does}"
         if isinstance(self._controller, MarginGrip):
-            acted, target = float(self._controller.acted[0]), self._controller.target
-            return f"acts on a margin of {max(acted, 0):.0%}, and aims at {target:.0%}: {does}"
+            aim = 100 * float(self._controller.aim[0])
+            return f"aims at a margin of {aim:.0f} %: {does}"
         return does
 
 

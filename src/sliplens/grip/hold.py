@@ -21,7 +21,7 @@ from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.source import GripSource, open_grip, usual_network
 from sliplens.live.contract import LiveSource, Pace, SourceOptions
 from sliplens.live.loop import LiveReader
-from sliplens.live.reading import LiveFrame, Reading
+from sliplens.live.reading import LiveFrame, Reading, describe_reading
 from sliplens.models.checkpoint import Run
 from sliplens.results.grip import Hold, HoldSteps
 
@@ -57,11 +57,19 @@ class HoldStep:
     """Newest reading of each fingertip; None before the first."""
 
     def __str__(self) -> str:
-        why = next((one.withheld for one in self.readings if one and one.withheld), None)
-        withheld = f" ({why})" if why and math.isnan(self.margin) else ""
-        return (
-            f"{self.time_s:8.2f} s  {self.command_n:5.2f} N told, {self.force_n:5.2f} N measured  {self.why}{withheld}"
-        )
+        several, blind = len(self.readings) > 1, math.isnan(self.margin)
+        words = [
+            (f"fingertip {number}: " if several else "")
+            + (
+                "the newest margin is too old"
+                if blind and reading.margin is not None
+                else str(describe_reading(reading))
+            )
+            for number, reading in enumerate(self.readings, start=1)
+            if reading is not None
+        ]
+        told = f"{self.time_s:8.2f} s  {self.command_n:5.2f} N told, {self.force_n:5.2f} N measured  {self.why}"
+        return "; ".join([told, *words])
 
 
 def hold_grip(

@@ -89,7 +89,8 @@ class SlipState(StrEnum):
     """What the motion of the markers tells."""
 
     SLIP = "slip"
-    STICKING = "sticking"
+    STICKING = "no full slip"
+    """The contact as a whole does not slide; its rim may (incipient slip)."""
     CANNOT_TELL = "cannot tell"
 
 
@@ -158,12 +159,122 @@ class Reading:
     """Where the source knows it, to compare with."""
 
     def __str__(self) -> str:
-        told = NO_NETWORK if self.withheld is None else f"no margin: {self.withheld}"
-        if self.margin is not None:
-            told = f"margin {self.margin:4.0%}"
-            if self.low is not None and self.high is not None:
-                told += f" ({self.low:.0%} to {self.high:.0%})"
-        return f"{self.time_s:8.2f} s  {told}  {self.latency.total_ms:.0f} ms, {self.dropped} dropped"
+        words = describe_reading(self)
+        return f"{self.time_s:8.2f} s  {words}; {self.latency.total_ms:.0f} ms, {self.dropped} dropped"
 
 
-__all__ = ["Check", "Latency", "LiveFrame", "MarkerReading", "Reading", "SlipState"]
+TARGET = 0.2, 0.4
+"""Margins that people keep when they hold something."""
+_OFF, _RISK, _DOUBT = 0.2, 0.1, 0.5
+"""Error whose chance `Reading.risk` is. Beyond the first limit, the chance that the interval leaves for margins outside
+it, the margin is uncertain by that error at least; beyond the second it is more likely wrong than right."""
+
+
+class Zone(StrEnum):
+    """Where the interval of a margin lies against `TARGET`."""
+
+    NONE = "none"
+    BELOW = "below"
+    UNCERTAIN = "uncertain"
+    WITHIN = "within"
+    NOT_BELOW = "not below"
+    ABOVE = "above"
+
+
+_ADVICE = {
+    Zone.BELOW: "close to slipping: hold tighter",
+    Zone.UNCERTAIN: "cannot tell: may be close to slipping",
+    Zone.WITHIN: "in the target zone",
+    Zone.NOT_BELOW: "not close to slipping",
+    Zone.ABOVE: "holds tighter than it needs to",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadingWords:
+    """A reading in words, the same on every screen and in every message."""
+
+    zone: Zone
+    advice: str
+    """What the reading means for a grip, or why there is no margin."""
+    margin: str
+    """Margin in percent; empty where there is none."""
+    interval: str
+    """Both ends of the interval in percent, and the risk where it is more than the interval says; empty without."""
+    contact: ContactState
+    """State of the contact, as far as interval and markers agree on it; else unknown."""
+
+    def __str__(self) -> str:
+        interval = f" ({self.interval})" if self.interval else ""
+        return f"margin {self.margin}{interval}; {self.advice}" if self.margin else self.advice
+
+
+def describe_reading(reading: Reading) -> ReadingWords:
+    """Describe a reading in words that follow its interval, risk and markers, not the margin alone.
+
+    Examples
+    --------
+    >>> from sliplens.live.reading import Reading, describe_reading
+    >>> reading = Reading(number=0, time_s=0.0, captured_s=0.0, margin=0.55, low=0.15, high=0.9)
+    >>> print(describe_reading(reading))
+    margin 55 % (15 to 90 %); cannot tell: may be close to slipping
+    """
+    zone, slips = _zone(*_ends(reading, risk=reading.risk)), reading.slip is SlipState.SLIP
+    rules = (
+        (reading.withheld is not None, Zone.NONE, f"no margin: {reading.withheld}"),
+        (slips and zone in {Zone.BELOW, Zone.UNCERTAIN}, Zone.BELOW, "slips, as the markers show: hold tighter"),
+        (slips, Zone.UNCERTAIN, "cannot tell: the markers show a slip, the margin does not"),
+        (reading.margin is None, Zone.NONE, NO_NETWORK),
+        (reading.low is None, Zone.UNCERTAIN, "cannot tell: the network was never calibrated, and gives no interval"),
+        ((reading.risk or 0) > _DOUBT, Zone.UNCERTAIN, "cannot tell: the margin is more likely wrong than right"),
+        (True, zone, _ADVICE[zone]),
+    )
+    zone, advice = next((judged, words) for applies, judged, words in rules if applies)
+    margin = interval = ""
+    if reading.margin is not None:
+        margin = f"{100 * reading.margin:.0f} %"
+        if reading.low is not None and reading.high is not None:
+            low, high = _ends(reading, risk=None)
+            interval = f"{100 * low:.0f} to {100 * high:.0f} %"
+            if _zone(low, high) is not _zone(*_ends(reading, risk=reading.risk)):
+                interval += f", but {100 * _OFF:.0f} points off with a chance of {100 * (reading.risk or 0):.0f} %"
+    return ReadingWords(zone=zone, advice=advice, margin=margin, interval=interval, contact=_contact(reading, zone))
+
+
+def _ends(reading: Reading, *, risk: float | None) -> tuple[float, float]:
+    """Ends of the interval in whole percents, as they are shown; moved apart where the risk is more than they say."""
+    margin, low, high = reading.margin, reading.low, reading.high
+    if margin is None or low is None or high is None:
+        return 0.0, 1.0
+    if risk is not None and risk > _RISK:
+        low, high = min(low, max(margin - _OFF, 0.0)), max(high, min(margin + _OFF, 1.0))
+    return round(low, 2), round(high, 2)
+
+
+def _zone(low: float, high: float) -> Zone:
+    """Zone of an interval."""
+    least, most = TARGET
+    if low < least:
+        return Zone.BELOW if high < least else Zone.UNCERTAIN
+    if high > most:
+        return Zone.ABOVE if low >= most else Zone.NOT_BELOW
+    return Zone.WITHIN
+
+
+def _contact(reading: Reading, zone: Zone) -> ContactState:
+    """State of the contact as far as interval and markers agree."""
+    low, high = _ends(reading, risk=reading.risk)
+    touches = reading.margin is not None or (reading.markers is not None and reading.markers.contact)
+    if reading.contact_state == ContactState.NO_CONTACT:
+        return ContactState.NO_CONTACT
+    if reading.withheld is not None or not touches:
+        return ContactState.UNKNOWN
+    if reading.slip is SlipState.SLIP:
+        return ContactState.UNKNOWN if zone is Zone.UNCERTAIN else ContactState.FULL_SLIP
+    return ContactState.INCIPIENT_SLIP if low > 0 and high < 1 else ContactState.CONTACT
+
+
+__all__ = [
+    "Check", "Latency", "LiveFrame", "MarkerReading", "Reading", "ReadingWords", "SlipState", "Zone",
+    "describe_reading",
+]  # fmt: skip

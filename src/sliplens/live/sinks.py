@@ -22,7 +22,7 @@ from sliplens.extras import Table, require_packages
 from sliplens.files import to_builtins
 from sliplens.images import encode_jpeg
 from sliplens.live.mailbox import Outlet
-from sliplens.live.reading import LiveFrame, Reading
+from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Frame
 
@@ -41,8 +41,8 @@ class Sink(Protocol):
 
 
 def encode_reading(reading: Reading) -> bytes:
-    """One line of JSON; what is not known is null."""
-    return msgspec.json.encode(to_builtins(reading))
+    """One line of JSON: the reading, and its `words`; what is not known is null."""
+    return msgspec.json.encode({**to_builtins(reading), "words": to_builtins(describe_reading(reading))})
 
 
 class JsonLines:
@@ -124,8 +124,9 @@ _FOXGLOVE_PORT = 8765
 
 def reading_schema() -> dict[str, Any]:
     """JSON schema of a reading, an object at its root as Foxglove wants it."""
-    (_,), parts = msgspec.json.schema_components([Reading], ref_template="#/$defs/{name}")
-    return {**parts.pop("Reading"), "$defs": parts}
+    (_, words), parts = msgspec.json.schema_components([Reading, ReadingWords], ref_template="#/$defs/{name}")
+    schema = parts.pop("Reading")
+    return {**schema, "properties": {**schema["properties"], "words": words}, "$defs": parts}
 
 
 class FoxgloveTopics:
@@ -217,7 +218,9 @@ def _new_file(address: str, *, kind: str) -> Path:
 
 
 class RerunFile:
-    """Readings and frames for the Rerun viewer, in a file: `margin`, `interval/low`, `interval/high` and `frame`.
+    """Readings and frames for the Rerun viewer, in a file.
+
+    Its entities are `margin`, `interval/low`, `interval/high`, `words` and `frame`.
 
     Parameters
     ----------
@@ -244,8 +247,7 @@ class RerunFile:
         ):  # fmt: skip
             # what is withheld ends the line, and is no longer shown as the newest
             stream.log(entity, rerun.Clear(recursive=False) if value is None else rerun.Scalars(value))
-        if reading.withheld is not None:
-            stream.log("withheld", rerun.TextLog(reading.withheld))
+        stream.log("words", rerun.TextLog(str(describe_reading(reading))))
         if image is not None:
             stream.log("frame", rerun.Image(image).compress(jpeg_quality=_QUALITY))
 
