@@ -342,6 +342,14 @@ class Ratio:
         return np.maximum(low - offset, 0), np.maximum(high + offset, 0)
 
 
+STRANGE = 0.01
+"""Share of the validation frames (`Estimate.known`) below which a frame is too unlike them for its margin to count."""
+STRANGE_REASON = (
+    f"strange to the network (known below {100 * STRANGE:g} %); use frames of the sensor it was trained on, or train "
+    "it on frames of this one"
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
     """Safety margins of some frames, and how sure they are."""
@@ -381,6 +389,14 @@ class Estimate:
         if self.probabilities is None or self.edges is None:
             return None
         return spread(self.margin, self.probabilities, self.edges)
+
+    def withheld(self, touches: Bool[np.ndarray, " frames"]) -> list[str | None]:
+        """Return why the margin of each frame is not to be believed, with the cure; None where it is.
+
+        `touches`: whether anything touches the sensor. An untouched one shows nothing but noise, which may be strange.
+        """
+        strange = np.zeros(len(self.margin), bool) if self.known is None else touches & (self.known < STRANGE)
+        return [STRANGE_REASON if each else None for each in strange]
 
     def beyond(self, error: float) -> Float[np.ndarray, " frames"]:
         """What the network gives for an error above a number of margin units, from 0 to 1; not calibrated.
