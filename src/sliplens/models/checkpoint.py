@@ -132,12 +132,6 @@ class Run:
         `reference`: the sensor untouched; None for frames that were compared before, or that need not be. Frames of
         another size than the network's sensor has raise `ImageError`, and so do those that are no 8-bit images.
         """
-        for images in (frames, reference):
-            if images is not None and images.dtype != np.uint8:
-                raise ImageError(
-                    f"images are {images.dtype}, networks read uint8 RGB; if they are in [0, 1], multiply them by 255, "
-                    "round, and convert them"
-                )
         self.require_frame_size(frames.shape[1:3])
         size = self.manifest.image_size
         if reference is None and self.encoding.beside:
