@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
+from sliplens.images import require_rgb
 from sliplens.live.contract import LiveSource
 from sliplens.live.health import OFF, HealthMonitor, margin_risk
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
@@ -177,6 +178,7 @@ class FrameReader:
         if reference is None:
             self._taker = _ReferenceTaker()
             return
+        require_rgb(reference, what="levels of the reference")
         if reference.shape[:2] != self._size:
             raise ImageError(
                 f"the reference has {_in_pixels(reference.shape[:2])} pixels, the frames of {self.source.name} have "
@@ -201,6 +203,7 @@ class FrameReader:
 
     def read(self, frame: LiveFrame) -> Reading:
         """Read the next frame."""
+        require_rgb(frame.image, what=f"levels of frame {frame.number} of {self.source.name}")
         last, self._last = self._last, frame
         self._dropped += 0 if last is None else max(0, frame.number - last.number - 1)
         begin = Reading(

@@ -132,12 +132,6 @@ class Run:
         `reference`: the sensor untouched; None for frames that were compared before, or that need not be. Frames of
         another size than the network's sensor has raise `ImageError`, and so do those that are no 8-bit images.
         """
-        for images in (frames, reference):
-            if images is not None and images.dtype != np.uint8:
-                raise ImageError(
-                    f"images are {images.dtype}, networks read uint8 RGB; if they are in [0, 1], multiply them by 255, "
-                    "round, and convert them"
-                )
         self.require_frame_size(frames.shape[1:3])
         size = self.manifest.image_size
         if reference is None and self.encoding.beside:
@@ -342,6 +336,14 @@ class Ratio:
         return np.maximum(low - offset, 0), np.maximum(high + offset, 0)
 
 
+STRANGE = 0.01
+"""Share of the validation frames (`Estimate.known`) below which a frame is too unlike them for its margin to count."""
+STRANGE_REASON = (
+    f"strange to the network (known below {100 * STRANGE:g} %); use frames of the sensor it was trained on, or train "
+    "it on frames of this one"
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
     """Safety margins of some frames, and how sure they are."""
@@ -381,6 +383,14 @@ class Estimate:
         if self.probabilities is None or self.edges is None:
             return None
         return spread(self.margin, self.probabilities, self.edges)
+
+    def withheld(self, touches: Bool[np.ndarray, " frames"]) -> list[str | None]:
+        """Return why the margin of each frame is not to be believed, with the cure; None where it is.
+
+        `touches`: whether anything touches the sensor. An untouched one shows nothing but noise, which may be strange.
+        """
+        strange = np.zeros(len(self.margin), bool) if self.known is None else touches & (self.known < STRANGE)
+        return [STRANGE_REASON if each else None for each in strange]
 
     def beyond(self, error: float) -> Float[np.ndarray, " frames"]:
         """What the network gives for an error above a number of margin units, from 0 to 1; not calibrated.

@@ -1,6 +1,6 @@
 """Safety margins of any number of frames, from any source, in the memory of a few batches."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -34,7 +34,6 @@ from sliplens.shards import LONGEST, MakePart, Work, make_table
 
 LEVEL = 0.9
 """Confidence of the intervals."""
-_STRANGE = 0.01
 _COLUMNS = {
     "trial": pa.string(),
     "frame": pa.int64(),
@@ -49,6 +48,7 @@ _COLUMNS = {
     "low_90": pa.float64(),
     "high_90": pa.float64(),
     "known": pa.float64(),
+    "withheld": pa.string(),
     "traction_ratio": pa.float64(),
     "traction_ratio_sigma": pa.float64(),
 }
@@ -63,15 +63,18 @@ class TrialMargins:
 
     trial: str
     margin: Float[np.ndarray, " frames"]
-    """In margin units, frame by frame; not clipped to [0, 1]."""
-    lowest: int
-    """Frame of the lowest margin, of those that touch; of all where none does, or nobody knows."""
+    """In margin units, frame by frame; not clipped to [0, 1], NaN where it is withheld."""
+    lowest: int | None
+    """Frame of the lowest margin, of those that touch; of all where none does, or nobody knows. None where the margin
+    of all of them is withheld."""
+    withheld: int
+    """Number of frames whose margin is withheld."""
     touching: int | None
     """How many frames touch; None where nobody knows."""
     time_s: float | None
     """Time of that frame; None where it is not known."""
     interval: tuple[float, float] | None
-    """Ends of its 90 % interval; None for a network that was never calibrated."""
+    """Ends of its 90 % interval; None for a network that was never calibrated, and without such a frame."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -99,10 +102,13 @@ class Predictions:
         Columns are `trial`, `frame`, `file` (of a folder of images), `time_s`, `safety_margin` (where the source has
         labels), `normal_force_n` and `tangential_force_n` (where it has forces), `touches` (whether anything does, by
         the labels, else by how far the picture is from that of the untouched sensor), `prediction`, `sigma`, `low_90`
-        and `high_90`, `known` (as in `Estimate`) of a network that tells it, and `traction_ratio` and
+        and `high_90`, `known` (as in `Estimate`) of a network that tells it, `withheld`, and `traction_ratio` and
         `traction_ratio_sigma` of one that tells F_t / F_n. What is not known is null: the time of images without a
         rate, sigma of a network that answers with one number, intervals of one that was never calibrated. Predictions
         are not clipped to [0, 1].
+
+        `withheld` says why a frame is not to be believed, with the cure (`Estimate.withheld`), and is null elsewhere.
+        Where it is set, whatever the network predicts is null: prediction, sigma, interval and traction ratio.
         """
         if self.rows is not None:
             return self.rows
@@ -122,13 +128,9 @@ class Predictions:
         return self.frame().__arrow_c_stream__(requested_schema)
 
     @property
-    def strange(self) -> int:
-        """Frames that touch and are like at most 1 in 100 of those that the network was validated on (`known`)."""
-        table = self.frame()
-        if "known" not in table.column_names:
-            return 0
-        touches = table["touches"].to_numpy() if "touches" in table.column_names else True
-        return int((touches & (table["known"].to_numpy() < _STRANGE)).sum())
+    def withheld(self) -> dict[str, int]:
+        """Number of frames whose margin is withheld, by reason."""
+        return dict(Counter(reason for reason in self.frame()["withheld"].to_pylist() if reason is not None))
 
     def trials(self) -> list[TrialMargins]:
         """Course and lowest margin of every trial."""
@@ -140,6 +142,7 @@ class Predictions:
         }
         known = "touches" in table.column_names
         touches = table["touches"].to_numpy(zero_copy_only=False).astype(bool) if known else np.ones(len(table), bool)
+        believed = table["withheld"].is_null().to_numpy(zero_copy_only=False)
         # the rows of a trial stand together
         bounds = dict.fromkeys([0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)])
         found = []
@@ -147,13 +150,15 @@ class Predictions:
             own = {name: values[first:end] for name, values in numbers.items()}
             touching = touches[first:end]
             # of an untouched sensor a difference image shows noise alone, brightened
-            lowest = int(np.where(touching | ~touching.any(), own["prediction"], np.inf).argmin())
-            at = {name: float(values[lowest]) for name, values in own.items()}
+            counted = np.where(touching | ~touching.any(), own["prediction"], np.nan)
+            lowest = int(np.nanargmin(counted)) if np.isfinite(counted).any() else None
+            at = {name: np.nan if lowest is None else float(values[lowest]) for name, values in own.items()}
             found.append(
                 TrialMargins(
                     trial=names[first],
                     margin=own["prediction"],
                     lowest=lowest,
+                    withheld=end - first - int(believed[first:end].sum()),
                     touching=int(touching.sum()) if known else None,
                     time_s=at["time_s"] if np.isfinite(at["time_s"]) else None,
                     interval=(at["low_90"], at["high_90"]) if np.isfinite(at["low_90"]) else None,
@@ -482,7 +487,9 @@ class _Reading(Work):
                 assert capture.time_s is not None  # `_require_order`
                 times = capture.time_s[first : first + len(touches)]
                 estimate = follower.update(estimate, times, np.array(touches))
-            for name, values in (_columns(estimate, capture, first) | {"touches": touches}).items():
+            withheld = estimate.withheld(np.array(touches))
+            columns = _columns(estimate, capture, first, withheld=withheld) | {"touches": touches}
+            for name, values in columns.items():
                 if name in rows:
                     rows[name].extend(values)
             on_progress(done := done + len(touches), count)
@@ -493,23 +500,31 @@ class _Reading(Work):
             yield rows
 
 
-def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, list]:
+def _columns(estimate: Estimate, trial: Capture, first: int, *, withheld: list[str | None]) -> dict[str, list]:
     count = len(estimate.margin)
     here, unknown = slice(first, first + count), [None] * count
     low, high = estimate.interval(LEVEL) or (None, None)
-    times, margins = (None if values is None else values[here] for values in (trial.time_s, trial.safety_margin))
     ratio = estimate.ratio
-    numbers = {"traction_ratio": None, "traction_ratio_sigma": None}
-    if ratio is not None:
-        numbers = {"traction_ratio": ratio.mean, "traction_ratio_sigma": ratio.sigma}
-    numbers |= {"time_s": times, "safety_margin": margins, "sigma": estimate.sigma, "low_90": low, "high_90": high}
+    predicted = {
+        "prediction": estimate.margin,
+        "sigma": estimate.sigma,
+        "low_90": low,
+        "high_90": high,
+        "traction_ratio": None if ratio is None else ratio.mean,
+        "traction_ratio_sigma": None if ratio is None else ratio.sigma,
+    }
+    believed = np.array([reason is None for reason in withheld])
+    numbers = {name: None if v is None else np.where(believed, v, np.nan) for name, v in predicted.items()}
+    labels = trial.labels
+    recorded = {"time_s": trial.time_s, "safety_margin": trial.safety_margin}
+    recorded |= {name: None if labels is None else getattr(labels, name) for name in _FORCES}
+    numbers |= {name: None if v is None else v[here] for name, v in recorded.items()}
     numbers["known"] = estimate.known
-    numbers |= {name: None if trial.labels is None else getattr(trial.labels, name)[here] for name in _FORCES}
     return {
         "trial": [trial.name] * count,
         "frame": list(range(first, first + count)),
         "file": list(trial.files[here]) if trial.files else unknown,
-        "prediction": estimate.margin.tolist(),
+        "withheld": withheld,
         # NaN as null: nothing is known
         **{name: unknown if v is None else pa.array(v, from_pandas=True).to_pylist() for name, v in numbers.items()},
     }
