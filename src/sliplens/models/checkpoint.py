@@ -342,6 +342,10 @@ class Ratio:
         return np.maximum(low - offset, 0), np.maximum(high + offset, 0)
 
 
+STRANGE = 0.01
+"""Share of the validation frames (`Estimate.known`) below which a frame is too unlike them for its margin to count."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
     """Safety margins of some frames, and how sure they are."""

@@ -17,7 +17,7 @@ from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_file, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
-from sliplens.models.checkpoint import Estimate, Run, open_run, sensor_kind
+from sliplens.models.checkpoint import STRANGE, Estimate, Run, open_run, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
 from sliplens.parts import require_new_table
@@ -34,7 +34,6 @@ from sliplens.shards import LONGEST, MakePart, Work, make_table
 
 LEVEL = 0.9
 """Confidence of the intervals."""
-_STRANGE = 0.01
 _COLUMNS = {
     "trial": pa.string(),
     "frame": pa.int64(),
@@ -128,7 +127,7 @@ class Predictions:
         if "known" not in table.column_names:
             return 0
         touches = table["touches"].to_numpy() if "touches" in table.column_names else True
-        return int((touches & (table["known"].to_numpy() < _STRANGE)).sum())
+        return int((touches & (table["known"].to_numpy() < STRANGE)).sum())
 
     def trials(self) -> list[TrialMargins]:
         """Course and lowest margin of every trial."""
