@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Event
 from typing import Protocol, runtime_checkable
@@ -15,7 +14,7 @@ from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.images import require_rgb
 from sliplens.live.contract import LiveSource
-from sliplens.live.health import OFF, HealthMonitor, margin_risk
+from sliplens.live.health import OFF, check_novelty, margin_risk
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run
@@ -127,7 +126,7 @@ class FrameReader:
         same_object: bool,
         sequence: bool,
         smoothing_s: float,
-        health: Callable[[Frame, Run | None], HealthWatch] | None,
+        health: Callable[[Frame], HealthWatch] | None,
         slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None,
     ) -> None:
         self.source, self.network = source, network
@@ -154,7 +153,6 @@ class FrameReader:
         self._tracker: Tracker | None = None
         self._smaller = 1
         self._taker: _ReferenceTaker | None = None
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="novelty")
         self._has_margin = False
         self._last: LiveFrame | None = None
         self._dropped = 0
@@ -185,10 +183,6 @@ class FrameReader:
                 f"{_in_pixels(self._size)}; name an image of this camera with --reference, or leave it out"
             )
         self._set_reference(reference)
-
-    def close(self) -> None:
-        """Read nothing more."""
-        self._beside.shutdown(wait=False, cancel_futures=True)
 
     def missing(self, why: str) -> Reading:
         """Reading where no frame came."""
@@ -230,7 +224,6 @@ class FrameReader:
         [(reading, withheld)] = checked or [self._check(begin, frame)]
         if self.network is None or withheld is not None:
             return self._withhold(reading, frame, withheld)
-        self._has_margin = True
         return self._estimate(reading, frame, answers or self._ask(frame))
 
     def _check(self, begin: Reading, frame: LiveFrame) -> tuple[Reading, str | None]:
@@ -288,6 +281,14 @@ class FrameReader:
         friction = self.learner.friction
         follower = self._follower if friction is None else None  # it looks for what is known then
         estimate = self.network.to_estimate(*answers.parts, friction=friction)
+        latency = replace(reading.latency, encode_ms=answers.encode_ms, network_ms=answers.network_ms)
+        reading = replace(reading, latency=latency)
+        novelty = None if self._health is None else check_novelty(estimate)
+        if novelty is not None:
+            reading = replace(reading, health=(*reading.health, novelty))
+            if not novelty.ok:
+                return self._withhold(reading, frame, novelty.sentence)
+        self._has_margin = True
         if follower is not None:
             estimate = follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
@@ -310,12 +311,7 @@ class FrameReader:
             risk=margin_risk(reading.health, float(estimate.beyond(OFF)[0])) if reading.health else None,
             contact_state=state,
             lag_s=self._smooth.time_constant_s,
-            latency=replace(
-                reading.latency,
-                encode_ms=answers.encode_ms,
-                network_ms=answers.network_ms,
-                total_ms=_since_ms(frame.captured_s),
-            ),
+            latency=replace(latency, total_ms=_since_ms(frame.captured_s)),
         )
 
     def _look_for_reference(self, frame: LiveFrame) -> None:
@@ -329,9 +325,7 @@ class FrameReader:
     def _set_reference(self, image: Frame) -> None:
         self.reference = image
         self.doubt = None if self.network is None else self.network.doubt_colour(image)
-        self._health = None if self._make_health is None else self._make_health(image, self.network)
-        if isinstance(self._health, HealthMonitor):
-            self._health.beside = self._beside
+        self._health = None if self._make_health is None else self._make_health(image)
         self._begin_anew()
 
     def _begin_anew(self) -> None:
