@@ -10,11 +10,12 @@ from scipy import fft
 from sliplens.images import shrink
 
 FULL_CIRCLE = (0.0, 360.0)
-"""Range of directions that leaves none out."""
+"""Range of directions that leaves none out. The first end of a range is from 0 to 360 degrees, the second at least the
+first: (345, 375) is from 345 on through 0 to 15."""
 TOLERANCE_DEG = 15.0
 """Angle beyond a range that still counts as inside. Up to 30 degrees from the middle of 75 to 105 the error of
 `chromatouch-pair` is that at the middle; it doubles at 60 (60 simulated trials pulled in every direction)."""
-LIMIT = 2.5
+DIRECTION_LIMIT = 2.5
 """Standard deviations beyond a range from which on a pull is outside. Of simulated frames (series `direction-choose`)
 with a press and no pull it leaves 1.4 % outside, of those pulled in range 0.1 %; of those pulled the other way with a
 margin under 0.3, 0.3 to 0.6 and 0.6 to 0.75 it finds 99, 91 and 81 %."""
@@ -78,6 +79,35 @@ class Shear:
         if beyond_deg <= 0:
             return 0.0
         return hypot(self.x_px, self.y_px) * sin(radians(min(beyond_deg, 90.0))) / self.sigma_px
+
+
+def enclosing_range(
+    directions_deg: Float[np.ndarray, " directions"], *, margin_deg: float = 0.0
+) -> tuple[float, float]:
+    """Find the smallest range that holds all of some directions, and widen it at both ends.
+
+    It is `FULL_CIRCLE` where less than twice `TOLERANCE_DEG` would be left out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.shear import enclosing_range
+    >>> enclosing_range(np.array([350.0, 20.0, 5.0]), margin_deg=5.0)
+    (345.0, 385.0)
+    """
+    ordered = np.sort(directions_deg % 360)
+    gaps = np.diff(ordered, append=ordered[0] + 360)
+    widest = int(gaps.argmax())
+    if gaps[widest] - 2 * margin_deg <= 2 * TOLERANCE_DEG:
+        return FULL_CIRCLE
+    low = float(ordered[(widest + 1) % len(ordered)] - margin_deg) % 360
+    return low, low + float(360 - gaps[widest] + 2 * margin_deg)
+
+
+def range_words(range_deg: tuple[float, float]) -> str:
+    """Format a range of directions for people, such as "75 to 105 degrees"."""
+    low, high = range_deg
+    return f"{low % 360:.0f} to {high if high <= 360 else high - 360:.0f} degrees"
 
 
 class ShearEstimator:
@@ -155,7 +185,7 @@ class ShearEstimator:
         seen = _cut(np.pad(self._plane(frame), _WINDOW), *self._corners, _WINDOW)
         places = _WINDOW - _PATCH + 1
         product, energy = (
-            fft.irfft2(_transform(part) * other, s=(_WINDOW, _WINDOW))[:, :places, :places]
+            np.asarray(fft.irfft2(_transform(part) * other, s=(_WINDOW, _WINDOW)))[:, :places, :places]
             for part, other in ((seen, self._patches), (seen**2, self._weight))
         )
         scale = np.sqrt(np.maximum(energy, 1e-3)) * np.maximum(self._energy, 1e-3)[:, None, None]
@@ -170,12 +200,13 @@ class ShearEstimator:
             at - (_WINDOW - _PATCH) // 2 + _parabola(*(match[rows, inside + step * side] for side in (-1, 0, 1)))
             for at, step in ((column, 1), (row, places))
         ]
-        found = np.where(matched[:, None], np.stack(moved, axis=1), np.nan)
-        return self._factor * _fill(found.reshape(*self._grid, 2)).reshape(-1, 2), float(matched.mean() if len(matched) else 0)
+        found = np.where(matched[:, None], np.stack(moved, axis=1), np.nan).reshape(*self._grid, 2)
+        share = float(matched.mean()) if len(matched) else 0.0
+        return self._factor * _fill(found).reshape(-1, 2), share
 
 
 def _transform(patches: Float32[np.ndarray, "*patches side side"]) -> np.ndarray:
-    return fft.rfft2(patches, s=(_WINDOW, _WINDOW))
+    return np.asarray(fft.rfft2(patches, s=(_WINDOW, _WINDOW)))
 
 
 def _cut(plane: Float32[np.ndarray, "height width"], top: np.ndarray, left: np.ndarray, side: int) -> np.ndarray:
@@ -192,16 +223,14 @@ def _parabola(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarr
 
 
 def _fill(moved: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
-    """Replace what is not known (NaN) or far from the median of its neighbours by that median; 0 where there is none."""
+    """Replace what is not known (NaN) or far from the median of its neighbours by that; 0 where there is none."""
     rows, columns = moved.shape[:2]
     for _ in range(2):
         padded = np.pad(moved, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
         around = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
         ordered = np.sort(np.stack(around), axis=0)  # what is not known comes last
         count = np.isfinite(ordered).sum(axis=0, keepdims=True)
-        low, high = (
-            np.take_along_axis(ordered, np.maximum(at, 0), axis=0)[0] for at in ((count - 1) // 2, count // 2)
-        )
+        low, high = (np.take_along_axis(ordered, np.maximum(at, 0), axis=0)[0] for at in ((count - 1) // 2, count // 2))
         median = (low + high) / 2
         with np.errstate(invalid="ignore"):
             stray = ~(np.linalg.norm(moved - median, axis=-1) <= _STRAY * _STEP) & np.isfinite(median[..., 0])
@@ -209,4 +238,12 @@ def _fill(moved: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows
     return np.nan_to_num(moved)
 
 
-__all__ = ["FULL_CIRCLE", "LIMIT", "TOLERANCE_DEG", "Shear", "ShearEstimator"]
+__all__ = [
+    "DIRECTION_LIMIT",
+    "FULL_CIRCLE",
+    "TOLERANCE_DEG",
+    "Shear",
+    "ShearEstimator",
+    "enclosing_range",
+    "range_words",
+]

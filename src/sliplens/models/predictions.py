@@ -31,6 +31,7 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, Frames, Trials, open_trials
 from sliplens.recordings.trial import ContactState
 from sliplens.shards import LONGEST, MakePart, Work, make_table
+from sliplens.shear import FULL_CIRCLE, range_words
 
 LEVEL = 0.9
 """Confidence of the intervals."""
@@ -270,8 +271,9 @@ def predict(
             options=options,
             sensor=None if sensor is None else load_profile(sensor),
         )
+    profile = _find_profile(trials, sensor)
     if trained is None:
-        name, named_by = _find_network(trials, sensor)
+        name, named_by = _find_network(trials, profile)
         note(on_progress, f"no network was named, so {name} reads it, {named_by}")
         trained = open_run(name, device=device)
     if known is not None:
@@ -280,6 +282,8 @@ def predict(
     if sequence:
         _require_order(trained, kinds, friction=known)
     notes = tuple(dict.fromkeys(words for one in kinds for words in (*one.notes, *_require_comparable(trained, one))))
+    turned = None if profile is None else trained.doubt_direction(profile)
+    notes = notes if turned is None else (*notes, turned)
     metadata = {
         "sliplens.source": kinds[0].opened,
         "sliplens.manifest_hash": hash_json(trained.manifest),
@@ -317,13 +321,18 @@ def predict(
     return Predictions(frames=trials.frames, engine=name, path=path, rows=rows, schema=path and written, notes=notes)
 
 
-def _find_network(trials: Trials, sensor: SensorProfile | Path | str | None) -> tuple[str, str]:
-    """Network for a source where none is named, and who names it."""
-    source, profile = trials.source, None if sensor is None else load_profile(sensor)
-    if profile is None and isinstance(source, Path) and (source / DATASET_FILE).is_file():
+def _find_profile(trials: Trials, sensor: SensorProfile | Path | str | None) -> SensorProfile | None:
+    """Profile that is named, or that a data set keeps of its first trial's sensor."""
+    if sensor is not None:
+        return load_profile(sensor)
+    source = trials.source
+    if isinstance(source, Path) and (source / DATASET_FILE).is_file():
         source = load_dataset(source)
-    if profile is None and isinstance(source, Dataset):
-        profile = source.profile(source.trials[0].sensor)
+    return source.profile(source.trials[0].sensor) if isinstance(source, Dataset) else None
+
+
+def _find_network(trials: Trials, profile: SensorProfile | None) -> tuple[str, str]:
+    """Network for a source where none is named, and who names it."""
     if profile is not None and profile.network is not None:
         return profile.network, f"which the profile {profile.name} names"
     if any(one.read_reference is None and not _is_recorded(one) for one in trials.kinds):
@@ -380,7 +389,12 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
             f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
             "name its image with --reference IMAGE, or a frame of it with --reference-frame N"
         )
-    yield f"{trial.name}: no reference was given, so its images were taken for difference images."
+    directions = trained.manifest.pull_direction_deg or FULL_CIRCLE
+    unseen = (
+        f", which hide the direction of the pull; the network was trained on {range_words(directions)} (90 is down)"
+    )
+    unseen = "" if directions == FULL_CIRCLE else unseen
+    yield f"{trial.name}: no reference was given, so its images were taken for difference images{unseen}."
 
 
 def _compare_markers(trained: Run, trial: Capture) -> str:
@@ -462,8 +476,9 @@ class _Reading(Work):
         capture = _assume_reference(self.trained, capture)
         reference = None if capture.read_reference is None else capture.read_reference()
         untouched, states = None if reference is None else soften(reference), _states(capture)
-        # batches are encoded while the ones before are under way; first frame of each, and which touch
-        encoded: deque[tuple[int, list[bool]]] = deque()
+        # batches are encoded while the ones before are under way; first frame of each, which touch, and doubts of them
+        encoded: deque[tuple[int, list[bool], list[str | None]]] = deque()
+        shear = None if reference is None else self.trained.shear_estimator(reference)
         follower = self.trained.follow() if self.sequence else None
         if follower is not None and capture.time_s is not None:
             require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
@@ -477,17 +492,22 @@ class _Reading(Work):
                     touches = [picture_change(soften(frame), untouched) >= LEAST_TOUCH for frame in images]
                 else:
                     touches = [True] * len(batch)
-                encoded.append((first, touches))
+                doubts = [
+                    self.trained.doubt_shear(shear.estimate(frame)) if shear is not None and touch else None
+                    for touch, frame in zip(touches, images, strict=True)
+                ]
+                encoded.append((first, touches, doubts))
                 yield self.trained.encode(np.stack(images), reference)
 
         for answers in engine.answers(encode()):
-            first, touches = encoded.popleft()
+            first, touches, doubts = encoded.popleft()
             estimate = self.trained.to_estimate(*answers, friction=self.friction)
             if follower is not None:
                 assert capture.time_s is not None  # `_require_order`
                 times = capture.time_s[first : first + len(touches)]
                 estimate = follower.update(estimate, times, np.array(touches))
-            withheld = estimate.withheld(np.array(touches))
+            reasons = zip(estimate.withheld(np.array(touches)), doubts, strict=True)
+            withheld = [strange or astray for strange, astray in reasons]
             columns = _columns(estimate, capture, first, withheld=withheld) | {"touches": touches}
             for name, values in columns.items():
                 if name in rows:
