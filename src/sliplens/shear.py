@@ -101,7 +101,7 @@ def enclosing_range(
     if gaps[widest] - 2 * margin_deg <= 2 * TOLERANCE_DEG:
         return FULL_CIRCLE
     low = float(ordered[(widest + 1) % len(ordered)] - margin_deg) % 360
-    return low, low + float(360 - gaps[widest] + 2 * margin_deg)
+    return low, low + max(0.0, float(360 - gaps[widest] + 2 * margin_deg))
 
 
 def range_words(range_deg: tuple[float, float]) -> str:
@@ -189,7 +189,7 @@ class ShearEstimator:
             for part, other in ((seen, self._patches), (seen**2, self._weight))
         )
         scale = np.sqrt(np.maximum(energy, 1e-3)) * np.maximum(self._energy, 1e-3)[:, None, None]
-        match = (product / scale).reshape(len(seen), -1)
+        match = (product / scale).reshape(len(seen), places**2)
         rows = np.arange(len(match))
         best = match.argmax(axis=1)
         row, column = np.divmod(best, places)

@@ -179,7 +179,7 @@ def train(
             frame_size=(info.height, info.width),
             sensor=info.sensor,
             colour=has_colour(data.read_labels(info).reference),
-            pull_direction_deg=_trained_directions(config, data, trials[0], start),
+            pull_direction_deg=trained_directions(config, data, trials[0], start),
             data_hash=data.hash,
             trained_on=[trial.sha256[:12] for some in trials for trial in some],
             start=start,
@@ -267,7 +267,7 @@ def _as_told(config: TrainConfig, data: Dataset, trials: Sequence[Sequence[Trial
     return config if told else replace(config, head="histogram")
 
 
-def _trained_directions(
+def trained_directions(
     config: TrainConfig, data: Dataset, trials: Sequence[TrialInfo], start: Run | None
 ) -> tuple[float, float] | None:
     """Directions of the pulls that a network is trained on; those of `start` where it stays as it is."""
