@@ -33,8 +33,8 @@ _WEIGHTS: dict[str, tuple[tuple[float, ...], tuple[float, ...], float]] = {
 }
 """By kind of sensor, at the knots: weights of a displacement and of its outward part, and the standard deviation of
 the shear as a share of the mean outward displacement. Fitted by ridge regression to the tangential force of simulated
-trials pulled in every direction (series `direction-fit`, 5 frames of each of 168 trials a sensor); the deviation was
-measured on others (`direction-choose`). The row without a name is of all simulated sensors together."""
+trials pulled in every direction (`benchmarks/directions.py --fit --trials 150 --frames 5`); the deviation was measured
+on other days (series `direction-choose`). The row without a name is of all simulated sensors together."""
 _KNOTS = np.array([0, 0.33, 0.66, 1.0, 1.4])  # distances from the centre over half of the shorter side
 _NOISE_PX = 0.027  # of the reduced picture
 
@@ -159,18 +159,24 @@ class ShearEstimator:
         distance = np.linalg.norm(away, axis=1) / (min(plane.shape) / 2)
         self._outward = away / np.maximum(np.linalg.norm(away, axis=1), 1e-6)[:, None]
         near = np.stack([np.interp(distance, _KNOTS, row) for row in np.eye(len(_KNOTS))], axis=1)
-        whole, radial, self._press_share = _WEIGHTS.get(kind, _WEIGHTS[""])
-        self._whole, self._radial = (near @ np.array(part) / max(1, len(near)) for part in (whole, radial))
+        self._near = near / max(1, len(near))
+        *weights, self._press_share = _WEIGHTS.get(kind, _WEIGHTS[""])
+        self._weights = np.concatenate(weights)
 
     def estimate(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> Shear:
         """Estimate the shear of a frame of the reference's size."""
-        moved_px, share = self._displacements(frame)
+        moved_px, share = self.measure_displacements(frame)
         if share < _LEAST_SHARE:
             return Shear(x_px=0.0, y_px=0.0, sigma_px=inf)
-        outward = (moved_px * self._outward).sum(axis=1)
-        x_px, y_px = self._whole @ moved_px + (self._radial * outward) @ self._outward
-        sigma_px = hypot(_NOISE_PX * self._factor, self._press_share * float(outward.mean()))
+        x_px, y_px = self._weights @ self.moments(moved_px)
+        outward_px = float((moved_px * self._outward).sum(axis=1).mean())
+        sigma_px = hypot(_NOISE_PX * self._factor, self._press_share * outward_px)
         return Shear(x_px=float(x_px), y_px=float(y_px), sigma_px=sigma_px)
+
+    def moments(self, moved_px: Float[np.ndarray, "patches 2"]) -> Float[np.ndarray, "moments 2"]:
+        """Mean displacement of the patches near each knot, then mean of its outward part, of which shear is a sum."""
+        outward = (moved_px * self._outward).sum(axis=1, keepdims=True) * self._outward
+        return np.concatenate([self._near.T @ moved_px, self._near.T @ outward])
 
     def _plane(self, image: UInt8[np.ndarray, "_ _ 3"]) -> Float32[np.ndarray, "rows columns"]:
         """Green channel, reduced, without what is wider than a marker."""
@@ -180,7 +186,7 @@ class ShearEstimator:
         box = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
         return plane - (box / side**2).astype(np.float32)
 
-    def _displacements(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[Float[np.ndarray, "patches 2"], float]:
+    def measure_displacements(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[Float[np.ndarray, "patches 2"], float]:
         """Measure the displacement (x, y) of each patch in pixels, and the share of the patches that were matched."""
         seen = _cut(np.pad(self._plane(frame), _WINDOW), *self._corners, _WINDOW)
         places = _WINDOW - _PATCH + 1
