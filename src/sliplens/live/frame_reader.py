@@ -12,8 +12,9 @@ from torch import Tensor
 
 from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
+from sliplens.images import require_rgb
 from sliplens.live.contract import LiveSource
-from sliplens.live.health import OFF, check_novelty, margin_risk
+from sliplens.live.health import OFF, check_direction, check_novelty, margin_risk
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run
@@ -23,6 +24,7 @@ from sliplens.models.sequence import require_frequent
 from sliplens.recordings.capture import Frame
 from sliplens.recordings.labels.lag import soften
 from sliplens.recordings.trial import ContactState, contact_states
+from sliplens.shear import ShearEstimator
 
 
 @runtime_checkable
@@ -148,6 +150,7 @@ class FrameReader:
         self._smooth = LowPass(time_constant_s=smoothing_s)
         self._make_health, self._make_slip = health, slip
         self._health: HealthWatch | None = None
+        self._shear: ShearEstimator | None = None
         self._slip: SlipWatch | None = None
         self._tracker: Tracker | None = None
         self._smaller = 1
@@ -175,6 +178,7 @@ class FrameReader:
         if reference is None:
             self._taker = _ReferenceTaker()
             return
+        require_rgb(reference, what="levels of the reference")
         if reference.shape[:2] != self._size:
             raise ImageError(
                 f"the reference has {_in_pixels(reference.shape[:2])} pixels, the frames of {self.source.name} have "
@@ -195,6 +199,7 @@ class FrameReader:
 
     def read(self, frame: LiveFrame) -> Reading:
         """Read the next frame."""
+        require_rgb(frame.image, what=f"levels of frame {frame.number} of {self.source.name}")
         last, self._last = self._last, frame
         self._dropped += 0 if last is None else max(0, frame.number - last.number - 1)
         begin = Reading(
@@ -233,6 +238,8 @@ class FrameReader:
             self.markers_px = self._in_frame(rest_px), self._in_frame(followed.position_px[: len(rest_px)])
             markers = self._slip.update(self.markers_px[1], frame.time_s)
         health = () if self._health is None else self._health.check(frame, followed)
+        if self._shear is not None and self.network is not None and all(check.ok for check in health):
+            health = (*health, check_direction(self.network, self._shear.estimate(frame.image)))
         latency = Latency(decode_ms=frame.decode_ms, checks_ms=1e3 * (time.perf_counter() - begun))
         withheld = next((check.sentence for check in health if not check.ok), None)
         reading = replace(begin, slip=markers and markers.state, markers=markers, health=health, latency=latency)
@@ -323,6 +330,8 @@ class FrameReader:
         self.reference = image
         self.doubt = None if self.network is None else self.network.doubt_colour(image)
         self._health = None if self._make_health is None else self._make_health(image)
+        checked = None if self._health is None else self.network
+        self._shear = None if checked is None else checked.shear_estimator(image)
         self._begin_anew()
 
     def _begin_anew(self) -> None:

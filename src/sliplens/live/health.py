@@ -12,9 +12,10 @@ from sliplens.errors import InputError
 from sliplens.live.reading import Check, LiveFrame, small_picture
 from sliplens.markers import MarkerStatus, TrackedFrame
 from sliplens.markers.camera import BorderMotion, CameraMotion, block_means, marker_camera_motion
-from sliplens.models.checkpoint import STRANGE, Estimate
+from sliplens.models.checkpoint import STRANGE, Estimate, Run
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labels.lag import LEAST_TOUCH, picture_change, soften
+from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, Shear
 
 Plane = Float32[np.ndarray, "height width"]
 
@@ -311,6 +312,17 @@ def check_novelty(estimate: Estimate) -> Check | None:
     told = f"{known:.0%} of the frames that the network was tested on are as strange as this picture"
     cure = "use the sensor that it was trained on, or train it on this one"
     return _judge("novelty", -float(np.log10(max(known, 1e-30))), -float(np.log10(STRANGE)), told, cure)
+
+
+def check_direction(network: Run, shear: Shear) -> Check:
+    """Check the direction of the shear against the directions of the network's training.
+
+    The value is the distance from them in standard deviations (`Shear.excess`), at its limit where `predict` withholds
+    too.
+    """
+    trained = network.manifest.pull_direction_deg or FULL_CIRCLE
+    told = f"the skin is sheared towards {shear.direction_deg:.0f} degrees (90 is down the image)"
+    return _judge("direction", shear.excess(trained), DIRECTION_LIMIT, told, network.doubt_shear(shear) or "")
 
 
 def severity(check: Check) -> float:

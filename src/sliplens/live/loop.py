@@ -259,11 +259,12 @@ class LiveReader:
     def doubts(self) -> tuple[str, ...]:
         """What the network was not made for, a sentence each.
 
-        Another sensor, friction that it was not trained on, and grey frames once one was compared.
+        Another sensor, one that is pulled in another direction, friction that it was not trained on, and grey frames
+        once one was compared.
         """
         network, profile, doubts = self.network, self._profile, [self._reader.doubt]
         if network is not None:
-            doubts.append(None if profile is None else network.doubt(profile.name))
+            doubts += [] if profile is None else [network.doubt(profile.name), network.doubt_direction(profile)]
             doubts.append(network.doubt_friction(self._reader.learner.friction))
         return tuple(doubt for doubt in doubts if doubt is not None)
 

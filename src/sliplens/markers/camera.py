@@ -158,7 +158,9 @@ class BorderMotion:
             pixels = level.padded(block_means(plane, factor))
             for _ in range(_STEPS):
                 shift = shift + factor * level.steps(pixels, shift / factor, similarity)
-                fitted, misfit = _fit(level.places, shift * (_HALF_PX / self._half), np.zeros((_PARTS, 0), dtype=complex))
+                fitted, misfit = _fit(
+                    level.places, shift * (_HALF_PX / self._half), np.zeros((_PARTS, 0), dtype=complex)
+                )
                 similarity = complex(fitted[1]) / _HALF_PX
         misfit_px, length_px = float(np.sort(misfit)[_PARTS - _STRAYS - 1]), float(np.linalg.norm(fitted))
         free = misfit_px < _STILL_PX + _ALIKE_SHARE * length_px

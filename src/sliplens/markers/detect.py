@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from sliplens.errors import ImageError, InputError
 from sliplens.extras import Table, import_cv2
+from sliplens.images import require_rgb
 
 Contrast: TypeAlias = Literal["dark", "light", "colour"]
 
@@ -313,6 +314,7 @@ def detect_markers(
     ImageError
         If no appearance is given and the frame is over- or underexposed, or shows fewer than 4 markers.
     """
+    require_rgb(frame, what="levels of the frame")
     if appearance is not None:
         return _detect(frame, appearance)
     first = find_appearance(frame, KINDS.pick(kind) if isinstance(kind, str) else kind)
