@@ -336,7 +336,7 @@ OFF = 0.2
 _HARM: dict[str, tuple[float, float]] = {
     "repeated": (0.98, 0.14), "saturation": (0.18, 0.06), "exposure": (0.69, 0.17), "focus": (0.28, 0.08),
     "light": (0.26, 0.07), "camera": (0.61, 0.86), "markers": (0.27, 1.20), "touch": (0.97, 1.20),
-    "novelty": (0.20, 0.55),
+    "novelty": (0.20, 0.55), "direction": (0.95, 0.91),
 }  # fmt: skip
 """Chance that a fault puts the margin off however strong it is, and its growth with severity, by check."""
 _SPREAD = -0.83, 0.57
