@@ -1,8 +1,14 @@
-"""Whether health tells that a margin is off: eight faults at graded strength on simulated trials, and healthy frames.
+"""Whether health tells that a margin is off: faults at graded strength on simulated trials, and healthy frames.
 
 Each frame in contact of unseen days and sensors is read as it is, and with each fault in each strength; faults of
-camera and light are there since before the touch. A margin is off
-where it errs by more than 0.2; without contact there is none, so any answer counts as off.
+camera and light are there since before the touch, a turn and a zoom also in a contact that was never seen without (`in
+contact`). `dropped` is a picture that falls by 28 pixels at once, `torn` one of the upper part of a frame and the lower
+part of one 0.4 or 1.6 s later, `pulled` a pull in another direction, in degrees, than those of the training. `half
+stale` and `frozen` are sequences at 10 frames a second with the samples of a force sensor, in which the lower half of
+the picture, or all of it under fresh noise, has stayed as it was 0.5 or 1 s ago; the last frame of each such sequence
+is also read without the fault. A margin is off where it errs by more than 0.2; without contact there is none, so any
+answer counts as off. `shown_wrong_share` is the share of a fault's frames that are off and not withheld, `shown_caused_share` that of those
+which are not off without the fault.
 
 `auroc` ranks all these frames by `margin_risk`, in which all checks and the network's own spread are one number, and
 `auroc_worst` by how far their worst check is from its limit. Two numbers say what can be reached. `auroc_told` is that
@@ -20,10 +26,11 @@ were trained on. Choice, fit and test share no day and no sensor.
 import argparse
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from scipy.optimize import minimize
@@ -31,14 +38,16 @@ from scipy.optimize import minimize
 from sliplens.codec import load_record, save_record
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import Check, HealthMonitor, LiveFrame
-from sliplens.live.health import OFF, margin_risk, severity
+from sliplens.live.health import OFF, check_novelty, margin_risk, severity
 from sliplens.markers import Tracker
 from sliplens.models import Run, load
 from sliplens.models.checkpoint import MANIFEST_FILE, Manifest
 from sliplens.models.novelty import fit_novelty
+from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import load_dataset
 from sliplens.simulation import TrialPlan, make_recipe, plan_trials
 from sliplens.simulation.filming import Film
+from sliplens.simulation.loading import Loading, load_at_margins
 from sliplens.simulation.trials import prepare_trial
 from sliplens.training.metrics import auroc, risk_coverage
 
@@ -104,12 +113,44 @@ def lose_lamp(image: np.ndarray, share: float, rng: np.random.Generator) -> np.n
     return image * (1 - share * ramp[..., None])
 
 
+def turn_camera(image: np.ndarray, degrees: float, rng: np.random.Generator) -> np.ndarray:
+    """Turn by so many degrees one way or the other, about the middle."""
+    return _warp(image, degrees=degrees * rng.choice([-1, 1]))
+
+
+def zoom_camera(image: np.ndarray, factor: float, _: np.random.Generator) -> np.ndarray:
+    """Enlarge about the middle."""
+    return _warp(image, factor=factor)
+
+
+def _warp(image: np.ndarray, *, degrees: float = 0.0, factor: float = 1.0) -> np.ndarray:
+    height, width = image.shape[:2]
+    matrix = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), degrees, factor)
+    return cv2.warpAffine(image, matrix, (width, height), borderMode=cv2.BORDER_REPLICATE)
+
+
+def drop_picture(image: np.ndarray, pixels: float, _: np.random.Generator) -> np.ndarray:
+    """Let the picture fall; its first row fills what comes above."""
+    return image[np.maximum(np.arange(len(image)) - round(pixels), 0)]
+
+
+TURNS = (0.3, 1.0, 3.0)
+ZOOMS = (0.97, 0.98, 1.02, 1.03)
 FAULTS: dict[str, tuple[Fault, tuple[float, ...]]] = {
     "defocus": (defocus, (0.7, 1.5, 3.0)),
     "camera moved": (move_camera, (1.0, 3.0, 6.0)),
     "exposure": (lambda image, factor, _: image * factor, (0.5, 0.8, 1.25, 1.7)),
     "lamp out": (lose_lamp, (0.2, 0.4, 0.7)),
+    "turned": (turn_camera, TURNS),
+    "zoomed": (zoom_camera, ZOOMS),
 }
+"""Faults that are there since before the touch."""
+SUDDEN: dict[str, tuple[Fault, tuple[float, ...]]] = {
+    "turned in contact": (turn_camera, TURNS),
+    "zoomed in contact": (zoom_camera, ZOOMS),
+    "dropped": (drop_picture, (28.0,)),
+}
+"""Faults of one frame, before which nothing was seen."""
 
 
 def plan_some(series: str, trials: int, *, sensor: str | None = None) -> list[TrialPlan]:
@@ -140,8 +181,26 @@ def hide_markers(film: Film, share: float, rng: np.random.Generator) -> Film:
     return replace(film, unit=replace(film.unit, contrast_factor=contrast))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """Frame that was seen before the one that is judged."""
+
+    image: np.ndarray
+    time_s: float
+    force_n: np.ndarray | None = None
+    """x, y, z; None without a force sensor."""
+
+    def frame(self) -> LiveFrame:
+        """Give it as a camera does."""
+        forces = None
+        if self.force_n is not None:
+            forces = Forces(time_s=np.array([self.time_s]), force_n=self.force_n[None], source="simulated")
+        pixels = np.clip(np.round(self.image), 0, 255).astype(np.uint8)
+        return LiveFrame(image=pixels, number=0, time_s=self.time_s, captured_s=0.0, forces=forces)
+
+
 class Judge:
-    """Reads frames of one trial, and asks for their health."""
+    """Reads frames of one trial, and checks their health."""
 
     def __init__(self, run: Run, reference: np.ndarray, *, trial: int) -> None:
         self._run, self._reference, self._trial = run, reference, trial
@@ -153,30 +212,70 @@ class Judge:
         *,
         fault: str = "none",
         strength: float = 0.0,
-        held_s: float = 0.0,
-        before: np.ndarray | None = None,
+        before: Sequence[Shot] = (),
+        force_n: np.ndarray | None = None,
         healthy_error: float = np.inf,
     ) -> Case:
-        """Read one frame; `held_s`: time for which it has been the same; `before`: the untouched sensor as it was seen
-        last.
-        """
-        pixels = np.clip(np.round(image), 0, 255).astype(np.uint8)
-        monitor, tracker = HealthMonitor(self._reference, self._run), Tracker(self._reference)
-        checks = ()
-        if before is not None:
-            first = np.clip(np.round(before), 0, 255).astype(np.uint8)
-            monitor.check(LiveFrame(image=first, number=0, time_s=-1.0, captured_s=0.0))
-        for time_s in (0.0, held_s) if held_s else (0.0,):
-            checks = monitor.check(
-                LiveFrame(image=pixels, number=0, time_s=time_s, captured_s=0.0), tracker.update(pixels)
-            )
-        estimate = self._run.estimate(self._run.encode(pixels[None], self._reference))
+        """Read one frame at the time 0; `before`: what was seen until then."""
+        monitor, tracker = HealthMonitor(self._reference), Tracker(self._reference)
+        checks, frame = (), Shot(image=image, time_s=0.0, force_n=force_n).frame()
+        for seen in (*(shot.frame() for shot in before), frame):
+            checks = monitor.check(seen, tracker.update(seen.image))
+        estimate = self._run.estimate(self._run.encode(frame.image[None], self._reference))
+        novelty = check_novelty(estimate)
         error = abs(float(np.clip(estimate.margin[0], 0, 1)) - margin) if np.isfinite(margin) else np.inf
         return Case(
-            trial=self._trial, fault=fault, strength=strength, error=error, checks=checks,
+            trial=self._trial, fault=fault, strength=strength, error=error,
+            checks=checks if novelty is None else (*checks, novelty),
             healthy_error=error if fault == "none" else healthy_error,
             beyond=float(estimate.beyond(OFF)[0]), known=1.0 if estimate.known is None else float(estimate.known[0]),
         )  # fmt: skip
+
+
+RATE_HZ = 10.0
+FROZEN_S = (0.5, 1.0)
+"""Time for which a picture stays as it was."""
+
+
+def film_pull(film: Film, loading: Loading, *, old: int, now: int, rng: np.random.Generator) -> tuple[list[Shot], float]:
+    """Film the load from one frame to another, a quarter of its first part twice; gives the margin at the end too."""
+    steps = np.linspace(0, 1, 1 + round(RATE_HZ * max(FROZEN_S)))
+    steps = np.concatenate([np.zeros(3), steps])
+    margins, normal_n = (
+        values[old] + (values[now] - values[old]) * steps for values in (loading.safety_margin, loading.normal_force_n)
+    )
+    shots, friction = [], film.grasp.friction
+    for at, (margin, normal) in enumerate(zip(margins.tolist(), normal_n.tolist(), strict=True)):
+        grasp = replace(film.grasp, normal_force_n=normal)
+        image = draw(film.under(load_at_margins(np.array([margin]), grasp=grasp), rng=rng), 0)
+        force_n = np.array([(1 - margin) * friction * normal, 0.0, normal])
+        shots.append(Shot(image=image, time_s=(at + 1 - len(steps)) / RATE_HZ, force_n=force_n))
+    return shots, float(margins[-1])
+
+
+def stop_half(shots: list[Shot], since: int, _: np.random.Generator) -> list[Shot]:
+    """Leave the lower half as it was at one frame."""
+    stale = shots[since].image
+    half = len(stale) // 2
+    return [
+        replace(shot, image=np.concatenate([shot.image[:half], stale[half:]])) if at > since else shot
+        for at, shot in enumerate(shots)
+    ]
+
+
+def stop_all(shots: list[Shot], since: int, rng: np.random.Generator) -> list[Shot]:
+    """Leave all as it was at one frame, under fresh noise."""
+    stale = shots[since].image
+    return [
+        replace(shot, image=stale + rng.normal(0, 2.2, stale.shape)) if at > since else shot
+        for at, shot in enumerate(shots)
+    ]
+
+
+STOPPED: dict[str, Callable[[list[Shot], int, np.random.Generator], list[Shot]]] = {
+    "half stale": stop_half,
+    "frozen": stop_all,
+}
 
 
 def judge_trial(run: Run, plan: TrialPlan, *, trial: int, frames: int, other: TrialPlan) -> Iterator[Case]:
@@ -192,23 +291,49 @@ def judge_trial(run: Run, plan: TrialPlan, *, trial: int, frames: int, other: Tr
         as_it_is = judge.say(image, margin)
         healthy[at] = as_it_is.error
         yield as_it_is
-        for fault, (make, strengths) in FAULTS.items():
-            for strength in strengths:
-                seed = int(rng.integers(2**32))
-                there, free = (make(one, strength, np.random.default_rng(seed)) for one in (image, untouched))
-                yield judge.say(
-                    there, margin, fault=fault, strength=strength, before=free, healthy_error=as_it_is.error
-                )
+        for faults, seen in ((FAULTS, True), (SUDDEN, False)):
+            for fault, (make, strengths) in faults.items():
+                for strength in strengths:
+                    seed = int(rng.integers(2**32))
+                    there, free = (make(one, strength, np.random.default_rng(seed)) for one in (image, untouched))
+                    before = [Shot(image=free, time_s=-1.0)] if seen else []
+                    yield judge.say(
+                        there, margin, fault=fault, strength=strength, before=before, healthy_error=as_it_is.error
+                    )
         for share in (0.1, 0.2, 0.4):
             hidden = draw(hide_markers(film, share, rng), at)
             yield judge.say(hidden, margin, fault="markers hidden", strength=share, healthy_error=as_it_is.error)
+        for later in (1, 4):
+            row = int(rng.uniform(0.25, 0.75) * len(image))
+            upper = draw(film, max(0, at - later))
+            yield judge.say(
+                np.concatenate([upper[:row], image[row:]]), margin, fault="torn", strength=float(later),
+                before=[Shot(image=upper, time_s=-0.03)], healthy_error=as_it_is.error,
+            )  # fmt: skip
+        for degrees in (180.0, 270.0):
+            turned = replace(film, grasp=replace(film.grasp, shear_direction_rad=np.radians(degrees)))
+            grasp = replace(film.grasp, normal_force_n=float(loading.normal_force_n[at]))
+            pulled = draw(turned.under(load_at_margins(np.array([margin]), grasp=grasp), rng=rng), 0)
+            yield judge.say(pulled, margin, fault="pulled", strength=degrees, healthy_error=as_it_is.error)
     for later in (1, 2):  # the picture stays that of an earlier frame, for longer and longer
         for old, now in zip(chosen[:-later], chosen[later:], strict=True):
-            held_s = float(loading.time_s[now] - loading.time_s[old])
+            image, held_s = draw(film, old), float(loading.time_s[now] - loading.time_s[old])
             yield judge.say(
-                draw(film, old), float(margins[now]), fault="stale", strength=float(later), held_s=held_s,
-                healthy_error=healthy[now],
+                image, float(margins[now]), fault="stale", strength=float(later),
+                before=[Shot(image=image, time_s=-held_s)], healthy_error=healthy[now],
             )  # fmt: skip
+    for old, now in zip(chosen[:-1], chosen[1:], strict=True):
+        shots, margin = film_pull(film, loading, old=old, now=now, rng=rng)
+        *before, last = shots
+        as_it_is = judge.say(last.image, margin, before=before, force_n=last.force_n)
+        yield as_it_is
+        for fault, stop in STOPPED.items():
+            for held_s in FROZEN_S:
+                *before, last = stop(shots, len(shots) - 1 - round(RATE_HZ * held_s), rng)
+                yield judge.say(
+                    last.image, margin, fault=fault, strength=held_s, before=before, force_n=last.force_n,
+                    healthy_error=as_it_is.error,
+                )  # fmt: skip
     for at in np.flatnonzero(~np.isfinite(margins))[:2]:
         yield judge.say(draw(film, at), np.nan, fault="no contact", healthy_error=0.0)
     loading, film = prepare_trial(other)
@@ -228,6 +353,20 @@ def off_elsewhere(cases: list[Case], off: np.ndarray) -> np.ndarray:
     return shares
 
 
+def count_withheld(cases: list[Case]) -> dict[str, object]:
+    """Shares of frames that are off, withheld, and off without being withheld, by the fault or in any case."""
+    sound = np.array([case.fault != "none" and case.healthy_error <= OFF for case in cases])
+    off, withheld = (np.array(values) for values in zip(*((c.error > OFF, bool(c.failed)) for c in cases), strict=True))
+    return {
+        "frames": len(cases),
+        "off": float(off.mean()),
+        "withheld": float(withheld.mean()),
+        "shown_wrong_share": float((off & ~withheld).mean()),
+        "shown_caused_share": float((off & ~withheld & sound).mean()),
+        "by": sorted({name for case in cases for name in case.failed}),
+    }
+
+
 def summarise(cases: list[Case]) -> dict[str, object]:
     """Ranking, withheld frames, by fault and strength, and the error of what is told as more is withheld."""
     errors, off = np.array([case.error for case in cases]), np.array([case.error > OFF for case in cases])
@@ -235,9 +374,10 @@ def summarise(cases: list[Case]) -> dict[str, object]:
     worst, known = np.array([case.worst for case in cases]), np.array([case.known for case in cases])
     told = off_elsewhere(cases, off)
     caused = off & np.array([case.healthy_error <= OFF for case in cases])
-    by_fault: dict[str, list[Case]] = defaultdict(list)
+    by_fault, by_strength = defaultdict[str, list[Case]](list), defaultdict[str, list[Case]](list)
     for case in cases:
-        by_fault[case.name].append(case)
+        by_fault[case.fault].append(case)
+        by_strength[case.name].append(case)
     kinds = np.array([case.fault for case in cases])
     healthy, faults = kinds == "none", sorted(set(kinds) - {"none"})
     touched = np.isfinite(errors)
@@ -262,15 +402,8 @@ def summarise(cases: list[Case]) -> dict[str, object]:
         "mean_error_by_share_withheld": {
             f"{1 - share:g}": kept.error_at("risk", share) for share in (1.0, 0.8, 0.6, 0.4, 0.2)
         },
-        "by_fault": {
-            name: {
-                "frames": len(some),
-                "off": float(np.mean([case.error > OFF for case in some])),
-                "withheld": float(np.mean([bool(case.failed) for case in some])),
-                "by": sorted({name for case in some for name in case.failed}),
-            }
-            for name, some in by_fault.items()
-        },
+        "by_fault": {name: count_withheld(some) for name, some in by_fault.items()},
+        "by_strength": {name: count_withheld(some) for name, some in by_strength.items()},
         "frames": len(cases),
     }  # fmt: skip
 
@@ -279,10 +412,12 @@ def choose(cases: list[Case]) -> dict[str, object]:
     """Quantiles of healthy values, and the numbers of `margin_risk` that make what happened most likely."""
     healthy = [{check.name: check.value for check in case.checks} for case in cases if case.fault == "none"]
     found: dict[str, object] = {
-        name: np.quantile([values[name] for values in healthy], (0.5, 0.9, 0.99, 0.997, 1.0)).round(4).tolist()
-        for name in healthy[0]
+        name: np.quantile([values[name] for values in healthy if name in values], (0.5, 0.9, 0.99, 0.997, 1.0))
+        .round(4)
+        .tolist()
+        for name in dict.fromkeys(name for values in healthy for name in values)
     }
-    names = [name for name in healthy[0] if name not in {"late", "drops"}]
+    names = [name for name in found if name not in {"late", "drops"}]
     off = np.array([case.error > OFF for case in cases])
 
     def unpack(numbers: np.ndarray) -> tuple[dict[str, tuple[float, float]], tuple[float, float]]:

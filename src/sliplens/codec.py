@@ -415,9 +415,11 @@ def read_written(path: Path, schema: pa.Schema) -> pa.Table:
     if path.is_dir():
         return pa.concat_tables([open_table(part).read() for part in sorted(path.glob("*=*/*.parquet"))])
     if path.suffix == ".csv":
+        # the writer quotes texts, and leaves null blank
+        options = pa_csv.ConvertOptions(column_types=schema, strings_can_be_null=True, quoted_strings_can_be_null=False)
         # none of Python's own: Arrow's thread may let go of it when Python has ended, and that aborts the process
         with path.open() if isinstance(path, StoredPath) else pa.OSFile(str(path)) as stream:
-            return pa_csv.read_csv(stream, convert_options=pa_csv.ConvertOptions(column_types=schema))
+            return pa_csv.read_csv(stream, convert_options=options)
     if path.suffix == ".json":
         return pa.Table.from_pylist(msgspec.json.decode(path.read_bytes()), schema)
     return open_table(path).read()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
+from PIL import ExifTags, Image
 
 from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2, missing_packages
@@ -26,11 +26,23 @@ _OTHER_MODES = {
     "LA": "2 channels (grey and alpha)",
     "RGBA": "4 channels (alpha)",
     "CMYK": "4 channels (CMYK)",
-    "I;16": "16 bits a pixel",
     "I": "more than 8 bits a pixel",
     "F": "floating-point pixels",
 }
 _BITS_PER_SAMPLE = 258  # TIFF tag
+_REDUCE = "divide its levels by 256, or by 16 or 4 where the camera gives 12 or 10 bits"
+_UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""Turns and mirror images that undo an orientation tag (EXIF 2.3, tag 274)."""
+_TAGGED = frozenset({"exif", "Raw profile type exif", "XML:com.adobe.xmp", "xmp"})
+"""Entries of a header in which Pillow finds the tag; without one it would decode a PNG to look behind its pixels."""
 MOST_PIXELS = 100_000_000
 """Pixels of a frame; a larger one is a damaged header, and would ask for gigabytes."""
 _DAMAGE = (OSError, SyntaxError, ValueError, MemoryError, Image.DecompressionBombError)  # what Pillow raises
@@ -78,8 +90,41 @@ def open_image(
         yield image
 
 
+def _orientation(image: Image.Image) -> int:
+    """Orientation tag of an image that is not decoded yet; 1 of a TIFF, which Pillow turns itself."""
+    if image.format == "TIFF" or not _TAGGED & image.info.keys():
+        return 1
+    return image.getexif().get(ExifTags.Base.Orientation, 1)
+
+
+def upright_size(image: Image.Image) -> tuple[int, int]:
+    """Height and width of an image as its orientation tag turns it, in pixels, from its header."""
+    height, width = image.size[::-1]
+    return (width, height) if _orientation(image) >= 5 else (height, width)
+
+
+def upright_pixels(image: Image.Image) -> UInt8[np.ndarray, "height width *channels"]:
+    """Pixels of an image, turned and mirrored as its orientation tag says."""
+    turn = _UPRIGHT.get(_orientation(image))
+    return np.array(image if turn is None else image.transpose(turn))
+
+
+def require_eight_bits(image: Image.Image, *, where: object) -> None:
+    """Refuse an image with more than 8 bits a channel.
+
+    Pillow keeps the upper 8 bits of 16, and of a camera with 12 bits those hold four.
+    """
+    bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))
+    if image.mode.startswith("I;16") or any(";16" in str(tile.args) for tile in getattr(image, "tile", ())):
+        bits = 16
+    if bits > 8:
+        raise ImageError(f"{where} has {bits} bits a channel; {_REDUCE}, and save it as 8-bit RGB")
+
+
 def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
     """Read an 8-bit RGB image (PNG, TIFF, JPEG or BMP), of a size (height, width) in pixels unless that is None.
+
+    An image that a tag turns or mirrors (EXIF orientation) comes upright.
 
     Raises
     ------
@@ -99,17 +144,18 @@ def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.n
     """
     require_image(path)
     with telling_damage(f"{path} cannot be read as an image", "copy or export it again"), open_image(path) as image:
-        if size is not None and image.size[::-1] != tuple(size):
+        height, width = upright_size(image)
+        if size is not None and (height, width) != tuple(size):
             raise ImageError(
-                f"{path} is {image.height} x {image.width} pixels, {size[0]} x {size[1]} are needed; "
+                f"{path} is {height} x {width} pixels, {size[0]} x {size[1]} are needed; "
                 "use frames of the sensor the network was trained for"
             )
-        bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))
-        if image.mode != "RGB" or bits > 8:
-            what = f"{bits} bits a pixel" if bits > 8 else _OTHER_MODES.get(image.mode, f"mode {image.mode}")
+        require_eight_bits(image, where=path)
+        if image.mode != "RGB":
+            what = _OTHER_MODES.get(image.mode, f"mode {image.mode}")
             cure = "drop the alpha channel" if image.mode == "RGBA" else "convert it to 8-bit RGB"
             raise ImageError(f"{path} has {what}; {cure}")
-        return np.array(image)
+        return upright_pixels(image)
 
 
 def write_png(path: Path, pixels: UInt8[np.ndarray, "height width *channels"]) -> None:
@@ -235,8 +281,35 @@ def signed_difference(
     return (frames >> 1) + (np.uint8(128) - (reference >> 1))
 
 
+_CURES = {
+    "f": "multiply them by 255 if they are in [0, 1], round them, and convert them with .astype(np.uint8)",
+    "u": f"{_REDUCE}, and convert them with .astype(np.uint8)",
+    "i": "if they are from 0 to 255, convert them with .astype(np.uint8)",
+}
+"""Ways to make 8-bit levels of an array, by NumPy's kind of its type."""
+
+
+def require_rgb(images: np.ndarray, *, what: str = "frames") -> None:
+    """Refuse an array that holds no 8-bit RGB images, one or a batch with the colours on the last axis.
+
+    Levels of another type cannot be compared with 8-bit ones: 1.0 may be white or next to black.
+    """
+    if not isinstance(images, np.ndarray):
+        raise ImageError(f"the {what} are of type {type(images).__name__}; give a NumPy array of uint8")
+    if images.dtype != np.uint8:
+        cure = _CURES.get(images.dtype.kind, "give the levels of the camera, from 0 to 255")
+        raise ImageError(f"the {what} hold {images.dtype}, and sliplens takes 8-bit RGB (uint8); {cure}")
+    if images.ndim < 3 or images.shape[-1] != 3:
+        raise ImageError(
+            f"the {what} have shape {tuple(images.shape)}, which does not end in (height, width, 3); give RGB images "
+            "with the colours on the last axis, a grey one as three equal colours"
+        )
+
+
 def require_same_size(frames: np.ndarray, reference: np.ndarray) -> None:
-    """Refuse frames of another size than their reference frame."""
+    """Refuse frames that cannot be compared with their reference frame: of another size or another type."""
+    require_rgb(frames)
+    require_rgb(reference, what="levels of the reference")
     if frames.shape[-3:] != reference.shape:
         frame, untouched = (f"{image.shape[-3]} x {image.shape[-2]}" for image in (frames, reference))
         raise ImageError(

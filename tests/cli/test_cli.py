@@ -106,7 +106,7 @@ def test_frames_and_data_at_once(
             "frames such as a_20.png are 50 x 48 pixels but the network was",
         ),
         ("a_20.png", np.zeros((48, 48, 4), np.uint8), "a_20.png has 4 channels (alpha)"),
-        ("a_20.tiff", np.zeros((48, 48), np.uint16), "a_20.tiff has 16 bits a pixel"),
+        ("a_20.tiff", np.zeros((48, 48), np.uint16), "a_20.tiff has 16 bits a channel"),
     ],
 )
 def test_bad_frames(difference_run: Path, tmp_path: Path, capsys, *, name: str, pixels: np.ndarray, message: str):

@@ -18,7 +18,9 @@ from sliplens.cli.predict import Predict
 from sliplens.cli.train import Train
 from sliplens.errors import InputError, SliplensError
 from sliplens.files import hash_file, hash_json, read_json
-from sliplens.recordings import Dataset
+from sliplens.images import write_png
+from sliplens.models.checkpoint import STRANGE_REASON
+from sliplens.recordings import Dataset, Recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 
@@ -152,3 +154,27 @@ def test_a_graphics_card_that_is_not_there_is_told(difference_run: Path, differe
         pytest.skip("there is one")
     with pytest.raises(InputError, match="device cuda is not on this machine; use cpu"):
         run(difference_run, difference_folder, "-o", tmp_path / "a.parquet", "--device", "cuda")
+
+
+@pytest.mark.parametrize("shown", [slice(10, 20), slice(None)])  # a line a frame, and a line a trial
+def test_what_is_withheld_has_no_margin_on_the_terminal(
+    trials: dict[str, Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str], shown: slice
+):
+    trial = trials["flat-gel"]
+    write_png(tmp_path / "untouched.png", trial.reference)
+    (tmp_path / "frames").mkdir()
+    for at, frame in enumerate(trial.frames[shown]):
+        write_png(tmp_path / "frames" / f"{at:02}.png", frame)
+    options = ("--reference", tmp_path / "untouched.png", "-o", tmp_path / "a.csv")
+    run("chromatouch-difference", tmp_path / "frames", *options)
+    lines = capsys.readouterr().out.splitlines()
+    withheld = [row["file"] for row in read_csv(tmp_path / "a.csv").to_pylist() if row["withheld"]]
+    assert any(line.startswith(f"withheld in {len(withheld)} frames: {STRANGE_REASON}") for line in lines)
+    if shown == slice(None):
+        [line] = (line for line in lines if line.startswith("frames "))
+        assert "lowest none" in line
+        assert f"{len(withheld)} withheld" in line
+    else:
+        told = {line.split()[1]: line for line in lines if ".png" in line}
+        assert all("withheld" in told[name] for name in withheld)
+        assert not any(" to " in told[name] for name in withheld)

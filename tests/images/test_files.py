@@ -1,11 +1,17 @@
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
+from there import there
 
 from sliplens.errors import ImageError, InputError
 from sliplens.images import decode_png, encode_png, list_images, read_image, write_png
+from sliplens.recordings.formats.images import frame_size
+from sliplens.recordings.formats.lerobot import decode_image
+from sliplens.recordings.source import open_source
 
 
 def save(path: Path, pixels: np.ndarray) -> Path:
@@ -49,7 +55,7 @@ def test_an_image_with_four_channels_is_refused(tmp_path: Path):
 
 def test_a_16_bit_tiff_is_refused(tmp_path: Path):
     path = save(tmp_path / "a.tiff", np.full((5, 7), 40_000, np.uint16))
-    with pytest.raises(ImageError, match=r"a\.tiff has 16 bits a pixel; convert it to 8-bit RGB"):
+    with pytest.raises(ImageError, match=r"a\.tiff has 16 bits a channel; divide its levels by 256"):
         read_image(path)
 
 
@@ -86,3 +92,58 @@ def test_a_file_instead_of_a_folder_is_refused(tmp_path: Path):
 def test_a_folder_without_images_is_refused(tmp_path: Path):
     with pytest.raises(InputError, match=r"holds no image \(looked for "):
         list_images(tmp_path)
+
+
+TAGGED = np.zeros((6, 10, 3), dtype=np.uint8)  # no turn and no mirror image leaves it as it is
+TAGGED[:3, :5] = 250
+TAGGED[:3, 5:] = 120
+
+
+def save_tagged(path: Path, orientation: int) -> Path:
+    tag = Image.Exif()
+    tag[ExifTags.Base.Orientation] = orientation
+    Image.fromarray(TAGGED).save(path, exif=tag)
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["png", "tiff", "jpg"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_an_orientation_tag_is_applied_wherever_images_are_read(tmp_path: Path, suffix: str, orientation: int):
+    path = save_tagged(tmp_path / f"a.{suffix}", orientation)
+    with Image.open(path) as image:
+        upright = np.asarray(ImageOps.exif_transpose(image))
+    assert frame_size(path) == upright.shape[:2]
+    (trial,) = open_source(tmp_path, reference=path)
+    read = [read_image(path, size=upright.shape[:2]), there(trial.reference), *trial.read_frames()]
+    if suffix != "tiff":
+        read.append(decode_image(path.read_bytes(), where="a message"))
+    for pixels in read:
+        np.testing.assert_array_equal(pixels, upright)
+
+
+def write_png_48(path: Path, pixels: np.ndarray) -> Path:
+    """Write 16 bits a channel, which Pillow cannot: the chunks of the PNG specification, 11.2."""
+    height, width, _ = pixels.shape
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels.astype(">u2").view(np.uint8).reshape(height, -1)], 1)
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    parts = (chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows.tobytes())), chunk(b"IEND", b""))
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    return path
+
+
+@pytest.mark.parametrize("bits", [10, 12, 16])
+def test_an_image_of_16_bits_is_refused_however_many_the_camera_used(tmp_path: Path, bits: int):
+    path = write_png_48(tmp_path / "a.png", np.full((6, 10, 3), 2**bits - 1, dtype=np.uint16))
+    (trial,) = open_source(tmp_path)
+    for read in (
+        lambda: read_image(path),
+        lambda: list(trial.read_frames()),
+        lambda: open_source(np.zeros((1, 6, 10, 3), np.uint8), reference=path),
+        lambda: decode_image(path.read_bytes(), where="a message"),
+    ):
+        with pytest.raises(ImageError, match="has 16 bits a channel; divide its levels by 256, or by 16 or 4"):
+            read()

@@ -210,9 +210,8 @@ def test_a_new_reference_is_taken_on_request(recording: Recording):
 class Strict:
     """Health that lets frames pass whose number is even."""
 
-    def __init__(self, reference: np.ndarray, network: Run | None) -> None:
+    def __init__(self, reference: np.ndarray) -> None:
         assert reference.shape == (48, 48, 3)
-        assert network is not None
 
     def check(self, frame: LiveFrame, _: TrackedFrame | None) -> tuple[Check, ...]:
         odd = frame.number % 2
@@ -228,6 +227,36 @@ def test_a_margin_is_withheld_where_a_check_fails(recording: Recording, differen
         (False, False, False),
         (True, True, True),
     }
+
+
+class Lenient:
+    """Health that finds nothing wrong with any picture."""
+
+    def __init__(self, reference: np.ndarray) -> None:
+        self.reference = reference
+
+    def check(self, _: LiveFrame, __: TrackedFrame | None) -> tuple[Check, ...]:
+        return ()
+
+
+def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Recording]):
+    trial, network = trials["chromatouch"], sl.load("chromatouch-pair")
+    touching = trial.frames[np.isfinite(trial.safety_margin)]
+    torn = np.concatenate([touching[::4][1:, :112], touching[::4][:-1, 112:]], axis=1)
+    whole = touching[1::4][: len(torn)]
+    frames = np.stack([whole, torn], axis=1).reshape(-1, *trial.frames.shape[1:])  # far less than 0.25 s apart
+    known = sl.predict(network, frames, reference=trial.reference).frame()["known"].to_numpy()
+    assert (known[1::2] < 0.01).any()
+    assert (known[::2] > 0.01).any()
+    source = Patient(frames, list(range(len(frames))))
+    readings = source.all_readings(
+        sl.LiveReader(source, network, reference=trial.reference, engine="eager", health=Lenient, slip=None, stall_s=10)
+    )
+    for reading, share in zip(readings, known, strict=True):
+        [check] = reading.health
+        assert (reading.margin is None) == (share < 0.01)
+        # one frame at a time or many: float32 sums in another order move the features by 1e-6, the logarithm by more
+        assert check.value == pytest.approx(-np.log10(share), abs=1e-2)
 
 
 def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording]):

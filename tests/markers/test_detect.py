@@ -1,7 +1,10 @@
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter
 
 from sliplens.errors import ImageError, InputError
 from sliplens.markers import KINDS, MarkerKind, detect_markers
@@ -95,9 +98,49 @@ def test_three_dots_are_no_pattern(dots):
         detect_markers(dots([(40, 40), (80, 80), (120, 60)]), "auto")
 
 
-def test_noise_is_not_taken_for_markers(rng):
+def noise(rng: np.random.Generator, *, blur_px: float) -> np.ndarray:
+    levels = rng.normal(size=(224, 224, 3))
+    levels = gaussian_filter(levels, (blur_px, blur_px, 0))
+    return np.clip(120 + 30 * levels / levels.std(), 0, 255).astype(np.uint8)
+
+
+def discs_of_many_sizes(rng: np.random.Generator) -> np.ndarray:
+    rows, columns = np.mgrid[:300, :300]
+    image = np.full((300, 300, 3), 180, dtype=np.uint8)
+    for x, y, radius in zip(*rng.integers(0, 300, (2, 40)), rng.uniform(3, 16, 40), strict=True):
+        image[np.hypot(columns - x, rows - y) < radius] = 60
+    return image
+
+
+def a_scene(rng: np.random.Generator) -> np.ndarray:
+    """Grey levels whose spectrum falls as that of photographs does, with the inverse of the frequency."""
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(256), np.fft.fftfreq(256)))
+    frequency[0, 0] = 1
+    levels = np.fft.ifft2(np.fft.fft2(rng.normal(size=(256, 256))) / frequency).real
+    return np.repeat(np.clip(120 + 45 * levels / levels.std(), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+PICTURES = {
+    "noise": partial(noise, blur_px=0),
+    "grain": partial(noise, blur_px=1),
+    "fabric": partial(noise, blur_px=2),
+    "clouds": partial(noise, blur_px=4),
+    "discs": discs_of_many_sizes,
+    "scene": a_scene,
+}
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_picture_without_dots_has_no_markers(name: str, seed: int):
     with pytest.raises(ImageError, match="markers"):
-        detect_markers(np.clip(rng.normal(120, 20, (120, 160, 3)), 0, 255).astype(np.uint8), "auto")
+        detect_markers(PICTURES[name](np.random.default_rng(seed)), "auto")
+
+
+def test_dots_that_lie_anywhere_are_markers_if_they_are_alike(dots, rng):
+    grid = rng.permutation(49)[:20]  # of a fine grid, so that none touches another
+    places = np.stack([20 + 26.0 * (grid % 7), 20 + 26.0 * (grid // 7)], axis=-1) + rng.uniform(-6, 6, (20, 2))
+    assert len(detect_markers(dots(places, size=(200, 200)), "auto")) == 20
 
 
 def test_kinds_that_cannot_be_are_refused(dots, grid):

@@ -15,9 +15,11 @@ import pytest
 from there import there
 
 import sliplens as sl
+from sliplens.codec import TABLE_SUFFIXES
 from sliplens.errors import ImageError, InputError, RecordingError, ShardError
 from sliplens.images import absolute_difference, write_png
 from sliplens.models import Run, load_checkpoint
+from sliplens.models.checkpoint import STRANGE_REASON
 from sliplens.models.predictions import Predictions
 from sliplens.models.predictions import predict as predict_source
 from sliplens.parts import read_status
@@ -34,6 +36,12 @@ TRIAL = "test-wet-7"
 @pytest.fixture
 def trained(networks: dict[str, Run]) -> Run:
     return networks["histogram"]
+
+
+@pytest.fixture
+def foreign(trials: dict[str, Recording]) -> Recording:
+    """Frames of a sensor that the networks of the package never saw."""
+    return trials["flat-gel"]
 
 
 @pytest.fixture
@@ -85,6 +93,7 @@ def test_a_data_set_is_predicted_frame_by_frame(trained: Run, small_dataset: Dat
         "sigma",
         "low_90",
         "high_90",
+        "withheld",
     ]
     assert rows["trial"] == ["test-dry-6"] * 12 + [TRIAL] * 12
     assert rows["frame"] == [*range(12), *range(12)]
@@ -116,7 +125,33 @@ def test_how_far_the_network_knows_each_frame_is_told(trials: dict[str, Recordin
     estimate = network.estimate(network.encode(frames, trial.reference))
     assert estimate.known is not None
     np.testing.assert_allclose(predictions.frame()["known"].to_numpy(), estimate.known, atol=1e-3)
-    assert predictions.strange == (estimate.known < 0.01).sum() == 2
+    strange = estimate.known < 0.01
+    assert predictions.withheld == {STRANGE_REASON: strange.sum()} == {STRANGE_REASON: 2}
+
+
+NETWORK_COLUMNS = ("prediction", "sigma", "low_90", "high_90", "traction_ratio", "traction_ratio_sigma")
+
+
+@pytest.mark.parametrize("suffix", [None, *TABLE_SUFFIXES])
+def test_where_a_frame_is_withheld_the_table_holds_no_answer_of_the_network(
+    foreign: Recording, tmp_path: Path, suffix: str | None
+):
+    out = None if suffix is None else tmp_path / f"margins{suffix}"
+    predictions = sl.predict("chromatouch-difference", foreign.frames, reference=foreign.reference, out=out)
+    rows = predictions.frame()
+    reasons = rows["withheld"].to_pylist()
+    assert {None} < set(reasons) == {None, STRANGE_REASON}  # the untouched frames are not judged
+    assert [reason is not None for reason in reasons] == rows["touches"].to_pylist()
+    for name in NETWORK_COLUMNS:
+        assert [value is None for value in rows[name].to_pylist()] == [reason is not None for reason in reasons]
+    assert predictions.withheld == {STRANGE_REASON: sum(rows["touches"].to_pylist())}
+    assert None not in rows["known"].to_pylist()  # it is what the reason was found by
+
+
+def test_a_trial_whose_margins_are_all_withheld_has_no_lowest(foreign: Recording):
+    (trial,) = sl.predict("chromatouch-difference", foreign.frames, reference=foreign.reference).trials()
+    assert (trial.lowest, trial.interval, trial.time_s) == (None, None, None)
+    assert trial.withheld == trial.touching == np.isnan(trial.margin).sum() > 10
 
 
 def test_a_network_with_one_number_tells_nothing_of_it(

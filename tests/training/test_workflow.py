@@ -53,6 +53,7 @@ def test_a_network_may_stay_in_memory(small_dataset: Dataset):
     dry = np.array(table["condition"]) == "dry"
     assert evaluation.conditions["dry"].mse == pytest.approx(squares[dry].mean())
     assert run.manifest.colour
+    assert run.manifest.pull_direction_deg is None  # what these pictures show is no shear
     assert evaluation.known_trials == 0
     assert sl.evaluate(run, small_dataset, split="train").known_trials == 4
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +25,7 @@ _FEW = 24
 """Frames of which each has a line on the terminal."""
 _TRIALS = 40
 """Trials of which each has a line."""
+_NO_BAR = "\u00b7"
 _BARS = "\u2581\u2582\u2583\u2584\u2585\u2586\u2587\u2588"
 
 
@@ -89,8 +91,8 @@ class Predict(SourceCommand):
         predictions = self.call(predict, **named)
         predictions = replace(predictions, rows=predictions.frame())  # a file is read back once
         _show(predictions)
-        if strange := predictions.strange:
-            say(f"strange to the network (known below 1 %), not to be relied on: {number_of(strange, 'frame')}")
+        for reason, frames in predictions.withheld.items():
+            say(f"withheld in {number_of(frames, 'frame')}: {reason}")
         if self.friction is not None:
             say(f"margins for a friction of {self.friction}, as you told it")
         if self.plot is not None:
@@ -111,7 +113,7 @@ def _show(predictions: "Predictions") -> None:
         told = [
             (
                 row.get("file") or f"{row['trial']} {row['frame']}",
-                _percent(row["prediction"]),
+                _percent(row["prediction"]) if row["withheld"] is None else "withheld",
                 _interval(row["low_90"], row["high_90"]),
                 *(_percent(row[name]) for name in more.values()),
             )
@@ -124,7 +126,8 @@ def _show(predictions: "Predictions") -> None:
         say(_course(trial))
     if len(trials) > _TRIALS:
         say(f"and {number_of(len(trials) - _TRIALS, 'more trial')}; -o margins.csv writes every frame")
-    say("bars: safety margin, 0 % to 100 %, the lowest of the frames that share one")
+    withheld = f", {_NO_BAR} where it is withheld" if predictions.withheld else ""
+    say(f"bars: safety margin, 0 % to 100 %, the lowest of the frames that share one{withheld}")
 
 
 def _course(trial: "TrialMargins") -> str:
@@ -132,9 +135,11 @@ def _course(trial: "TrialMargins") -> str:
     low, high = trial.interval or (None, None)
     interval = "" if low is None else f" ({_interval(low, high)})"
     touching = "" if trial.touching is None else f", {trial.touching:,} touch" if trial.touching else ", none touches"
+    lowest = "none" if trial.lowest is None else f"{_percent(float(trial.margin[trial.lowest]))}{interval} at {where}"
+    withheld = f", {trial.withheld:,} withheld" if trial.withheld else ""
     return (
-        f"{trial.trial}  {_sparkline(trial.margin.tolist())}  lowest {_percent(float(trial.margin[trial.lowest]))}"
-        f"{interval} at {where}, {number_of(len(trial.margin), 'frame')}{touching}"
+        f"{trial.trial}  {_sparkline(trial.margin.tolist())}  lowest {lowest}, "
+        f"{number_of(len(trial.margin), 'frame')}{touching}{withheld}"
     )
 
 
@@ -147,7 +152,10 @@ def _interval(low: float | None, high: float | None) -> str:
 
 
 def _sparkline(shares: Sequence[float], *, width: int = 40) -> str:
-    """Shares in [0, 1] as bars of a line, the lowest of those that fall into one; full height is 1."""
+    """Draw shares in [0, 1] as bars of a line, the lowest of those that fall into one; NaN has no bar."""
     count = min(width, len(shares))
     parts = (shares[at * len(shares) // count : (at + 1) * len(shares) // count] for at in range(count))
-    return "".join(_BARS[round(min(max(min(part), 0.0), 1.0) * (len(_BARS) - 1))] for part in parts)
+    lowest = (min((share for share in part if not isnan(share)), default=None) for part in parts)
+    return "".join(
+        _NO_BAR if share is None else _BARS[round(min(max(share, 0.0), 1.0) * (len(_BARS) - 1))] for share in lowest
+    )

@@ -267,7 +267,7 @@ def controls_win(scores: Mapping[str, Faithfulness], controls: Mapping[str, Fait
 
 Frames: TypeAlias = UInt8[np.ndarray, "images height width 3"]
 Maps: TypeAlias = Explanation | Float[np.ndarray, "maps rows columns"]
-"""Explanation of the frames, or the influence of each pixel of the network's input: larger where it matters more."""
+"""Explanation of the frames, or a number for each pixel of the network's input, whose meaning `signed` names."""
 _CHECKED_IMAGES = 4
 _TILES_ACROSS = 14
 
@@ -277,6 +277,7 @@ def score(
     frames: Frames,
     maps: Maps,
     *,
+    signed: bool = True,
     reference: UInt8[np.ndarray, "height width 3"] | None = None,
     fill: str = "reference",
     unit: Literal["pixel", "tile"] = "pixel",
@@ -298,7 +299,12 @@ def score(
     frames, reference
         As `explain` took them.
     maps
-        What `explain` gave; or an array, larger where a pixel matters more to f(x) - f(reference).
+        What `explain` gave; or an array (frames, size, size) of one number a pixel of the network's input.
+    signed
+        Meaning of an array. True: above zero where a pixel raises the prediction, as `Explanation.relevance` and the
+        attributions of Captum, summed over the colours. Pixels then rank by sign(f(x) - f(reference)) times the map,
+        as those of an `Explanation` do. False: larger where a pixel matters more, whichever way the prediction went,
+        as a saliency in [0, 1].
     fill
         What removed pixels become, a row of `FILLS`; `reference`, the untouched sensor, is the one that networks know.
     unit
@@ -311,15 +317,16 @@ def score(
     InputError
         If there is no such fill, or the network needs a reference.
     SaliencyError
-        If there is not a map a frame, or one has another size than the network's input, or holds NaN.
+        If there is not a map a frame, or one has another size than the network's input, or holds NaN; or if a signed
+        array has no number below zero for a frame whose prediction fell.
     """
     fill_of_name, trained = get_fill(fill), open_run(run)
     inputs, empty = network_inputs(trained, frames, reference)
     method = maps.method if isinstance(maps, Explanation) else "maps"
-    influence = {method: _influence(maps, inputs)}
-    influence |= control_maps(trained.model, inputs, empty.expand_as(inputs))
     whole, untouched = (trained.predict(images).double().numpy() for images in (inputs, empty[None]))
     towards = np.sign(whole - untouched)
+    influence = {method: _influence(maps, inputs, towards=towards, signed=signed)}
+    influence |= control_maps(trained.model, inputs, empty.expand_as(inputs))
     shape = (inputs.shape[-2], inputs.shape[-1])
     units = tile_units(shape, size=1 if unit == "pixel" else max(1, shape[0] // _TILES_ACROSS))
     orders = 2 * len(influence) + random_orders
@@ -354,6 +361,7 @@ def score_by_deletion(
     frames: Frames,
     maps: Maps,
     *,
+    signed: bool = True,
     reference: UInt8[np.ndarray, "height width 3"] | None = None,
     fill: str = "grey",
     steps: int | None = None,
@@ -372,7 +380,8 @@ def score_by_deletion(
     fill_of_name, trained = get_fill(fill), open_run(run)
     inputs, empty = network_inputs(trained, frames, reference)
     shape = (inputs.shape[-2], inputs.shape[-1])
-    salient = np.maximum(_influence(maps, inputs), 0)
+    whole, untouched = (trained.predict(images).double().numpy() for images in (inputs, empty[None]))
+    salient = np.maximum(_influence(maps, inputs, towards=np.sign(whole - untouched), signed=signed), 0)
     rng = np.random.default_rng(seed)
     orders = np.concatenate([saliency_orders(salient, shape), [random_order(shape, rng=rng) for _ in salient]])
     curves = deletion_curves(
@@ -399,10 +408,22 @@ def prepare_passes(trained: Run, inputs: Float[Tensor, "images colours size size
         return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
 
 
-def _influence(maps: Maps, inputs: Tensor) -> Float64[np.ndarray, "images height width"]:
-    values = maps.influence.double().cpu().numpy() if isinstance(maps, Explanation) else maps.astype(np.float64)
+def _influence(
+    maps: Maps, inputs: Tensor, *, towards: Float[np.ndarray, " images"], signed: bool
+) -> Float64[np.ndarray, "images height width"]:
+    """Rank the pixels by what works towards the prediction, `towards` the sign of f(x) - f(reference)."""
+    of_record = isinstance(maps, Explanation)
+    values = maps.influence.double().cpu().numpy() if of_record else maps.astype(np.float64)
     if len(values) != len(inputs):
         raise SaliencyError(f"there are {len(values)} maps of {len(inputs)} frames; explain the frames that are scored")
     for index, each in enumerate(values):
         require_saliency(each, inputs.shape[-2:], where=f"map {index}")
-    return values
+    if of_record or not signed:
+        return values
+    for index in np.flatnonzero((towards < 0) & (values.min(axis=(1, 2)) >= 0) & (values.max(axis=(1, 2)) > 0)):
+        raise SaliencyError(
+            f"map {index} has no number below 0, but the prediction of its frame is lower than that of the untouched "
+            "sensor, which a signed map must explain by pixels that lower it; if its numbers say how much a pixel "
+            "matters whichever way, give signed=False"
+        )
+    return towards[:, None, None] * values

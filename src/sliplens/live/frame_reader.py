@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Event
 from typing import Protocol, runtime_checkable
@@ -13,8 +12,9 @@ from torch import Tensor
 
 from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
+from sliplens.images import require_rgb
 from sliplens.live.contract import LiveSource
-from sliplens.live.health import OFF, HealthMonitor, margin_risk
+from sliplens.live.health import OFF, check_direction, check_novelty, margin_risk
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run
@@ -24,6 +24,7 @@ from sliplens.models.sequence import require_frequent
 from sliplens.recordings.capture import Frame
 from sliplens.recordings.labels.lag import soften
 from sliplens.recordings.trial import ContactState, contact_states
+from sliplens.shear import ShearEstimator
 
 
 @runtime_checkable
@@ -126,7 +127,7 @@ class FrameReader:
         same_object: bool,
         sequence: bool,
         smoothing_s: float,
-        health: Callable[[Frame, Run | None], HealthWatch] | None,
+        health: Callable[[Frame], HealthWatch] | None,
         slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None,
     ) -> None:
         self.source, self.network = source, network
@@ -149,11 +150,11 @@ class FrameReader:
         self._smooth = LowPass(time_constant_s=smoothing_s)
         self._make_health, self._make_slip = health, slip
         self._health: HealthWatch | None = None
+        self._shear: ShearEstimator | None = None
         self._slip: SlipWatch | None = None
         self._tracker: Tracker | None = None
         self._smaller = 1
         self._taker: _ReferenceTaker | None = None
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="novelty")
         self._has_margin = False
         self._last: LiveFrame | None = None
         self._dropped = 0
@@ -177,16 +178,13 @@ class FrameReader:
         if reference is None:
             self._taker = _ReferenceTaker()
             return
+        require_rgb(reference, what="levels of the reference")
         if reference.shape[:2] != self._size:
             raise ImageError(
                 f"the reference has {_in_pixels(reference.shape[:2])} pixels, the frames of {self.source.name} have "
                 f"{_in_pixels(self._size)}; name an image of this camera with --reference, or leave it out"
             )
         self._set_reference(reference)
-
-    def close(self) -> None:
-        """Read nothing more."""
-        self._beside.shutdown(wait=False, cancel_futures=True)
 
     def missing(self, why: str) -> Reading:
         """Reading where no frame came."""
@@ -201,6 +199,7 @@ class FrameReader:
 
     def read(self, frame: LiveFrame) -> Reading:
         """Read the next frame."""
+        require_rgb(frame.image, what=f"levels of frame {frame.number} of {self.source.name}")
         last, self._last = self._last, frame
         self._dropped += 0 if last is None else max(0, frame.number - last.number - 1)
         begin = Reading(
@@ -227,7 +226,6 @@ class FrameReader:
         [(reading, withheld)] = checked or [self._check(begin, frame)]
         if self.network is None or withheld is not None:
             return self._withhold(reading, frame, withheld)
-        self._has_margin = True
         return self._estimate(reading, frame, answers or self._ask(frame))
 
     def _check(self, begin: Reading, frame: LiveFrame) -> tuple[Reading, str | None]:
@@ -240,6 +238,8 @@ class FrameReader:
             self.markers_px = self._in_frame(rest_px), self._in_frame(followed.position_px[: len(rest_px)])
             markers = self._slip.update(self.markers_px[1], frame.time_s)
         health = () if self._health is None else self._health.check(frame, followed)
+        if self._shear is not None and self.network is not None and all(check.ok for check in health):
+            health = (*health, check_direction(self.network, self._shear.estimate(frame.image)))
         latency = Latency(decode_ms=frame.decode_ms, checks_ms=1e3 * (time.perf_counter() - begun))
         withheld = next((check.sentence for check in health if not check.ok), None)
         reading = replace(begin, slip=markers and markers.state, markers=markers, health=health, latency=latency)
@@ -285,6 +285,14 @@ class FrameReader:
         friction = self.learner.friction
         follower = self._follower if friction is None else None  # it looks for what is known then
         estimate = self.network.to_estimate(*answers.parts, friction=friction)
+        latency = replace(reading.latency, encode_ms=answers.encode_ms, network_ms=answers.network_ms)
+        reading = replace(reading, latency=latency)
+        novelty = None if self._health is None else check_novelty(estimate)
+        if novelty is not None:
+            reading = replace(reading, health=(*reading.health, novelty))
+            if not novelty.ok:
+                return self._withhold(reading, frame, novelty.sentence)
+        self._has_margin = True
         if follower is not None:
             estimate = follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
@@ -307,12 +315,7 @@ class FrameReader:
             risk=margin_risk(reading.health, float(estimate.beyond(OFF)[0])) if reading.health else None,
             contact_state=state,
             lag_s=self._smooth.time_constant_s,
-            latency=replace(
-                reading.latency,
-                encode_ms=answers.encode_ms,
-                network_ms=answers.network_ms,
-                total_ms=_since_ms(frame.captured_s),
-            ),
+            latency=replace(latency, total_ms=_since_ms(frame.captured_s)),
         )
 
     def _look_for_reference(self, frame: LiveFrame) -> None:
@@ -326,9 +329,9 @@ class FrameReader:
     def _set_reference(self, image: Frame) -> None:
         self.reference = image
         self.doubt = None if self.network is None else self.network.doubt_colour(image)
-        self._health = None if self._make_health is None else self._make_health(image, self.network)
-        if isinstance(self._health, HealthMonitor):
-            self._health.beside = self._beside
+        self._health = None if self._make_health is None else self._make_health(image)
+        checked = None if self._health is None else self.network
+        self._shear = None if checked is None else checked.shear_estimator(image)
         self._begin_anew()
 
     def _begin_anew(self) -> None:

@@ -3,7 +3,6 @@
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,26 +11,24 @@ from jaxtyping import Float, Float32
 from sliplens.errors import InputError
 from sliplens.live.reading import Check, LiveFrame, small_picture
 from sliplens.markers import MarkerStatus, TrackedFrame
-from sliplens.models.checkpoint import Run
-from sliplens.models.novelty import read_features
-from sliplens.recordings.capture import Frame
+from sliplens.markers.camera import BorderMotion, CameraMotion, block_means, marker_camera_motion
+from sliplens.models.checkpoint import STRANGE, Estimate, Run
+from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labels.lag import LEAST_TOUCH, picture_change, soften
+from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, Shear
 
 Plane = Float32[np.ndarray, "height width"]
 
 _BRIGHT, _DARK = 250, 5
-_BORDER = 0.14  # share of the side: what touches seldom reaches there
-_COARSE = 4
-_REACH_PX = 8
-_PARTS, _STRAYS = 8, 2
-"""Parts of the border, and how many of them may move otherwise while the camera moves."""
-_STRAY_SHARE, _STRAY_PX = 0.2, 0.1
 _TILES = 4
 _SEEN = 10.0
 """Grey levels below which a ratio of brightness means nothing."""
-_NOVELTY_EVERY_S = 0.25
 _DROPS_OVER_S = 1.0
 _OLDEST_S = 0.1
+_BLOCK_PX = 4
+_CHANGED_SHARE, _NOISE_SHARE, _LEAST_SQUARE = 1.5, 0.2, 0.02
+"""Of the noise of means of blocks, that show a change and that a square of it is known to; and squares of grey levels
+that rounding makes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,8 +36,8 @@ class HealthLimits:
     """Bounds of healthy values; a frame beyond one of them has no margin.
 
     The defaults lie above all values of 80 healthy frames in contact on 16 simulated validation days: exposure, focus
-    and light at four times the largest and more (`benchmarks/health.py --choose`). Those of markers, camera, touch and
-    time are chosen by hand.
+    and light at four times the largest and more (`benchmarks/health.py --choose`), the camera at 1.4 times, halves and
+    force at twice the largest of 96 simulated sequences of 0.7 s. Those of markers, touch and time are chosen by hand.
     """
 
     repeated_s: float = 0.25
@@ -57,8 +54,13 @@ class HealthLimits:
     """Share of the reference's sharpness that is lost."""
     light: float = 0.2
     """Brightness of one side of the border against the rest, as the ratio's power of 2, up or down."""
-    camera_px: float = 0.8
-    """Motion of the border as a whole against the reference, in pixels of a picture 224 high."""
+    camera_px: float = 0.6
+    """Motion of the border by a shift, turn or zoom of the picture that no contact explains, in pixels of a picture 224
+    high."""
+    halves: float = 4.0
+    """How many times as much one half of the picture may change as the other, which shows its noise alone."""
+    frozen_n: float = 0.15
+    """Change of the force since the picture last changed by more than its noise, in newtons."""
     markers: float = 0.15
     """Share of the reference's markers that are not seen where they should be."""
     touch: float = LEAST_TOUCH
@@ -71,21 +73,20 @@ class HealthLimits:
 
 
 class HealthMonitor:
-    """Checks frames against the untouched sensor, and against what a network was trained on.
+    """Checks frames against the untouched sensor.
 
-    Looked at in every frame are whether frames repeat, come late or are lost; saturation and exposure; markers that are
-    missing or have jumped; and whether anything touches at all. What changes slowly takes turns, one of the three a
+    Looked at in every frame are whether frames repeat, come late or are lost; whether the picture, or half of it, shows
+    nothing but noise while the force or the other half changes; saturation and exposure; markers that are missing or
+    have jumped; and whether anything touches at all. What changes slowly takes turns, one of the three a
     frame, and is told of a frame at most 0.1 s ago: focus; light that falls unevenly, as when a lamp is out; and the
-    border of the picture, which moves as a whole when the camera does (in a wide contact only what was seen before it
-    is known). Every quarter of a second, how far the network's own features are from those of its training frames,
-    for networks whose manifest holds that.
+    border of the picture, which is shifted, turned and zoomed when the camera moves. Markers beyond the contact tell that
+    in every frame, and in a contact too; without markers parts of the border do, which see a turn in a contact, and a
+    shift and a zoom before it alone.
 
     Parameters
     ----------
     reference
         The sensor untouched.
-    run
-        Network whose input is judged; None for the picture alone.
     limits
         Bounds of healthy values.
 
@@ -101,22 +102,17 @@ class HealthMonitor:
     'the picture is 1.3 times as bright as the reference; fix exposure and gain of the camera, or take a new reference'
     """
 
-    def __init__(self, reference: Frame, run: Run | None = None, limits: HealthLimits | None = None) -> None:
+    def __init__(self, reference: Frame, limits: HealthLimits | None = None) -> None:
         self.limits = limits or HealthLimits()
-        self._reference, self._run = reference, run
         small = small_picture(reference)
         grey = _green(small)
         self._soft, self._sharp, self._lost = soften(small), _sharpness(grey), _saturated(small)
-        self._fine, self._coarse = (_Border(plane) for plane in (grey, _shrink(grey, _COARSE)))
+        self._border, self._stillness = BorderMotion(grey), _Stillness()
+        self._camera: CameraMotion | None = None
         self._before: np.ndarray | None = None
-        self._changed_s = self._moved_px = 0.0
+        self._changed_s = 0.0
         self._numbers: deque[tuple[float, int]] = deque()
         self._sometimes: dict[str, tuple[float, Check]] = {}
-        self._novelty: tuple[float, Check] | None = None
-        self._coming: tuple[float, Future[Check]] | None = None
-        self.beside: Executor | None = None
-        """Where the network looks for what is new to it, so that no frame waits for that but the first: a check then
-        tells of a frame up to half a second ago. In the same thread, of a quarter of a second ago, if None."""
 
     def check(self, frame: LiveFrame, markers: TrackedFrame | None = None, /) -> tuple[Check, ...]:
         """Check a frame of the reference's size, and its markers where they are followed.
@@ -128,8 +124,10 @@ class HealthMonitor:
         both = (self._soft > _SEEN) & (soft > _SEEN) & (self._soft < _BRIGHT) & (soft < _BRIGHT)
         ratio = np.log2(np.where(both, soft, 1) / np.where(both, self._soft, 1))
         gain = float(np.median(ratio[both])) if both.any() else 0.0
+        camera = None if markers is None else marker_camera_motion(markers)
         checks = [
             self._check_repeated(frame),
+            *self._check_frozen(frame),
             self._check_late(frame),
             self._check_drops(frame),
             self._check_saturation(frame.small),
@@ -138,7 +136,9 @@ class HealthMonitor:
                 {
                     "focus": lambda: self._check_focus(_green(frame.small), gain),
                     "light": lambda: self._check_light(ratio - gain, both),
-                    "camera": lambda: self._check_camera(_green(frame.small), gain),
+                    "camera": lambda: self._check_camera(
+                        camera or self._border.measure(_green(frame.small) * np.float32(2**-gain))
+                    ),
                 },
                 frame.time_s,
             ),
@@ -146,8 +146,6 @@ class HealthMonitor:
         if markers is not None:
             checks.append(self._check_markers(markers))
         checks.append(self._check_touch(soft, gain))
-        if self._run is not None and self._run.manifest.novelty is not None:
-            checks.append(self._check_novelty(frame, self._run))
         return tuple(checks)
 
     def _check_sometimes(self, checks: Mapping[str, Callable[[], Check]], time_s: float) -> Iterable[Check]:
@@ -165,6 +163,16 @@ class HealthMonitor:
         value = max(0.0, frame.time_s - self._changed_s)
         told = f"the picture has not changed by a single pixel for {value:.2g} s"
         return _judge("repeated", value, self.limits.repeated_s, told, "start the camera again")
+
+    def _check_frozen(self, frame: LiveFrame) -> Iterable[Check]:
+        """Check for a picture, or a half of it, that stays as it is but for its noise; forces are known in part."""
+        still, cure = self._stillness, "start the camera again"
+        still.update(block_means(_green(frame.small), _BLOCK_PX), frame.forces)
+        told = f"one half of the picture changes {still.ratio:.2g} times as much as the other"
+        yield _judge("halves", still.ratio, self.limits.halves, told, cure)
+        if still.force_change_n is not None:
+            told = f"the force changed by {still.force_change_n:.2g} N while the picture showed nothing but noise"
+            yield _judge("frozen", still.force_change_n, self.limits.frozen_n, told, cure)
 
     def _check_late(self, frame: LiveFrame) -> Check:
         value = max(0.0, time.monotonic() - frame.captured_s) if frame.captured_s > 0 else 0.0
@@ -213,19 +221,21 @@ class HealthMonitor:
         told = f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference"
         return _judge("light", worst, self.limits.light, told, "look after the lamps, or take a new reference")
 
-    def _check_camera(self, grey: Plane, gain: float) -> Check:
-        level = np.float32(2**-gain)
-        start = _COARSE * self._coarse.shifts(_shrink(grey, _COARSE) * level, np.zeros((_PARTS, 2)))
-        shifts = self._fine.shifts(grey * level, start)
-        middle = np.median(shifts, axis=0)
-        length, strays = float(np.linalg.norm(middle)), np.linalg.norm(shifts - middle, axis=1)
-        # a camera moves all parts alike, a contact does not: what was seen before it holds until it is let go
-        if np.sort(strays)[_PARTS - _STRAYS - 1] < _STRAY_SHARE * length + _STRAY_PX:
-            self._moved_px = min(length, _REACH_PX)
-        value = self._moved_px
-        told = f"the border of the picture moved by {value:.1f} px since the reference"
-        cure = "the camera or the skin has shifted; fasten it, and take a new reference"
-        return _judge("camera", value, self.limits.camera_px, told, cure)
+    def _check_camera(self, motion: CameraMotion | None) -> Check:
+        limit = self.limits.camera_px
+        if motion is None:
+            told = "the border of the picture shows too little to tell whether the camera has moved"
+            return _judge("camera", 0.0, limit, told, "")
+        # a contact hides part of the camera's motion: what was seen before it holds until it is let go
+        if motion.free or self._camera is None or motion.excess_px > self._camera.excess_px:
+            self._camera = motion
+        moved = self._camera
+        told = (
+            f"since the reference the picture was shifted by {moved.shift_px:.1f} px, turned by {moved.turn_deg:+.1f} "
+            f"degrees and zoomed by {100 * moved.zoom:+.1f} %"
+        )
+        cure = "the camera or the skin has moved: fasten it, and take a new reference"
+        return _judge("camera", moved.excess_px, limit, told, cure)
 
     def _check_markers(self, markers: TrackedFrame) -> Check:
         status = markers.status
@@ -245,28 +255,74 @@ class HealthMonitor:
         sentence = told if touches else "nothing touches the sensor; press it on something"
         return Check(name="touch", value=value, limit=self.limits.touch, ok=touches, sentence=sentence)
 
-    def _check_novelty(self, frame: LiveFrame, run: Run) -> Check:
-        age_s = np.inf if self._novelty is None else frame.time_s - self._novelty[0]
-        if not 0 <= age_s < 2 * _NOVELTY_EVERY_S:  # of too old a picture: this one is waited for
-            self._novelty = self._coming = None
-        if not 0 <= age_s < _NOVELTY_EVERY_S:
-            if self.beside is None:
-                self._novelty = frame.time_s, self._read_novelty(frame, run)
-            elif self._coming is None:
-                self._coming = frame.time_s, self.beside.submit(self._read_novelty, frame, run)
-        if self._coming is not None and (self._novelty is None or self._coming[1].done()):
-            self._novelty, self._coming = (self._coming[0], self._coming[1].result()), None
-        assert self._novelty is not None
-        return self._novelty[1]
 
-    def _read_novelty(self, frame: LiveFrame, run: Run) -> Check:
-        novelty = run.manifest.novelty
-        assert novelty is not None
-        inputs = run.encode(frame.image[None], self._reference)
-        value = float(novelty.distance(read_features(run.model, novelty.layer, inputs))[0])
-        told = f"to the network the picture is {value / novelty.limit:.2f} times as strange as what it was tested on"
-        cure = "use the sensor that it was trained on, or train it on this one"
-        return _judge("novelty", value, novelty.limit, told, cure)
+class _Stillness:
+    """Changes of the two halves of the picture, upper and lower, against their noise.
+
+    A half has changed once its mean square is above 1.5 times that from frame to frame, which is its noise and somewhat
+    more; until then it is compared with the picture of its last change.
+    """
+
+    def __init__(self) -> None:
+        self.ratio = 0.0
+        """How many times as much one half has changed as the other since that last changed, noise taken off."""
+        self.force_change_n: float | None = None
+        """Change of the force since either half changed; None before any force."""
+        self._before: Plane | None = None
+        self._last: list[Plane] = []
+        self._force_n: np.ndarray | None = None
+        self._last_force_n: np.ndarray | None = None
+
+    def update(self, plane: Plane, forces: Forces | None) -> None:
+        """Take the next frame in means of blocks, and the samples of the force since the one before."""
+        if forces is not None:
+            self._force_n = forces.force_n.mean(axis=0)
+        if self._before is None:
+            self._before, self._last = plane, [plane, plane]
+        noise = _half_squares(plane - self._before)
+        self.ratio, changed = 0.0, False
+        for half in (0, 1):
+            squares = _half_squares(plane - self._last[half])
+            excess = np.maximum(squares - noise, 0)
+            floor = _NOISE_SHARE * noise[half] + _LEAST_SQUARE
+            self.ratio = max(self.ratio, float(np.sqrt(excess[1 - half] / (excess[half] + floor))))
+            if squares[half] > _CHANGED_SHARE * noise[half] + _LEAST_SQUARE:
+                self._last[half], changed = plane, True
+        if changed or self._last_force_n is None:
+            self._last_force_n = self._force_n
+        if self._force_n is not None and self._last_force_n is not None:
+            self.force_change_n = float(np.linalg.norm(self._force_n - self._last_force_n))
+        self._before = plane
+
+
+def _half_squares(plane: Plane) -> Float[np.ndarray, " 2"]:
+    """Mean squares of the upper and the lower half."""
+    middle = len(plane) // 2
+    return np.array([np.mean(np.square(plane[:middle])), np.mean(np.square(plane[middle:]))], dtype=np.float64)
+
+
+def check_novelty(estimate: Estimate) -> Check | None:
+    """Check how far the network knows a frame, by the estimate of this frame alone; None of a network without novelty.
+
+    The value is the negative decimal logarithm of `Estimate.known`, at its limit where `predict` withholds too.
+    """
+    if estimate.known is None:
+        return None
+    known = float(estimate.known[0])
+    told = f"{known:.0%} of the frames that the network was tested on are as strange as this picture"
+    cure = "use the sensor that it was trained on, or train it on this one"
+    return _judge("novelty", -float(np.log10(max(known, 1e-30))), -float(np.log10(STRANGE)), told, cure)
+
+
+def check_direction(network: Run, shear: Shear) -> Check:
+    """Check the direction of the shear against the directions of the network's training.
+
+    The value is the distance from them in standard deviations (`Shear.excess`), at its limit where `predict` withholds
+    too.
+    """
+    trained = network.manifest.pull_direction_deg or FULL_CIRCLE
+    told = f"the skin is sheared towards {shear.direction_deg:.0f} degrees (90 is down the image)"
+    return _judge("direction", shear.excess(trained), DIRECTION_LIMIT, told, network.doubt_shear(shear) or "")
 
 
 def severity(check: Check) -> float:
@@ -280,7 +336,7 @@ OFF = 0.2
 _HARM: dict[str, tuple[float, float]] = {
     "repeated": (0.98, 0.14), "saturation": (0.18, 0.06), "exposure": (0.69, 0.17), "focus": (0.28, 0.08),
     "light": (0.26, 0.07), "camera": (0.61, 0.86), "markers": (0.27, 1.20), "touch": (0.97, 1.20),
-    "novelty": (0.20, 0.55),
+    "novelty": (0.20, 0.55), "direction": (0.95, 0.91),
 }  # fmt: skip
 """Chance that a fault puts the margin off however strong it is, and its growth with severity, by check."""
 _SPREAD = -0.83, 0.57
@@ -328,19 +384,6 @@ def _judge(name: str, value: float, limit: float, told: str, cure: str) -> Check
     return Check(name=name, value=value, limit=limit, ok=ok, sentence=told if ok else f"{told}; {cure}")
 
 
-def _shrink(plane: Plane, factor: int) -> Float32[np.ndarray, "rows columns"]:
-    """Means of square blocks; what fills no block at the right and below is left out."""
-    height, width = (side // factor for side in plane.shape)
-    # line by line, several times as fast as a mean over two axes
-    lines = plane[: height * factor, : width * factor].reshape(height, factor, width, factor)
-    sums, means = np.zeros((height, width, factor), dtype=np.float32), np.zeros((height, width), dtype=np.float32)
-    for line in range(factor):
-        sums += lines[:, line]
-    for column in range(factor):
-        means += sums[..., column]
-    return means / np.float32(factor**2)
-
-
 def _green(image: Frame) -> Plane:
     """Green, which cameras see best."""
     return image[..., 1].astype(np.float32)
@@ -361,44 +404,6 @@ def _saturated(image: Frame) -> float:
     red, green, blue = (image[::4, ::4, channel] for channel in range(3))
     white = np.minimum(np.minimum(red, green), blue) >= _BRIGHT
     return float(np.mean(white | (np.maximum(np.maximum(red, green), blue) <= _DARK)))
-
-
-class _Border:
-    """Border of a picture in eight parts, whose shifts are found by least squares on the slopes of each.
-
-    Lucas and Kanade, *An Iterative Image Registration Technique with an Application to Stereo Vision*, IJCAI 1981.
-    """
-
-    def __init__(self, plane: Plane) -> None:
-        height, width = plane.shape
-        wide = max(4, round(_BORDER * min(height, width)))
-        rows, columns = np.mgrid[:height, :width]
-        # bearing from the middle, the sides of the picture made alike: eight sectors of the border
-        bearing = np.arctan2(rows / (height - 1) - 0.5, columns / (width - 1) - 0.5)
-        sector = np.floor((bearing / (2 * np.pi) + 1) * _PARTS).astype(int) % _PARTS
-        sector[wide:-wide, wide:-wide] = -1
-        sector[[0, -1]] = sector[:, [0, -1]] = -1
-        down, along = np.gradient(plane)
-        self._stride = width + 2 * _REACH_PX
-        self._parts = []
-        for part in range(_PARTS):
-            inside = np.nonzero(sector == part)
-            terms = np.stack([along[inside], down[inside], np.ones(len(inside[0]))], axis=1)
-            place = (inside[0] + _REACH_PX) * self._stride + inside[1] + _REACH_PX
-            self._parts.append((place, plane[inside], np.linalg.pinv(terms, rcond=1e-3)[:2]))
-
-    def shifts(self, plane: Plane, start: Float[np.ndarray, "parts 2"]) -> Float[np.ndarray, "parts 2"]:
-        """Motion (x, y) of each part since the picture that it was made from, in pixels, near a first guess."""
-        pixels = np.pad(plane, _REACH_PX, mode="edge").ravel()
-        found, step, before = start, np.zeros((_PARTS, 2)), np.full((_PARTS, 2), np.nan)
-        for _ in range(3):
-            whole = np.clip(np.round(found), -_REACH_PX, _REACH_PX)
-            offsets = (whole @ (1, self._stride)).astype(int)
-            for part in np.flatnonzero((whole != before).any(axis=1)):  # what did not move would be found again
-                place, values, inverse = self._parts[part]
-                step[part] = inverse @ (values - pixels[place + offsets[part]])
-            found, before = whole + np.clip(step, -1.5, 1.5), whole
-        return found
 
 
 __all__ = ["OFF", "HealthLimits", "HealthMonitor", "margin_risk", "severity"]

@@ -142,7 +142,8 @@ class LiveReader:
     forces
         File or named pipe into which another program writes the samples of a force sensor, as `ForceStream` reads it.
     health
-        Called with each new reference and the network, gives what checks the frames; None for no checks.
+        Called with each new reference, gives what checks the frames; None for no checks, not even of the network's
+        answer (`check_novelty`).
     slip
         Called with the places of the markers in each new reference, gives what tells slip from their motion; None for
         not following them. A sensor without markers is read without.
@@ -182,7 +183,7 @@ class LiveReader:
         seconds: float | None = None,
         stall_s: float = 1.0,
         forces: Path | str | None = None,
-        health: Callable[[Frame, Run | None], HealthWatch] | None = HealthMonitor,
+        health: Callable[[Frame], HealthWatch] | None = HealthMonitor,
         slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None = SlipDetector,
     ) -> None:
         if not smoothing_s >= 0:
@@ -258,11 +259,12 @@ class LiveReader:
     def doubts(self) -> tuple[str, ...]:
         """What the network was not made for, a sentence each.
 
-        Another sensor, friction that it was not trained on, and grey frames once one was compared.
+        Another sensor, one that is pulled in another direction, friction that it was not trained on, and grey frames
+        once one was compared.
         """
         network, profile, doubts = self.network, self._profile, [self._reader.doubt]
         if network is not None:
-            doubts.append(None if profile is None else network.doubt(profile.name))
+            doubts += [] if profile is None else [network.doubt(profile.name), network.doubt_direction(profile)]
             doubts.append(network.doubt_friction(self._reader.learner.friction))
         return tuple(doubt for doubt in doubts if doubt is not None)
 
@@ -296,7 +298,6 @@ class LiveReader:
             raise InputError("a reader reads once; make another one of the same source")
         with ExitStack() as stack:
             stack.enter_context(_share_cores())
-            stack.callback(self._reader.close)
             stack.callback(self._end_outputs)
             stack.enter_context(self.source)
             if self._forces is not None:

@@ -24,6 +24,7 @@ from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
+from sliplens.recordings.formats.video import display_turn
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
@@ -296,8 +297,9 @@ class StreamSource(LiveSource):
             except StopIteration:
                 raise SourceError(f"{self.name} has ended; start the camera again") from None
             for frame in frames:
-                height, width = self._size or (frame.height, frame.width)
-                image = to_rgb.reformat(frame, width=width, height=height, format="rgb24").to_ndarray()
+                turn = display_turn(frame, where=self.name)
+                height, width = turn.size(*(self._size or turn.size(frame.height, frame.width)))
+                image = turn.apply(to_rgb.reformat(frame, width=width, height=height, format="rgb24").to_ndarray())
                 yield LiveFrame(
                     image=image,
                     number=number,

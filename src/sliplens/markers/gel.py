@@ -107,7 +107,7 @@ def propose_profile(
     factor = 1.0 if size_px is None else size_px[0] / crop[2]
     notes += [
         f"frame {untouched} is taken for the untouched sensor; change reference_frame if it was touched then",
-        "check by eye: rotate_deg, flip and colours; the lens and the force axes cannot be seen in frames",
+        "check by eye: rotate_deg, flip and colours; lens, force axes and pull_direction_deg cannot be seen in frames",
     ]
     profile = SensorProfile(
         name=name,

@@ -18,8 +18,8 @@ _CLEAR = 0.5  # pitches, from where a known marker should be
 class Newcomers:
     """Spots that no known marker accounts for, until they have stayed long enough to be markers."""
 
-    def __init__(self, *, pitch_px: float) -> None:
-        self._pitch = pitch_px
+    def __init__(self, *, pitch_px: float, size: tuple[int, int]) -> None:
+        self._pitch, self._size = pitch_px, size
         self._known = np.zeros((0, 2))
         self._waiting: list[tuple[np.ndarray, int]] = []
 
@@ -56,8 +56,15 @@ class Newcomers:
             place, radius = np.concatenate([place, spot[None]]), np.append(radius, spare.radius_px[at])
         self._waiting = waiting
         status = np.where(np.isfinite(place[:, 0]), MarkerStatus.NEW, MarkerStatus.MISSING).astype(np.uint8)
-        deviation = np.full(len(status), np.nan)
-        return TrackedFrame(position_px=place, radius_px=radius, deviation_px=deviation, status=status)
+        unknown = np.full_like(place, np.nan)
+        return TrackedFrame(
+            position_px=place,
+            motion_px=unknown,
+            size=self._size,
+            radius_px=radius,
+            deviation_px=unknown[:, 0],
+            status=status,
+        )
 
 
 _FEWEST = 4
@@ -76,11 +83,12 @@ class Tracker:
             raise ImageError(
                 f"the reference shows {len(self.rest)} whole markers, at least {_FEWEST} are needed; name another kind"
             )
-        self._size = reference.shape[:2]
+        height, width, _ = reference.shape
+        self._size = height, width
         self._neighbours = find_neighbours(self.rest.centre_px)
         self._shift = np.zeros_like(self.rest.centre_px)
         self._usual, self._lost = Usual(), False
-        self._newcomers = Newcomers(pitch_px=float(np.median(self._neighbours.pitch_px)))
+        self._newcomers = Newcomers(pitch_px=float(np.median(self._neighbours.pitch_px)), size=self._size)
 
     def update(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> TrackedFrame:
         """Follow the markers into the next frame T_n, of the reference's size."""
@@ -103,7 +111,14 @@ class Tracker:
         if pairing is None:
             count = len(rest) + self._newcomers.forget()
             place, status = np.full((count, 2), np.nan), np.full(count, MarkerStatus.LOST, dtype=np.uint8)
-            return TrackedFrame(position_px=place, radius_px=place[:, 0], deviation_px=place[:, 0], status=status)
+            return TrackedFrame(
+                position_px=place,
+                motion_px=place,
+                size=self._size,
+                radius_px=place[:, 0],
+                deviation_px=place[:, 0],
+                status=status,
+            )
         self._usual = self._usual.after(pairing)
         return self._judge(found, pairing.spot)
 
@@ -129,6 +144,8 @@ class Tracker:
         new = self._newcomers.update(found.only(spare), np.where(np.isfinite(place), place, rest + self._shift))
         return TrackedFrame(
             position_px=np.concatenate([place, new.position_px]),
+            motion_px=np.concatenate([place - rest, new.motion_px]),
+            size=self._size,
             radius_px=np.concatenate([np.where(hidden, np.nan, _taken(found.radius_px, spot)), new.radius_px]),
             deviation_px=np.concatenate([np.where(hidden, np.nan, deviation), new.deviation_px]),
             status=np.concatenate([status, new.status]),

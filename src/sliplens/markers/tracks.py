@@ -34,6 +34,10 @@ class TrackedFrame:
 
     position_px: Float[np.ndarray, "markers 2"]
     """x, y; NaN where a marker was not seen whole."""
+    motion_px: Float[np.ndarray, "markers 2"]
+    """Displacement from the place at rest; NaN of new markers too."""
+    size: tuple[int, int]
+    """Height and width of the picture, in pixels."""
     radius_px: Float[np.ndarray, " markers"]
     deviation_px: Float[np.ndarray, " markers"]
     """Distance of a marker's displacement from that of the skin around it; NaN where either is not known."""
@@ -73,6 +77,9 @@ class Tracks:
         return np.all(np.isfinite(self.rest_px), axis=1)
 
 
+_STACKED = ("position_px", "radius_px", "deviation_px", "status")
+
+
 def stack_tracks(
     frames: list[TrackedFrame],
     *,
@@ -86,7 +93,7 @@ def stack_tracks(
         missing = [(0, count - len(values)), *((0, 0) for _ in values.shape[1:])]
         return np.pad(values, missing, constant_values=np.nan if values.dtype.kind == "f" else MarkerStatus.UNSEEN)
 
-    joined = {name: np.stack([padded(getattr(frame, name)) for frame in frames]) for name in vars(frames[0])}
+    joined = {name: np.stack([padded(getattr(frame, name)) for frame in frames]) for name in _STACKED}
     return Tracks(rest_px=padded(rest_px), rest_radius_px=padded(rest_radius_px), **joined)
 
 

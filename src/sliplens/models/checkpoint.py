@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from math import erfc, sqrt
+from math import cos, erfc, radians, sin, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,9 @@ from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty
 from sliplens.models.sequence import Follower, SequenceHead, SequenceManifest
 from sliplens.progress import number_of
+from sliplens.recordings.sensor import SensorProfile
 from sliplens.results.evaluation import Training
+from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, Shear, ShearEstimator, range_words
 
 WEIGHTS_FILE, SEQUENCE_FILE = "model.safetensors", "sequence.safetensors"
 SCHEMA_VERSION = 1
@@ -66,6 +68,9 @@ class Manifest:
     """Where its training frames lie in its features; None where that was never fitted."""
     sequence: SequenceManifest | None = None
     """Of the margins that it reads from several frames; None where it reads each frame by itself alone."""
+    pull_direction_deg: tuple[float, float] | None = None
+    """Directions in which its training trials were pulled, lowest and highest: 0 is right, 90 down the image, (0, 360)
+    all. None where they are not known."""
     versions: dict[str, str] = field(default_factory=dict)
     trained_on: tuple[str, ...] = ()
     """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""
@@ -77,8 +82,14 @@ class Manifest:
         if not 1 <= self.image_size <= LARGEST_INPUT or min(height, width) <= 0 or height * width > MOST_PIXELS:
             sizes = f"frames of {height} x {width} pixels at {self.image_size}"
             raise ValueError(f"no network reads {sizes}")
+        low, high = self.pull_direction_deg or FULL_CIRCLE
+        if not 0 <= low <= high <= low + 360 or low > 360:
+            raise ValueError(f"pull_direction_deg is {[low, high]}; give a low from 0 to 360, then a high")
 
 
+_TURN_CURE = (
+    "turn the sensor, or train on this direction with `sliplens train DATA -o RUN --augmentation all-directions`"
+)
 _DARKEST_FRAME, _BRIGHTEST_DIFFERENCE = 8.0, 64.0
 """Medians, in grey levels: no camera frame that shows something is darker, no difference image brighter."""
 
@@ -132,12 +143,6 @@ class Run:
         `reference`: the sensor untouched; None for frames that were compared before, or that need not be. Frames of
         another size than the network's sensor has raise `ImageError`, and so do those that are no 8-bit images.
         """
-        for images in (frames, reference):
-            if images is not None and images.dtype != np.uint8:
-                raise ImageError(
-                    f"images are {images.dtype}, networks read uint8 RGB; if they are in [0, 1], multiply them by 255, "
-                    "round, and convert them"
-                )
         self.require_frame_size(frames.shape[1:3])
         size = self.manifest.image_size
         if reference is None and self.encoding.beside:
@@ -214,6 +219,33 @@ class Run:
             f"the friction {known} ({friction.mean:.3g}) lies outside that of the network's training, {low:.2g} to "
             f"{high:.2g}: its intervals were not measured there, so {cure}, or take the margins for a trend"
         )
+
+    def doubt_direction(self, profile: SensorProfile) -> str | None:
+        """Describe a sensor that is pulled in another direction than the training trials; None where it is not."""
+        trained = self.manifest.pull_direction_deg
+        if profile.pull_direction_deg is None or trained is None:
+            return None
+        pull = radians(profile.pull_direction_deg)
+        if not Shear(x_px=cos(pull), y_px=sin(pull), sigma_px=1.0).excess(trained):
+            return None
+        return (
+            f"the profile {profile.name} says that the sensor is pulled at {profile.pull_direction_deg:g} degrees in "
+            f"the image, and the network was trained on {range_words(trained)} (90 is down): its margins will "
+            f"be withheld, so {_TURN_CURE}"
+        )
+
+    def shear_estimator(self, reference: UInt8[np.ndarray, "height width 3"]) -> ShearEstimator | None:
+        """Estimator of the shear of frames; None for a network whose directions are all, or not known."""
+        if self.manifest.pull_direction_deg in {None, FULL_CIRCLE}:
+            return None
+        return ShearEstimator(reference, sensor_kind(self.manifest.sensor))
+
+    def doubt_shear(self, shear: Shear) -> str | None:
+        """Reason to withhold the margin of a frame that is pulled outside the trained directions; None inside."""
+        trained = self.manifest.pull_direction_deg
+        if trained is None or shear.excess(trained) <= DIRECTION_LIMIT:
+            return None
+        return f"pulled outside the trained {range_words(trained)} (90 is down); {_TURN_CURE}"
 
     @torch.no_grad()
     def answers(self, batches: Iterable[Tensor]) -> tuple[Tensor, ...]:
@@ -342,6 +374,14 @@ class Ratio:
         return np.maximum(low - offset, 0), np.maximum(high + offset, 0)
 
 
+STRANGE = 0.01
+"""Share of the validation frames (`Estimate.known`) below which a frame is too unlike them for its margin to count."""
+STRANGE_REASON = (
+    f"strange to the network (known below {100 * STRANGE:g} %); use frames of the sensor it was trained on, or train "
+    "it on frames of this one"
+)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
     """Safety margins of some frames, and how sure they are."""
@@ -381,6 +421,14 @@ class Estimate:
         if self.probabilities is None or self.edges is None:
             return None
         return spread(self.margin, self.probabilities, self.edges)
+
+    def withheld(self, touches: Bool[np.ndarray, " frames"]) -> list[str | None]:
+        """Return why the margin of each frame is not to be believed, with the cure; None where it is.
+
+        `touches`: whether anything touches the sensor. An untouched one shows nothing but noise, which may be strange.
+        """
+        strange = np.zeros(len(self.margin), bool) if self.known is None else touches & (self.known < STRANGE)
+        return [STRANGE_REASON if each else None for each in strange]
 
     def beyond(self, error: float) -> Float[np.ndarray, " frames"]:
         """What the network gives for an error above a number of margin units, from 0 to 1; not calibrated.

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from sliplens.extras import Table
-from sliplens.images import absolute_difference, require_same_size, signed_difference
+from sliplens.images import absolute_difference, require_rgb, require_same_size, signed_difference
 
 Frames = UInt8[np.ndarray, "batch height width 3"]
 Reference = UInt8[np.ndarray, "_ _ 3"]
@@ -47,6 +47,7 @@ class Encoding:
         Bilinear with antialiasing: the noise of neighbouring pixels averages out instead of aliasing. Its weights are
         rounded so that all is done in 8 bits, a tenth of the time of floats and within a grey level of them.
         """
+        require_rgb(compared)
         images = torch.from_numpy(np.require(compared, requirements=["C", "W"])).permute(0, 3, 1, 2)
         if images.shape[-2:] != (image_size, image_size):
             size = image_size, image_size

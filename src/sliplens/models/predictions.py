@@ -1,6 +1,6 @@
 """Safety margins of any number of frames, from any source, in the memory of a few batches."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,10 +31,10 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, Frames, Trials, open_trials
 from sliplens.recordings.trial import ContactState
 from sliplens.shards import LONGEST, MakePart, Work, make_table
+from sliplens.shear import FULL_CIRCLE, range_words
 
 LEVEL = 0.9
 """Confidence of the intervals."""
-_STRANGE = 0.01
 _COLUMNS = {
     "trial": pa.string(),
     "frame": pa.int64(),
@@ -49,6 +49,7 @@ _COLUMNS = {
     "low_90": pa.float64(),
     "high_90": pa.float64(),
     "known": pa.float64(),
+    "withheld": pa.string(),
     "traction_ratio": pa.float64(),
     "traction_ratio_sigma": pa.float64(),
 }
@@ -63,15 +64,18 @@ class TrialMargins:
 
     trial: str
     margin: Float[np.ndarray, " frames"]
-    """In margin units, frame by frame; not clipped to [0, 1]."""
-    lowest: int
-    """Frame of the lowest margin, of those that touch; of all where none does, or nobody knows."""
+    """In margin units, frame by frame; not clipped to [0, 1], NaN where it is withheld."""
+    lowest: int | None
+    """Frame of the lowest margin, of those that touch; of all where none does, or nobody knows. None where the margin
+    of all of them is withheld."""
+    withheld: int
+    """Number of frames whose margin is withheld."""
     touching: int | None
     """How many frames touch; None where nobody knows."""
     time_s: float | None
     """Time of that frame; None where it is not known."""
     interval: tuple[float, float] | None
-    """Ends of its 90 % interval; None for a network that was never calibrated."""
+    """Ends of its 90 % interval; None for a network that was never calibrated, and without such a frame."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -99,10 +103,13 @@ class Predictions:
         Columns are `trial`, `frame`, `file` (of a folder of images), `time_s`, `safety_margin` (where the source has
         labels), `normal_force_n` and `tangential_force_n` (where it has forces), `touches` (whether anything does, by
         the labels, else by how far the picture is from that of the untouched sensor), `prediction`, `sigma`, `low_90`
-        and `high_90`, `known` (as in `Estimate`) of a network that tells it, and `traction_ratio` and
+        and `high_90`, `known` (as in `Estimate`) of a network that tells it, `withheld`, and `traction_ratio` and
         `traction_ratio_sigma` of one that tells F_t / F_n. What is not known is null: the time of images without a
         rate, sigma of a network that answers with one number, intervals of one that was never calibrated. Predictions
         are not clipped to [0, 1].
+
+        `withheld` says why a frame is not to be believed, with the cure (`Estimate.withheld`), and is null elsewhere.
+        Where it is set, whatever the network predicts is null: prediction, sigma, interval and traction ratio.
         """
         if self.rows is not None:
             return self.rows
@@ -122,13 +129,9 @@ class Predictions:
         return self.frame().__arrow_c_stream__(requested_schema)
 
     @property
-    def strange(self) -> int:
-        """Frames that touch and are like at most 1 in 100 of those that the network was validated on (`known`)."""
-        table = self.frame()
-        if "known" not in table.column_names:
-            return 0
-        touches = table["touches"].to_numpy() if "touches" in table.column_names else True
-        return int((touches & (table["known"].to_numpy() < _STRANGE)).sum())
+    def withheld(self) -> dict[str, int]:
+        """Number of frames whose margin is withheld, by reason."""
+        return dict(Counter(reason for reason in self.frame()["withheld"].to_pylist() if reason is not None))
 
     def trials(self) -> list[TrialMargins]:
         """Course and lowest margin of every trial."""
@@ -140,6 +143,7 @@ class Predictions:
         }
         known = "touches" in table.column_names
         touches = table["touches"].to_numpy(zero_copy_only=False).astype(bool) if known else np.ones(len(table), bool)
+        believed = table["withheld"].is_null().to_numpy(zero_copy_only=False)
         # the rows of a trial stand together
         bounds = dict.fromkeys([0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)])
         found = []
@@ -147,13 +151,15 @@ class Predictions:
             own = {name: values[first:end] for name, values in numbers.items()}
             touching = touches[first:end]
             # of an untouched sensor a difference image shows noise alone, brightened
-            lowest = int(np.where(touching | ~touching.any(), own["prediction"], np.inf).argmin())
-            at = {name: float(values[lowest]) for name, values in own.items()}
+            counted = np.where(touching | ~touching.any(), own["prediction"], np.nan)
+            lowest = int(np.nanargmin(counted)) if np.isfinite(counted).any() else None
+            at = {name: np.nan if lowest is None else float(values[lowest]) for name, values in own.items()}
             found.append(
                 TrialMargins(
                     trial=names[first],
                     margin=own["prediction"],
                     lowest=lowest,
+                    withheld=end - first - int(believed[first:end].sum()),
                     touching=int(touching.sum()) if known else None,
                     time_s=at["time_s"] if np.isfinite(at["time_s"]) else None,
                     interval=(at["low_90"], at["high_90"]) if np.isfinite(at["low_90"]) else None,
@@ -265,8 +271,9 @@ def predict(
             options=options,
             sensor=None if sensor is None else load_profile(sensor),
         )
+    profile = _find_profile(trials, sensor)
     if trained is None:
-        name, named_by = _find_network(trials, sensor)
+        name, named_by = _find_network(trials, profile)
         note(on_progress, f"no network was named, so {name} reads it, {named_by}")
         trained = open_run(name, device=device)
     if known is not None:
@@ -275,6 +282,8 @@ def predict(
     if sequence:
         _require_order(trained, kinds, friction=known)
     notes = tuple(dict.fromkeys(words for one in kinds for words in (*one.notes, *_require_comparable(trained, one))))
+    turned = None if profile is None else trained.doubt_direction(profile)
+    notes = notes if turned is None else (*notes, turned)
     metadata = {
         "sliplens.source": kinds[0].opened,
         "sliplens.manifest_hash": hash_json(trained.manifest),
@@ -312,13 +321,18 @@ def predict(
     return Predictions(frames=trials.frames, engine=name, path=path, rows=rows, schema=path and written, notes=notes)
 
 
-def _find_network(trials: Trials, sensor: SensorProfile | Path | str | None) -> tuple[str, str]:
-    """Network for a source where none is named, and who names it."""
-    source, profile = trials.source, None if sensor is None else load_profile(sensor)
-    if profile is None and isinstance(source, Path) and (source / DATASET_FILE).is_file():
+def _find_profile(trials: Trials, sensor: SensorProfile | Path | str | None) -> SensorProfile | None:
+    """Profile that is named, or that a data set keeps of its first trial's sensor."""
+    if sensor is not None:
+        return load_profile(sensor)
+    source = trials.source
+    if isinstance(source, Path) and (source / DATASET_FILE).is_file():
         source = load_dataset(source)
-    if profile is None and isinstance(source, Dataset):
-        profile = source.profile(source.trials[0].sensor)
+    return source.profile(source.trials[0].sensor) if isinstance(source, Dataset) else None
+
+
+def _find_network(trials: Trials, profile: SensorProfile | None) -> tuple[str, str]:
+    """Network for a source where none is named, and who names it."""
     if profile is not None and profile.network is not None:
         return profile.network, f"which the profile {profile.name} names"
     if any(one.read_reference is None and not _is_recorded(one) for one in trials.kinds):
@@ -375,7 +389,12 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
             f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
             "name its image with --reference IMAGE, or a frame of it with --reference-frame N"
         )
-    yield f"{trial.name}: no reference was given, so its images were taken for difference images."
+    directions = trained.manifest.pull_direction_deg or FULL_CIRCLE
+    unseen = (
+        f", which hide the direction of the pull; the network was trained on {range_words(directions)} (90 is down)"
+    )
+    unseen = "" if directions == FULL_CIRCLE else unseen
+    yield f"{trial.name}: no reference was given, so its images were taken for difference images{unseen}."
 
 
 def _compare_markers(trained: Run, trial: Capture) -> str:
@@ -457,8 +476,9 @@ class _Reading(Work):
         capture = _assume_reference(self.trained, capture)
         reference = None if capture.read_reference is None else capture.read_reference()
         untouched, states = None if reference is None else soften(reference), _states(capture)
-        # batches are encoded while the ones before are under way; first frame of each, and which touch
-        encoded: deque[tuple[int, list[bool]]] = deque()
+        # batches are encoded while the ones before are under way; first frame of each, which touch, and doubts of them
+        encoded: deque[tuple[int, list[bool], list[str | None]]] = deque()
+        shear = None if reference is None else self.trained.shear_estimator(reference)
         follower = self.trained.follow() if self.sequence else None
         if follower is not None and capture.time_s is not None:
             require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
@@ -472,17 +492,24 @@ class _Reading(Work):
                     touches = [picture_change(soften(frame), untouched) >= LEAST_TOUCH for frame in images]
                 else:
                     touches = [True] * len(batch)
-                encoded.append((first, touches))
+                doubts = [
+                    self.trained.doubt_shear(shear.estimate(frame)) if shear is not None and touch else None
+                    for touch, frame in zip(touches, images, strict=True)
+                ]
+                encoded.append((first, touches, doubts))
                 yield self.trained.encode(np.stack(images), reference)
 
         for answers in engine.answers(encode()):
-            first, touches = encoded.popleft()
+            first, touches, doubts = encoded.popleft()
             estimate = self.trained.to_estimate(*answers, friction=self.friction)
             if follower is not None:
                 assert capture.time_s is not None  # `_require_order`
                 times = capture.time_s[first : first + len(touches)]
                 estimate = follower.update(estimate, times, np.array(touches))
-            for name, values in (_columns(estimate, capture, first) | {"touches": touches}).items():
+            reasons = zip(estimate.withheld(np.array(touches)), doubts, strict=True)
+            withheld = [strange or astray for strange, astray in reasons]
+            columns = _columns(estimate, capture, first, withheld=withheld) | {"touches": touches}
+            for name, values in columns.items():
                 if name in rows:
                     rows[name].extend(values)
             on_progress(done := done + len(touches), count)
@@ -493,23 +520,31 @@ class _Reading(Work):
             yield rows
 
 
-def _columns(estimate: Estimate, trial: Capture, first: int) -> dict[str, list]:
+def _columns(estimate: Estimate, trial: Capture, first: int, *, withheld: list[str | None]) -> dict[str, list]:
     count = len(estimate.margin)
     here, unknown = slice(first, first + count), [None] * count
     low, high = estimate.interval(LEVEL) or (None, None)
-    times, margins = (None if values is None else values[here] for values in (trial.time_s, trial.safety_margin))
     ratio = estimate.ratio
-    numbers = {"traction_ratio": None, "traction_ratio_sigma": None}
-    if ratio is not None:
-        numbers = {"traction_ratio": ratio.mean, "traction_ratio_sigma": ratio.sigma}
-    numbers |= {"time_s": times, "safety_margin": margins, "sigma": estimate.sigma, "low_90": low, "high_90": high}
+    predicted = {
+        "prediction": estimate.margin,
+        "sigma": estimate.sigma,
+        "low_90": low,
+        "high_90": high,
+        "traction_ratio": None if ratio is None else ratio.mean,
+        "traction_ratio_sigma": None if ratio is None else ratio.sigma,
+    }
+    believed = np.array([reason is None for reason in withheld])
+    numbers = {name: None if v is None else np.where(believed, v, np.nan) for name, v in predicted.items()}
+    labels = trial.labels
+    recorded = {"time_s": trial.time_s, "safety_margin": trial.safety_margin}
+    recorded |= {name: None if labels is None else getattr(labels, name) for name in _FORCES}
+    numbers |= {name: None if v is None else v[here] for name, v in recorded.items()}
     numbers["known"] = estimate.known
-    numbers |= {name: None if trial.labels is None else getattr(trial.labels, name)[here] for name in _FORCES}
     return {
         "trial": [trial.name] * count,
         "frame": list(range(first, first + count)),
         "file": list(trial.files[here]) if trial.files else unknown,
-        "prediction": estimate.margin.tolist(),
+        "withheld": withheld,
         # NaN as null: nothing is known
         **{name: unknown if v is None else pa.array(v, from_pandas=True).to_pylist() for name, v in numbers.items()},
     }

@@ -31,6 +31,7 @@ from sliplens.plots.style import (
     place_text,
     require_picture_path,
     save_page,
+    shade_withheld,
 )
 from sliplens.results.explanation import Strip
 from sliplens.results.grip import GripTrace, HoldSteps
@@ -73,15 +74,20 @@ def draw_margins(rows: pa.Table, path: Path, *, title: str) -> int:
 
 
 def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
-    """Draw the margin of one trial with its 90 % interval over time or frames, and the label where it is known."""
+    """Draw the margin of one trial with its 90 % interval over time or frames, and the label where it is known.
+
+    Frames whose margin is withheld are grey, and the legend says why.
+    """
     across, label = _across(rows)
+    shade_withheld(across, rows["withheld"].to_pylist(), ax=ax)
     if "low_90" in rows.column_names:
         low, high = 100 * column(rows, "low_90"), 100 * column(rows, "high_90")
         if np.isfinite(low).any():  # a network that was never calibrated tells none
             ax.fill_between(across, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
     # few frames have a dot each: one alone makes no line
     dot = "o" if len(across) <= 40 else ""
-    ax.plot(across, 100 * column(rows, "prediction"), color=BLUE, marker=dot, markersize=3, label="read")
+    if np.isfinite(read := 100 * column(rows, "prediction")).any():
+        ax.plot(across, read, color=BLUE, marker=dot, markersize=3, label="read")
     if "safety_margin" in rows.column_names and np.isfinite(true := column(rows, "safety_margin")).any():
         ax.plot(across, 100 * true, color=BLACK, linestyle="--", label="true")
     ax.axhline(0, color=GREY, linewidth=0.8)

@@ -6,11 +6,14 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from cycler import cycler
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -281,6 +284,25 @@ def place_text(figure: Figure, left: float, top: float, text: str, **settings: A
     """Write words there, their upper edge on that line unless told otherwise."""
     across, down = figure.get_size_inches()
     figure.text(left / across, 1 - top / down, text, **{"va": "top", **settings})
+
+
+def shade_withheld(across: Float[np.ndarray, " frames"], reasons: Sequence[str | None], *, ax: Axes) -> None:
+    """Shade the frames whose margin is withheld, and name the reasons in the legend without their cures.
+
+    `across`: place of each frame on the axis.
+    """
+    edges = np.concatenate([across[:1], (across[1:] + across[:-1]) / 2, across[-1:]])
+    named: set[str] = set()
+    for reason, frames in groupby(range(len(reasons)), key=lambda at: reasons[at]):
+        if not reason:
+            continue
+        first, *others = frames
+        left, right = edges[first], edges[[first, *others][-1] + 1]
+        if left == right:  # the only frame there is
+            left, right = left - 0.5, right + 0.5
+        label = f"withheld: {reason.partition(';')[0]}"
+        ax.axvspan(left, right, color=GREY, alpha=0.3, linewidth=0, label=None if label in named else label)
+        named.add(label)
 
 
 def write_over(ax: Axes, words: str, **settings: Any) -> None:

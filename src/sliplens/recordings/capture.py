@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
+from sliplens.images import require_rgb
 from sliplens.progress import number_of
 from sliplens.recordings.labelling import Clip, ReferenceChoice
 from sliplens.recordings.trial import CLOCK_S, Labels, TrialFacts
@@ -87,6 +88,8 @@ class Capture(TrialFacts):
                 f"{number_of(len(self.labels.safety_margin), 'label')}; "
                 "give one a frame"
             )
+        if self.reference is not None:
+            require_rgb(self.reference, what="levels of the reference")
         if self.reference is not None and self.reference.shape[:2] != self.frame_size:
             raise RecordingError(
                 f"{self.source} has frames of {self.frame_size[0]} x {self.frame_size[1]} pixels but a reference of "

@@ -86,6 +86,9 @@ class SensorProfile:
     """Axis of the force sensor that presses; found if None."""
     normal_sign: Literal[1, -1] | None = None
     """1 if pressing is positive as recorded, -1 if negative; found if None."""
+    pull_direction_deg: float | None = None
+    """Direction in which what is held pulls, mostly that of gravity, in frames as the profile makes them: 0 is right,
+    90 down the image. Checked against the directions that a network was trained on."""
     network: str | None = None
     """Network that reads these frames: a folder, or the name of one that comes with sliplens."""
 
@@ -103,6 +106,10 @@ class SensorProfile:
             inside = left + width <= self.camera_size_px[0] and top + height <= self.camera_size_px[1]
             if min(left, top) < 0 or min(width, height) <= 0 or not inside:
                 raise ValueError(f"crop_px is {list(self.crop_px)}, not inside a frame of {list(self.camera_size_px)}")
+        if self.pull_direction_deg is not None and not 0 <= self.pull_direction_deg < 360:
+            raise ValueError(
+                f"pull_direction_deg is {self.pull_direction_deg:g}; give 0 for right, 90 for down, up to below 360"
+            )
         if self.undistort is not None and self.camera_size_px is None:
             raise ValueError("a lens is told in pixels of a frame; tell its camera_size_px, width and height, too")
 

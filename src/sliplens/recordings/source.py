@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.files import as_path, hash_file, hash_json, hash_tree
-from sliplens.images import list_images, read_image
+from sliplens.images import list_images, read_image, require_rgb
 from sliplens.parts import Shard, shard
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
@@ -180,6 +180,7 @@ class Trials:
                 nonlocal following
                 number = first - 1
                 for number, frame in islice(frames, count):
+                    require_rgb(frame, what=f"levels of frame {number} of {capture.source}")
                     yield number, frame
                 if number + 1 < first + count:
                     ends = f"ends after {number + 1} of its {first + count} frames"
@@ -276,6 +277,7 @@ def _words(source: Path | Frames) -> str:
 def _array(frames: Frames, options: ReadOptions) -> Capture:
     if not len(frames):
         raise InputError("there is no frame; give one or more")
+    require_rgb(frames)
     if strange := [option for option in options.given() if option != "frame_rate"]:
         raise InputError(f"{Capture.opened} do not take {spoken(strange)}; leave it out")
     return Capture(

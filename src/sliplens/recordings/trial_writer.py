@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_limits
 from sliplens.codec import RESULT_FILE, load_record, save_record
 from sliplens.errors import RecordingError, ShardError, SliplensError
 from sliplens.files import remove
+from sliplens.images import require_rgb
 from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress, number_of, stage
 from sliplens.recordings.capture import Capture, Frame
@@ -288,6 +289,7 @@ def _frames(capture: Capture) -> Iterator[Frame]:
     """Frames of a capture, which must be as many as it promised and of one size."""
     read = 0
     for frame in capture.read_frames():
+        require_rgb(frame, what=f"levels of frame {read} of {capture.source}")
         if frame.shape[:2] != capture.frame_size:
             raise RecordingError(
                 f"frame {read} of {capture.source} is {frame.shape[0]} x {frame.shape[1]} pixels, not "

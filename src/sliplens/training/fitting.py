@@ -31,13 +31,15 @@ from sliplens.models.backbones import (
     with_reference,
 )
 from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
-from sliplens.models.checkpoint import Estimate, Ratio, load, tell_each
+from sliplens.models.checkpoint import Estimate, Ratio, load, sensor_kind, tell_each
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty, fit_novelty
 from sliplens.progress import OnProgress, note, stage, wrote
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
+from sliplens.recordings.trial import Recording
 from sliplens.results.evaluation import Training
+from sliplens.shear import FULL_CIRCLE, Shear, ShearEstimator, enclosing_range
 from sliplens.training.config import TrainConfig, get_recipe, open_logger
 from sliplens.training.data import (
     EpochShuffle,
@@ -73,6 +75,11 @@ _STAYS = {"ratio", "sequence"}
 """What is learnt beside a network that answers as before."""
 _SEQUENCE_TAKES = {"epochs", "batch_size", "learning_rate", "weight_decay", "seed"}
 """What of a recipe shapes a head of several frames."""
+_DIRECTION_TRIALS, _DIRECTION_FRAMES, _LEAST_DIRECTIONS = 40, 5, 3
+"""Trials and frames of each from which the directions of the pulls are estimated, at most, and trials at least."""
+_PULLED, _SURE, _DIRECTION_MARGIN_DEG = 0.6, 5.0, 10.0
+"""Margin below which a frame is pulled enough; length of a shear, in standard deviations, whose direction is known to
+11 degrees; and what a range is widened by at both ends, for that and for directions that no trial had."""
 _NOVELTY_FRAMES = 2000
 """Frames from which the place of healthy inputs in the features is told, at most."""
 
@@ -172,6 +179,7 @@ def train(
             frame_size=(info.height, info.width),
             sensor=info.sensor,
             colour=has_colour(data.read_labels(info).reference),
+            pull_direction_deg=trained_directions(config, data, trials[0], start),
             data_hash=data.hash,
             trained_on=[trial.sha256[:12] for some in trials for trial in some],
             start=start,
@@ -257,6 +265,42 @@ def _as_told(config: TrainConfig, data: Dataset, trials: Sequence[Sequence[Trial
         return config
     told = all(any(tells_ratio(data.read_labels(info)) for info in some) for some in trials)
     return config if told else replace(config, head="histogram")
+
+
+def trained_directions(
+    config: TrainConfig, data: Dataset, trials: Sequence[TrialInfo], start: Run | None
+) -> tuple[float, float] | None:
+    """Directions of the pulls that a network is trained on; those of `start` where it stays as it is."""
+    if start is not None and config.learns in _STAYS:
+        return start.manifest.pull_direction_deg
+    augmentation = get_augmentation(config.augmentation)
+    turned_deg = getattr(augmentation, "rotation_deg", 0.0)
+    if turned_deg >= 180:
+        return FULL_CIRCLE
+    few = trials[:: max(1, len(trials) // _DIRECTION_TRIALS)]
+    directions = [pull_direction(data.load(info, truth=False)) for info in few]
+    told = np.array([direction for direction in directions if direction is not None])
+    if len(told) < _LEAST_DIRECTIONS:
+        return None
+    return enclosing_range(told, margin_deg=_DIRECTION_MARGIN_DEG + turned_deg)
+
+
+def pull_direction(trial: Recording) -> float | None:
+    """Direction in which a labelled trial is pulled, in degrees, estimated as for the frames that a network reads.
+
+    It is that of the mean shear of the frames with the lowest margins; None where they show no shear.
+    """
+    pulled = np.flatnonzero(trial.labelled & (trial.safety_margin < _PULLED))
+    lowest = pulled[np.argsort(trial.safety_margin[pulled], kind="stable")][:_DIRECTION_FRAMES]
+    estimator = ShearEstimator(trial.reference, sensor_kind(trial.sensor))
+    shears = [estimator.estimate(trial.frames[frame]) for frame in lowest]
+    if not shears:
+        return None
+    x_px, y_px, sigma_px = (
+        float(np.mean([getattr(one, name) for one in shears])) for name in ("x_px", "y_px", "sigma_px")
+    )
+    mean = Shear(x_px=x_px, y_px=y_px, sigma_px=sigma_px)
+    return mean.direction_deg if np.hypot(x_px, y_px) > _SURE * sigma_px else None
 
 
 def _advise(
@@ -364,6 +408,7 @@ def fit(
     sensor: str,
     data_hash: str,
     colour: bool | None = None,
+    pull_direction_deg: tuple[float, float] | None = None,
     trained_on: Sequence[str] = (),
     start: Run | None = None,
     trainer: lightning.Trainer | None = None,
@@ -382,9 +427,9 @@ def fit(
     folder
         Gets `model.safetensors`, `manifest.json` and `metrics.csv`; while training runs also checkpoints, from which a
         call with the same folder goes on. All processes must see it.
-    frame_size, sensor, data_hash, colour, trained_on
+    frame_size, sensor, data_hash, colour, pull_direction_deg, trained_on
         Kept in the manifest: height and width of the sensor's frames, its name, hash of the data set, whether its
-        frames have colours, and hashes of the trials.
+        frames have colours, the directions of its pulls, and hashes of the trials.
     start
         Network whose weights it starts from, instead of random ones; it is left as it is.
     trainer
@@ -425,6 +470,7 @@ def fit(
         sensor=sensor,
         data_hash=data_hash,
         colour=colour,
+        pull_direction_deg=pull_direction_deg,
         trained_on=(*trained_on, *(start.manifest.trained_on if start else ())),
         started_from=start.manifest.weights_sha256 if start else "",
         versions=versions(),

@@ -117,7 +117,7 @@ def test_frames_of_two_sizes_are_refused(folder: Path, frames: np.ndarray):
 @pytest.mark.parametrize(
     ("pixels", "mode", "cure"),
     [
-        (np.zeros((20, 30), dtype=np.uint16), "I;16", "16 bits a pixel; convert it to 8-bit RGB"),
+        (np.zeros((20, 30), dtype=np.uint16), "I;16", "16 bits a channel; divide its levels by 256"),
         (np.zeros((20, 30, 4), dtype=np.uint8), "RGBA", "4 channels .alpha.; drop the alpha channel"),
     ],
 )

@@ -391,3 +391,56 @@ def test_a_clip_that_its_table_does_not_know_is_refused(gelsight_folder: Path, t
     table.write_text("clip,label\na,1\n")
     with pytest.raises(RecordingError, match="is no table of GelSight clips; it needs columns file, n_frames, object"):
         read_gelsight_clip(clip, labels=table)
+
+
+CORNERED = np.zeros((48, 64, 3), dtype=np.uint8)  # no turn and no mirror image leaves it as it is
+CORNERED[:24, :32] = 250
+CORNERED[:24, 32:] = 120
+TURNS = [(degrees, mirrored) for degrees in (0, 90, 180, 270) for mirrored in (False, True)]
+
+
+def write_turned(path: Path, degrees: float, *, mirrored: bool = False) -> Path:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        assert isinstance(stream, av.VideoStream)
+        stream.height, stream.width, stream.pix_fmt = 48, 64, "yuv420p"
+        if not hasattr(stream, "set_display_rotation"):
+            pytest.skip("this PyAV writes no display matrix")
+        stream.set_display_rotation(degrees, hflip=mirrored)
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(CORNERED, format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["mp4", "mov", "mkv"])
+@pytest.mark.parametrize(("degrees", "mirrored"), TURNS)
+def test_a_display_matrix_is_applied(tmp_path: Path, degrees: int, mirrored: bool, suffix: str):
+    # PyAV turns counterclockwise, then mirrors
+    upright = np.rot90(CORNERED, degrees // 90)
+    upright = upright[:, ::-1] if mirrored else upright
+    capture = read_video(write_turned(tmp_path / f"a.{suffix}", degrees, mirrored=mirrored))
+    frames = list(capture.read_frames())
+    assert capture.frame_size == upright.shape[:2]
+    assert len(frames) == 3
+    for frame in frames:
+        assert frame.shape == upright.shape
+        # coding rings at the edges of the blocks; another turn would differ by 60 and more
+        assert np.abs(frame.astype(float) - upright).mean() < 8
+
+
+def test_a_turn_that_is_no_right_angle_is_refused(tmp_path: Path):
+    refused(read_video, write_turned(tmp_path / "a.mp4", 30), "turned by .* degrees.*export it upright")
+
+
+@pytest.mark.parametrize("pixels", ["gray16le", "rgb48le"])
+def test_a_video_of_16_bits_is_refused(tmp_path: Path, pixels: str):
+    path = write_video(tmp_path / "a.mkv", brightening(3), pixels=pixels)
+    refused(read_video, path, "16 bits a channel.*export it with 8")
+
+
+@pytest.mark.parametrize("pixels", ["gray10le", "gray12le", "gbrp10le", "gbrp12le"])
+def test_a_video_of_10_or_12_bits_keeps_its_brightness(tmp_path: Path, pixels: str):
+    capture = read_video(write_video(tmp_path / "a.mkv", brightening(3), pixels=pixels))
+    for frame, wanted in zip(capture.read_frames(), brightening(3), strict=True):
+        assert np.abs(frame.astype(int) - wanted).max() <= 2  # rounding to 10 bits and back

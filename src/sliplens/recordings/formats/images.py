@@ -12,7 +12,16 @@ from jaxtyping import Float
 from PIL import Image
 
 from sliplens.errors import ImageError, RecordingError
-from sliplens.images import list_images, open_image, read_image, require_image, telling_damage
+from sliplens.images import (
+    list_images,
+    open_image,
+    read_image,
+    require_eight_bits,
+    require_image,
+    telling_damage,
+    upright_pixels,
+    upright_size,
+)
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import (
     UNITS,
@@ -38,12 +47,13 @@ def open_encoded(data: Any, *, where: str) -> Iterator[Image.Image]:
     with open_image(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
         if image.mode not in {"RGB", "L"}:
             raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
+        require_eight_bits(image, where=where)
         yield image
 
 
 def rgb_pixels(image: Image.Image) -> Frame:
-    """Pixels of an RGB or grey image; a grey one gets three equal channels."""
-    pixels = np.array(image)
+    """Pixels of an RGB or grey image, upright; a grey one gets three equal channels."""
+    pixels = upright_pixels(image)
     return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
 
 
@@ -54,14 +64,14 @@ def frame_size(path: Path) -> tuple[int, int]:
         pages = getattr(image, "n_frames", 1)
         if pages > 1:
             raise ImageError(f"{path} holds {pages} images; save one image a file")
-        return image.height, image.width
+        return upright_size(image)
 
 
 def read_frame(path: Path, *, size: tuple[int, int]) -> Frame:
     """Read an image as a frame."""
     require_image(path)
     with _telling_of(path), open_image(path) as image:
-        if image.mode != "L" or image.size != size[::-1]:
+        if image.mode != "L" or upright_size(image) != size:
             return read_image(path, size=size)  # says what is wrong, too
         return rgb_pixels(image)
 

@@ -25,7 +25,7 @@ from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.images import open_encoded, rgb_pixels
 from sliplens.recordings.formats.stored import ExportedTrial
 from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.formats.video import open_video, require_size
+from sliplens.recordings.formats.video import display_turn, open_video, read_display_turn, require_size
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.store import load_forces
 
@@ -212,7 +212,8 @@ def read_video_header(path: Path) -> tuple[tuple[int, int], tuple[str, ...]]:
     with open_video(path, missing=_NO_VIDEO) as (_, video):
         codec = video.codec_context.codec
         note = f"Frames are coded with loss ({codec.canonical_name}), which moves markers a little."
-        return require_size(path, video), (note,) * codec.lossy
+        size = require_size(path, video)
+    return read_display_turn(path, missing=_NO_VIDEO).size(*size), (note,) * codec.lossy
 
 
 def video_frames(
@@ -230,12 +231,14 @@ def video_frames(
                     f"{path} has no frame at {wanted:.3f} s; it is cut off, or was not written with this data set"
                 )
             frame = current[1]
-            if (frame.height, frame.width) != frame_size:
+            turn = display_turn(frame, where=path)
+            height, width = turn.size(frame.height, frame.width)
+            if (height, width) != frame_size:
                 raise RecordingError(
-                    f"{path} has frames of {frame.height} x {frame.width} pixels at {wanted:.3f} s, its header says "
+                    f"{path} has frames of {height} x {width} pixels at {wanted:.3f} s, its header says "
                     f"{frame_size[0]} x {frame_size[1]}; leave the episode out"
                 )
-            yield frame.to_ndarray(format="rgb24")
+            yield turn.apply(frame.to_ndarray(format="rgb24"))
 
 
 def image_frames(episode: Episode, key: str) -> tuple[tuple[int, int], Callable[[], Iterator[Frame]]]:

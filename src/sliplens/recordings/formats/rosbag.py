@@ -22,7 +22,7 @@ from PIL import Image
 from sliplens.errors import RecordingError, SliplensError
 from sliplens.extras import require_packages
 from sliplens.files import require_file
-from sliplens.images import telling_damage
+from sliplens.images import telling_damage, upright_size
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.images import open_encoded, rgb_pixels
 from sliplens.recordings.formats.mcap import (
@@ -53,7 +53,7 @@ def image_size(message: Any, *, where: str) -> tuple[int, int]:
     """Height and width of an image, in pixels, without decoding it."""
     if message.__msgtype__ == COMPRESSED:
         with _open_compressed(message, where=where) as image:
-            return image.height, image.width
+            return upright_size(image)
     channels = _CHANNELS.get(message.encoding)
     if channels is None:
         raise RecordingError(

@@ -14,7 +14,7 @@ from av.error import FFmpegError
 from av.stream import Disposition
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32, Int64, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images import MOST_PIXELS, is_image
@@ -104,7 +104,7 @@ class VideoFile:
     counted: bool
     """The container counts frames and holds no presentation stamps."""
     frame_size: tuple[int, int]
-    """Height and width, in pixels."""
+    """Height and width of the upright frames, in pixels."""
     notes: tuple[str, ...]
 
 
@@ -138,7 +138,62 @@ def inspect_video(path: Path) -> VideoFile:
                 "copy it again"
             )
         notes = _notes(container, video, path)
-    return VideoFile(frames=len(found), stamps=stamps, time_s=time, counted=counted, frame_size=size, notes=notes)
+        turn = read_display_turn(path)
+    return VideoFile(
+        frames=len(found), stamps=stamps, time_s=time, counted=counted, frame_size=turn.size(*size), notes=notes
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DisplayTurn:
+    """Turn by right angles, and mirror image, by which a player shows the frames of a video."""
+
+    transpose: bool = False
+    """Rows become columns, before anything is reversed."""
+    reverse_columns: bool = False
+    reverse_rows: bool = False
+
+    def apply(self, pixels: UInt8[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+        """Turn the pixels of a frame upright."""
+        pixels = pixels.transpose(1, 0, 2) if self.transpose else pixels
+        return np.ascontiguousarray(pixels[:: -1 if self.reverse_rows else 1, :: -1 if self.reverse_columns else 1])
+
+    def size(self, height: int, width: int) -> tuple[int, int]:
+        """Height and width of an upright frame, in pixels."""
+        return (width, height) if self.transpose else (height, width)
+
+
+def display_turn(frame: av.VideoFrame, *, where: object) -> DisplayTurn:
+    """Return how a frame is turned by its display matrix, in which a telephone keeps how it was held.
+
+    The matrix maps column p and row q to column a p + c q and row b p + d q; its first entries are a, b, u, c, d in
+    16.16 fixed point (ISO/IEC 14496-12, 8.2.2).
+
+    Raises
+    ------
+    RecordingError
+        If it does more than turn by right angles and mirror.
+    """
+    side_data = frame.side_data.get("DISPLAYMATRIX")
+    if side_data is None:
+        return DisplayTurn()
+    fixed = np.frombuffer(bytes(side_data), dtype=np.int32)  # pyright: ignore[reportArgumentType]
+    a, b, _, c, d = (fixed[:5] / 65536).tolist()
+    if (abs(a), abs(b), abs(c), abs(d)) not in {(1, 0, 0, 1), (0, 1, 1, 0)}:
+        raise RecordingError(
+            f"{where} is turned by {frame.rotation} degrees, or stretched, by its display matrix; export it upright"
+        )
+    return DisplayTurn(transpose=a == 0, reverse_columns=a + c < 0, reverse_rows=b + d < 0)
+
+
+def read_display_turn(path: Path, *, missing: str = "name a video file") -> DisplayTurn:
+    """Return how the frames of a video are turned, from the first; a damaged one is left to whoever decodes it."""
+    with open_video(path, missing=missing) as (container, video):
+        try:
+            first = next(container.decode(video), None)
+        except FFmpegError:
+            first = None
+        return DisplayTurn() if first is None else display_turn(first, where=path)
 
 
 @contextmanager
@@ -156,6 +211,7 @@ def open_video(path: Path, *, missing: str = "name a video file") -> Iterator[tu
                 raise RecordingError(f"{path} has no video stream; name the file that the camera wrote")
             if streams[0].codec_context is None:
                 raise RecordingError(f"{path} {_NO_DECODER}")
+            _require_few_bits(streams[0], path)
             yield container, streams[0]
     except (FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -170,6 +226,16 @@ def require_size(path: Path, video: VideoStream) -> tuple[int, int]:
             f"{path} claims frames of {size[1]} x {size[0]} pixels; the file is damaged, copy or export it again"
         )
     return size
+
+
+def _require_few_bits(video: VideoStream, path: Path) -> None:
+    """Refuse 16 bits a channel: a decoder keeps the upper 8, and of a camera with 12 bits those hold four."""
+    pixels = video.codec_context.format
+    if pixels is not None and max(part.bits for part in pixels.components) >= 16:
+        raise RecordingError(
+            f"{path} has 16 bits a channel ({pixels.name}), and does not say how many of them its camera used; export "
+            "it with 8, the camera's largest level as 255"
+        )
 
 
 def _moving(container: InputContainer) -> list[VideoStream]:
@@ -212,7 +278,7 @@ def _ends_early(
 
 
 def decode_video(path: Path, file: VideoFile) -> Iterator[Frame]:
-    """Decode the frames in the order they are shown."""
+    """Decode the frames in the order they are shown, upright."""
     count = 0
     to_rgb = VideoReformatter()  # one for all: preparing it costs as much as a frame
     with open_video(path) as (container, video):
@@ -225,13 +291,15 @@ def decode_video(path: Path, file: VideoFile) -> Iterator[Frame]:
                     file.stamps is None or file.counted or frame.pts in {None, file.stamps[count]}
                 ):
                     raise RecordingError(_damaged(path, count, "its stamp is not among those of the file"))
-                if (frame.height, frame.width) != file.frame_size:
+                turn = display_turn(frame, where=path)
+                height, width = turn.size(frame.height, frame.width)
+                if (height, width) != file.frame_size:
                     raise RecordingError(
-                        f"frame {count} of {path} is {frame.width} x {frame.height} pixels but the file says "
+                        f"frame {count} of {path} is {width} x {height} pixels but the file says "
                         f"{file.frame_size[1]} x {file.frame_size[0]}; record one size a file"
                     )
                 count += 1
-                yield to_rgb.reformat(frame, format="rgb24").to_ndarray()
+                yield turn.apply(to_rgb.reformat(frame, format="rgb24").to_ndarray())
         except FFmpegError as error:
             raise RecordingError(_damaged(path, count, error.strerror)) from None
     if count < file.frames:

@@ -1,0 +1,117 @@
+"""Directions of the pull: margins outside those of the training are withheld, inside they are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pulled import pulled_frames
+
+import sliplens as sl
+from sliplens.images import absolute_difference
+from sliplens.live import LiveFrame
+from sliplens.live.frame_reader import FrameReader
+from sliplens.live.health import HealthMonitor
+from sliplens.live.reading import Reading
+from sliplens.live.sources import open_live
+from sliplens.models import Run
+from sliplens.recordings.sensor import SensorProfile
+from sliplens.shear import FULL_CIRCLE
+
+TURNS = {
+    "as it is": lambda images: images,
+    "turned": lambda images: images[..., ::-1, ::-1, :],
+    "mirrored": lambda images: images[..., ::-1, :],
+    "upside down": lambda images: images[..., ::-1, :, :],
+}
+ASTRAY = [(0.0, "as it is"), (180.0, "as it is"), (270.0, "as it is"), (90.0, "turned"), (90.0, "upside down")]
+IN_RANGE = [(90.0, "as it is"), (90.0, "mirrored"), (270.0, "turned")]
+
+
+@pytest.fixture(scope="module")
+def pulled_down() -> Run:
+    """Network of the package that was trained on pulls of 75 to 105 degrees, whatever its manifest says."""
+    network = sl.load("chromatouch-pair")
+    return replace(network, manifest=replace(network.manifest, pull_direction_deg=(75.0, 105.0), novelty=None))
+
+
+def turned_frames(direction_deg: float, turn: str, *, margins: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    reference, frames = pulled_frames(direction_deg, 1, margins=margins)
+    return np.ascontiguousarray(TURNS[turn](reference)), np.ascontiguousarray(TURNS[turn](frames))
+
+
+def read_live(network: Run, reference: np.ndarray, frames: np.ndarray) -> list[Reading]:
+    """Read frames as a running sensor's, none of them dropped."""
+    reader = FrameReader(
+        open_live(frames), network, friction=None, same_object=False, sequence=False, smoothing_s=0.0,
+        health=HealthMonitor, slip=None,
+    )  # fmt: skip
+    reader.begin(sl.models.make_engine("eager", network, batch_size=1), reference)
+    return [
+        reader.read(LiveFrame(image=image, number=at, time_s=at / 30, captured_s=0.0))
+        for at, image in enumerate(frames)
+    ]
+
+
+def withheld_by(network: Run, reference: np.ndarray, frames: np.ndarray, *, live: bool) -> list[bool]:
+    if live:
+        return [
+            any(check.name == "direction" and not check.ok for check in reading.health) and reading.margin is None
+            for reading in read_live(network, reference, frames)
+        ]
+    table = sl.predict(network, frames, reference=reference, engine="eager").frame()
+    hidden = [reason is not None for reason in table["withheld"].to_pylist()]
+    assert [margin is None for margin in table["prediction"].to_pylist()] == hidden
+    return hidden
+
+
+@pytest.mark.parametrize("live", [False, True], ids=["files", "live"])
+@pytest.mark.parametrize(("direction_deg", "turn"), ASTRAY)
+def test_a_margin_is_withheld_where_the_pull_is_in_another_direction(
+    pulled_down: Run, direction_deg: float, turn: str, live: bool
+):
+    reference, frames = turned_frames(direction_deg, turn, margins=(0.02, 0.15, 0.25))
+    assert all(withheld_by(pulled_down, reference, frames, live=live))
+
+
+@pytest.mark.parametrize("live", [False, True], ids=["files", "live"])
+@pytest.mark.parametrize(("direction_deg", "turn"), IN_RANGE)
+def test_no_margin_is_withheld_where_it_is_not(pulled_down: Run, direction_deg: float, turn: str, live: bool):
+    reference, frames = turned_frames(direction_deg, turn, margins=(0.02, 0.25, 0.6, 1.0))
+    assert not any(withheld_by(pulled_down, reference, frames, live=live))
+
+
+@pytest.mark.parametrize("live", [False, True], ids=["files", "live"])
+def test_a_network_of_all_directions_withholds_none(pulled_down: Run, live: bool):
+    reference, frames = turned_frames(270.0, "as it is", margins=(0.02,))
+    for directions in (FULL_CIRCLE, None):
+        network = replace(pulled_down, manifest=replace(pulled_down.manifest, pull_direction_deg=directions))
+        assert not any(withheld_by(network, reference, frames, live=live))
+
+
+def test_difference_images_hide_the_direction_and_a_note_says_so():
+    network = sl.load("chromatouch-difference")
+    reference, frames = turned_frames(270.0, "as it is", margins=(0.02,))
+    compared = absolute_difference(frames, reference)
+    limited = replace(network, manifest=replace(network.manifest, pull_direction_deg=(75.0, 105.0)))
+    told = [note for note in sl.predict(limited, compared, engine="eager").notes if "75 to 105 degrees" in note]
+    assert len(told) == 1
+    everywhere = replace(network, manifest=replace(network.manifest, pull_direction_deg=FULL_CIRCLE))
+    assert not any("degrees" in note for note in sl.predict(everywhere, compared, engine="eager").notes)
+
+
+@pytest.mark.parametrize(("seat_deg", "fits"), [(90.0, True), (70.0, True), (0.0, False), (270.0, False), (None, True)])
+def test_a_profile_that_sits_otherwise_is_told_once_where_it_is_opened(
+    pulled_down: Run, seat_deg: float | None, fits: bool
+):
+    profile = SensorProfile(name="chromatouch-9", pull_direction_deg=seat_deg)
+    reference, frames = turned_frames(90.0, "as it is", margins=(0.5,))
+    notes = sl.predict(pulled_down, frames, reference=reference, sensor=profile, engine="eager").notes
+    doubts = sl.LiveReader(frames, pulled_down, reference=reference, sensor=profile).doubts
+    for told in (notes, doubts):
+        assert sum("chromatouch-9" in sentence and "75 to 105" in sentence for sentence in told) == (not fits)
+
+
+@pytest.mark.parametrize("directions", [(105.0, 75.0), (-10.0, 20.0), (0.0, 400.0), (370.0, 380.0)])
+def test_a_range_runs_upwards_and_not_further_than_round(pulled_down: Run, directions: tuple[float, float]):
+    with pytest.raises(ValueError, match="pull_direction_deg"):
+        replace(pulled_down.manifest, pull_direction_deg=directions)
