@@ -139,6 +139,7 @@ def write_evaluation(
         safety_margin=np.concatenate(labels),
         prediction=np.concatenate(answers),
         **{column: np.full(len(trial), np.nan) for column in ("sigma", "low_90", "high_90")},
+        withheld=np.full(len(trial), ""),
     )
     result = made_up_evaluation(predictions, name=name)
     return write_run(workspace / f"test-{name}", "evaluate", {"input": name}, result, minute=9)

@@ -31,6 +31,7 @@ def evaluation(*, sure: bool = True) -> Evaluation:
         sigma=sigma,
         low_90=np.clip(answers - 1.6 * sigma, 0, 1),
         high_90=np.clip(answers + 1.6 * sigma, 0, 1),
+        withheld=np.full(180, ""),
     )
     return made_up_evaluation(predictions, sure=sure)
 

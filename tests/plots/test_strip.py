@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,6 +24,7 @@ def strip() -> Strip:
             prediction=np.nan_to_num(margin, nan=1.0) * 0.9,
             low=np.nan_to_num(margin) * 0.5,
             high=np.ones(5),
+            withheld=np.full(5, ""),
         ),
         shown=(1, 3),
         pictures=np.full((2, 8, 8, 3), 100, dtype=np.uint8),
@@ -49,3 +52,16 @@ def test_the_chart_has_units_and_marks_the_moments_with_pictures(strip):
     chart = next(ax for ax in figure.axes if ax.get_xlabel() == "Time (s)")
     assert chart.get_ylabel() == "Safety margin (%)"
     assert {text.get_text() for text in chart.texts} == {"1", "2"}
+
+
+def test_a_withheld_moment_shows_no_margin_and_a_grey_chart(strip):
+    gap = np.arange(5) == 3
+    values = {name: np.where(gap, np.nan, getattr(strip.readings, name)) for name in ("prediction", "low", "high")}
+    readings = replace(strip.readings, **values, withheld=np.where(gap, "strange; train it", ""))
+    figure = draw_strip(replace(strip, readings=readings))
+    titles = [ax.get_title(loc="center") for ax in figure.axes]
+    assert "2: withheld\n20 % true" in titles
+    chart = next(ax for ax in figure.axes if ax.get_xlabel() == "Time (s)")
+    legend = chart.get_legend()
+    assert legend is not None
+    assert "withheld: strange" in {text.get_text() for text in legend.get_texts()}

@@ -19,6 +19,7 @@ def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> Scored
         safety_margin=np.full(error.size, 0.5),
         prediction=(0.5 + error.ravel())[rows],
         **{name: np.full(error.size, np.nan) for name in ("sigma", "low_90", "high_90")},
+        withheld=np.full(error.size, ""),
     )
 
 

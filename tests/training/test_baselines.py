@@ -76,6 +76,7 @@ def labelled_frames(data: Dataset, *, split: str = "test") -> ScoredFrames:
                 sigma=unknown,
                 low_90=unknown,
                 high_90=unknown,
+                withheld=np.full(len(rows), ""),
             )
         )
     return ScoredFrames(

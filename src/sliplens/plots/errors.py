@@ -29,6 +29,7 @@ from sliplens.plots.style import (
     place_text,
     require_picture_path,
     save_page,
+    shade_withheld,
     short_input_name,
     write_over,
 )
@@ -117,9 +118,12 @@ def plot_margin_over_time(trials: Mapping[str, ScoredFrames], *, ax: Axes) -> Ax
     ordered = {name: trials[name].where(np.argsort(trials[name].time_s)) for name in inputs_in_order(trials)}
     label = next(iter(ordered.values()))
     ax.plot(label.time_s, 100 * label.safety_margin, color=BLACK, linewidth=2.4, label="true")
+    together = zip(*(trial.withheld.tolist() for trial in ordered.values()), strict=False)
+    shade_withheld(label.time_s, [next(filter(None, reasons), "") for reasons in together], ax=ax)
     for name, trial in ordered.items():
         line = {"color": INPUT_COLOURS.get(name, PURPLE), "marker": "o", "markersize": 3, "linewidth": 1.2}
-        ax.plot(trial.time_s, 100 * trial.prediction, label=short_input_name(name), **line)
+        read = np.where(trial.withheld == "", 100 * trial.prediction, np.nan)
+        ax.plot(trial.time_s, read, label=short_input_name(name), **line)
     ax.axhline(0, color=GREY, linewidth=0.8)
     ylim = _limits(np.concatenate([trial.prediction for trial in trials.values()]))
     ax.set(xlabel="Time (s)", ylabel=MARGIN_LABEL, ylim=ylim)
@@ -234,10 +238,16 @@ def _plot_typical(predictions: ScoredFrames, trials: Mapping[str, RegressionScor
     trial = ranked[(len(ranked) - 1) // 2]
     rows = np.flatnonzero(predictions.trial == trial)
     shown = predictions.where(rows[np.argsort(predictions.time_s[rows], kind="stable")])
-    if np.isfinite(shown.low_90).any():
+    shade_withheld(shown.time_s, shown.withheld.tolist(), ax=ax)
+    read, low, high = (
+        np.where(shown.withheld == "", 100 * values, np.nan)
+        for values in (shown.prediction, shown.low_90, shown.high_90)
+    )
+    if np.isfinite(low).any():
         interval = {"color": VERMILLION, "alpha": 0.2, "linewidth": 0, "label": "90 % interval"}
-        ax.fill_between(shown.time_s, 100 * shown.low_90, 100 * shown.high_90, **interval)
-    ax.plot(shown.time_s, 100 * shown.prediction, color=VERMILLION, label="predicted")
+        ax.fill_between(shown.time_s, low, high, **interval)
+    if np.isfinite(read).any():
+        ax.plot(shown.time_s, read, color=VERMILLION, label="predicted")
     ax.plot(shown.time_s, 100 * shown.safety_margin, color=BLACK, linestyle="--", label="true")
     ax.set(xlabel="Time (s)", ylabel="Γ (%)")
     ax.set_title(f"Median error: {trial if len(trial) <= 18 else f'…{trial[-17:]}'}", parse_math=False)

@@ -30,6 +30,7 @@ from sliplens.plots.style import (
     method_name,
     methods_in_order,
     percent,
+    reading_words,
     written_whole,
 )
 from sliplens.results.evaluation import Diagnosis
@@ -109,7 +110,9 @@ def _explained(explained: Explained, ax: Axes, index: int) -> None:
     ax.imshow(overlay_saliency(explained.pictures[place], stretch_saliency(explained.saliency[method][place])))
     ax.set_axis_off()
     frame = explained.frames[place]
-    ax.set_title(f"{method_name(method)}: true {percent(frame.safety_margin)}, read {percent(frame.prediction)}")
+    ax.set_title(
+        f"{method_name(method)}: true {percent(frame.safety_margin)}, {reading_words(frame.prediction, frame.withheld)}"
+    )
 
 
 def _faithfulness(faithfulness: Any, ax: Axes, _: int) -> None:

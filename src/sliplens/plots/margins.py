@@ -143,8 +143,9 @@ def draw_strip(strip: Strip) -> Figure:
             ax = place_axes(figure, _MARGIN_IN + number * (cell + _GAP_IN), 1.05, cell, cell)
             ax.imshow(overlay_relevance(picture, relevance / limit))
             ax.set_axis_off()
-            read, true = _percent(strip.readings.prediction[frame]), _percent(strip.readings.safety_margin[frame])
-            words = f"{number + 1}: {read} read\n{true} true"
+            readings = strip.readings
+            read, true = _percent(readings.prediction[frame]), _percent(readings.safety_margin[frame])
+            words = f"{number + 1}: {'withheld' if readings.withheld[frame] else f'{read} read'}\n{true} true"
             ax.set_title(words, fontsize=9.5, loc="center", fontweight="normal")
         bar = place_axes(figure, _WIDTH_IN - 0.9, 1.05, 0.13, cell)
         figure.colorbar(ScalarMappable(Normalize(-limit, limit), SIGN_COLOURS), cax=bar)
@@ -163,6 +164,7 @@ def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
     read, low, high = (
         np.where(touched, 100 * value, np.nan) for value in (readings.prediction, readings.low, readings.high)
     )
+    shade_withheld(time_s, readings.withheld.tolist(), ax=ax)
     if np.isfinite(low).any():  # a network that was never calibrated tells none
         ax.fill_between(time_s, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
     ax.plot(time_s, read, color=BLUE, label="read from the image")

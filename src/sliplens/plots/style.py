@@ -213,6 +213,11 @@ def percent(value: float | None, *, digits: int = 0) -> str:
     return UNKNOWN if value is None else f"{decimals(100 * value, digits)}\N{NO-BREAK SPACE}%"
 
 
+def reading_words(prediction: float, withheld: str | None) -> str:
+    """Write what a network reads of a frame, or that it is withheld."""
+    return "withheld" if withheld else f"read {percent(prediction)}"
+
+
 def signed(value: float, digits: int) -> str:
     """Write a number with its sign; what rounds to nothing is +0."""
     return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "\N{MINUS SIGN}")

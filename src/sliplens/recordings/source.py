@@ -22,11 +22,14 @@ from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import LIMITS, Budget, ReadOptions, spoken
+from sliplens.recordings.repeats import inspect_repeats
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.shards import LONGEST
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 """RGB images of the camera, one after another."""
+_INSPECTED = 8
+"""Recordings whose first frames are looked at for repeats."""
 
 
 def open_source(
@@ -226,7 +229,12 @@ def open_trials(
         raise InputError("two of the trials have one name; give each its own")
     shown = hash_tree(source) if resumable and isinstance(source, Path) else ""
     rows = [(one.name, one.frames, shown) for one in opened]
-    return Trials(source=source if isinstance(source, Path) else opened, named=named, kinds=opened, rows=tuple(rows))
+    # of many recordings a few: to open all takes long enough
+    kinds = tuple(
+        replace(one, notes=(*one.notes, *inspect_repeats(one))) if at < _INSPECTED else one
+        for at, one in enumerate(opened)
+    )
+    return Trials(source=source if isinstance(source, Path) else opened, named=named, kinds=kinds, rows=tuple(rows))
 
 
 def _open(source: Path | Frames, format: str | None, options: ReadOptions, *, whole: bool) -> Sequence[Capture]:

@@ -23,6 +23,7 @@ from sliplens.recordings.labelling import Edit, EditKind, Labelling, ReferenceCh
 from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion, soften
 from sliplens.recordings.labels.lag import Soft
 from sliplens.recordings.options import LabelSettings
+from sliplens.recordings.repeats import describe_repeats
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.store import (
     ROW_GROUP,
@@ -250,6 +251,10 @@ def label_footage(
     if labels is None:
         assert capture.forces is not None
         labels = found = label_trial(capture.frame_time_s, footage.motion, capture.forces, settings=settings, rng=rng)
+        doubt = describe_repeats(footage.motion, capture.frame_time_s)
+        if doubt is not None:
+            basis = replace(found.basis, doubts=(*found.basis.doubts, doubt))
+            labels = found = replace(found, basis=basis)
     if image is not None and index is None:
         method = "recorded apart from the frames" if found else "came with the recording"
         choice = capture.reference_choice or ReferenceChoice(method=method)

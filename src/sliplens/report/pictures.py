@@ -35,6 +35,7 @@ from sliplens.plots.style import (
     methods_in_order,
     percent,
     place_axes,
+    reading_words,
     short_input_name,
     signed,
     source_name,
@@ -131,7 +132,8 @@ def plate_states(results: Results, explained: Explained) -> Plate | None:
 def plate_strip(strip: Strip) -> Plate:
     """Draw one trial from stick to slip, its true and read margin, and the maps of a few frames."""
     readings = strip.readings
-    first, last = (percent(float(readings.prediction[strip.shown[place]])) for place in (0, -1))
+    ends = (strip.shown[place] for place in (0, -1))
+    first, last = ("nothing" if readings.withheld[at] else percent(float(readings.prediction[at])) for at in ends)
     return Plate(
         name="strip",
         figure=draw_strip(strip),
@@ -215,7 +217,7 @@ def _measured(explained: Explained, method: str, frame: ShownFrame) -> tuple[Any
 
 
 def _answer(frame: ExplainedFrame) -> str:
-    return f"true {percent(frame.safety_margin)}, read {percent(frame.prediction)}"
+    return f"true {percent(frame.safety_margin)}, {reading_words(frame.prediction, frame.withheld)}"
 
 
 def shown_methods(results: Results) -> list[str]:
@@ -548,7 +550,7 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         ]
         maps = [explained.relevance[method][index] for method in methods]
         cells += [Cell(picture=_painted(picture, one, percentile=FULL_COLOUR_PERCENTILE)) for one in maps]
-        rows.append((f"Γ {percent(own.safety_margin)}\nread {percent(own.prediction)}", cells))
+        rows.append((f"Γ {percent(own.safety_margin)}\n{reading_words(own.prediction, own.withheld)}", cells))
     truths = ("Shapley values\nin the answer", "Put back alone:\nthe answer", "Put back alone:\nthe margin")
     heads = [called, *truths, *(method_name(one) for one in methods)]
     return Plate(

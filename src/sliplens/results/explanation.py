@@ -25,6 +25,8 @@ class ExplainedFrame:
     prediction: Annotated[float, ANSWER]
     reference_prediction: Annotated[float, ANSWER]
     day: int = 1
+    withheld: str | None = None
+    """Reason for which the prediction is not to be believed as a margin; None where it is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,6 +164,9 @@ class StripReadings(Columns):
     """Lower end of its 90 % interval; NaN for a network that was never calibrated."""
     high: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Upper end of its 90 % interval."""
+    withheld: Shaped[np.ndarray, " frames"]
+    """Reason for which the margin is not to be believed, with the cure; empty where it is. Margin and interval of such
+    a frame are NaN."""
 
 
 @dataclass(frozen=True, kw_only=True)

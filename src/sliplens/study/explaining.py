@@ -282,7 +282,8 @@ class Explaining(Stage[Explained]):
         trained, chosen, frames = self.trained, self.chosen, len(self.chosen.ids)
         maps = {method: pieces[at * frames : (at + 1) * frames] for at, method in enumerate(self.explainers)}
         # the same answers for every method: asked once, on all frames
-        predictions, untouched = trained.predict(self.inputs).tolist(), trained.predict(chosen.references).tolist()
+        estimate, untouched = trained.estimate(self.inputs), trained.predict(chosen.references).tolist()
+        withheld = estimate.withheld(np.ones(frames, dtype=bool))  # who explains a frame holds it to touch something
         return Explained(
             input=trained.encoding.name,
             source=chosen.source,
@@ -294,7 +295,8 @@ class Explaining(Stage[Explained]):
                     day=chosen.day[index],
                     condition=chosen.condition[index],
                     safety_margin=float(margin) if np.isfinite(margin) else None,
-                    prediction=predictions[index],
+                    prediction=float(estimate.margin[index]),
+                    withheld=withheld[index],
                     reference_prediction=untouched[index],
                 )
                 for index, margin in enumerate(chosen.safety_margin)

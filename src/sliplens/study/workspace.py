@@ -23,7 +23,7 @@ from sliplens.images import write_png
 from sliplens.models import Run
 from sliplens.models.checkpoint import open_run
 from sliplens.plots.saliency import SIGN_COLOURS, draw_panel, full_colour, overlay_jet, overlay_relevance
-from sliplens.plots.style import drawing_style, method_name, percent
+from sliplens.plots.style import drawing_style, method_name, percent, reading_words
 from sliplens.progress import OnProgress, note, number_of, stage, wrote
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
@@ -246,7 +246,7 @@ def draw_explained(explained: Explained, folder: Path, *, colours: Literal["sign
         rows[f"{method_name(method)}{scale}"] = [row[column] for column in columns]
     titles = [
         # of recorded images the margin need not be known
-        f"{_short(frame.id)}\nread {percent(frame.prediction)}"
+        f"{_short(frame.id)}\n{reading_words(frame.prediction, frame.withheld)}"
         + ("" if frame.safety_margin is None else f", true {percent(frame.safety_margin)}")
         for frame in (explained.frames[column] for column in columns)
     ]
@@ -366,6 +366,8 @@ def explain_trial(
     estimate = run.estimate(inputs)
     unknown = np.full(len(margin), np.nan)
     low, high = estimate.interval(_CONFIDENCE) or (unknown, unknown)
+    withheld = estimate.withheld(np.isfinite(margin))
+    believed = np.array([reason is None for reason in withheld])
     named, explained, size = study_explainers([method]), inputs[list(shown)], run.manifest.image_size
     reference = run.encoding.empty(recording.reference, image_size=size)
     try:
@@ -378,10 +380,12 @@ def explain_trial(
     explanation = explainer(
         run.model, explained, reference=reference.expand(len(shown), -1, -1, -1), on_progress=on_progress
     )
-    read = {"safety_margin": margin, "prediction": estimate.margin, "low": low, "high": high}
+    read = {"prediction": estimate.margin, "low": low, "high": high}
+    read = {name: np.where(believed, values, np.nan) for name, values in read.items()} | {"safety_margin": margin}
     readings = StripReadings(
         time_s=recording.time_s.astype(np.float64),
         contact_state=np.array([str(state) for state in recording.contact_state]),
+        withheld=np.array([reason or "" for reason in withheld]),
         **{name: values.astype(np.float64) for name, values in read.items()},
     )
     maps, pictures = explanation.relevance.to(torch.float32).cpu().numpy(), recording.frames[list(shown)]

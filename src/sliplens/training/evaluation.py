@@ -354,6 +354,7 @@ def evaluate_frames(
         sigma=unknown if sigma is None else sigma,
         low_90=low_90,
         high_90=high_90,
+        withheld=np.array([reason or "" for reason in estimate.withheld(np.ones(len(frames), dtype=bool))]),
     )
     conditions = {name: predictions.condition == name for name in sorted(set(frames.condition))}
     days = {

@@ -1,0 +1,68 @@
+"""Frames that a recorder repeated: noticed whatever the coding, and a working camera is never accused of them."""
+
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from readers import read_video
+
+import sliplens as sl
+from sliplens.recordings import Recording
+from sliplens.recordings.repeats import describe_repeats, inspect_repeats
+
+CODECS = {
+    "libx264": ("yuv420p", "mp4"),
+    "mpeg4": ("yuv420p", "mp4"),
+    "mjpeg": ("yuvj420p", "avi"),
+    "ffv1": ("bgr0", "mkv"),
+}
+
+
+def write_video(path: Path, frames: np.ndarray, places: np.ndarray, *, codec: str) -> Path:
+    pixels, suffix = CODECS[codec]
+    path = path.with_suffix(f".{suffix}")
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=30)
+        assert isinstance(stream, av.VideoStream)
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = pixels
+        stream.codec_context.bit_rate = 4_000_000
+        for place in places:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frames[place], format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize("camera_hz", [30, 24, 15, 10])
+def test_a_camera_slower_than_its_file_is_noticed(
+    trials: dict[str, Recording], tmp_path: Path, camera_hz: int, codec: str
+):
+    frames = trials["chromatouch"].frames
+    shown = np.arange(len(frames) * 30 // camera_hz) * camera_hz // 30
+    capture = read_video(write_video(tmp_path / "a", frames, shown, codec=codec))
+    notes = inspect_repeats(capture)
+    assert len(notes) == (camera_hz < 30)
+    assert all("repeat the one before" in note for note in notes)
+
+
+def test_predict_and_track_say_it(trials: dict[str, Recording], tmp_path: Path):
+    path = write_video(tmp_path / "a.mkv", trials["chromatouch"].frames[:20], np.arange(40) // 2, codec="ffv1")
+    predictions = sl.predict("chromatouch-difference", path, reference_frame=0)
+    assert any("repeat the one before" in note for note in predictions.notes)
+
+
+def test_a_scene_that_rests_is_no_repeat():
+    moves = np.r_[np.ones(20), np.full(15, 0.01), np.ones(20), np.full(30, 0.01)]
+    assert describe_repeats(moves, np.arange(len(moves)) / 30) is None
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5, 60])
+def test_frames_that_never_change_are_no_repeats(frames: int):
+    assert describe_repeats(np.zeros(frames), np.arange(frames) / 30) is None
+
+
+def test_key_frames_of_lossy_video_are_no_repeats():
+    moves = np.tile([0.7, 0.2, 0.1, 0.09, 0.07, 0.05, 0.04, 0.03, 0.02, 0.03, 0.01, 0.03], 8)
+    assert describe_repeats(moves, np.arange(len(moves)) / 30) is None
