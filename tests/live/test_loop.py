@@ -21,7 +21,6 @@ from sliplens.live.contract import LiveSource
 from sliplens.live.frame_reader import LowPass
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.markers import TrackedFrame, Tracker
-from sliplens.models import Run
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.source import open_source
 
