@@ -170,7 +170,7 @@ class BorderMotion:
                 )
                 similarity = complex(fitted[1]) / _HALF_PX
         misfit_px, length_px = float(np.sort(misfit)[_PARTS - _STRAYS - 1]), float(np.linalg.norm(fitted))
-        free = misfit_px < _STILL_PX + _ALIKE_SHARE * length_px
+        free = length_px < _LIGHT_PX or misfit_px < _STILL_PX + _ALIKE_SHARE * length_px
         return _as_motion(fitted, 0.0 if free else misfit_px, _NO_SHARES if free else _BORDER_SHARES, free=free)
 
 
