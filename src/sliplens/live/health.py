@@ -333,8 +333,8 @@ _HARM: dict[str, tuple[float, float]] = {
 }  # fmt: skip
 """Chance that a fault puts the margin off however strong it is, and its growth with severity, by check.
 
-Fitted by `benchmarks/health.py --choose --trials 6 --frames 3`; so few frames without a touch do not show its growth,
-and is that of an earlier fit to twice as many trials.
+Fitted by `benchmarks/health.py --choose --trials 6 --frames 3`. Too few of these show no touch: the growth of that
+is of an earlier fit, to twice as many trials.
 """
 _SPREAD = -2.07, 0.59
 """Offset and slope of the logit of what the network itself gives for an error above `OFF`."""
