@@ -3,12 +3,13 @@
 Each frame in contact of unseen days and sensors is read as it is, and with each fault in each strength; faults of
 camera and light are there since before the touch, a turn and a zoom also in a contact that was never seen without (`in
 contact`). `dropped` is a picture that falls by 28 pixels at once, `torn` one of the upper part of a frame and the lower
-part of one 0.4 or 1.6 s later, `pulled` a pull in another direction, in degrees, than those of the training. `half
-stale` and `frozen` are sequences at 10 frames a second with the samples of a force sensor, in which the lower half of
-the picture, or all of it under fresh noise, has stayed as it was 0.5 or 1 s ago; the last frame of each such sequence
-is also read without the fault. A margin is off where it errs by more than 0.2; without contact there is none, so any
-answer counts as off. `shown_wrong_share` is the share of a fault's frames that are off and not withheld, `shown_caused_share` that of those
-which are not off without the fault.
+part of one 0.4 or 1.6 s later, `pulled` a pull towards 180 or 270 degrees, with which a network is only wrong where its
+training had no such pulls: all others are pulled as in that. `half stale` and `frozen` are sequences at 10 frames a
+second with the samples of a force sensor, in which the lower half of the picture, or all of it under fresh noise, has
+stayed as it was 0.5 or 1 s ago; the last frame of each such sequence is also read without the fault. A margin is off
+where it errs by more than 0.2; without contact there is none, so any answer counts as off. `shown_wrong_share` is the
+share of a fault's frames that are off and not withheld, `shown_caused_share` that of those which are not off without
+the fault.
 
 `auroc` ranks all these frames by `margin_risk`, in which all checks and the network's own spread are one number, and
 `auroc_worst` by how far their worst check is from its limit. Two numbers say what can be reached. `auroc_told` is that
@@ -28,6 +29,7 @@ import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -38,7 +40,7 @@ from scipy.optimize import minimize
 from sliplens.codec import load_record, save_record
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import Check, HealthMonitor, LiveFrame
-from sliplens.live.health import OFF, check_novelty, margin_risk, severity
+from sliplens.live.health import OFF, check_direction, check_novelty, margin_risk, severity
 from sliplens.markers import Tracker
 from sliplens.models import Run, load
 from sliplens.models.checkpoint import MANIFEST_FILE, Manifest
@@ -153,13 +155,17 @@ SUDDEN: dict[str, tuple[Fault, tuple[float, ...]]] = {
 """Faults of one frame, before which nothing was seen."""
 
 
-def plan_some(series: str, trials: int, *, sensor: str | None = None) -> list[TrialPlan]:
-    """One trial of each of as many days, each with a sensor of its own; series share no day and no sensor."""
-    recipe = replace(
-        make_recipe("varied", sensor=sensor, days=trials + 2, dry_trials=trials + 2, wet_trials=0, test_days=1),
-        series=series,
-        sensors=trials + 2,
-    )
+def plan_some(
+    series: str, trials: int, *, sensor: str | None = None, pull_deg: tuple[float, float] | None = None
+) -> list[TrialPlan]:
+    """One trial of each of as many days, each with a sensor of its own; series share no day and no sensor.
+
+    `pull_deg`: directions of the pull; those of the recipe if None.
+    """
+    recipe = make_recipe("varied", sensor=sensor, days=trials + 2, dry_trials=trials + 2, wet_trials=0, test_days=1)
+    directions = pull_deg or recipe.nuisances.shear_direction_deg
+    nuisances = replace(recipe.nuisances, shear_direction_deg=directions)
+    recipe = replace(recipe, nuisances=nuisances, series=series, sensors=trials + 2)
     return list(plan_trials(recipe))[:trials]
 
 
@@ -204,6 +210,7 @@ class Judge:
 
     def __init__(self, run: Run, reference: np.ndarray, *, trial: int) -> None:
         self._run, self._reference, self._trial = run, reference, trial
+        self._shear = run.shear_estimator(reference)
 
     def say(
         self,
@@ -221,6 +228,8 @@ class Judge:
         checks, frame = (), Shot(image=image, time_s=0.0, force_n=force_n).frame()
         for seen in (*(shot.frame() for shot in before), frame):
             checks = monitor.check(seen, tracker.update(seen.image))
+        if self._shear is not None and all(check.ok for check in checks):
+            checks = (*checks, check_direction(self._run, self._shear.estimate(frame.image)))
         estimate = self._run.estimate(self._run.encode(frame.image[None], self._reference))
         novelty = check_novelty(estimate)
         error = abs(float(np.clip(estimate.margin[0], 0, 1)) - margin) if np.isfinite(margin) else np.inf
@@ -237,7 +246,9 @@ FROZEN_S = (0.5, 1.0)
 """Time for which a picture stays as it was."""
 
 
-def film_pull(film: Film, loading: Loading, *, old: int, now: int, rng: np.random.Generator) -> tuple[list[Shot], float]:
+def film_pull(
+    film: Film, loading: Loading, *, old: int, now: int, rng: np.random.Generator
+) -> tuple[list[Shot], float]:
     """Film the load from one frame to another, a quarter of its first part twice; gives the margin at the end too."""
     steps = np.linspace(0, 1, 1 + round(RATE_HZ * max(FROZEN_S)))
     steps = np.concatenate([np.zeros(3), steps])
@@ -278,6 +289,38 @@ STOPPED: dict[str, Callable[[list[Shot], int, np.random.Generator], list[Shot]]]
 }
 
 
+def judge_stopped(
+    judge: Judge,
+    loading: Loading,
+    film: Film,
+    *,
+    chosen: np.ndarray,
+    healthy: dict[int, float],
+    rng: np.random.Generator,
+) -> Iterator[Case]:
+    """Cases of pictures that stay as they were, whole or in part, and of the same sequences without the fault."""
+    margins = loading.safety_margin
+    for later in (1, 2):  # the picture stays that of an earlier frame, for longer and longer
+        for old, now in zip(chosen[:-later], chosen[later:], strict=True):
+            image, held_s = draw(film, old), float(loading.time_s[now] - loading.time_s[old])
+            yield judge.say(
+                image, float(margins[now]), fault="stale", strength=float(later),
+                before=[Shot(image=image, time_s=-held_s)], healthy_error=healthy[now],
+            )  # fmt: skip
+    for old, now in pairwise(chosen):
+        shots, margin = film_pull(film, loading, old=old, now=now, rng=rng)
+        *before, last = shots
+        as_it_is = judge.say(last.image, margin, before=before, force_n=last.force_n)
+        yield as_it_is
+        for fault, stop in STOPPED.items():
+            for held_s in FROZEN_S:
+                *before, last = stop(shots, len(shots) - 1 - round(RATE_HZ * held_s), rng)
+                yield judge.say(
+                    last.image, margin, fault=fault, strength=held_s, before=before, force_n=last.force_n,
+                    healthy_error=as_it_is.error,
+                )  # fmt: skip
+
+
 def judge_trial(run: Run, plan: TrialPlan, *, trial: int, frames: int, other: TrialPlan) -> Iterator[Case]:
     """All cases of one trial."""
     rng = np.random.default_rng(plan.seed)
@@ -315,25 +358,7 @@ def judge_trial(run: Run, plan: TrialPlan, *, trial: int, frames: int, other: Tr
             grasp = replace(film.grasp, normal_force_n=float(loading.normal_force_n[at]))
             pulled = draw(turned.under(load_at_margins(np.array([margin]), grasp=grasp), rng=rng), 0)
             yield judge.say(pulled, margin, fault="pulled", strength=degrees, healthy_error=as_it_is.error)
-    for later in (1, 2):  # the picture stays that of an earlier frame, for longer and longer
-        for old, now in zip(chosen[:-later], chosen[later:], strict=True):
-            image, held_s = draw(film, old), float(loading.time_s[now] - loading.time_s[old])
-            yield judge.say(
-                image, float(margins[now]), fault="stale", strength=float(later),
-                before=[Shot(image=image, time_s=-held_s)], healthy_error=healthy[now],
-            )  # fmt: skip
-    for old, now in zip(chosen[:-1], chosen[1:], strict=True):
-        shots, margin = film_pull(film, loading, old=old, now=now, rng=rng)
-        *before, last = shots
-        as_it_is = judge.say(last.image, margin, before=before, force_n=last.force_n)
-        yield as_it_is
-        for fault, stop in STOPPED.items():
-            for held_s in FROZEN_S:
-                *before, last = stop(shots, len(shots) - 1 - round(RATE_HZ * held_s), rng)
-                yield judge.say(
-                    last.image, margin, fault=fault, strength=held_s, before=before, force_n=last.force_n,
-                    healthy_error=as_it_is.error,
-                )  # fmt: skip
+    yield from judge_stopped(judge, loading, film, chosen=chosen, healthy=healthy, rng=rng)
     for at in np.flatnonzero(~np.isfinite(margins))[:2]:
         yield judge.say(draw(film, at), np.nan, fault="no contact", healthy_error=0.0)
     loading, film = prepare_trial(other)
@@ -483,8 +508,9 @@ def main() -> None:
         return
     run = load(options.network)
     series = "health-choose" if options.choose else "health-test"
-    plans = plan_some(series, options.trials)
-    others = plan_some(series, options.trials, sensor="flat-gel")
+    pull_deg = run.manifest.pull_direction_deg
+    plans = plan_some(series, options.trials, pull_deg=pull_deg)
+    others = plan_some(series, options.trials, sensor="flat-gel", pull_deg=pull_deg)
     cases = [
         case
         for trial, (plan, other) in enumerate(zip(plans, others, strict=True))

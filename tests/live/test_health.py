@@ -12,6 +12,7 @@ from sliplens.live.health import check_novelty, margin_risk, severity
 from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Estimate
 from sliplens.recordings import Recording
+from sliplens.recordings.capture import Forces
 
 SIDE = 112
 
@@ -118,6 +119,45 @@ def test_frames_that_repeat_come_late_or_are_lost_are_told(
     late = shot(untouched, rng, number=4, time_s=0.5)
     assert failed(monitor.check(replace(late, captured_s=late.captured_s - 2))) == {"late"}
     assert failed(monitor.check(shot(untouched, rng, number=90, time_s=0.6))) == {"drops"}
+
+
+def stopping(untouched: np.ndarray, rng: np.random.Generator, *, rows: slice, force_n: float | None) -> list[LiveFrame]:
+    """Frames of a picture that deepens, some rows of which stop after the third, by a load that grows meanwhile."""
+    frames = []
+    for number in range(12):
+        depth = np.full((SIDE, 1, 1), number)
+        depth[rows] = min(number, 2)
+        time_s = number / 30
+        forces = None
+        if force_n is not None:
+            forces = Forces(time_s=np.array([time_s]), force_n=np.array([[0.0, 0.0, force_n * number]]), source="test")
+        frames.append(replace(shot(untouched - 2.0 * depth, rng, number=number, time_s=time_s), forces=forces))
+    return frames
+
+
+@pytest.mark.parametrize(
+    ("rows", "force_n", "expected"),
+    [
+        (slice(0, 0), 0.1, set()),
+        (slice(SIDE // 2, None), 0.1, {"halves"}),
+        (slice(0, SIDE // 2), None, {"halves"}),
+        (slice(0, SIDE), 0.1, {"frozen"}),
+        (slice(0, SIDE), 0.0, set()),
+        (slice(0, SIDE), None, set()),  # nothing but noise changes: a hand that holds still looks the same
+    ],
+)
+def test_what_shows_noise_alone_while_something_else_changes_is_frozen(
+    *,
+    monitor: HealthMonitor,
+    untouched: np.ndarray,
+    rng: np.random.Generator,
+    rows: slice,
+    force_n: float | None,
+    expected: set[str],
+):
+    checks = [monitor.check(frame) for frame in stopping(untouched, rng, rows=rows, force_n=force_n)]
+    assert failed(checks[-1]) & {"halves", "frozen"} == expected
+    assert failed(checks[2]) & {"halves", "frozen"} == set()
 
 
 def test_without_a_touch_there_is_nothing_to_tell(

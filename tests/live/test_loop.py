@@ -21,7 +21,6 @@ from sliplens.live.contract import LiveSource
 from sliplens.live.frame_reader import LowPass
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.markers import TrackedFrame, Tracker
-from sliplens.models import Run
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.source import open_source
 
@@ -242,8 +241,9 @@ class Lenient:
 def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Recording]):
     trial, network = trials["chromatouch"], sl.load("chromatouch-pair")
     touching = trial.frames[np.isfinite(trial.safety_margin)]
-    torn = np.concatenate([touching[::4][1:, :112], touching[::4][:-1, 112:]], axis=1)
-    whole = touching[1::4][: len(torn)]
+    whole, torn = touching[::8], touching[4::8].copy()
+    torn[:, 112:] = 0  # the lower part never came
+    whole = whole[: len(torn)]
     frames = np.stack([whole, torn], axis=1).reshape(-1, *trial.frames.shape[1:])  # far less than 0.25 s apart
     known = sl.predict(network, frames, reference=trial.reference).frame()["known"].to_numpy()
     assert (known[1::2] < 0.01).any()
@@ -253,7 +253,9 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
         sl.LiveReader(source, network, reference=trial.reference, engine="eager", health=Lenient, slip=None, stall_s=10)
     )
     for reading, share in zip(readings, known, strict=True):
-        [check] = reading.health
+        if not all(check.ok for check in reading.health if check.name == "direction"):
+            continue  # the network was not run
+        [check] = [check for check in reading.health if check.name == "novelty"]
         assert (reading.margin is None) == (share < 0.01)
         # one frame at a time or many: float32 sums in another order move the features by 1e-6, the logarithm by more
         assert check.value == pytest.approx(-np.log10(share), abs=1e-2)

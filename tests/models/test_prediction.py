@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -18,6 +19,7 @@ import sliplens as sl
 from sliplens.codec import TABLE_SUFFIXES
 from sliplens.errors import ImageError, InputError, RecordingError, ShardError
 from sliplens.images import absolute_difference, write_png
+from sliplens.markers.camera import CAMERA_REASON
 from sliplens.models import Run, load_checkpoint
 from sliplens.models.checkpoint import STRANGE_REASON
 from sliplens.models.predictions import Predictions
@@ -426,3 +428,15 @@ def test_a_damaged_trial_does_not_lose_the_others(trained: Run, small_dataset: D
     trial_path(data, TRIAL).write_bytes(good)
     assert predict_source(trained, data, **own, retry_failed=True).frames == 24
     assert read_status(tmp_path / "set") == []
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1.5, -3.0])
+def test_frames_of_a_camera_that_has_turned_are_withheld(trials: dict[str, Recording], degrees: float):
+    trial = trials["chromatouch"]
+    turn = cv2.getRotationMatrix2D((111.5, 111.5), degrees, 1.0)
+    frames = np.stack(
+        [cv2.warpAffine(frame, turn, (224, 224), borderMode=cv2.BORDER_REPLICATE) for frame in trial.frames]
+    )
+    predictions = sl.predict("chromatouch-pair", frames, reference=trial.reference)
+    turned = predictions.withheld.get(CAMERA_REASON, 0)
+    assert turned == (len(frames) if degrees else 0)

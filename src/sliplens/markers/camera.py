@@ -6,14 +6,20 @@ import numpy as np
 from jaxtyping import Complex, Float, Float32
 
 from sliplens.markers.tracks import TrackedFrame
+from sliplens.recordings.capture import Frame
 
 Plane = Float32[np.ndarray, "height width"]
 
 SIDE_PX = 224
-"""Height of the picture in whose pixels motions of the camera are given, so that limits suit every camera."""
+"""Height of the picture in whose pixels the camera's motions are given, so that limits suit every camera."""
 _HALF_PX = SIDE_PX / 2
+CAMERA_LIMIT_PX = 0.8
+"""`CameraMotion.excess_px` above which the camera has moved: nearly twice what contacts of a fixed camera reach. Turns
+up to 0.3 degrees and zooms up to 0.5 %, on which networks are trained, stay below it."""
+CAMERA_REASON = "the camera turned, moved or zoomed since the reference; fasten it, and take a new reference"
+"""Reason to withhold a margin."""
 _LEAST_RADIUS = 0.62
-"""Distance of a marker from the middle, in halves of the picture's shorter side, from which the model of a contact
+"""Distance of a marker from the middle, in halves of the picture's shorter side, beyond which the model of a contact
 holds: nearer, the contact itself is seen."""
 _FEWEST = 10
 _PASSES, _SCALE_PX = 5, 0.3
@@ -143,15 +149,16 @@ class BorderMotion:
     def __init__(self, plane: Plane) -> None:
         factors = [max(1, min(plane.shape) // blocks) for blocks in _SCALES]
         self._levels = tuple((_Level(block_means(plane, factor)), factor) for factor in factors)
-        self._half = min(plane.shape) / 2
+        self._half, self._level = min(plane.shape) / 2, _brightness(plane)
         coarse, _ = self._levels[0]
         self.textured = int((coarse.texture > _TEXTURE).sum()) >= _PARTS - _STRAYS
         """Whether the border shows enough for its motion to be seen."""
 
     def measure(self, plane: Plane) -> CameraMotion | None:
-        """Measure the camera's motion in a picture as bright as the reference; None without texture."""
+        """Measure the camera's motion in a picture of the reference's size; None without texture."""
         if not self.textured:
             return None
+        plane = plane * np.float32(self._level / _brightness(plane))
         shift, similarity, misfit = np.zeros(_PARTS, dtype=complex), 0j, np.zeros(_PARTS)
         fitted = np.zeros(2, dtype=complex)
         for level, factor in self._levels:
@@ -163,8 +170,49 @@ class BorderMotion:
                 )
                 similarity = complex(fitted[1]) / _HALF_PX
         misfit_px, length_px = float(np.sort(misfit)[_PARTS - _STRAYS - 1]), float(np.linalg.norm(fitted))
-        free = misfit_px < _STILL_PX + _ALIKE_SHARE * length_px
+        free = length_px < _LIGHT_PX or misfit_px < _STILL_PX + _ALIKE_SHARE * length_px
         return _as_motion(fitted, 0.0 if free else misfit_px, _NO_SHARES if free else _BORDER_SHARES, free=free)
+
+
+def _brightness(plane: Plane) -> float:
+    return max(1.0, float(np.median(plane[::4, ::4])))
+
+
+class CameraWatch:
+    """Camera's motion over the frames of a sensor: what was seen before a contact holds until that is let go.
+
+    Markers show it, where they are followed and enough of them are seen beyond the contact, else parts of the border.
+
+    Parameters
+    ----------
+    reference
+        The sensor untouched.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.markers.camera import CameraWatch
+    >>> pixels = np.random.default_rng(0).integers(60, 200, (28, 28, 3), dtype=np.uint8)
+    >>> untouched = np.kron(pixels, np.ones((8, 8, 1), dtype=np.uint8))
+    >>> moved = CameraWatch(untouched).update(np.roll(untouched, 2, axis=1))
+    >>> round(moved.shift_px, 1), moved.excess_px > 0.6
+    (2.0, True)
+    """
+
+    def __init__(self, reference: Frame) -> None:
+        self._border = BorderMotion(reference[..., 1].astype(np.float32))
+        self._last: CameraMotion | None = None
+
+    def update(self, frame: Frame, markers: TrackedFrame | None = None) -> CameraMotion | None:
+        """Take the next frame; gives the motion that counts, None where neither markers nor the border show any."""
+        motion = None if markers is None else marker_camera_motion(markers)
+        if motion is None:
+            motion = self._border.measure(frame[..., 1].astype(np.float32))  # green, which cameras see best
+        if motion is None:
+            return None
+        if motion.free or self._last is None or motion.excess_px > self._last.excess_px:
+            self._last = motion
+        return self._last
 
 
 class _Level:
@@ -206,7 +254,7 @@ class _Level:
         self, pixels: Float32[np.ndarray, " pixels"], shift: Complex[np.ndarray, " parts"], similarity: complex
     ) -> Complex[np.ndarray, " parts"]:
         """How far each part lies from where its shift and the common similarity put it, in pixels."""
-        start = np.stack([shift.real, shift.imag]).astype(np.float32)[:, self._part]
+        start = np.stack([np.real(shift), np.imag(shift)]).astype(np.float32)[:, self._part]
         zoom, turn = np.float32(similarity.real), np.float32(similarity.imag)
         right, down = self._arm
         motion = start + np.stack([zoom * right - turn * down, turn * right + zoom * down])
@@ -218,4 +266,12 @@ class _Level:
         return np.clip(steps[0], -1.5, 1.5) + 1j * np.clip(steps[1], -1.5, 1.5)
 
 
-__all__ = ["BorderMotion", "CameraMotion", "block_means", "marker_camera_motion"]
+__all__ = [
+    "CAMERA_LIMIT_PX",
+    "CAMERA_REASON",
+    "BorderMotion",
+    "CameraMotion",
+    "CameraWatch",
+    "block_means",
+    "marker_camera_motion",
+]

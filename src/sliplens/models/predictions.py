@@ -17,6 +17,7 @@ from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_file, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
+from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
 from sliplens.models.checkpoint import Estimate, Run, open_run, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
@@ -33,6 +34,8 @@ from sliplens.recordings.trial import ContactState
 from sliplens.shards import LONGEST, MakePart, Work, make_table
 from sliplens.shear import FULL_CIRCLE, range_words
 
+_CAMERA_EVERY = 4
+"""Frames of a recording of which one is compared with the reference for the camera's motion."""
 LEVEL = 0.9
 """Confidence of the intervals."""
 _COLUMNS = {
@@ -479,11 +482,13 @@ class _Reading(Work):
         # batches are encoded while the ones before are under way; first frame of each, which touch, and doubts of them
         encoded: deque[tuple[int, list[bool], list[str | None]]] = deque()
         shear = None if reference is None else self.trained.shear_estimator(reference)
+        camera, moved = None if reference is None else CameraWatch(reference), False
         follower = self.trained.follow() if self.sequence else None
         if follower is not None and capture.time_s is not None:
             require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
 
         def encode() -> Iterator[Tensor]:
+            nonlocal moved
             while batch := list(islice(frames, engine.batch_size)):
                 first, images = batch[0][0], [frame for _, frame in batch]
                 if states:
@@ -492,10 +497,14 @@ class _Reading(Work):
                     touches = [picture_change(soften(frame), untouched) >= LEAST_TOUCH for frame in images]
                 else:
                     touches = [True] * len(batch)
-                doubts = [
-                    self.trained.doubt_shear(shear.estimate(frame)) if shear is not None and touch else None
-                    for touch, frame in zip(touches, images, strict=True)
-                ]
+                doubts: list[str | None] = []
+                for at, (touch, frame) in enumerate(zip(touches, images, strict=True), start=first):
+                    # a camera that has moved stays so; images of a folder are of any time
+                    if camera is not None and (at % _CAMERA_EVERY == 0 or capture.files is not None):
+                        motion = camera.update(frame)
+                        moved = motion is not None and motion.excess_px > CAMERA_LIMIT_PX
+                    astray = self.trained.doubt_shear(shear.estimate(frame)) if shear is not None and touch else None
+                    doubts.append(CAMERA_REASON if moved else astray)
                 encoded.append((first, touches, doubts))
                 yield self.trained.encode(np.stack(images), reference)
 
@@ -507,7 +516,7 @@ class _Reading(Work):
                 times = capture.time_s[first : first + len(touches)]
                 estimate = follower.update(estimate, times, np.array(touches))
             reasons = zip(estimate.withheld(np.array(touches)), doubts, strict=True)
-            withheld = [strange or astray for strange, astray in reasons]
+            withheld = [doubt or strange for strange, doubt in reasons]
             columns = _columns(estimate, capture, first, withheld=withheld) | {"touches": touches}
             for name, values in columns.items():
                 if name in rows:
