@@ -19,7 +19,7 @@ from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import require_device
 from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import LEARNT, Friction, FrictionLike, as_friction
-from sliplens.images import MOST_PIXELS, has_colour
+from sliplens.images import MOST_PIXELS, has_colour, require_rgb
 from sliplens.models.backbones import (
     Answers,
     HistogramRegressor,
@@ -143,6 +143,7 @@ class Run:
         `reference`: the sensor untouched; None for frames that were compared before, or that need not be. Frames of
         another size than the network's sensor has raise `ImageError`, and so do those that are no 8-bit images.
         """
+        require_rgb(frames)
         self.require_frame_size(frames.shape[1:3])
         size = self.manifest.image_size
         if reference is None and self.encoding.beside:
