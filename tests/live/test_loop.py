@@ -250,7 +250,9 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
     assert (known[::2] > 0.01).any()
     source = Patient(frames, list(range(len(frames))))
     readings = source.all_readings(
-        sl.LiveReader(source, network, reference=trial.reference, engine="eager", health=Lenient, slip=None, stall_s=10)
+        sl.LiveReader(
+            source, network, reference=trial.reference, engine="eager", health=Lenient, slip=None, stall_s=10.0
+        )
     )
     for reading, share in zip(readings, known, strict=True):
         if not all(check.ok for check in reading.health if check.name == "direction"):
