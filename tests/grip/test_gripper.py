@@ -5,6 +5,8 @@ import os
 import socket
 import threading
 import time
+from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +22,7 @@ from sliplens.grip.gripper import (
     GuardedGripper,
     LineGripper,
     RosGripper,
+    _open_serial,
     open_gripper,
 )
 
@@ -107,7 +110,7 @@ def test_a_late_answer_never_counts_as_that_of_another_line(numbered):
 
 def test_a_serial_gripper_without_numbers_is_left_alone_after_an_answer_that_did_not_come(clock):
     gripper_end, ours = os.openpty()
-    gripper = LineGripper(lambda: open(os.ttyname(ours), "r+b", buffering=0), timeout_s=0.0, silence_s=2.0)  # noqa: SIM115
+    gripper = LineGripper(partial(_open_serial, Path(os.ttyname(ours))), timeout_s=0.0, silence_s=2.0)
     with pytest.raises(GripperError, match="did not answer"):
         gripper.read_state()
     heard = os.read(gripper_end, 100)

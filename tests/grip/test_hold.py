@@ -1,5 +1,6 @@
 """A real gripper is held by what fingertips read: each margin with its own force, and nothing is loosened blindly."""
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -8,6 +9,7 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,8 +22,8 @@ import sliplens as sl
 from sliplens.codec import load_result
 from sliplens.errors import InputError, SourceError
 from sliplens.grip.controllers import CONTROLLERS, TOLD, Holder, MarginGrip, MarginLaw, Observation
-from sliplens.grip.gripper import DryRun, GripperError
-from sliplens.grip.hold import HoldStep
+from sliplens.grip.gripper import DryRun, GripperError, GripperState, GuardedGripper
+from sliplens.grip.hold import HoldStep, _Holding
 from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.source import GripSource
 from sliplens.live.contract import LiveSource
@@ -103,7 +105,8 @@ def test_without_a_measured_force_the_last_command_is_repeated(controller):
         assert answer.why == "no force is measured: holds"
     # the force of the moment of the frame was not measured either
     holder.hear(told(0.1), taken_s=now_s + 0.5)
-    assert holder.answer(now_s := now_s + 1.0, 2.0).why == "no force is measured: holds"
+    now_s += 1.0
+    assert holder.answer(now_s, 2.0).why == "no force is measured: holds"
     holder.hear(told(0.1), taken_s=now_s)
     assert holder.answer(now_s, 2.0).slip  # which was not forgotten
 
@@ -121,7 +124,7 @@ def test_a_force_that_does_not_follow_the_commands_is_a_trouble_and_held(share):
     troubles = [answer.trouble for answer in answers]
     assert troubles[29] is None  # for half a second it may be the actuator
     assert len(set(troubles[32:])) == 1
-    assert f"measures {share * 2.0:.1f} N where 2.0 N is commanded" in str(troubles[-1])
+    assert f"measures {share * 2.0:.3g} N where 2 N is commanded" in str(troubles[-1])
     # as soon as the force follows it counts again
     holder.hear(told(0.1), taken_s=now_s + 1.0)
     answer = holder.answer(now_s + 1.0, 2.0)
@@ -134,7 +137,7 @@ class Loosens:
     """Controller of somebody else, which lets go whatever is read."""
 
     def command(self, seen: Observation) -> np.ndarray:
-        return np.array([0.0])
+        return 0.0 * seen.command_n
 
 
 @given(
@@ -408,6 +411,34 @@ def test_who_does_not_know_what_is_held_tells_nothing():
     with plain_reader(Frames()) as reader, pytest.raises(GripperError, match=r"tells no force .*no sensor"):
         sl.hold_grip(reader, gripper, controller="fixed", settings={"force_n": 1.5}, seconds=0.1)
     assert gripper.told == ()
+
+
+@pytest.mark.parametrize("force_n", [0.0, -2.0])
+def test_a_gripper_that_measures_no_force_from_the_start_is_refused_and_keeps_its_command(force_n, monkeypatch):
+    class Numb(DryRun):
+        width_m = 0.04
+
+        def read_state(self) -> GripperState:
+            return GripperState(force_n=force_n, width_m=self.width_m)
+
+    clock = SimpleNamespace(now_s=100.0)
+    clock.monotonic = lambda: clock.now_s
+    monkeypatch.setattr("sliplens.grip.hold.time", clock)
+    gripper, reader = Numb(), plain_reader(Frames())
+    with GuardedGripper(gripper, ceiling_n=3.0, watchdog_s=60.0) as guard:
+        holding = _Holding(guard, [reader], "margin", None, 3.0)
+        for _ in range(300):  # its fingers close for 5 s, which is no reason to refuse it
+            clock.now_s += 1 / 60
+            gripper.width_m -= 1.2e-4
+            holding._step(100.0)
+        for _ in range(119):
+            clock.now_s += 1 / 60
+            holding._step(100.0)
+        clock.now_s += 3 / 60
+        with pytest.raises(GripperError, match="its fingers do not move"):
+            holding._step(100.0)
+    assert math.isclose(clock.now_s, 107.0, abs_tol=0.1)
+    assert set(gripper.sent) == {"F 2.000"}
 
 
 def test_a_reader_that_was_not_entered_is_refused():

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from threading import Lock
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -300,6 +300,37 @@ class Answer:
     """What is wrong with the measured force; None where it follows the commands."""
 
 
+class SlipGate:
+    """Passes each detected slip of some contacts once, where the skin did not spring back for another reason.
+
+    While the fingers close, and where the grip was loosened within the last `SPRINGS_BACK_S`, the markers move back as
+    they do in a slip.
+    """
+
+    def __init__(self) -> None:
+        self._slipping: np.bool | Bool[np.ndarray, " contacts"] = np.bool(False)
+
+    def update(
+        self,
+        slip: bool | Bool[np.ndarray, " contacts"],
+        *,
+        since_touch_s: float | Float[np.ndarray, " contacts"],
+        force_n: float | Float[np.ndarray, " contacts"],
+        earlier_n: float | Float[np.ndarray, " contacts"],
+    ) -> Any:
+        """Whether a slip begins that counts, from the grip force of the frame and the one `SPRINGS_BACK_S` before."""
+        slip = np.logical_and(slip, np.greater(since_touch_s, _CLOSING_S))
+        begins = slip & ~self._slipping & ~np.less(force_n, np.multiply(0.99, earlier_n))
+        self._slipping = slip
+        return begins
+
+
+SPRINGS_BACK_S = 0.25
+"""Time within which the markers tell of skin that springs back."""
+_CLOSING_S = 0.5
+"""Time after the first touch in which the markers move because the fingers close."""
+
+
 class Holder:
     """Answers the readings of one or two running fingertips with a grip force, command after command.
 
@@ -339,7 +370,7 @@ class Holder:
         self._lock, self._knows_friction = Lock(), False
         self._told = [False] * fingers  # whether the readings of each know a friction
         self._heard: list[tuple[Reading, float] | None] = [None] * fingers
-        self._slipping, self._slip = [False] * fingers, False
+        self._gates, self._slip = [SlipGate() for _ in range(fingers)], False
         self._past: deque[tuple[float, float, float]] = deque(maxlen=_MEMORY)
         """Times of the last commands, with the grip force and the load that were measured then."""
         self._touched_s: float | None = None
@@ -369,12 +400,14 @@ class Holder:
                 if self._knows_friction != all(self._told):
                     self._knows_friction = not self._knows_friction
                     self._suit()
-            closed = self._touched_s is not None and taken_s - self._touched_s > _CLOSING_S
-            slips = reading.slip is SlipState.SLIP and closed
-            if slips and not self._slipping[finger]:
-                (force_n, _), (earlier_n, _) = self._measured(taken_s), self._measured(taken_s - _SPRINGS_BACK_S)
-                self._slip |= not force_n < 0.99 * earlier_n
-            self._slipping[finger], self._heard[finger] = slips, (reading, taken_s)
+            (force_n, _), (earlier_n, _) = self._measured(taken_s), self._measured(taken_s - SPRINGS_BACK_S)
+            self._slip |= self._gates[finger].update(
+                reading.slip is SlipState.SLIP,
+                since_touch_s=-1.0 if self._touched_s is None else taken_s - self._touched_s,
+                force_n=force_n,
+                earlier_n=earlier_n,
+            )
+            self._heard[finger] = reading, taken_s
 
     def _suit(self) -> None:
         """Take the constants that suit what the readings now know of the friction; the grip goes on where it was."""
@@ -409,9 +442,14 @@ class Holder:
             if unmeasured or trouble is not None:
                 reason = "no force is measured" if unmeasured else "the measured force does not follow the commands"
                 return Answer(
-                    command_n=self._command, margin=read, low=lowest, slip=False, why=f"{reason}: holds", trouble=trouble
+                    command_n=self._command,
+                    margin=read,
+                    low=lowest,
+                    slip=False,
+                    why=f"{reason}: holds",
+                    trouble=trouble,
                 )
-            slip, self._slip = self._slip, False
+            slip, self._slip = bool(self._slip), False
             seen = Observation(
                 time_s=0.0 if self._touched_s is None else time_s - self._touched_s,
                 force_n=np.array([force_n if np.isnan(then_n) else then_n]),
@@ -442,7 +480,7 @@ class Holder:
             self._follows_s, self._trouble = time_s, None
         elif self._trouble is None and time_s - self._follows_s > _DIFFERS_S:
             self._trouble = (
-                f"the gripper measures {force_n:.1f} N where {self._command:.1f} N is commanded, for more than "
+                f"the gripper measures {force_n:.3g} N where {self._command:.3g} N is commanded, for more than "
                 f"{_DIFFERS_S:g} s; check its force sensor and the unit of its forces"
             )
         return differs, self._trouble
@@ -474,10 +512,6 @@ def _value(reading: Reading, name: str) -> float:
 
 _STALE_S = 0.5
 """Age from which a reading says nothing of now."""
-_CLOSING_S = 0.5
-"""Time after the first touch in which the markers move because the fingers close."""
-_SPRINGS_BACK_S = 0.25
-"""Time within which the markers tell of skin that springs back."""
 _TOUCH_N = 0.02
 """Grip force that is a touch."""
 _DIFFERS, _DIFFERS_N, _DIFFERS_S = 0.3, 0.1, 0.5

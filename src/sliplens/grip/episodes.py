@@ -301,7 +301,7 @@ class _Job:
         # one of the caller's own is copied: what it remembers is of the grasp before
         own = not isinstance(chosen, str)
         chosen = deepcopy(chosen) if own else make_controller(chosen, setup.settings, told=known)
-        loop = GripLoop(Plant(self.held, episodes=len(scripts)), eyes, chosen, latency_s=setup.latency_s, lift_s=LIFT_S)
+        loop = GripLoop(Plant(self.held, episodes=len(scripts)), eyes, chosen, latency_s=setup.latency_s)
         return run_scripts(loop, scripts, condition=setup.condition, on_tick=on_tick)
 
     def _eyes(

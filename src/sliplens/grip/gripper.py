@@ -129,7 +129,9 @@ class LineGripper:
             if not self._numbered or len(self._rest) >= _ANSWER_BYTES:
                 self._break(silence_s=self._silence_s)
             heard = f", it sent {error}" if str(error) else ""
-            raise GripperError(f"the gripper did not answer {line!r} in time{heard}; check its cable and power") from None
+            raise GripperError(
+                f"the gripper did not answer {line!r} in time{heard}; check its cable and power"
+            ) from None
         except (OSError, ValueError) as error:
             self._break()
             raise GripperError(f"the gripper cannot be reached ({error}); check its cable and power") from None

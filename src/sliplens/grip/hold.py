@@ -311,8 +311,8 @@ class _Holding:
         elif now_s - self._closes[0] > _STUCK_S and self._rows[-1][1].command_n > 0:
             raise GripperError(
                 f"the gripper measures {state.force_n:.2f} N and its fingers do not move, {_STUCK_S:g} s after "
-                f"{self._rows[-1][1].command_n:.2f} N was commanded; without a force sensor, or with forces of the other "
-                "sign, it cannot be held by the margin: check its driver"
+                f"{self._rows[-1][1].command_n:.2f} N was commanded; without a force sensor, or with forces of the "
+                "other sign, it cannot be held by the margin: check its driver"
             )
 
 
