@@ -86,6 +86,7 @@ def test_a_late_answer_never_counts_as_that_of_another_line(numbered):
     """A gripper falls behind by some lines: each answer tells the force of its own line, or none is taken."""
     fake, late = FakeGripper(numbered=numbered), threading.Event()
     gripper = open_gripper(fake.address, timeout_s=0.05)
+    assert isinstance(gripper, LineGripper)
     asked = 0
 
     def answer(line: str) -> bytes:
