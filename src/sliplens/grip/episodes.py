@@ -80,7 +80,7 @@ def run_episodes(
 
     Each episode lasts 6 s: the fingers close, lift from 0.5 s on, and hold while something happens. Rendered, both
     fingertips are filmed, read by the network and their markers followed, 60 times a second; otherwise readings are
-    looked up in what was measured of the network on such images, hundreds of episodes a second.
+    looked up in what was measured of the network on such images, dozens of episodes a second.
 
     Parameters
     ----------
