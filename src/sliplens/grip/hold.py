@@ -55,7 +55,7 @@ class HoldStep:
     """Whether the markers told a slip."""
     why: str
     trouble: str | None
-    """What the gripper failed at; None while it takes its commands."""
+    """What the gripper failed at; None while it takes its commands and its force follows them."""
     readings: tuple[Reading | None, ...]
     """Newest reading of each fingertip; None before the first."""
 
