@@ -5,6 +5,8 @@ import os
 import socket
 import threading
 import time
+from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,6 +22,7 @@ from sliplens.grip.gripper import (
     GuardedGripper,
     LineGripper,
     RosGripper,
+    _open_serial,
     open_gripper,
 )
 
@@ -64,33 +67,61 @@ def test_a_force_a_width_and_a_question_are_lines(fake):
         (b"ERR too hot\n", "refused 'F 1.000': too hot"),
         (b"OK nan 0.04\n", "not `OK force_n width_m`"),
         (b"OK 1.0\n", "not `OK force_n width_m`"),
-        (b"hello\n", "answered 'hello'"),
-        (b"\xff\xfe\n", "not `OK force_n width_m`"),
+        (b"hello\n", "did not answer 'F 1.000' in time, it sent 'hello'"),
+        (b"\xff\xfe\n", "did not answer 'F 1.000' in time, it sent"),
         (b"x" * 500 + b"\n", "did not answer"),
         (None, "cannot be reached|did not answer"),
     ],
 )
 def test_a_wrong_answer_is_told_in_a_sentence(fake, answer, told):
     fake.answer = answer
-    gripper = open_gripper(fake.address, timeout_s=0.1 if answer is None else 10.0)
+    gripper = open_gripper(fake.address, timeout_s=0.1 if not answer or b"OK" not in answer else 10.0)
     with pytest.raises(GripperError, match=told):
         gripper.set_force(1.0)
     gripper.close()
 
 
-def test_a_late_answer_is_forgotten_and_the_next_one_counts(fake):
-    fake.answer = None
+@pytest.mark.parametrize("numbered", [True, False])
+def test_a_late_answer_never_counts_as_that_of_another_line(numbered):
+    """A gripper falls behind by some lines: each answer tells the force of its own line, or none is taken."""
+    fake, late = FakeGripper(numbered=numbered), threading.Event()
     gripper = open_gripper(fake.address, timeout_s=0.05)
     assert isinstance(gripper, LineGripper)
+    asked = 0
+
+    def answer(line: str) -> bytes:
+        nonlocal asked
+        asked += 1
+        if asked == 1:
+            late.wait(5)  # the first answer comes after the second line was sent
+        return f"OK {line[2:]} 0.0400\n".encode()
+
+    fake.answer = answer
     with pytest.raises(GripperError, match="did not answer"):
         gripper.set_force(1.0)
-    wait_until(lambda: fake.heard)
-    fake.send(b"ERR too late\n")
-    fake.answer = b"OK 2.000 0.0300\n"
-    wait_until(lambda: gripper._ready(0.0))
+    with pytest.raises(GripperError, match="did not answer"):
+        gripper.set_force(2.0)
+    late.set()
     gripper._timeout_s = 2.0
-    assert gripper.read_state().force_n == 2.0
+    for force_n in (3.0, 4.0):
+        assert gripper._ask(f"F {force_n:.3f}").force_n == force_n
     gripper.close()
+    fake.close()
+
+
+def test_a_serial_gripper_without_numbers_is_left_alone_after_an_answer_that_did_not_come(clock):
+    gripper_end, ours = os.openpty()
+    gripper = LineGripper(partial(_open_serial, Path(os.ttyname(ours))), timeout_s=0.0, silence_s=2.0)
+    with pytest.raises(GripperError, match="did not answer"):
+        gripper.read_state()
+    heard = os.read(gripper_end, 100)
+    for clock.now_s in (0.5, 1.9):
+        with pytest.raises(GripperError, match="left alone"):
+            gripper.read_state()
+    assert heard.strip() == b"S #1"
+    gripper.close()
+    os.close(gripper_end)
+    os.close(ours)
 
 
 def test_a_connection_that_breaks_is_opened_again_with_the_next_line(fake):
@@ -115,15 +146,16 @@ def test_a_serial_line_is_spoken_as_tcp_is():
     told = []
 
     def answer() -> None:
-        told.append(os.read(gripper_end, 100))
-        os.write(gripper_end, b"OK 1.500 0.0")  # in two pieces
-        os.write(gripper_end, b"400\n")
+        for _ in range(2):  # to the first line, without its number: a plain one follows
+            told.append(os.read(gripper_end, 100))
+            os.write(gripper_end, b"OK 1.500 0.0")  # in two pieces
+            os.write(gripper_end, b"400\n")
 
     answering = threading.Thread(target=answer)
     answering.start()
     assert gripper.read_state().width_m == 0.04
     answering.join()
-    assert told == [b"S\n"]
+    assert told == [b"S #1\n", b"S\n"]
     gripper.close()
     os.close(gripper_end)
     os.close(ours)

@@ -1,5 +1,6 @@
 """A real gripper is held by what fingertips read: each margin with its own force, and nothing is loosened blindly."""
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -8,17 +9,21 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from fake_gripper import FakeGripper
+from hypothesis import given
+from hypothesis import strategies as st
 
 import sliplens as sl
 from sliplens.codec import load_result
 from sliplens.errors import InputError, SourceError
-from sliplens.grip.controllers import TOLD, Holder, MarginLaw, Observation
-from sliplens.grip.gripper import DryRun, GripperError
-from sliplens.grip.hold import HoldStep
+from sliplens.grip.controllers import CONTROLLERS, TOLD, Holder, MarginGrip, MarginLaw, Observation
+from sliplens.grip.gripper import DryRun, GripperError, GripperState, GuardedGripper
+from sliplens.grip.hold import HoldStep, _Holding
 from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.source import GripSource
 from sliplens.live.contract import LiveSource
@@ -46,7 +51,8 @@ def told(margin: float | None, *, low: float | None = None, slip: SlipState | No
 
 def holder_of(controller, *, forces: np.ndarray | None = None, fingers: int = 1) -> tuple[Holder, float]:
     """Holder that has measured some forces, one a period, and the time now."""
-    holder, forces = Holder(controller, ceiling_n=4.0, fingers=fingers), np.full(90, 2.0) if forces is None else forces
+    holder = Holder(controller, ceiling_n=4.0, fingers=fingers)
+    forces = np.full(90, 2.0) if forces is None else forces
     for number, force_n in enumerate(forces):
         holder.answer(number * PERIOD_S, float(force_n))
     return holder, len(forces) * PERIOD_S
@@ -81,21 +87,79 @@ def test_nothing_is_loosened_without_a_margin_whatever_a_controller_says(reading
         holder.hear(reading, taken_s=now_s - 0.6)
     for wanted_n, force_n in ((1.0, 2.0), (np.nan, 2.0), (3.0, 3.0), (-1.0, 3.0), (9.0, 4.0), (0.0, 4.0)):
         says.force_n = wanted_n
-        answer = holder.answer(now_s, 2.0)
+        answer = holder.answer(now_s, force_n)
         assert answer.command_n == force_n
         assert answer.why.startswith("no margin is read")
     holder.hear(told(0.9), taken_s=now_s)
-    assert holder.answer(now_s, 2.0).command_n == 0.0
+    assert holder.answer(now_s, 4.0).command_n == 0.0
 
 
-def test_a_force_that_was_not_measured_is_paired_with_no_margin():
-    says = Says()
-    holder, now_s = holder_of(says, forces=np.array([*np.full(60, 2.0), *np.full(30, np.nan)]))
-    holder.hear(told(0.5), taken_s=70 * PERIOD_S)
-    assert np.isnan(holder.answer(now_s, 2.0).margin)
-    assert says.seen[-1].force_n == 2.0  # as it was told
-    holder.hear(told(0.5), taken_s=now_s)
-    assert holder.answer(now_s, 2.0).margin == 0.5
+@pytest.mark.parametrize("controller", [Says(force_n=3.0), Says(force_n=0.0), "margin", "reflex"])
+def test_without_a_measured_force_the_last_command_is_repeated(controller):
+    holder, now_s = holder_of(Says(force_n=2.0))
+    holder.choose(controller)
+    holder.hear(told(0.1, slip=SlipState.SLIP), taken_s=now_s)
+    for step in range(60):
+        answer = holder.answer(now_s + step * PERIOD_S, np.nan)
+        assert (answer.command_n, answer.slip) == (2.0, False)
+        assert answer.why == "no force is measured: holds"
+    # the force of the moment of the frame was not measured either
+    holder.hear(told(0.1), taken_s=now_s + 0.5)
+    now_s += 1.0
+    assert holder.answer(now_s, 2.0).why == "no force is measured: holds"
+    holder.hear(told(0.1), taken_s=now_s)
+    assert holder.answer(now_s, 2.0).slip  # which was not forgotten
+
+
+@pytest.mark.parametrize("share", [-1.0, 0.0, 0.5, 1.5, 3.0, 1e6])
+def test_a_force_that_does_not_follow_the_commands_is_a_trouble_and_held(share):
+    holder, now_s = holder_of(Says(force_n=2.0))
+    holder.choose("margin")
+    answers = []
+    for step in range(60):
+        # a margin above the one aimed at, so that the law would loosen by the force that is measured
+        holder.hear(told(0.7), taken_s=now_s + step * PERIOD_S)
+        answers.append(holder.answer(now_s + step * PERIOD_S, share * 2.0))
+    assert {answer.command_n for answer in answers} == {2.0}
+    troubles = [answer.trouble for answer in answers]
+    assert troubles[29] is None  # for half a second it may be the actuator
+    assert len(set(troubles[32:])) == 1
+    assert f"measures {share * 2.0:.3g} N where 2 N is commanded" in str(troubles[-1])
+    # as soon as the force follows it counts again
+    holder.hear(told(0.1), taken_s=now_s + 1.0)
+    answer = holder.answer(now_s + 1.0, 2.0)
+    assert answer.trouble is None
+    assert answer.command_n >= 2.0
+
+
+@dataclass
+class Loosens:
+    """Controller of somebody else, which lets go whatever is read."""
+
+    def command(self, seen: Observation) -> np.ndarray:
+        return 0.0 * seen.command_n
+
+
+@given(
+    name=st.sampled_from([*(name for name in CONTROLLERS if name != "oracle"), "own"]),
+    command_n=st.floats(0.6, 4.0),
+    # of what is commanded, as a gripper may measure it
+    share=st.floats(0.0, 2.0),
+    read=st.lists(st.floats(0.0, 1.0), min_size=2, max_size=30),
+)
+def test_below_the_margin_aimed_at_no_controller_commands_less_than_before(name, command_n, share, read):
+    """What is acted on is at most what is read: a reading under the target is a margin under it, but for noise."""
+    holder = Holder(Loosens() if name == "own" else name, ceiling_n=5.0, command_n=command_n)
+    before = command_n
+    controller: Any = holder._controller
+    for step, margin in enumerate(read):
+        time_s = 2.0 + step * PERIOD_S
+        holder.hear(told(margin), taken_s=time_s)
+        after = holder.answer(time_s, share * before, load_n=0.0).command_n
+        acted = float(controller.acted[0]) if isinstance(controller, MarginGrip) else margin
+        if acted < getattr(controller, "target", MarginLaw.target):
+            assert after >= before
+        before = after
 
 
 def test_time_begins_at_the_touch_and_what_a_slow_gripper_missed_is_not_made_up_for():
@@ -138,7 +202,8 @@ def test_what_a_slip_teaches_of_the_friction_makes_no_law_forget_the_slip():
     loosened = {}
     for after_s in (0.1, MarginLaw.calm_s + 0.1):
         holder.hear(told(0.95, friction="0.6"), taken_s=now_s + after_s)
-        loosened[after_s] = holder.answer(now_s + after_s, 2.0).command_n < pressed.command_n
+        answer = holder.answer(now_s + after_s, pressed.command_n)
+        loosened[after_s] = answer.command_n < pressed.command_n
     assert list(loosened.values()) == [False, True]
 
 
@@ -152,7 +217,7 @@ def test_what_a_slip_teaches_of_the_friction_makes_no_law_forget_the_slip():
     ],
 )
 def test_a_slip_counts_once_and_only_where_the_skin_does_not_spring_back_by_itself(forces, taken_s, counts):
-    holder, now_s = holder_of("reflex", forces=forces)
+    holder, now_s = holder_of(Says(force_n=2.5), forces=forces)
     for expected in (counts, False):
         holder.hear(told(0.5, slip=SlipState.SLIP), taken_s=taken_s)
         assert holder.answer(now_s, 2.0).slip is expected
@@ -322,7 +387,7 @@ def test_a_gripper_that_never_answers_is_told_on_and_its_failure_noted():
 
         def read_state(self):
             self.reads += 1
-            if self.reads == 2:  # the first time it answers, and then never
+            if self.reads in {2, 3}:  # twice it answers, and then never
                 return super().read_state()
             raise RuntimeError("no sensor")
 
@@ -330,7 +395,7 @@ def test_a_gripper_that_never_answers_is_told_on_and_its_failure_noted():
         hold = sl.hold_grip(reader, Dead(), controller="fixed", settings={"force_n": 1.5}, seconds=0.1)
     assert hold.troubles == ("no motor for 1.5 N",)
     assert hold.steps.failed.all()
-    assert np.isnan(hold.steps.force_n).all()
+    assert np.isnan(hold.steps.force_n[1:]).all()
 
 
 def test_who_does_not_know_what_is_held_tells_nothing():
@@ -347,6 +412,34 @@ def test_who_does_not_know_what_is_held_tells_nothing():
     with plain_reader(Frames()) as reader, pytest.raises(GripperError, match=r"tells no force .*no sensor"):
         sl.hold_grip(reader, gripper, controller="fixed", settings={"force_n": 1.5}, seconds=0.1)
     assert gripper.told == ()
+
+
+@pytest.mark.parametrize("force_n", [0.0, -2.0])
+def test_a_gripper_that_measures_no_force_from_the_start_is_refused_and_keeps_its_command(force_n, monkeypatch):
+    class Numb(DryRun):
+        width_m = 0.04
+
+        def read_state(self) -> GripperState:
+            return GripperState(force_n=force_n, width_m=self.width_m)
+
+    clock = SimpleNamespace(now_s=100.0)
+    clock.monotonic = lambda: clock.now_s
+    monkeypatch.setattr("sliplens.grip.hold.time", clock)
+    gripper, reader = Numb(), plain_reader(Frames())
+    with GuardedGripper(gripper, ceiling_n=3.0, watchdog_s=60.0) as guard:
+        holding = _Holding(guard, [reader], "margin", None, 3.0)
+        for _ in range(300):  # its fingers close for 5 s, which is no reason to refuse it
+            clock.now_s += 1 / 60
+            gripper.width_m -= 1.2e-4
+            holding._step(100.0)
+        for _ in range(119):
+            clock.now_s += 1 / 60
+            holding._step(100.0)
+        clock.now_s += 3 / 60
+        with pytest.raises(GripperError, match="its fingers do not move"):
+            holding._step(100.0)
+    assert math.isclose(clock.now_s, 107.0, abs_tol=0.1)
+    assert set(gripper.sent) == {"F 2.000"}
 
 
 def test_a_reader_that_was_not_entered_is_refused():

@@ -7,9 +7,13 @@ from contextlib import suppress
 
 
 class FakeGripper:
-    """A gripper on a port of this machine that speaks the line protocol, or as badly as it is told to."""
+    """A gripper on a port of this machine that speaks the line protocol, or as badly as it is told to.
 
-    def __init__(self) -> None:
+    The first line of a connection, which asks whether it repeats numbers, is always answered and not noted.
+    """
+
+    def __init__(self, *, numbered: bool = False) -> None:
+        self.numbered = numbered
         self.answer: bytes | Callable[[str], bytes | None] | None = b"OK 1.000 0.0400\n"
         self.heard: list[str] = []
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -23,12 +27,17 @@ class FakeGripper:
                 self._connection, _ = self._server.accept()
                 # whoever hangs up in the middle of an answer resets the connection
                 with suppress(ConnectionError), self._connection, self._connection.makefile("rwb") as stream:
-                    for line in stream:
+                    for count, line in enumerate(stream):
                         told = self.answer  # first: another one may be set once it has heard
-                        self.heard.append(line.decode().strip())
-                        answer = told(self.heard[-1]) if callable(told) else told
+                        words, _, number = line.decode().strip().partition(" #")
+                        if not count:
+                            answer = b"OK 1.000 0.0400\n"
+                        else:
+                            self.heard.append(words)
+                            answer = told(words) if callable(told) else told
                         if answer is not None:
-                            stream.write(answer)
+                            ends = f" #{number}\n".encode() if self.numbered else b"\n"
+                            stream.write(answer.replace(b"\n", ends))
                             stream.flush()
 
     def send(self, answer: bytes) -> None:

@@ -321,7 +321,7 @@ def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
         def update(self, positions_px: np.ndarray, time_s: float) -> MarkerReading:
             assert len(positions_px) == self.markers
             slipping_s = 0.06 if time_s > 0.12 else None
-            return MarkerReading(state=SlipState.STICKING, contact=True, slipping_s=slipping_s)
+            return MarkerReading(state=SlipState.STICKING, contact=True, slipped_s=slipping_s)
 
     told, source = sl.Friction.between(0.3, 0.9), Patient(trial.frames[10:14], [0, 1, 2, 3])
     reader = sl.LiveReader(
@@ -350,7 +350,7 @@ class Grasps:
         place, self.count = self.count % 5, self.count + 1
         if place == 4:
             return MarkerReading(state=SlipState.CANNOT_TELL, contact=False)
-        return MarkerReading(state=SlipState.STICKING, contact=True, slipping_s=0.06 if place == 3 else None)
+        return MarkerReading(state=SlipState.STICKING, contact=True, slipped_s=0.06 if place == 3 else None)
 
 
 @pytest.mark.parametrize("sequence", [False, True])

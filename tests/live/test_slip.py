@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
+from sliplens.friction import Friction, SlipLearner
 from sliplens.grip.fingertip import Fingertip
 from sliplens.live import MarkerReading, SlipDetector, SlipLimits, SlipState
+from sliplens.live.slip import SlipBatch
 
 RATE_HZ = 60.0
 REST = np.stack(np.meshgrid(np.arange(7.0), np.arange(7.0)), axis=-1).reshape(-1, 2) * 20.0
@@ -127,3 +129,41 @@ def test_a_gripper_that_tightens_and_loosens_does_not_pass_for_a_slip_and_a_slip
     assert SlipState.SLIP not in said[:300]
     assert set(said[60:300]) == {SlipState.STICKING}
     assert SlipState.SLIP in said[300:304]
+
+
+def test_contacts_of_a_batch_are_read_as_each_alone(rng: np.random.Generator):
+    """Other contacts change nothing, though they begin, slip, end and lose markers at other times."""
+    played = []
+    for number in range(5):
+        places = np.roll(play(pull(0.4 * number), rng=rng), -5 * number, axis=0)
+        places[120 + number : 140, : 9 * number] = np.nan
+        played.append(places)
+    batch = SlipBatch(np.stack([REST] * 5))
+    states = [
+        batch.update(np.stack(places), number / RATE_HZ) for number, places in enumerate(zip(*played, strict=True))
+    ]
+    for contact, places in enumerate(played):
+        for number, reading in enumerate(watch(places)):
+            together = states[number]
+            assert bool(together.slip[contact]) is (reading.state is SlipState.SLIP)
+            assert bool(together.contact[contact]) is bool(reading.contact)
+            if reading.shear_px is not None:
+                assert together.shear_px[contact] == pytest.approx(reading.shear_px)
+
+
+@pytest.mark.parametrize("frames", [2.0, 9.0])  # as fast as skin springs back, and by hand
+@pytest.mark.parametrize("share", [0.5, 0.75, 1.0])
+def test_a_pull_that_is_let_go_is_no_confirmed_slip_and_teaches_no_friction(share, frames, rng: np.random.Generator):
+    taught = {}
+    for name, fall in (("slip", 0.2), ("let go", share)):
+        learner = SlipLearner(Friction.between(0.2, 1.0), same_object=True)
+        for number, reading in enumerate(
+            watch(play(pull(4.0 * fall, frames=2.0 if name == "slip" else frames), rng=rng))
+        ):
+            learner.update(number / RATE_HZ, slipping_s=reading.slipped_s)
+            ratio = 0.5 * np.clip((number - PULLED) / (SPRUNG - PULLED), 0, 1)
+            learner.note(float(ratio), sigma=0.03, time_s=number / RATE_HZ)
+        taught[name] = learner.learnt
+    assert taught["let go"] is None
+    assert taught["slip"] is not None
+    assert taught["slip"].mean == pytest.approx(0.5, abs=0.06)  # two standard deviations of what was read

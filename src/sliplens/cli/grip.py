@@ -17,7 +17,7 @@ class Grip(Command):
 
     One episode is closed through pixels: both fingertips are filmed, read by the network, and the force answers. It is
     written as a data set with both fingertips, a clip, and a page with force, margin, slip and map. Of more episodes
-    the readings are looked up in the network's measured errors, hundreds a second. Interrupted, it goes on.
+    the readings are looked up in the network's measured errors, dozens a second. Interrupted, it goes on.
     """
 
     output: Output

@@ -4,7 +4,7 @@ from sliplens.grip.controllers import CONTROLLERS, Answer, Controller, Holder, O
 from sliplens.grip.episodes import run_episodes, run_scripts
 from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.hold import HoldStep, hold_grip
-from sliplens.grip.loop import Eyes, GripLoop, NoEyes, RenderedEyes, Sight, SlipWatch, TableEyes, Tick
+from sliplens.grip.loop import Eyes, GripLoop, NoEyes, RenderedEyes, Sight, TableEyes, Tick
 from sliplens.grip.plant import OBJECTS, GripperModel, HeldObject, Plant, PlantState, World, least_force, pick_object
 from sliplens.grip.readings import ReadingTable, load_readings, measure_readings
 from sliplens.grip.scripts import CONDITIONS, Scripts, draw_scripts
@@ -32,7 +32,6 @@ __all__ = [
     "RenderedEyes",
     "Scripts",
     "Sight",
-    "SlipWatch",
     "TableEyes",
     "Tick",
     "World",

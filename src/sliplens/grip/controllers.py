@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from threading import Lock
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -164,6 +164,8 @@ class MarginGrip(ABC):
         wanted = np.where(seen.time_s - self._seen_s > self.blind_s, np.maximum(wanted, self.safe_n), wanted)
         up, down = self.up_n_s * seen.since_s, self.down_n_s * seen.since_s
         told = np.clip(wanted, seen.command_n - down, seen.command_n + up)
+        # whatever force was measured: below the margin aimed at, a force that falls is one that was measured wrong
+        told = np.where(self.acted < self.target, np.maximum(told, seen.command_n), told)
         # a reflex knows no rate
         told = np.where(slip, np.maximum(told, self.boost * seen.force_n), told)
         return np.maximum(told, self.start_n if seen.time_s < _SETTLED_S else self.least_n)
@@ -299,6 +301,39 @@ class Answer:
     slip: bool
     """Whether the markers told a slip since the command before."""
     why: str
+    trouble: str | None = None
+    """What is wrong with the measured force; None where it follows the commands."""
+
+
+class SlipGate:
+    """Passes each detected slip of some contacts once, where the skin did not spring back for another reason.
+
+    While the fingers close, and where the grip was loosened within the last `SPRINGS_BACK_S`, the markers move back as
+    they do in a slip.
+    """
+
+    def __init__(self) -> None:
+        self._slipping: np.bool | Bool[np.ndarray, " contacts"] = np.bool(False)
+
+    def update(
+        self,
+        slip: bool | Bool[np.ndarray, " contacts"],
+        *,
+        since_touch_s: float | Float[np.ndarray, " contacts"],
+        force_n: float | Float[np.ndarray, " contacts"],
+        earlier_n: float | Float[np.ndarray, " contacts"],
+    ) -> Any:
+        """Whether a slip begins that counts, from the grip force of the frame and the one `SPRINGS_BACK_S` before."""
+        slip = np.logical_and(slip, np.greater(since_touch_s, _CLOSING_S))
+        begins = slip & ~self._slipping & ~np.less(force_n, np.multiply(0.99, earlier_n))
+        self._slipping = slip
+        return begins
+
+
+SPRINGS_BACK_S = 0.25
+"""Time within which the markers tell of skin that springs back."""
+_CLOSING_S = 0.5
+"""Time after the first touch in which the markers move because the fingers close."""
 
 
 class Holder:
@@ -306,8 +341,12 @@ class Holder:
 
     A reading counts for half a second, with the grip force of the moment in which its frame was taken. A slip that the
     markers tell counts once; while the fingers close, or the grip is loosened, skin that springs back looks the same,
-    and does not count. Without a margin nothing is loosened, whatever the controller says, and a controller that says
-    no number holds. The controller's time begins at the first touch. Readings may be heard in other threads.
+    and does not count. The controller's time begins at the first touch. Readings may be heard in other threads.
+
+    Three laws hold for every controller. Without a margin, or below the margin aimed at (that of a `MarginLaw` where
+    the controller has no `target`), the force never falls. Where no force is measured, or the measured one differs from
+    the command by more than 30 % for more than 0.5 s, the last command is repeated until the force follows again; a
+    slip in that time is answered afterwards. A controller that says no number holds.
 
     Parameters
     ----------
@@ -336,11 +375,17 @@ class Holder:
         self._lock, self._knows_friction = Lock(), False
         self._told = [False] * fingers  # whether the readings of each know a friction
         self._heard: list[tuple[Reading, float] | None] = [None] * fingers
-        self._slipping, self._slip = [False] * fingers, False
+        self._gates, self._slip = [SlipGate() for _ in range(fingers)], False
         self._past: deque[tuple[float, float, float]] = deque(maxlen=_MEMORY)
         """Times of the last commands, with the grip force and the load that were measured then."""
         self._touched_s: float | None = None
+        self._follows_s, self._trouble = -np.inf, None
         self.choose(controller)
+
+    @property
+    def touched(self) -> bool:
+        """Whether a grip force was measured yet."""
+        return self._touched_s is not None
 
     def choose(self, controller: str | Controller) -> None:
         """Have another controller answer from now on."""
@@ -360,12 +405,14 @@ class Holder:
                 if self._knows_friction != all(self._told):
                     self._knows_friction = not self._knows_friction
                     self._suit()
-            closed = self._touched_s is not None and taken_s - self._touched_s > _CLOSING_S
-            slips = reading.slip is SlipState.SLIP and closed
-            if slips and not self._slipping[finger]:
-                (force_n, _), (earlier_n, _) = self._measured(taken_s), self._measured(taken_s - _SPRINGS_BACK_S)
-                self._slip |= not force_n < 0.99 * earlier_n
-            self._slipping[finger], self._heard[finger] = slips, (reading, taken_s)
+            (force_n, _), (earlier_n, _) = self._measured(taken_s), self._measured(taken_s - SPRINGS_BACK_S)
+            self._slip |= self._gates[finger].update(
+                reading.slip is SlipState.SLIP,
+                since_touch_s=-1.0 if self._touched_s is None else taken_s - self._touched_s,
+                force_n=force_n,
+                earlier_n=earlier_n,
+            )
+            self._heard[finger] = reading, taken_s
 
     def _suit(self) -> None:
         """Take the constants that suit what the readings now know of the friction; the grip goes on where it was."""
@@ -381,43 +428,67 @@ class Holder:
         """Grip force to command at a time, from the force measured now; NaN where nothing is measured."""
         with self._lock:
             before_s = self._past[-1][0] if self._past else time_s - PERIOD_S
+            if self._touched_s is None and force_n > _TOUCH_N:
+                self._touched_s = self._follows_s = time_s
+            differs, trouble = self._compare(time_s, force_n)
+            if differs and force_n > self._command:
+                force_n = self._command  # no gripper presses harder than it was told so soon after
             self._past.append((time_s, force_n, load_n))
-            # a force that is not measured is taken for the one that was told
-            if self._touched_s is None and (self._command if np.isnan(force_n) else force_n) > _TOUCH_N:
-                self._touched_s = time_s
-            slip, self._slip = self._slip, False
             heard = [one if one and time_s - one[1] <= _STALE_S else None for one in self._heard]
             measured = [self._measured(one[1]) for one in heard if one]
             then_n, load_n = np.mean(measured, axis=0).tolist() if measured else (force_n, load_n)
-            paired = not np.isnan(then_n)
             margin, low, true_margin = (
-                np.resize([_value(one[0], name) if one and paired else np.nan for one in heard], (1, 2))
+                np.resize([_value(one[0], name) if one else np.nan for one in heard], (1, 2))
                 for name in ("margin", "low", "true_margin")
             )
+            low, blind = np.where(np.isnan(low), margin, low), bool(np.isnan(margin).all())
+            read, lowest = (np.nan, np.nan) if blind else (float(np.nanmean(margin)), float(np.nanmean(low)))
+            unmeasured = np.isnan(force_n) or (not blind and np.isnan(then_n))
+            if unmeasured or trouble is not None:
+                reason = "no force is measured" if unmeasured else "the measured force does not follow the commands"
+                return Answer(
+                    command_n=self._command,
+                    margin=read,
+                    low=lowest,
+                    slip=False,
+                    why=f"{reason}: holds",
+                    trouble=trouble,
+                )
+            slip, self._slip = bool(self._slip), False
             seen = Observation(
                 time_s=0.0 if self._touched_s is None else time_s - self._touched_s,
-                force_n=np.array([then_n if paired else self._command]),
+                force_n=np.array([force_n if np.isnan(then_n) else then_n]),
                 command_n=np.array([self._command]),
                 load_n=np.array([load_n]),
                 margin=margin,
-                low=np.where(np.isnan(low), margin, low),
+                low=low,
                 slip=np.array([slip]),
                 true_margin=true_margin,
                 since_s=min(time_s - before_s, _LONGEST_S),
             )
             command_n = float(np.asarray(self._controller.command(seen))[0])
-            blind = bool(np.isnan(margin).all())
-            if np.isnan(command_n) or (blind and command_n < self._command):
+            acted = float(self._controller.acted[0]) if isinstance(self._controller, MarginGrip) else read
+            below = acted < getattr(self._controller, "target", MarginLaw.target)
+            if np.isnan(command_n) or ((blind or below or differs) and command_n < self._command):
                 command_n = self._command
             command_n = min(max(command_n, 0.0), self._ceiling)
             change, self._command = command_n - self._command, command_n
-            return Answer(
-                command_n=command_n,
-                margin=np.nan if blind else float(np.nanmean(seen.margin)),
-                low=np.nan if blind else float(np.nanmean(seen.low)),
-                slip=slip,
-                why=self._why(change, slip=slip, blind=blind),
+            why = self._why(change, slip=slip, blind=blind)
+            return Answer(command_n=command_n, margin=read, low=lowest, slip=slip, why=why)
+
+    def _compare(self, time_s: float, force_n: float) -> tuple[bool, str | None]:
+        """Compare the measured force with the command: whether they differ now, and the trouble if that lasts."""
+        if self._touched_s is None or np.isnan(force_n):
+            return False, None
+        differs = abs(force_n - self._command) > max(_DIFFERS * self._command, _DIFFERS_N)
+        if not differs:
+            self._follows_s, self._trouble = time_s, None
+        elif self._trouble is None and time_s - self._follows_s > _DIFFERS_S:
+            self._trouble = (
+                f"the gripper measures {force_n:.3g} N where {self._command:.3g} N is commanded, for more than "
+                f"{_DIFFERS_S:g} s; check its force sensor and the unit of its forces"
             )
+        return differs, self._trouble
 
     def _measured(self, time_s: float) -> tuple[float, float]:
         """Grip force and load at a time; NaN where none was measured."""
@@ -446,12 +517,11 @@ def _value(reading: Reading, name: str) -> float:
 
 _STALE_S = 0.5
 """Age from which a reading says nothing of now."""
-_CLOSING_S = 0.5
-"""Time after the first touch in which the markers move because the fingers close."""
-_SPRINGS_BACK_S = 0.25
-"""Time within which the markers tell of skin that springs back."""
 _TOUCH_N = 0.02
 """Grip force that is a touch."""
+_DIFFERS, _DIFFERS_N, _DIFFERS_S = 0.3, 0.1, 0.5
+"""Share of the command, least force, and time from which a measured force that differs so much is a trouble. An
+actuator with a lag of 50 ms that closes on a soft object (17 N/s) is there within 0.3 s of any command."""
 _LONGEST_S = 3 * PERIOD_S
 """Time that the force may change for at once: what a slow gripper missed is not made up for."""
 _MEMORY = 240

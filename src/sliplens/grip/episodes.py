@@ -80,7 +80,7 @@ def run_episodes(
 
     Each episode lasts 6 s: the fingers close, lift from 0.5 s on, and hold while something happens. Rendered, both
     fingertips are filmed, read by the network and their markers followed, 60 times a second; otherwise readings are
-    looked up in what was measured of the network on such images, hundreds of episodes a second.
+    looked up in what was measured of the network on such images, dozens of episodes a second.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ class _Job:
         # one of the caller's own is copied: what it remembers is of the grasp before
         own = not isinstance(chosen, str)
         chosen = deepcopy(chosen) if own else make_controller(chosen, setup.settings, told=known)
-        loop = GripLoop(Plant(self.held, episodes=len(scripts)), eyes, chosen, latency_s=setup.latency_s, lift_s=LIFT_S)
+        loop = GripLoop(Plant(self.held, episodes=len(scripts)), eyes, chosen, latency_s=setup.latency_s)
         return run_scripts(loop, scripts, condition=setup.condition, on_tick=on_tick)
 
     def _eyes(

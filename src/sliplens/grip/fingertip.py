@@ -1,21 +1,20 @@
 """A simulated fingertip that is filmed as it is loaded, frame after frame."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
-from sliplens.simulation.filming import Film, batches, prepare_film
+from sliplens.simulation.filming import Film, batches, prepare_film, see_markers
 from sliplens.simulation.loading import load_at_margins, load_at_states
 from sliplens.simulation.nuisances import Day, Nuisances, draw_day, draw_grasp, draw_unit
 from sliplens.simulation.sensor import CHROMATOUCH, Sensor
 
 _TOUCH_N = 0.02
 """Lighter touches are none: the simulator's labels have no contact there either."""
-_INNER = 19
-"""Markers that surely touch: the apex and two rings of the dome."""
 
 
 class Fingertip:
@@ -43,19 +42,34 @@ class Fingertip:
         day: Day | None = None,
     ) -> None:
         nuisances = Nuisances() if nuisances is None else nuisances
-        day_rng, unit_rng, grasp_rng, film_rng, self._rng = np.random.default_rng(seed).spawn(5)
-        day = draw_day(nuisances, quantile=0.5, rng=day_rng) if day is None else day
-        grasp = draw_grasp(nuisances, day=day, wet=False, rng=grasp_rng)
-        self._film = prepare_film(
-            sensor,
-            loading=load_at_margins(np.ones(1), grasp=grasp),
-            grasp=grasp,
-            day=day,
-            unit=draw_unit(nuisances, markers=sensor.geometry.markers, rng=unit_rng),
-            rng=film_rng,
-            noise=sensor.noise,
+        day_rng, unit_rng, grasp_rng, self._film_rng, self._rng = np.random.default_rng(seed).spawn(5)
+        self.day = draw_day(nuisances, quantile=0.5, rng=day_rng) if day is None else day
+        self._sensor, self._grasp = sensor, draw_grasp(nuisances, day=self.day, wet=False, rng=grasp_rng)
+        self._unit = draw_unit(nuisances, markers=sensor.geometry.markers, rng=unit_rng)
+
+    @cached_property
+    def _film(self) -> Film:
+        return prepare_film(
+            self._sensor,
+            loading=load_at_margins(np.ones(1), grasp=self._grasp),
+            grasp=self._grasp,
+            day=self.day,
+            unit=self._unit,
+            rng=self._film_rng,
+            noise=self._sensor.noise,
         )
-        self.day = day
+
+    def markers(
+        self,
+        normal_force_n: Float[np.ndarray, " frames"],
+        *,
+        friction: Float[np.ndarray, " frames"],
+        margins: Float[np.ndarray, " frames"],
+        held_s: Float[np.ndarray, " frames"] | None = None,
+    ) -> tuple[Float[np.ndarray, "markers 2"], Float[np.ndarray, "frames markers 2"]]:
+        """Places of the markers in pixels (x, y), at rest and in contact states as `film` takes them."""
+        loading = load_at_states(normal_force_n, friction=friction, margins=margins, held_s=held_s)
+        return see_markers(self._sensor, loading=loading, grasp=self._grasp, day=self.day, unit=self._unit)[1:]
 
     @cached_property
     def reference(self) -> UInt8[np.ndarray, "height width 3"]:
@@ -97,14 +111,74 @@ def draw_film(film: Film) -> UInt8[np.ndarray, "frames height width 3"]:
     return torch.cat([film.draw(part) for part in batches(len(film), device="cpu")]).numpy()
 
 
-def mean_shear(
-    rest_px: Float[np.ndarray, "markers 2"], now_px: Float[np.ndarray, "*frames markers 2"]
-) -> Float[np.ndarray, "*frames"]:
-    """Mean displacement of the 19 innermost markers down the image, in pixels: the way of the pull.
+class MarkerField:
+    """Places of the markers of the two fingertips of some grippers, in any state of their contacts.
 
-    Markers that are not seen (NaN) are left out; without any it is NaN.
+    They are interpolated between states of a grid in force and margin. The part that the pull adds is proportional to
+    the friction at a given margin (Cattaneo and Mindlin), and turns round with the pull.
+
+    Parameters
+    ----------
+    seeds
+        Seed of the first fingertip of each gripper; the second one has the next seed, and the same day.
     """
-    away = np.linalg.norm(rest_px - np.median(rest_px, axis=0), axis=1)
-    moved = (now_px - rest_px)[..., np.argsort(away, kind="stable")[:_INNER], 1]
-    seen = np.isfinite(moved)
-    return np.asarray(np.where(seen, moved, 0).sum(axis=-1) / np.where(seen.any(axis=-1), seen.sum(axis=-1), np.nan))
+
+    def __init__(self, seeds: Sequence[int]) -> None:
+        parts = [_marker_grid(seed) for seed in seeds]
+        self.rest_px, self._press, self._shear = (np.stack(values) for values in zip(*parts, strict=True))
+
+    def at(
+        self,
+        grippers: Int[np.ndarray, " episodes"],
+        normal_force_n: Float[np.ndarray, " episodes"],
+        *,
+        friction: Float[np.ndarray, "episodes 2"],
+        margins: Float[np.ndarray, "episodes 2"],
+        pulled_back: Bool[np.ndarray, "episodes 2"],
+    ) -> Float[np.ndarray, "episodes 2 markers 2"]:
+        """Places in pixels (x, y); at rest where nothing presses."""
+        which = grippers[:, None], np.arange(2)
+        (force, part), (margin, share) = (
+            place_in_grid(np.asarray(grid), values)
+            for grid, values in ((_FORCES_N, normal_force_n), (_MARGINS, margins))
+        )
+        force, part = force[:, None], part[:, None, None, None]
+        share, pull = share[..., None, None], (np.where(pulled_back, -1, 1) * friction)[..., None, None]
+        press = sum(weight * self._press[*which, force + upper] for upper, weight in ((0, 1 - part), (1, part)))
+        shear = sum(
+            one * other * self._shear[*which, force + upper, margin + right]
+            for upper, one in ((0, 1 - part), (1, part))
+            for right, other in ((0, 1 - share), (1, share))
+        )
+        touches = (normal_force_n > _TOUCH_N)[:, None, None, None]
+        return self.rest_px[grippers] + np.where(touches, press + pull * shear, 0)
+
+
+_FORCES_N = (_TOUCH_N, 0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+_MARGINS = (0.0, 0.03, 0.1, 0.25, 0.45, 0.7, 1.0)
+_SEEN = 40
+"""Markers followed, those nearest to the middle: about 42 of the sensor's 82 lie within the frame."""
+
+
+@lru_cache(maxsize=256)
+def _marker_grid(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places of a gripper's markers at rest, and their motion by the press and by a pull of friction 1, by state."""
+    force, gamma = np.meshgrid(_FORCES_N, _MARGINS, indexing="ij")
+    first = Fingertip(seed=seed)
+    parts = []
+    for tip in (first, Fingertip(seed=seed + 1, day=first.day)):
+        rest, places = tip.markers(
+            force.ravel(), friction=np.ones(force.size), margins=gamma.ravel(), held_s=np.ones(force.size)
+        )
+        middle = np.asarray(tip._sensor.geometry.centre_px)
+        nearest = np.argsort(np.linalg.norm(rest - middle, axis=1), kind="stable")[:_SEEN]
+        moved = (places - rest)[:, nearest].reshape(*force.shape, len(nearest), 2)
+        parts.append((rest[nearest], moved[:, -1], moved - moved[:, -1:]))
+    rest, press, shear = (np.stack(values) for values in zip(*parts, strict=True))
+    return rest, press.astype(np.float32), shear.astype(np.float32)
+
+
+def place_in_grid(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cell of a grid that each value lies in, and how far in it, 0 to 1."""
+    at = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
+    return at, np.clip((values - grid[at]) / (grid[at + 1] - grid[at]), 0, 1)

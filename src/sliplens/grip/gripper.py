@@ -27,6 +27,8 @@ from sliplens.live.sinks import ZENOH_ADDRESS, ZenohRos, parse_zenoh
 
 _ANSWER_BYTES = 200
 """Longer lines are no answers."""
+_SILENCE_S = 2.0
+"""Time after which a serial gripper without numbers is taken to answer no more what it was asked."""
 
 
 class GripperError(SliplensError):
@@ -68,9 +70,13 @@ class LineGripper:
     """A gripper spoken to in lines of ASCII, over a serial port or TCP.
 
     `F 1.250` sets the force in newtons, `W 0.0400` the width in metres, `S` asks; each is answered by one line,
-    `OK force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`; what comes later than
-    that is thrown away before the next line is sent, and answers nothing. A connection that breaks is a `GripperError`
-    too, and is opened again with the next line.
+    `OK force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`, and so is a connection
+    that breaks; it is opened again with the next line.
+
+    The first line of a connection is `S #1`. A gripper that ends its answer with `#1` gets a number with every line and
+    repeats it: an answer with another number is late, and thrown away. Any other gripper gets plain lines. As nobody
+    can tell to which of them a late answer belongs, the connection is closed where one does not come in time, and a
+    serial line is then left alone for `silence_s`.
 
     Parameters
     ----------
@@ -78,11 +84,19 @@ class LineGripper:
         Opens the socket, or file of a serial device, that carries the lines; see `open_gripper`.
     timeout_s
         Time, in seconds, within which an answer has to come.
+    silence_s
+        Time, in seconds, after which an answer of a gripper without numbers that is late no longer comes on a new
+        connection; 0 where the old connection takes it along, as TCP does.
     """
 
-    def __init__(self, connect: Callable[[], socket.socket | FileIO], *, timeout_s: float = 0.1) -> None:
-        self._connect, self._timeout_s = connect, timeout_s
-        self._wire, self._broken = connect(), False
+    def __init__(
+        self, connect: Callable[[], socket.socket | FileIO], *, timeout_s: float = 0.1, silence_s: float = 0.0
+    ) -> None:
+        self._connect, self._timeout_s, self._silence_s = connect, timeout_s, silence_s
+        self._wire, self._broken, self._silent_until_s = connect(), False, -math.inf
+        self._numbered: bool | None = None
+        """Whether the gripper repeats numbers; None before it was asked."""
+        self._number, self._rest = 0, b""
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
@@ -102,45 +116,79 @@ class LineGripper:
 
     def _ask(self, line: str) -> GripperState:
         if self._broken:
-            self._wire = self._connect()
-            self._broken = False
+            if (wait_s := self._silent_until_s - time.monotonic()) > 0:
+                raise GripperError(f"the gripper answers late and without numbers; it is left alone for {wait_s:.1f} s")
+            self._wire, self._broken, self._rest, self._numbered = self._connect(), False, b"", None
         try:
-            while self._ready(0.0):
-                self._read()
-            os.write(self._wire.fileno(), f"{line}\n".encode("ascii"))
-            answer, ends_s = b"", time.monotonic() + self._timeout_s
-            while b"\n" not in answer and len(answer) < _ANSWER_BYTES and self._ready(ends_s - time.monotonic()):
-                answer += self._read()
-        except (OSError, ValueError) as error:
-            self._broken = True
-            self._wire.close()
-            raise GripperError(f"the gripper cannot be reached ({error}); check its cable and power") from None
-        told, end, _ = answer.partition(b"\n")
-        text = told.decode("ascii", errors="replace").strip()
-        if not end:
-            raise GripperError(f"the gripper did not answer {line!r} in time; check its cable and power")
-        words = text.split()
-        if words[:1] == ["ERR"]:
-            raise GripperError(f"the gripper refused {line!r}: {' '.join(words[1:]) or 'no reason told'}")
-        try:
-            said, force_n, width_m = words[0], *map(float, words[1:])
-        except (ValueError, IndexError):
-            said, force_n, width_m = "", math.nan, math.nan
-        if said != "OK" or not (math.isfinite(force_n) and math.isfinite(width_m)):
+            if self._numbered is None:
+                answer = self._exchange("S", numbered=True)
+                self._numbered = answer[:1] == ["OK"] and answer[-1:] == [f"#{self._number}"]
+            answer = self._exchange(line, numbered=self._numbered)
+        except TimeoutError as error:
+            # late answers come with their number, if they are no endless line
+            if not self._numbered or len(self._rest) >= _ANSWER_BYTES:
+                self._break(silence_s=self._silence_s)
+            heard = f", it sent {error}" if str(error) else ""
             raise GripperError(
-                f"the gripper answered {text!r} to {line!r}, not `OK force_n width_m`; check its protocol"
+                f"the gripper did not answer {line!r} in time{heard}; check its cable and power"
+            ) from None
+        except (OSError, ValueError) as error:
+            self._break()
+            raise GripperError(f"the gripper cannot be reached ({error}); check its cable and power") from None
+        if self._numbered:
+            answer = answer[:-1]
+        if answer[0] == "ERR":
+            raise GripperError(f"the gripper refused {line!r}: {' '.join(answer[1:]) or 'no reason told'}")
+        try:
+            force_n, width_m = map(float, answer[1:])
+        except ValueError:
+            force_n, width_m = math.nan, math.nan
+        if not (math.isfinite(force_n) and math.isfinite(width_m)):
+            raise GripperError(
+                f"the gripper answered {' '.join(answer)!r} to {line!r}, not `OK force_n width_m`; check its protocol"
             )
         return GripperState(force_n=force_n, width_m=width_m)
+
+    def _exchange(self, line: str, *, numbered: bool) -> list[str]:
+        """Send a line; give the words of its answer. What was sent for no line, or for one before, is passed over."""
+        ends_s = time.monotonic() + self._timeout_s
+        heard = ""
+        if numbered:
+            self._number += 1
+            line = f"{line} #{self._number}"
+        else:
+            while self._rest or self._ready(0.0):
+                self._line(ends_s)
+        os.write(self._wire.fileno(), f"{line}\n".encode("ascii"))
+        while True:
+            try:
+                words = (heard := self._line(ends_s)).split()
+            except TimeoutError:
+                raise TimeoutError(repr(heard) if heard else "") from None
+            late = self._numbered and words[-1:] != [f"#{self._number}"]
+            if words[:1] in (["OK"], ["ERR"]) and not late:
+                return words
+
+    def _break(self, *, silence_s: float = 0.0) -> None:
+        """Close the connection, and with it all answers that are still to come."""
+        self._broken, self._silent_until_s = True, time.monotonic() + silence_s
+        self._wire.close()
+
+    def _line(self, ends_s: float) -> str:
+        """Next whole line; `TimeoutError` where none comes, or one without an end."""
+        while b"\n" not in self._rest:
+            if len(self._rest) >= _ANSWER_BYTES or not self._ready(ends_s - time.monotonic()):
+                raise TimeoutError
+            read = os.read(self._wire.fileno(), _ANSWER_BYTES)
+            if not read:
+                raise OSError("it has hung up")
+            self._rest += read
+        line, _, self._rest = self._rest.partition(b"\n")
+        return line.decode("ascii", errors="replace").strip()
 
     def _ready(self, wait_s: float) -> bool:
         """Whether there is something to read within so many seconds."""
         return bool(select.select([self._wire.fileno()], [], [], max(0.0, wait_s))[0])
-
-    def _read(self) -> bytes:
-        heard = os.read(self._wire.fileno(), _ANSWER_BYTES)
-        if not heard:
-            raise OSError("it has hung up")
-        return heard
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,7 +382,7 @@ def open_gripper(
         key, where = parse_zenoh(address.removeprefix("zenoh:"), purpose="zenoh")
         return RosGripper(key, where, messages=messages, joint=joint, timeout_s=timeout_s)
     if not address.startswith("tcp://"):
-        return LineGripper(partial(_open_serial, Path(address)), timeout_s=timeout_s)
+        return LineGripper(partial(_open_serial, Path(address)), timeout_s=timeout_s, silence_s=_SILENCE_S)
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     if not host or not port.isdigit():
         raise InputError(f"{address} is no address of a gripper; write tcp://HOST:PORT")
@@ -360,6 +408,7 @@ def _open_serial(path: Path) -> FileIO:
     try:
         stream = path.open("r+b", buffering=0)
         tty.setraw(stream.fileno())
+        termios.tcflush(stream.fileno(), termios.TCIFLUSH)
     except (OSError, termios.error) as error:
         raise GripperError(f"{path} cannot be opened as a serial device ({error}); check who uses it") from None
     return stream

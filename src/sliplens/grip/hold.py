@@ -16,7 +16,7 @@ from sliplens.codec import save_result
 from sliplens.errors import InputError
 from sliplens.files import output_folder
 from sliplens.grip.controllers import Answer, AssumedFriction, Controller, Holder, MarginGrip, Oracle, make_controller
-from sliplens.grip.gripper import DryRun, Gripper, GripperError, GuardedGripper, open_gripper
+from sliplens.grip.gripper import DryRun, Gripper, GripperError, GripperState, GuardedGripper, open_gripper
 from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.source import GripSource, open_grip, usual_network
 from sliplens.live.contract import LiveSource, Pace, SourceOptions
@@ -32,6 +32,9 @@ GRIPPERS = {
 """Names of grippers that are no address, and what they are."""
 
 _TRIES = 30  # at the first force, for half a second: a driver may not have heard of it yet
+_STUCK_S, _STUCK_M = 2.0, 1e-4
+"""Time in which a gripper without any force has to close by a tenth of a millimetre; the simulated one opens for 1.5 s
+first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +55,7 @@ class HoldStep:
     """Whether the markers told a slip."""
     why: str
     trouble: str | None
-    """What the gripper failed at; None while it takes its commands."""
+    """What the gripper failed at; None while it takes its commands and its force follows them."""
     readings: tuple[Reading | None, ...]
     """Newest reading of each fingertip; None before the first."""
 
@@ -197,6 +200,8 @@ class _Holding:
         self.troubles: dict[str, None] = {}
         """What the gripper failed at, in the order in which it first did."""
         force_n = self._first_force()
+        self._closes: tuple[float, float] | None = None
+        """Time at which the fingers last moved without any force, and their opening then; None once they pressed."""
         self._holder = Holder(
             controller,
             settings=settings,
@@ -225,7 +230,10 @@ class _Holding:
                     return "failed" if failed else "source", ", ".join(map(str, ends)), None
                 if seconds is not None and time.monotonic() - begun_s >= seconds:
                     break
-                step = self._step(begun_s)
+                try:
+                    step = self._step(begun_s)
+                except GripperError as error:
+                    return "failed", str(error), error
                 if on_step is not None:
                     try:
                         on_step(step)
@@ -257,13 +265,14 @@ class _Holding:
         )
 
     def _step(self, begun_s: float) -> HoldStep:
-        force_n, trouble = self._measure()
-        now_s = time.monotonic()
+        state, trouble = self._measure()
+        now_s, force_n = time.monotonic(), state.force_n
         answer = self._holder.answer(now_s, force_n)
+        self._require_force(state, now_s)
         try:
             self._guard.set_force(answer.command_n)
         finally:  # interrupted, it was told none the less
-            trouble = self._guard.failure or trouble
+            trouble = self._guard.failure or trouble or answer.trouble
             if trouble is not None:
                 self.troubles[trouble] = None
             self._rows.append((now_s - begun_s, answer, force_n, trouble is not None))
@@ -283,21 +292,36 @@ class _Holding:
         """Grip force before anything is told: who does not know it would let go of what is held."""
         trouble = None
         for _ in range(_TRIES):
-            force_n, trouble = self._measure()
-            if not math.isnan(force_n):
-                return force_n
+            state, trouble = self._measure()
+            if not math.isnan(state.force_n):
+                return state.force_n
             time.sleep(PERIOD_S)
         raise GripperError(
             f"the gripper tells no force to begin with ({trouble or 'no number'}); check its connection: it was told "
             "nothing"
         )
 
-    def _measure(self) -> tuple[float, str | None]:
-        """Grip force that the gripper tells; NaN and what it failed at where it tells none."""
+    def _measure(self) -> tuple[GripperState, str | None]:
+        """State of the gripper; NaN and what it failed at where it gives none."""
         try:
-            return self._guard.read_state().force_n, None
+            return self._guard.read_state(), None
         except Exception as error:  # whatever a driver raises: what is held is held on
-            return math.nan, str(error) or type(error).__name__
+            return GripperState(force_n=math.nan, width_m=math.nan), str(error) or type(error).__name__
+
+    def _require_force(self, state: GripperState, now_s: float) -> None:
+        """Refuse a gripper that has measured no force from the start, though its fingers have stopped."""
+        if math.isnan(state.width_m):
+            return
+        if self._holder.touched or not self._rows:
+            self._closes = None
+        elif self._closes is None or abs(state.width_m - self._closes[1]) > _STUCK_M:
+            self._closes = now_s, state.width_m
+        elif now_s - self._closes[0] > _STUCK_S and self._rows[-1][1].command_n > 0:
+            raise GripperError(
+                f"the gripper measures {state.force_n:.2f} N and its fingers do not move, {_STUCK_S:g} s after "
+                f"{self._rows[-1][1].command_n:.2f} N was commanded; without a force sensor, or with forces of the "
+                "other sign, it cannot be held by the margin: check its driver"
+            )
 
 
 def _readers(

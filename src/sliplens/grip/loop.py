@@ -1,9 +1,10 @@
 """The loop of a grip: images are read, a controller answers, the gripper acts, and the object moves or holds."""
 
 import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -12,16 +13,18 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.friction import SlipLearner
-from sliplens.grip.controllers import Controller, Observation
-from sliplens.grip.fingertip import Fingertip, mean_shear
+from sliplens.grip.controllers import SPRINGS_BACK_S, Controller, Observation, SlipGate
+from sliplens.grip.fingertip import Fingertip, MarkerField
 from sliplens.grip.plant import PERIOD_S, Episodes, Fingers, Plant, PlantState, World
 from sliplens.grip.readings import ReadingTable
+from sliplens.live.slip import SlipBatch
 from sliplens.markers import Tracker
 from sliplens.models import Engine, Run, make_engine
 from sliplens.models.predictions import LEVEL
+from sliplens.simulation.intervention import NOISE_PX
 
-_SHEAR_NOISE_PX = 0.02
-"""Noise of the mean of 19 markers that are each followed to 0.1 px (docs/limit.md)."""
+Markers: TypeAlias = Float[np.ndarray, "_ _ 2"]
+"""Places of a fingertip's markers, in pixels (x, y), by episode and marker."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +34,8 @@ class Sight:
     margin: Float[np.ndarray, "episodes 2"]
     low: Float[np.ndarray, "episodes 2"]
     high: Float[np.ndarray, "episodes 2"]
-    shear_px: Float[np.ndarray, "episodes 2"]
-    """Mean displacement of the inner markers the way of the pull, in pixels."""
+    markers_px: tuple[Markers, Markers] | None = None
+    """Places (x, y) of the markers of both fingertips; None where nothing follows them."""
     frames: UInt8[np.ndarray, "2 height width 3"] | None = None
     """What the cameras saw, where anything was filmed."""
 
@@ -41,10 +44,14 @@ class Sight:
 class Eyes(Protocol):
     """What looks at the fingertips: images and a network, or a table of what the network said of such images."""
 
+    def still(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
+        """Markers of both fingertips in frames of the untouched sensors, the places at rest first; none if unseen."""
+        ...
+
     def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
         """Read both fingertips of every episode.
 
-        `slipping_s`: how many seconds ago a slip began that the markers have just told; NaN where they tell none.
+        `slipping_s`: how many seconds ago a slip began that the markers have just confirmed; NaN where none.
         """
         ...
 
@@ -70,6 +77,8 @@ class TableEyes:
         learners: Sequence[SlipLearner] | None = None,
     ) -> None:
         pair = fingertips.astype(np.int64) % (len(table) // 2)
+        pairs, self._gripper = np.unique(pair, return_inverse=True)
+        self._field = MarkerField((table.seed + 2 * pairs).tolist())
         self._table, self._tips = table, 2 * pair[:, None] + np.arange(2)
         self._rng, self._scale = rng, error_scale
         self._learners, known = learners, [one.friction is not None for one in learners or ()]
@@ -78,6 +87,16 @@ class TableEyes:
         if any(known) and not all(known):
             raise InputError("of some episodes the friction is known and of some it is not; run them apart")
 
+    def still(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
+        """Markers of the untouched fingertips, the places at rest first."""
+        rest = self._field.rest_px[self._gripper]
+        return [(rest[:, 0], rest[:, 1]), *(self._follow(rest) for _ in range(frames))]
+
+    def _follow(self, places_px: Float[np.ndarray, "episodes 2 markers 2"]) -> tuple[Markers, Markers]:
+        """Places as markers are followed to them, of each finger."""
+        followed = places_px + NOISE_PX * self._rng.standard_normal(places_px.shape)
+        return followed[:, 0], followed[:, 1]
+
     def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
         """Read both fingertips of every episode."""
         true = state.margin
@@ -85,26 +104,28 @@ class TableEyes:
         known = np.where(pressing, true, 1.0)
         force = np.broadcast_to(state.force_n[:, None], known.shape)
         friction, table = state.holding_friction, self._table
-        margin, low, high, shear, *ratio = table.read(self._tips, force, friction=friction, margins=known)
-        noise = self._rng.standard_normal((2, *known.shape))
+        margin, low, high, *ratio = table.read(self._tips, force, friction=friction, margins=known)
+        noise = self._rng.standard_normal(known.shape)
         told = None
         if self._learners is not None:
             sliding = np.where(state.sliding, state.kinetic_ratio[:, None], 1 - known)
             held = np.where(pressing, state.friction * sliding, 0.0)
-            pulled = held + self._scale * (ratio[0] - held + table.ratio_noise * noise[0])
+            pulled = held + self._scale * (ratio[0] - held + table.ratio_noise * noise)
             self._learn(pulled, self._scale * ratio[1], state.time_s, slipping_s)
             told = _told_margin(pulled, self._scale * ratio[1], self._learners)
         if told is None:
-            change = (self._scale - 1) * (margin - known) + table.noise * self._scale * noise[0]
+            change = (self._scale - 1) * (margin - known) + table.noise * self._scale * noise
             reach = [(self._scale - 1) * (end - margin) for end in (low, high)]
             told = margin + change, low + change + reach[0], high + change + reach[1]
         margin, low, high = told
-        shear = np.copysign(shear, state.shear_n) if (state.shear_n < 0).any() else shear
+        places = self._field.at(
+            self._gripper, state.force_n, friction=friction, margins=known, pulled_back=state.shear_n < 0
+        )
         return Sight(
             margin=np.where(pressing, margin, 1.0),
             low=np.where(pressing, np.clip(low, 0, 1), 1.0),
             high=np.where(pressing, np.clip(high, 0, 1), 1.0),
-            shear_px=np.where(pressing, shear, 0.0) + _SHEAR_NOISE_PX * noise[1],
+            markers_px=self._follow(places),
         )
 
     def _learn(self, ratio: Fingers, sigma: Fingers, time_s: float, slipping_s: Episodes) -> None:
@@ -178,10 +199,18 @@ class RenderedEyes:
         """The two untouched sensors, T_0."""
         return np.stack([tip.reference for tip in self.fingertips])
 
+    def still(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
+        """Markers followed in frames of the untouched fingertips, the places at rest first."""
+        followed = [[tracker.rest.centre_px[None] for tracker in self._trackers]]
+        for _ in range(frames):
+            films = [tip.draw(0.0, friction=1.0, margin=1.0) for tip in self.fingertips]
+            followed.append([_places(*both) for both in zip(self._trackers, films, strict=True)])
+        return [(first, second) for first, second in followed]
+
     def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
         """Film both fingertips and read them."""
         frames: list[np.ndarray] = []
-        shear_px: list[float] = []
+        markers_px: list[Markers] = []
 
         def inputs() -> Iterator[Tensor]:
             for finger, (tip, tracker) in enumerate(zip(self.fingertips, self._trackers, strict=True)):
@@ -196,9 +225,8 @@ class RenderedEyes:
                     encoded = self._run.encode(frame[None], tip.reference)
                 yield encoded
                 with self._threads.limit(limits=1):
-                    place_px = tracker.update(frame).position_px[: len(tracker.rest)]
+                    markers_px.append(_places(tracker, frame))
                 frames.append(frame)
-                shear_px.append(float(mean_shear(tracker.rest.centre_px, place_px)))
 
         known, learner = None, self._learner
         if learner is not None:
@@ -223,60 +251,55 @@ class RenderedEyes:
             margin=margin[None],
             low=low[None],
             high=high[None],
-            shear_px=np.array([shear_px]),
+            markers_px=(markers_px[0], markers_px[1]),
             frames=np.stack(frames),
         )
+
+
+def _places(tracker: Tracker, frame: UInt8[np.ndarray, "height width 3"]) -> Markers:
+    """Places of a tracker's markers in its next frame."""
+    return tracker.update(frame).position_px[None, : len(tracker.rest)]
 
 
 class NoEyes:
     """No fingertips at all: for controllers that read nothing."""
 
+    def still(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
+        """No markers."""
+        return []
+
     def look(self, state: PlantState, slipping_s: Episodes) -> Sight:
         """Read nothing."""
         nothing = np.full((len(slipping_s), 2), np.nan)
-        return Sight(margin=nothing, low=nothing, high=nothing, shear_px=0 * state.shear_n + np.nan)
+        return Sight(margin=nothing, low=nothing, high=nothing)
 
 
-_SPAN = 3
-"""Images whose markers are averaged before and after a slip."""
+class _SlipWatch:
+    """Slip of both fingers of each episode, by the detector and the gate of a real hold."""
+
+    def __init__(self, eyes: Eyes) -> None:
+        rest, *still = eyes.still(_STILL_FRAMES) or [()]
+        self._fingers = [(SlipBatch(places), SlipGate()) for places in rest]
+        for number, frame in enumerate(still):
+            for (batch, _), places in zip(self._fingers, frame, strict=True):
+                batch.update(places, (number - len(still)) * PERIOD_S)
+        self._forces: deque[Episodes] = deque(maxlen=round(SPRINGS_BACK_S / PERIOD_S) + 1)
+
+    def update(self, sight: Sight, state: PlantState) -> tuple[Bool[np.ndarray, " episodes"], Episodes]:
+        """Whether a slip begins at a finger, and how many seconds ago one began that is confirmed now; NaN for none."""
+        self._forces.append(state.force_n)
+        begins, slipped_s = np.zeros(len(state.force_n), dtype=bool), np.full(len(state.force_n), np.nan)
+        for (batch, gate), places in zip(self._fingers, sight.markers_px or (), strict=True):
+            states = batch.update(places, state.time_s)
+            begins |= gate.update(
+                states.slip, since_touch_s=state.held_s, force_n=state.force_n, earlier_n=self._forces[0]
+            )
+            slipped_s = np.fmax(slipped_s, states.slipped_s)
+        return begins, slipped_s
 
 
-class SlipWatch:
-    """Tells gross slip from the markers: as the friction falls from static to kinetic, the skin springs back.
-
-    It is a slip where the pull on the markers of both fingers, their mean, falls by more than an eighth from three
-    images to the next three while the grip is not loosened. A pull that ends at once looks the same, and is answered as
-    a slip. What pressing alone displaced before the lift is subtracted.
-    """
-
-    def __init__(self, *, share: float = 0.12, floor_px: float = 0.05) -> None:
-        self._share, self._floor = share, floor_px
-        self._past: list[tuple[np.ndarray, np.ndarray]] = []
-        self._pressed: np.ndarray | float = 0.0
-
-    def update(
-        self,
-        shear_px: Float[np.ndarray, "episodes 2"],
-        force_n: Float[np.ndarray, " episodes"],
-        *,
-        lifted: bool,
-    ) -> Bool[np.ndarray, " episodes"]:
-        """Whether a finger begins to slip, from the markers' displacement in pixels and the grip force in newtons."""
-        self._past = [*self._past[1 - 2 * _SPAN :], (shear_px, force_n)]
-        if not lifted:
-            self._pressed = np.nan_to_num(shear_px)
-        if len(self._past) < 2 * _SPAN or not lifted:
-            return np.zeros(len(shear_px), dtype=bool)
-        before, now = (
-            np.mean([shear for shear, _ in part], axis=0) for part in (self._past[:_SPAN], self._past[_SPAN:])
-        )
-        seen = np.isfinite(before) & np.isfinite(now)
-        pull, left = (
-            np.abs(np.where(seen, shear - self._pressed, 0).sum(axis=1)) / np.maximum(seen.sum(axis=1), 1)
-            for shear in (before, now)
-        )
-        loosened = force_n < 0.97 * self._past[0][1]
-        return (pull - left > np.maximum(self._floor, self._share * pull)) & ~loosened
+_STILL_FRAMES = 30
+"""Frames of the untouched fingertips before they close, from which the noise of the markers is learnt."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -306,8 +329,6 @@ class GripLoop:
         Anything with `command(observation)`.
     latency_s
         From an image to the command that answers it, rounded up to whole images; the actuator's lag comes on top.
-    lift_s
-        When the hand begins to rise: markers tell slip from then on.
 
     Examples
     --------
@@ -323,13 +344,11 @@ class GripLoop:
     array([2.])
     """
 
-    def __init__(
-        self, plant: Plant, eyes: Eyes, controller: Controller, *, latency_s: float = 0.02, lift_s: float = 0.5
-    ) -> None:
+    def __init__(self, plant: Plant, eyes: Eyes, controller: Controller, *, latency_s: float = 0.02) -> None:
         self.plant, self.eyes, self.controller = plant, eyes, controller
-        self._delay, self._lift_s = math.ceil(latency_s / PERIOD_S - 1e-9), lift_s
-        self._past: list[tuple[PlantState, Sight]] = []
-        self._watch = SlipWatch()
+        self._delay = math.ceil(latency_s / PERIOD_S - 1e-9)
+        self._past: list[tuple[PlantState, Sight, Bool[np.ndarray, " episodes"]]] = []
+        self._watch = _SlipWatch(eyes)
         self._command = np.zeros(len(plant.state.force_n))
         self._slipping_s = np.full(len(plant.state.force_n), np.nan)
 
@@ -337,15 +356,16 @@ class GripLoop:
         """Look, command, step; `dark` fingers read nothing."""
         now, sight = self.plant.state, self.eyes.look(self.plant.state, self._slipping_s)
         if dark is not None and dark.any():
-            blind = {
-                name: np.where(dark, np.nan, getattr(sight, name)) for name in ("margin", "low", "high", "shear_px")
-            }
+            blind = {name: np.where(dark, np.nan, getattr(sight, name)) for name in ("margin", "low", "high")}
+            if sight.markers_px is not None:
+                hidden = zip(dark.T[..., None, None], sight.markers_px, strict=True)
+                first, second = (np.where(unseen, np.nan, places) for unseen, places in hidden)
+                blind["markers_px"] = first, second
             sight = replace(sight, **blind)
-        self._past = [*self._past[-self._delay :], (now, sight)] if self._delay else [(now, sight)]
-        then, read = self._past[0]
-        slip = self._watch.update(read.shear_px, then.force_n, lifted=then.time_s > self._lift_s)
-        # it began among the images that were averaged before it
-        self._slipping_s = np.where(slip, now.time_s - then.time_s + 1.5 * _SPAN * PERIOD_S, np.nan)
+        slip, slipped_s = self._watch.update(sight, now)
+        self._slipping_s = slipped_s + PERIOD_S  # when it is looked at next
+        self._past = [*self._past[-self._delay :], (now, sight, slip)] if self._delay else [(now, sight, slip)]
+        then, read, slip = self._past[0]
         seen = Observation(
             time_s=now.time_s,
             force_n=then.force_n,

@@ -10,11 +10,11 @@ from jaxtyping import Float, Float32, Int
 from sliplens.codec import load_result
 from sliplens.errors import InputError
 from sliplens.files import find_run, shipped_names
-from sliplens.grip.fingertip import Fingertip, draw_film, mean_shear
+from sliplens.grip.fingertip import Fingertip, draw_film, place_in_grid
 from sliplens.models import Run, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.progress import OnProgress
-from sliplens.results.evaluation import ANSWER, MARGIN, PIXEL
+from sliplens.results.evaluation import ANSWER, MARGIN
 
 FRICTIONS = (0.1, 0.18, 0.3, 0.5, 0.8, 1.3)
 """Coefficients of friction at which readings are measured; between them they are interpolated in the logarithm."""
@@ -42,8 +42,6 @@ class ReadingTable:
     low: Annotated[Float32[np.ndarray, "fingertips frictions forces margins"], MARGIN]
     """Lower end of the 90 % interval."""
     high: Annotated[Float32[np.ndarray, "fingertips frictions forces margins"], MARGIN]
-    shear_px: Annotated[Float32[np.ndarray, "fingertips frictions forces margins"], PIXEL]
-    """Mean displacement of the inner markers down the image, in pixels: the way of the pull."""
     noise: float
     """Standard deviation of the margin read anew of the same state, in margin units."""
     ratio: dict[str, Float32[np.ndarray, "fingertips frictions forces margins"]] = field(default_factory=dict)
@@ -56,7 +54,7 @@ class ReadingTable:
 
     def of(self, fingertips: slice) -> "ReadingTable":
         """Table of some of the fingertips."""
-        parts = {name: getattr(self, name)[fingertips] for name in ("margin", "low", "high", "shear_px")}
+        parts = {name: getattr(self, name)[fingertips] for name in ("margin", "low", "high")}
         ratio = {name: values[fingertips] for name, values in self.ratio.items()}
         return replace(self, seed=self.seed + (fingertips.start or 0), ratio=ratio, **parts)
 
@@ -68,15 +66,15 @@ class ReadingTable:
         friction: Float[np.ndarray, "*contacts"],
         margins: Float[np.ndarray, "*contacts"],
     ) -> tuple[Float[np.ndarray, "*contacts"], ...]:
-        """Margin, both ends of its interval, and shear in pixels, of contacts in these states, without noise.
+        """Margin and both ends of its interval, of contacts in these states, without noise.
 
         Mean and sigma of F_t / F_n follow, of a network that tells it. Forces and frictions beyond the measured ones
         are read as the outermost.
         """
         places = [
-            _place(np.log(FRICTIONS), np.log(np.maximum(friction, 1e-6))),
-            _place(np.log(FORCES_N), np.log(np.maximum(normal_force_n, 1e-6))),
-            _place(np.asarray(MARGINS), margins),
+            place_in_grid(np.log(FRICTIONS), np.log(np.maximum(friction, 1e-6))),
+            place_in_grid(np.log(FORCES_N), np.log(np.maximum(normal_force_n, 1e-6))),
+            place_in_grid(np.asarray(MARGINS), margins),
         ]
         stacked = self._stacked
         total = np.zeros((*np.shape(fingertips), stacked.shape[-1]))
@@ -94,15 +92,9 @@ class ReadingTable:
         cached = self.__dict__.get("_cache")
         if cached is None:
             ratio = [self.ratio[name] for name in ("mean", "sigma") if self.ratio]
-            cached = np.stack([self.margin, self.low, self.high, self.shear_px, *ratio], axis=-1)
+            cached = np.stack([self.margin, self.low, self.high, *ratio], axis=-1)
             object.__setattr__(self, "_cache", cached)
         return cached
-
-
-def _place(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cell of a grid that each value lies in, and how far in it, 0 to 1."""
-    at = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
-    return at, np.clip((values - grid[at]) / (grid[at + 1] - grid[at]), 0, 1)
 
 
 def require_calibration(run: Run) -> None:
@@ -154,8 +146,7 @@ def measure_readings(
         assert ends is not None  # it is calibrated
         ratio = [] if estimate.ratio is None else [estimate.ratio.mean, estimate.ratio.sigma]
         count = len(frames)
-        shear = mean_shear(film.motion.rest_px, film.motion.centres_px)
-        rows = [estimate.margin[:count], *(end[:count] for end in ends), shear, *(one[:count] for one in ratio)]
+        rows = [estimate.margin[:count], *(end[:count] for end in ends), *(one[:count] for one in ratio)]
         table = np.empty((len(rows), *mu.shape), dtype=np.float32)
         for row, values in zip(table, rows, strict=True):
             row[shown] = values
@@ -164,7 +155,7 @@ def measure_readings(
         repeats.append(np.stack([one[count:] - one[:count][again] for one in (estimate.margin, *ratio[:1])]))
         if on_progress is not None:
             on_progress(number + 1, fingertips)
-    margin, low, high, shear_px, *ratios = np.stack(found, axis=1)
+    margin, low, high, *ratios = np.stack(found, axis=1)
     noise, *ratio_noise = (np.std(np.concatenate(repeats, axis=1), axis=1) / np.sqrt(2)).tolist()
     return ReadingTable(
         network=run.manifest.weights_sha256,
@@ -172,7 +163,6 @@ def measure_readings(
         margin=margin,
         low=low,
         high=high,
-        shear_px=shear_px,
         noise=noise,
         ratio=dict(zip(("mean", "sigma"), ratios, strict=False)),
         ratio_noise=sum(ratio_noise),

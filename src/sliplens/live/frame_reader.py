@@ -249,7 +249,7 @@ class FrameReader:
             withheld = withheld or (None if self.network is None else _NO_CONTACT)
         if self._follower is not None and reading.contact_state == ContactState.NO_CONTACT:
             self._follower.forget()
-        slipping_s = None if markers is None else markers.slipping_s
+        slipping_s = None if markers is None else markers.slipped_s  # of a pull that was let go it is None
         touches = reading.contact_state != ContactState.NO_CONTACT
         self.learner.update(frame.time_s, slipping_s=slipping_s, touches=touches)
         return reading, withheld

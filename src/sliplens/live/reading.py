@@ -107,6 +107,9 @@ class MarkerReading:
     """Share of the contact's markers that move with its middle, from 0 to 1; None without a contact."""
     slipping_s: float | None = None
     """Time since the slip began, as the markers tell it afterwards; None where there is none."""
+    slipped_s: float | None = None
+    """Time since a slip began, in the one frame in which it is confirmed: the load is still there, and was not let go.
+    Confirmed slips teach friction."""
 
 
 NO_NETWORK = "no network, so no margin is read; name one with --network"

@@ -82,13 +82,12 @@ class Film:
 
         The model that moves the markers is the sensor's default; the grasp's offset, direction and haze stay.
         """
-        touch = Touch(grasp=self.grasp, modulus_factor=self.day.modulus_factor, marker_depth=self.unit.marker_depth)
-        motion, frames = move_markers(self.sensor, touch, loading=loading), len(loading.time_s)
-        see = partial(_see, centre_px=np.asarray(self.sensor.geometry.centre_px), day=self.day)
+        motion, _, marker_px = see_markers(self.sensor, loading=loading, grasp=self.grasp, day=self.day, unit=self.unit)
+        frames = len(loading.time_s)
         return replace(
             self,
             motion=motion,
-            marker_px=see(motion.centres_px + self.unit.marker_jitter_px),
+            marker_px=marker_px,
             blur_px=np.append(self.blur_px[:1], np.full(frames, self.grasp.blur_px)),
             noise_picks=np.concatenate([self.noise_picks[:1], pick_noise(frames, rng=rng)]),
         )
@@ -209,8 +208,9 @@ def prepare_film(
 
     `noise`: the camera's noise; None films without it.
     """
-    touch = Touch(grasp=grasp, modulus_factor=day.modulus_factor, marker_depth=unit.marker_depth)
-    motion = move_markers(sensor, touch, loading=loading, displacement=displacement)
+    motion, rest_px, marker_px = see_markers(
+        sensor, loading=loading, grasp=grasp, day=day, unit=unit, displacement=displacement
+    )
     geometry, frames = sensor.geometry, len(loading.time_s)
     middle = np.asarray(geometry.centre_px)
     see = partial(_see, centre_px=middle, day=day)
@@ -224,8 +224,8 @@ def prepare_film(
         unit=unit,
         motion=motion,
         noise=noise,
-        marker_rest_px=see(motion.rest_px + unit.marker_jitter_px),
-        marker_px=see(motion.centres_px + unit.marker_jitter_px),
+        marker_rest_px=rest_px,
+        marker_px=marker_px,
         # drawn before the noise, so that a clean film differs in its noise alone
         blur_px=grasp.blur_px * rng.uniform(0.8, 1.2, frames + 1),
         noise_picks=pick_noise(frames + 1, rng=rng),
@@ -238,6 +238,16 @@ def prepare_film(
         haze=haze(sensor, grasp=grasp, contact_px=contact_px, radius_px=float(edge[0] - apex[0]), rng=grain),
         relief=relief(sensor, contact_px=contact_px),
     )
+
+
+def see_markers(
+    sensor: Sensor, *, loading: Loading, grasp: Grasp, day: Day, unit: Unit, displacement: str | None = None
+) -> tuple[Motion, Float[np.ndarray, "markers 2"], Float[np.ndarray, "frames markers 2"]]:
+    """Move the markers; give the motion, and their places (pixels, x and y) at rest and in each frame, as seen."""
+    touch = Touch(grasp=grasp, modulus_factor=day.modulus_factor, marker_depth=unit.marker_depth)
+    motion = move_markers(sensor, touch, loading=loading, displacement=displacement)
+    see = partial(_see, centre_px=np.asarray(sensor.geometry.centre_px), day=day)
+    return motion, see(motion.rest_px + unit.marker_jitter_px), see(motion.centres_px + unit.marker_jitter_px)
 
 
 def _turn(day: Day) -> Float[np.ndarray, "2 2"]:

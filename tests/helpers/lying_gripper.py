@@ -1,0 +1,141 @@
+"""Grippers that lie for a while, held by the margin in virtual time; run as a script it prints what they were sent."""
+
+import random
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from sliplens.grip.controllers import Controller, Holder, MarginGrip, MarginLaw
+from sliplens.grip.gripper import GuardedGripper, LineGripper
+from sliplens.grip.plant import PERIOD_S
+from sliplens.live.reading import Reading
+
+CEILING_N, FRICTION = 3.0, 0.7
+LIES_S, ENDS_S, OVER_S = 2.0, 2.8, 3.2
+"""When the gripper begins to lie, when it stops, and when the hold is over."""
+NOISE = random.Random(0)
+
+
+def state(force_n: float) -> bytes:
+    return f"OK {force_n:.3f} 0.0400\n".encode()
+
+
+LIES: dict[str, Callable[[float], bytes | None]] = {
+    "zero": lambda _: state(0.0),
+    "half": lambda force_n: state(0.5 * force_n),
+    "negative": lambda force_n: state(-force_n),
+    "triple": lambda force_n: state(3 * force_n),
+    "huge": lambda _: state(1e6),
+    "constant": lambda _: state(0.8),
+    "noise of 0.5 N": lambda force_n: state(max(0.0, force_n + NOISE.gauss(0, 0.5))),
+    "garbage": lambda _: b"\x00\xff{}OK nan\n",
+    "no answer": lambda _: None,
+    "refusals": lambda _: b"ERR hot\n",
+    "endless line": lambda _: b"x" * 10_000,
+}
+"""Answer to a line, by the force that is pressed."""
+WIRE = ("late answers", "hangs up")
+"""Lies of the line itself."""
+
+
+class LyingGripper:
+    """Gripper on a pair of sockets that presses as it is told, with a lag, and tells something else."""
+
+    def __init__(self, lie: str) -> None:
+        self.lie, self.lies = lie, False
+        self.force_n = self.command_n = 0.0
+        self.sent: list[str] = []
+
+    def connect(self) -> socket.socket:
+        ours, theirs = socket.socketpair()
+        threading.Thread(target=self._serve, args=(theirs,), daemon=True).start()
+        return ours
+
+    def _serve(self, wire: socket.socket) -> None:
+        with suppress(OSError), wire, wire.makefile("rwb") as stream:
+            for line in stream:
+                words = line.decode().split()
+                self.sent.append(words[0])
+                if words[0] == "F":
+                    self.command_n = float(words[1])
+                answer = state(self.force_n)
+                if self.lies and self.lie == "hangs up":
+                    return
+                if self.lies and self.lie == "late answers":
+                    time.sleep(0.05)
+                elif self.lies:
+                    answer = LIES[self.lie](self.force_n)
+                if answer is not None:
+                    stream.write(answer)
+                    stream.flush()
+
+
+@dataclass(frozen=True, kw_only=True)
+class LyingHold:
+    """Commands of a hold, a row each."""
+
+    time_s: np.ndarray
+    command_n: np.ndarray
+    acted: np.ndarray
+    """Margin acted on, or read by a controller of another kind; NaN where none is."""
+    force_n: np.ndarray
+    """Grip force as it is."""
+    troubles: tuple[str, ...]
+    sent: frozenset[str]
+    """First words of all lines."""
+
+
+def hold(lie: str, controller: str | Controller = "margin") -> LyingHold:
+    """Hold with a lying gripper an object that is pulled at with 0.6 N from 1 s on, and with 0.8 N as it lies."""
+    gripper = LyingGripper(lie)
+    holder = Holder(controller, ceiling_n=CEILING_N)
+    rows, troubles = [], dict[str, None]()
+    line = LineGripper(gripper.connect, timeout_s=0.02)
+    with GuardedGripper(line, ceiling_n=CEILING_N, watchdog_s=60.0) as guard:
+        for step in range(round(OVER_S / PERIOD_S)):
+            now_s = step * PERIOD_S
+            gripper.lies = LIES_S <= now_s < ENDS_S
+            gripper.force_n += (gripper.command_n - gripper.force_n) * (1 - np.exp(-PERIOD_S / 0.05))
+            pull_n = 0.0 if now_s < 1 else 0.6 if now_s < LIES_S + 0.3 else 0.8
+            margin = max(0.0, 1 - pull_n / (FRICTION * max(gripper.force_n, 1e-9)))
+            read = 0.5 + 0.5 * margin  # as a network reads that sees no friction
+            holder.hear(Reading(number=step, time_s=now_s, captured_s=now_s, margin=read), taken_s=now_s)
+            try:
+                force_n, trouble = guard.read_state().force_n, None
+            except Exception as error:  # as `hold_grip` takes it
+                force_n, trouble = np.nan, str(error)
+            answer = holder.answer(now_s, force_n)
+            guard.set_force(answer.command_n)
+            for words in (guard.failure, trouble, answer.trouble):
+                if words is not None:
+                    troubles[words] = None
+            law = holder._controller
+            acted = float(law.acted[0]) if isinstance(law, MarginGrip) else read
+            rows.append((now_s, answer.command_n, acted, gripper.force_n))
+    time_s, command_n, acted, force_n = np.array(rows).T
+    return LyingHold(
+        time_s=time_s, command_n=command_n, acted=acted, force_n=force_n,
+        troubles=tuple(troubles), sent=frozenset(gripper.sent),
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Write a row a lie."""
+    for lie in (*LIES, *WIRE):
+        held = hold(lie)
+        lying = (held.time_s >= LIES_S) & (held.time_s < ENDS_S)
+        fell = np.diff(held.command_n, prepend=0.0)[lying & (held.acted < MarginLaw.target)]
+        sys.stdout.write(
+            f"| {lie} | {held.command_n[lying].min():.2f} to {held.command_n[lying].max():.2f} N "
+            f"| {max(0.0, -float(fell.min(initial=0.0))):.2f} N | {held.troubles[0] if held.troubles else 'none'} |\n"
+        )
+
+
+if __name__ == "__main__":
+    main()
