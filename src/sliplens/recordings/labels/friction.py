@@ -138,7 +138,10 @@ _SUDDEN = 1.5  # a slip falls by so many times what the ratio falls in as long a
 _SLIDING_SHARE = 0.3
 _PULL_SHARE = 0.5  # share of the fall of the ratio that the pull falls by: a firmer press alone is no slip
 _APART_S = 0.1  # a load that is lost for less time is the same contact
-_BEFORE_S, _AFTER_S = 0.6, 0.2  # what of the ratio is fitted, before and after its break
+# what of the ratio is fitted before its break: the longer knows it better, unless the pull was no parabola so long
+_BEFORE_S = (0.6, 0.25, 0.1)
+_AFTER_S = 0.2  # and after it
+_LIKE_SHARE, _LIKE_SIGMAS = 0.02, 5.0  # a parabola that ends this far from the largest mean ratio there was none
 _BEFORE_STEPS, _AFTER_STEPS = 12, 6  # and of slow samples at least so many
 _BAND = (0.16, 0.84)  # quantiles that hold 68 %
 _SEEN_SIGMAS = 3.0  # an image that moves by so many standard deviations more than before sees the slip
@@ -219,7 +222,7 @@ def estimate_friction(
         reach_s = 0.0 if time_s == slip_s else _REACH_S
         limits = {"contact_threshold_n": contact_threshold_n, "reach_s": reach_s, "draws": draws}
         try:
-            slips.append(_fit_slip(forces, time_s, **limits, rng=rng))
+            slips.append(_fit_slip(forces, time_s, means=means[0], **limits, rng=rng))
         except RecordingError:
             if mu is None and not slips:
                 raise
@@ -272,12 +275,11 @@ def _find_contradictions(
 ) -> tuple[list[str], float]:
     """Compare a friction with the forces: what contradicts it, and by how much the friction is off for that."""
     mu, given, ratio, time = friction.mu, friction.found is Found.DECLARED, means.ratio, means.time_s
-    allowed = max(_LAW_SIGMAS * friction_change, _LAW_SHARE) * mu
     written = f"{mu:.2f}" if given else f"{mu:.2f} ({friction.low:.2f} to {friction.high:.2f})"
     notes, error = [], 0.0
     if given and slips and slips[0].mu is not None:
         first, apart = slips[0], abs(slips[0].mu - mu)
-        if apart > max(_LAW_SIGMAS * (first.high - first.low) / 2, allowed):
+        if apart > max(_LAW_SIGMAS * (first.high - first.low) / 2, _LAW_SHARE * mu):
             notes.append(
                 f"F_t / F_n is {first.mu:.2f} ({first.low:.2f} to {first.high:.2f}) at the slip at "
                 f"{first.time_s:.2f} s, and a friction of {written} was given: the difference counts as an error of "
@@ -286,9 +288,12 @@ def _find_contradictions(
             error = apart
     highest = int(np.argmax(means.surely))
     # a friction that comes from these forces has their tare in its own uncertainty
-    sigma = float(means.tare_sigma[highest]) if given else friction.sigma
-    if not notes and means.surely[highest] > mu + max(_LAW_SIGMAS * sigma, allowed):
-        onset_s = friction.onset_s
+    sigma, onset_s = float(means.tare_sigma[highest]) if given else friction.sigma, friction.onset_s
+    # on the way to the slip friction may still change, as in the labels' own uncertainty
+    begin = float(time[np.argmax(means.pulled)])
+    far = 1.0 if onset_s is None else abs(float(time[highest]) - onset_s) / max(onset_s - begin, 1e-9)
+    sigma = np.hypot(sigma, friction_change * min(far, 1.0) * mu)
+    if not notes and means.surely[highest] > mu + max(_LAW_SIGMAS * sigma, _LAW_SHARE * mu):
         when = "before" if onset_s is None or time[highest] < onset_s else "after"
         where = "nothing slips" if onset_s is None else f"{when} the slip at {onset_s:.2f} s"
         notes.append(
@@ -324,6 +329,7 @@ def _fit_slip(
     forces: ContactForces,
     rough_s: float,
     *,
+    means: "_MeanRatio",
     contact_threshold_n: float,
     reach_s: float,
     rng: np.random.Generator,
@@ -331,17 +337,22 @@ def _fit_slip(
 ) -> _Slip:
     """Fit the break of the ratio about the rough time of a slip."""
     step = typical_step(forces.time_s)
-    near = forces.time_s >= rough_s - max(_BEFORE_S, _BEFORE_STEPS * step)
-    near &= forces.time_s <= rough_s + max(_AFTER_S, _AFTER_STEPS * step)
-    near &= forces.normal_n > contact_threshold_n
-    if not np.any(near & (forces.time_s <= rough_s)):
-        raise RecordingError(
-            f"nothing presses before the slip at {rough_s:.2f} s; set it later, or the contact earlier"
-        )
-    pull = forces.tangential_n[near & (forces.time_s <= rough_s)].mean(axis=0)
-    # along the direction of the pull: a projection is not biased by noise
-    ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
-    fit = fit_break(forces.time_s[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
+    pressed = (forces.normal_n > contact_threshold_n) & (forces.time_s <= rough_s + max(_AFTER_S, _AFTER_STEPS * step))
+    for before_s in _BEFORE_S:
+        near = pressed & (forces.time_s >= rough_s - max(before_s, _BEFORE_STEPS * step))
+        before = near & (forces.time_s <= rough_s)
+        if not before.any():
+            raise RecordingError(
+                f"nothing presses before the slip at {rough_s:.2f} s; set it later, or the contact earlier"
+            )
+        pull = forces.tangential_n[before].mean(axis=0)
+        # along the direction of the pull: a projection is not biased by noise
+        ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
+        fit = fit_break(forces.time_s[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
+        top = np.abs(means.time_s - fit.time_s) <= _STEP_S
+        apart = abs(fit.level - means.ratio[top].max(initial=0.0))
+        if reach_s == 0 or apart <= _LIKE_SHARE * fit.level + _LIKE_SIGMAS * means.sigma[top].max(initial=0.0):
+            break
     # no resampling of the slip can show the uncertainty of the tare
     (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
     tare = np.hypot(tangential, fit.level * normal)
@@ -412,30 +423,32 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
     padded = np.concatenate((np.where(means.ratio > 0, means.ratio, np.inf), np.full(count, np.inf)))
     fall = means.ratio - np.lib.stride_tricks.sliding_window_view(padded, count + 1).min(axis=1)
     least = np.maximum(_DROP_SIGMAS * np.sqrt(2) * means.sigma, _DROP_SHARE * means.ratio)
-    starts, ends = np.flatnonzero(np.diff(inside & (fall > least), prepend=False, append=False)).reshape(-1, 2).T
-    if not len(starts):
+    falling = inside & (fall > least)
+    if not falling.any():
         return []
     reach_s = max(_STEP_S, step)
 
     def mean(values: Samples, at_s: Times) -> Times:
         return mean_force(time, values, at_s, window_s=reach_s)
 
-    # of each stretch the moment at which the ratio falls most steeply: it begins before its fall by the time that a
-    # fall may take, and may end as it begins
+    # the moments at which the ratio falls most steeply, up to the time of a slip after it is seen to fall
     steep = mean(means.ratio, time - reach_s / 2) - mean(means.ratio, time + reach_s)
-    found = {start + int(np.argmax(steep[start : end + count])): start for start, end in zip(starts, ends, strict=True)}
+    beside = max(1, round(reach_s / step))
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(steep, beside, mode="edge"), 2 * beside + 1)
+    soon = np.lib.stride_tricks.sliding_window_view(np.pad(falling, (count, 0)), count + 1).any(axis=1)
+    tops = np.flatnonzero(soon & (steep > 0) & (steep == around.max(axis=1)))
     highest = float(means.surely[inside].max())
     allowed = max(_DROP_SHARE, _LAW_SIGMAS * friction_change)
     falls = []
-    for top, start in found.items():
-        level = float(means.ratio[max(0, start - count) : top + 1].max())
-        if highest > level * (1 + allowed):
+    for top in tops.tolist():
+        if highest > float(means.ratio[max(0, top - 2 * beside) : top + 1].max()) * (1 + allowed):
             continue
         places = time[top] + reach_s * np.array([-3.5, -1.0, 1.5, 4.0])
         earlier, before, after, later = mean(means.ratio, places)
         normal, pull = (mean(values, places[1:3]) for values in (means.normal_n, means.tangential_n))
         slips = (
             normal[1] > _HELD_SHARE * normal[0],
+            before - after > _PULL_SHARE * least[top],
             after > _SLIDING_SHARE * before,
             before - after > _SUDDEN * max(earlier - before, after - later),
             1 - pull[1] / pull[0] > _PULL_SHARE * (1 - after / before),
