@@ -129,9 +129,12 @@ def _check_friction(recording: Recording, *, slips: Bool[np.ndarray, " frames"])
     pressed = normal > _PRESSED_SHARE * np.nanmax(normal, initial=0.0)
     ratio = np.where(pressed, recording.tangential_force_n / np.where(pressed, normal, 1), np.nan)
     sigma = np.zeros(len(normal)) if recording.safety_margin_sigma is None else recording.safety_margin_sigma
+    basis = recording.labelling.basis if recording.labelling else None
+    # of the margin, and so of the ratio as a share of the friction: at the slip, where all of it is used, no less
+    sigma = np.maximum(np.nan_to_num(sigma), basis.friction.sigma / basis.friction.mu if basis else 0.0)
     # the last frame before a slip has the friction that holds until then
     last = np.maximum.accumulate(np.where(recording.labelled & ~slips, np.arange(len(normal)), -1))
-    most = (coefficient * (1 + _LAW_SIGMAS * np.nan_to_num(sigma)))[last] + _ROUNDING
+    most = (coefficient * (1 + _LAW_SIGMAS * sigma))[last] + _ROUNDING
     beyond = (last >= 0) & (ratio > most)
     # exact labels may have a friction that changes from frame to frame: until the slip it may have grown
     estimated = recording.safety_margin_sigma is not None
