@@ -35,7 +35,7 @@ from sliplens.simulation.intervention import (
 )
 from sliplens.simulation.loading import TRIAL_S, load_at_margins, load_grasp
 from sliplens.simulation.motion import move_markers
-from sliplens.simulation.nuisances import Grasp, Touch, draw_day, draw_grasp, draw_unit
+from sliplens.simulation.nuisances import Grasp, Nuisances, Touch, draw_day, draw_grasp, draw_unit
 
 MODELS = ("calibrated", "half-space")
 FRAMES = 50
@@ -46,7 +46,7 @@ DOME = cast("Dome", CHROMATOUCH.geometry)
 LEAN = replace(CHROMATOUCH, geometry=replace(DOME, ring_counts=DOME.ring_counts[:5], ring_scale=DOME.ring_scale[:5]))
 """Without the outermost ring, which the camera does not see."""
 SEEN = visible_markers(LEAN)
-THESIS = PRESETS["thesis"]
+THESIS = replace(PRESETS["thesis"], nuisances=Nuisances())
 FRICTIONS = np.linspace(0.12, 1.34, 100)
 """All that can occur in contact, dry or wet."""
 MIXTURES = {"mixed": 1, "mixed 4:1": 4, "mixed 16:1": 16}

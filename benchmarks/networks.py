@@ -21,6 +21,8 @@ with rests, jerks and lettings back), so that no sequence reads the clock, and `
 by one. `several_gain` is what the first is ahead of the second, resampled together; of fast pulls, which last less than
 3 s from the first tug to the slip, and of slow ones too.
 
+`--directions` pulls the same trials to the right (0 degrees), down (90), to the left and up.
+
 `--known` asks instead how far the network knows frames of its own kind of sensor and of others, on days of their own.
 
 Intervals hold 95 % over days.
@@ -46,6 +48,7 @@ from sliplens.models.checkpoint import Ratio, load
 from sliplens.simulation import PRESETS, SimulationRecipe
 from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import Loading
+from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import PULLS, TrialPlan, plan_trials
 from sliplens.simulation.trials import prepare_trial
 from sliplens.training.metrics import auroc
@@ -65,6 +68,7 @@ WITHIN = 0.1
 FAST_S = 3.0
 """A pull that lasts less is fast: about half of the varied ones."""
 KNOWN_DAYS = 10
+DIRECTIONS_DEG = (0, 90, 180, 270)
 RESAMPLES = 2000
 
 
@@ -79,8 +83,11 @@ class Seen:
     """Whether the contact was pulled: frames before are read at once, by anyone."""
 
 
-def fresh_days(series: str, days: int) -> SimulationRecipe:
-    """Days to test on, in a series of their own: series share no day, sensor or trial."""
+def fresh_days(series: str, days: int, *, pull_deg: float = 90.0) -> SimulationRecipe:
+    """Days to test on, in a series of their own: series share no day, sensor or trial.
+
+    `pull_deg`: direction of the pulls in the image, within 15 degrees; 90 is down. Nothing else depends on it.
+    """
     return replace(
         PRESETS["varied"],
         series=series,
@@ -89,13 +96,13 @@ def fresh_days(series: str, days: int) -> SimulationRecipe:
         test_days=days,
         dry_trials=TRIALS * (days + 1),
         wet_trials=TRIALS * days,
-        nuisances=PRESETS["thesis"].nuisances,
+        nuisances=Nuisances(shear_direction_deg=(pull_deg - 15, pull_deg + 15)),
     )
 
 
-def test_plans(name: str, *, trials: int | None) -> list[TrialPlan]:
+def plans_of_set(name: str, *, trials: int | None, pull_deg: float = 90.0) -> list[TrialPlan]:
     """Trials of a set, or about so many of them."""
-    plans = [plan for plan in plan_trials(fresh_days(*SETS[name])) if plan.split == "test"]
+    plans = [plan for plan in plan_trials(fresh_days(*SETS[name], pull_deg=pull_deg)) if plan.split == "test"]
     require_disjoint(plans)
     if trials:  # of both conditions, which stand in groups of a day
         plans = sorted(plans, key=lambda plan: plan.condition)[:: max(1, len(plans) // trials)]
@@ -116,6 +123,7 @@ def require_disjoint(plans: Sequence[TrialPlan]) -> None:
             for dry, days, seed in ((1020, 340, 4), (2040, 680, 7))
         ),
         *(replace(varied, seed=seed, dry_trials=5100, days=1700, test_days=10, wet_trials=10) for seed in (5, 6)),
+        replace(varied, seed=11, dry_trials=3600, days=1200, test_days=10, wet_trials=10),
         PRESETS["thesis"],
         PRESETS["small"],
     ]
@@ -230,7 +238,7 @@ def read_frames(run: Run, name: str, *, trials: int | None = None, grasp_spread:
     rng, aside = np.random.default_rng(DRAWS[name]), np.random.default_rng(22)
     told: dict[str, list[Estimate]] = {}
     truth, ratios, days, wet, pulled = [], [], [], [], []
-    for plan in test_plans(name, trials=trials):
+    for plan in plans_of_set(name, trials=trials):
         seen, friction = draw(run, plan, rng=rng), friction_of(plan)
         untold = run.estimate(seen.inputs)
         slip = draw(run, earlier_grasp(plan, friction, rng=rng), rng=rng, before_slip=BEFORE_SLIP)
@@ -348,7 +356,7 @@ def follow(run: Run, plan: TrialPlan) -> Followed:
 
 def follow_all(run: Run, name: str, *, trials: int | None = None) -> list[Followed]:
     """Read all frames of the trials of a set in order, their pulls varied."""
-    plans = test_plans(name, trials=trials)
+    plans = plans_of_set(name, trials=trials)
     return [follow(run, replace(plan, recipe=replace(plan.recipe, pulls=PULLS["varied"]))) for plan in plans]
 
 
@@ -410,6 +418,25 @@ def measure_known(run: Run, *, trials: int | None = None) -> dict[str, Any]:
     return found
 
 
+def measure_directions(run: Run, name: str, *, trials: int | None = None) -> dict[str, Any]:
+    """R2 of one frame where the same trials are pulled in each direction, and the largest difference between two."""
+    scores: dict[str, Any] = {}
+    for pull_deg in DIRECTIONS_DEG:
+        rng, plans = np.random.default_rng(DRAWS[name]), plans_of_set(name, trials=trials, pull_deg=pull_deg)
+        seen = [draw(run, plan, rng=rng) for plan in plans]
+        margin = np.concatenate([one.margin for one in seen])
+        answer = np.concatenate([run.estimate(one.inputs).margin for one in seen])
+        rows = {"dry": [plan.condition == "dry" for plan in plans], "wet": [plan.condition == "wet" for plan in plans]}
+        for condition, chosen in rows.items():
+            of = np.repeat(chosen, [len(s.margin) for s in seen])
+            days = np.repeat([plan.day for plan in plans], [len(s.margin) for s in seen])
+            scores |= r2_over_days(f"pull_{pull_deg}_r2_{condition}", margin[of], answer[of], days[of])
+    for condition in ("dry", "wet"):
+        each = [scores[f"pull_{pull_deg}_r2_{condition}"] for pull_deg in DIRECTIONS_DEG]
+        scores[f"pull_spread_{condition}"] = max(each) - min(each)
+    return scores
+
+
 def main() -> None:
     """Print what was measured, as a table or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -419,6 +446,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, help="about so many trials, for a quick look")
     parser.add_argument("--sequences", action="store_true", help="only what several frames tell")
     parser.add_argument("--known", action="store_true", help="only how far it knows its own kind of sensor, and others")
+    parser.add_argument("--directions", action="store_true", help="only R2 by the direction of the pull")
     parser.add_argument(
         "--grasp-spread", type=float, help="also: an earlier grasp whose friction differs by this share"
     )
@@ -432,6 +460,10 @@ def main() -> None:
         sys.exit(f"{Path(__file__).name}: {error}")
     found: dict[str, Any] = {"weights_sha256": run.manifest.weights_sha256}
     chosen = {"name": options.set, "trials": options.trials}
+    if options.directions:
+        found |= {"set": options.set} | measure_directions(run, **chosen)
+        print(json.dumps(found, indent=None if options.json else 2))
+        return
     found |= measure_known(run, trials=options.trials) if options.known else {"set": options.set}
     if not (options.known or options.sequences):
         read = read_frames(run, **chosen, grasp_spread=options.grasp_spread)

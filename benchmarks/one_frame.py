@@ -23,11 +23,12 @@ import torch
 from jaxtyping import Float
 
 from limit import SEEN, Samples, read, train
-from networks import SETS, draw_in_contact, film_frames, fresh_days, lead, r2_over_days, require_disjoint, test_plans
+from networks import SETS, draw_in_contact, film_frames, fresh_days, lead, plans_of_set, r2_over_days, require_disjoint
 from sliplens.errors import SliplensError
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.simulation import PRESETS
+from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import TrialPlan, plan_trials
 from sliplens.simulation.trials import prepare_trial
 
@@ -62,7 +63,13 @@ class Seen:
 def training_plans(days: int) -> dict[str, tuple[TrialPlan, ...]]:
     """Trials to learn from, in series of their own."""
     as_network = replace(
-        PRESETS["varied"], series="one frame", dry_trials=3 * days, days=days, test_days=1, wet_trials=1
+        PRESETS["varied"],
+        series="one frame",
+        dry_trials=3 * days,
+        days=days,
+        test_days=1,
+        wet_trials=1,
+        nuisances=Nuisances(dry_friction=(0.15, 1.2)),
     )
     plans = {"perceptron": plan_trials(as_network), "as_tested": plan_trials(fresh_days("one frame, mixed", days // 2))}
     for some in plans.values():
@@ -98,7 +105,7 @@ def find_basis(seen: Seen, *, noise_px: float) -> Float[np.ndarray, "coordinates
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:
     """R2 of the network and of each perceptron, and what the network is ahead of it, dry and wet."""
-    test = see(test_plans(options.set, trials=options.trials), seed=1, network=load(options.run))
+    test = see(plans_of_set(options.set, trials=options.trials), seed=1, network=load(options.run))
     assert test.answer is not None
     found: dict[str, Any] = {"set": options.set, "frames": len(test.margin)}
     answers = {"network": test.answer}

@@ -29,6 +29,7 @@ from sliplens.errors import SliplensError
 from sliplens.models import Run
 from sliplens.models.checkpoint import load
 from sliplens.simulation import PRESETS, SimulationRecipe, simulate_dataset
+from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import PULLS
 from sliplens.training import evaluate_frames
 from sliplens.training.data import load_frames
@@ -124,10 +125,9 @@ def main() -> None:
         dry_trials=3 * (days + 1),
         wet_trials=0,
         pulls=PULLS[options.pulls],
+        nuisances=Nuisances(dry_friction=(0.15, 1.2)),
     )
-    tried_on = replace(
-        learned_from, seed=102, test_days=days, wet_trials=3 * days, nuisances=PRESETS["thesis"].nuisances
-    )
+    tried_on = replace(learned_from, seed=102, test_days=days, wet_trials=3 * days, nuisances=Nuisances())
     with tempfile.TemporaryDirectory() as scratch:
         learn = answered(trained, learned_from, Path(scratch) / "learn", split="train")
         test = answered(trained, tried_on, Path(scratch) / "test", split="test")

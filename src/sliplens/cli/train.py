@@ -52,7 +52,8 @@ class Train(Command):
     untouched_share: float | None = None
     """Images of the untouched sensor, as full stick, for each labelled frame: explanations are measured against it."""
     augmentation: str | None = None
-    """Random changes of training images. thesis: slight rotations, noise and blur. default: shifts and colour too."""
+    """Random changes of training images. noise: noise alone. thesis: slight rotations, noise and blur. default: shifts
+    and colour too. all-directions: turns by any angle, mirrors and magnifies, for pulls in any direction."""
     seed: int = 0
     """Seed of weights, order and augmentation."""
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"

@@ -163,9 +163,8 @@ def thesis_plan(trials: Sequence[TrialFacts]) -> SplitPlan:
     """Lay out the splits of the thesis for the days there are, as the simulator does.
 
     The first day trains and the last day tests. Of the dry trials of the days between a quarter validates, evenly
-    spaced in the list of the first trial of each of these days, then the second of each, and so on; all others train.
-    Without such trials the first day gives up a quarter of its dry ones. Within a day their names tell the order of the
-    trials, 2 before 10.
+    spaced within each day; all others train. Without such trials the first day gives up a quarter of its dry ones.
+    Within a day the trials are in the order of their names, 2 before 10.
 
     References
     ----------
@@ -189,10 +188,10 @@ def thesis_plan(trials: Sequence[TrialFacts]) -> SplitPlan:
 
 
 def _dry_of(trials: Sequence[TrialFacts], day: int) -> list[tuple[int, int, str]]:
-    """Dry trials of a day: place within the day, day, name."""
+    """Dry trials of a day: day, place within the day, name."""
     names = [one.trial for one in trials if (one.day, one.condition) == (day, "dry")]
     # a01 and a1 are alike to the natural order
-    return [(place, day, name) for place, name in enumerate(sorted(names, key=lambda name: (natural_key(name), name)))]
+    return [(day, place, name) for place, name in enumerate(sorted(names, key=lambda name: (natural_key(name), name)))]
 
 
 def _dealt_plan(by: str) -> SplitPlan:

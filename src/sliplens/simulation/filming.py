@@ -14,7 +14,7 @@ from sliplens.mechanics import normal_slope
 from sliplens.simulation.geometry import Point, Rays, pixel_grid
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.motion import Motion, move_markers
-from sliplens.simulation.nuisances import Day, Grasp, Touch, Unit
+from sliplens.simulation.nuisances import Day, Grasp, Nuisances, Touch, Unit
 from sliplens.simulation.sensor import DrawnMarkers, Noise, Sensor, draw_look, mix_noise, pick_noise
 
 Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
@@ -248,6 +248,21 @@ def _turn(day: Day) -> Float[np.ndarray, "2 2"]:
 def _see(points_px: Float[np.ndarray, "*batch 2"], *, centre_px: Point, day: Day) -> Float[np.ndarray, "*batch 2"]:
     """Pixels of the day's camera, which sits turned about the image of the skin's middle, and shifted."""
     return (points_px - centre_px) @ _turn(day) + centre_px + np.asarray(day.camera_shift_px)
+
+
+def move_camera(film: Film, nuisances: Nuisances, *, rng: np.random.Generator) -> Film:
+    """Turn and magnify the markers of each frame about the middle of the image, against the reference frame.
+
+    The ranges are `frame_turn_deg` and `frame_zoom` of the nuisances. Skin, light and contact stay: they vary slowly.
+    """
+    if nuisances.frame_turn_deg == (0.0, 0.0) and nuisances.frame_zoom == (1.0, 1.0):
+        return film
+    frames, middle = len(film), np.asarray(film.sensor.geometry.centre_px)
+    turn = np.radians(rng.uniform(*nuisances.frame_turn_deg, size=frames))[:, None]
+    zoom = rng.uniform(*nuisances.frame_zoom, size=frames)[:, None]
+    x, y = np.moveaxis(film.marker_px - middle, -1, 0)
+    moved = zoom[..., None] * np.stack([x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn)], -1)
+    return replace(film, marker_px=moved + middle)
 
 
 def brightness(sensor: Sensor, *, day: Day) -> Planes:

@@ -1,7 +1,7 @@
 """What differs between days, sensors, trials and frames, and how it is drawn."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -51,6 +51,17 @@ class Nuisances:
     """Strength of the lamps' reflections over the sensor's."""
     camera_shift_px: Range = (-3.0, 3.0)
     camera_rotation_deg: Range = (-3.0, 3.0)
+    sensor_gain: Range = (1.0, 1.0)
+    """Gain of a sensor's camera; `gain` is the change of a day, and so for the next five."""
+    sensor_white_balance: Range = (1.0, 1.0)
+    sensor_gradient: Range = (0.0, 0.0)
+    sensor_glare: Range = (1.0, 1.0)
+    sensor_shift_px: Range = (0.0, 0.0)
+    sensor_rotation_deg: Range = (0.0, 0.0)
+    frame_turn_deg: Range = (0.0, 0.0)
+    """Turn of the camera against the reference frame, drawn for each frame."""
+    frame_zoom: Range = (1.0, 1.0)
+    """Magnification of each frame over that of the reference frame."""
     marker_jitter_px: float = 0.4
     """Standard deviation of the markers' centres, by sensor."""
     marker_depth: Range = (0.0, 0.1)
@@ -80,13 +91,13 @@ class Nuisances:
 
 _POSITIVE = {"dry_friction", "dry_friction_factor", "wet_friction", "kinetic_ratio", "normal_force_n", "modulus_factor"}
 _POSITIVE |= {"shear_exponent", "creep_time_s", "stick_slip_hz", "white_balance", "gain", "marker_radius"}
-_POSITIVE |= {"marker_contrast"}
+_POSITIVE |= {"marker_contrast", "sensor_gain", "sensor_white_balance", "frame_zoom"}
 _NOT_NEGATIVE = {"contact_offset", "marker_depth", "stick_slip_share", "creep", "illumination_gradient", "glare"}
-_NOT_NEGATIVE |= {"skin_grain", "marker_jitter_px", "blur_px"}
+_NOT_NEGATIVE |= {"skin_grain", "marker_jitter_px", "blur_px", "sensor_gradient", "sensor_glare"}
 _UPPER: dict[str, float] = dict.fromkeys(
     ("contact_offset", "marker_depth", "normal_force_drift", "wet_friction_drift"), 0.5
 )
-_UPPER |= {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "illumination_gradient": 1.0}
+_UPPER |= {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "illumination_gradient": 1.0, "sensor_gradient": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,11 +139,9 @@ class Pulls:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Day:
-    """Facts of a day: the friction of the dry object, the gel's stiffness, light and camera."""
+class Camera:
+    """Seat and light of a camera: its shift and turn in the image, gain, white balance, light gradient and glare."""
 
-    friction: float = 0.775
-    modulus_factor: float = 1.0
     gain: float = 1.0
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
     gradient: float = 0.0
@@ -140,6 +149,14 @@ class Day:
     glare: float = 1.0
     camera_shift_px: tuple[float, float] = (0.0, 0.0)
     camera_rotation_rad: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Day(Camera):
+    """Facts of a day: the friction of the dry object, the gel's stiffness, light and camera."""
+
+    friction: float = 0.775
+    modulus_factor: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,6 +205,43 @@ class Touch:
     modulus_factor: float = 1.0
     marker_depth: float = 0.03
     """Depth of the markers under the skin, in radii of the contact's sphere."""
+
+
+def draw_camera(nuisances: Nuisances, *, rng: np.random.Generator) -> Camera:
+    """Draw the camera and the lamps that are built into a sensor, from the ranges named `sensor_...`."""
+    return Camera(
+        gain=rng.uniform(*nuisances.sensor_gain),
+        white_balance=_three(rng, nuisances.sensor_white_balance),
+        gradient=rng.uniform(*nuisances.sensor_gradient),
+        gradient_direction_rad=rng.uniform(-np.pi, np.pi),
+        glare=rng.uniform(*nuisances.sensor_glare),
+        camera_shift_px=(rng.uniform(*nuisances.sensor_shift_px), rng.uniform(*nuisances.sensor_shift_px)),
+        camera_rotation_rad=float(np.radians(rng.uniform(*nuisances.sensor_rotation_deg))),
+    )
+
+
+def mount_camera(day: Day, camera: Camera) -> Day:
+    """Return a day as the camera of a sensor sees it: shifts, turns and gradients add, gains and glare multiply.
+
+    Examples
+    --------
+    >>> mount_camera(Day(camera_shift_px=(0.1, 0.0)), Camera(camera_shift_px=(2.0, 1.0))).camera_shift_px
+    (2.1, 1.0)
+    """
+    slopes = [one.gradient * np.exp(1j * one.gradient_direction_rad) for one in (day, camera)]
+    slope = complex(sum(slopes))
+    red, green, blue = (ours * theirs for ours, theirs in zip(day.white_balance, camera.white_balance, strict=True))
+    (x, y), (seat_x, seat_y) = day.camera_shift_px, camera.camera_shift_px
+    return replace(
+        day,
+        gain=day.gain * camera.gain,
+        white_balance=(red, green, blue),
+        gradient=abs(slope),
+        gradient_direction_rad=float(np.angle(slope)),
+        glare=day.glare * camera.glare,
+        camera_shift_px=(x + seat_x, y + seat_y),
+        camera_rotation_rad=day.camera_rotation_rad + camera.camera_rotation_rad,
+    )
 
 
 def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator) -> Day:

@@ -13,11 +13,11 @@ from sliplens.extras import Table
 from sliplens.files import hash_json, to_builtins
 from sliplens.recordings.splits import hold_out
 from sliplens.simulation.loading import MINIMUM_FRAMES
-from sliplens.simulation.nuisances import Day, Nuisances, Pulls, draw_day
+from sliplens.simulation.nuisances import Day, Nuisances, Pulls, draw_camera, draw_day, mount_camera
 from sliplens.simulation.sensor import CHROMATOUCH, SENSORS, Sensor
 
 # branches of the seed: what is drawn for one never moves what is drawn for another
-_DAYS, _UNITS, _TRIALS = range(3)
+_DAYS, _UNITS, _TRIALS, _CAMERAS = range(4)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +34,8 @@ class SimulationRecipe:
     """All that shapes a simulated data set; the same recipe gives the same bytes on the same machine.
 
     The days and splits follow the thesis: the first day and three quarters of the dry trials of the days between train,
-    the other quarter validates, the test day tests. Wet trials are all of the test day, or dealt to the test days. A
-    number out of range, or too few trials to fill every split, is an `InputError`.
+    the other quarter validates, evenly spaced over these days, and the test day tests. Wet trials are all of the test
+    day, or dealt to the test days. A number out of range, or too few trials to fill every split, is an `InputError`.
     """
 
     dry_trials: int | tuple[int, ...] = 40
@@ -220,15 +220,19 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     """
     tested, recipe_hash = recipe.tested, recipe.hash
     days = _draw_days(recipe)
+    cameras = [
+        draw_camera(recipe.nuisances, rng=np.random.default_rng(_seed(recipe, _CAMERAS, unit)))
+        for unit in range(recipe.sensors)
+    ]
     if isinstance(recipe.dry_trials, tuple):
         dry = dict(enumerate(recipe.dry_trials, start=1))
     else:
         dry = _spread(recipe.dry_trials, days=recipe.days, tested=tested)
     wet = {day: len(range(index, recipe.wet_trials, len(tested))) for index, day in enumerate(tested)}
-    between = [(number, day) for day in dry if day not in (1, *tested) for number in range(1, dry[day] + 1)]
+    between = [(day, number) for day in sorted(dry) if day not in (1, *tested) for number in range(1, dry[day] + 1)]
     # without days between, the first day has to give up some of its own
-    candidates = sorted(between or [(number, 1) for number in range(1, dry[1] + 1)])
-    validation = {(day, number) for number, day in hold_out(candidates, recipe.validation_share)}
+    candidates = between or [(1, number) for number in range(1, dry[1] + 1)]
+    validation = set(hold_out(candidates, recipe.validation_share))
 
     plans = []
     for day in range(1, recipe.days + 1):
@@ -249,7 +253,7 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
                         unit=unit,
                         unit_seed=_seed(recipe, _UNITS, unit),
                         day_seed=_seed(recipe, _DAYS, day),
-                        day_draw=days[day],
+                        day_draw=mount_camera(days[day], cameras[unit]),
                         recipe=recipe,
                         recipe_hash=recipe_hash,
                     )
@@ -318,11 +322,24 @@ _ROWS = {
         dry_trials=(100, 40, 40, 11), wet_trials=10, frames_per_trial=800,
         frame_totals=FrameTotals(train=128_043, validation=15_839, test=16_875),
         days=4, sensors=1, series="thesis",
+        # one sensor for all days: camera and lamps are built into it
+        nuisances=Nuisances(
+            dry_friction=(0.6, 1.1), wet_friction=(0.3, 0.7),
+            sensor_gain=(0.9, 1.1), sensor_white_balance=(0.95, 1.05), sensor_gradient=(0.0, 0.25),
+            sensor_glare=(0.5, 1.1), sensor_shift_px=(-3.0, 3.0), sensor_rotation_deg=(-3.0, 3.0),
+            gain=(0.98, 1.02), white_balance=(0.995, 1.005), illumination_gradient=(0.0, 0.02), glare=(0.97, 1.03),
+            camera_shift_px=(-0.15, 0.15), camera_rotation_deg=(-0.15, 0.15),
+        ),
     ),
     "varied": SimulationRecipe(
         # many short trials, each day with three: of long ones a network learns the trials by heart
         dry_trials=2460, wet_trials=60, frames_per_trial=20, days=820, test_days=20, validation_share=0.1,
-        sensors=200, nuisances=Nuisances(dry_friction=(0.15, 1.2)),
+        sensors=200,
+        # how a sensor sits in a gripper differs, so that pulls come from every side; a camera may move a little
+        nuisances=Nuisances(
+            dry_friction=(0.15, 1.2), shear_direction_deg=(-180.0, 180.0),
+            frame_turn_deg=(-0.3, 0.3), frame_zoom=(0.995, 1.005),
+        ),
     ),
 }  # fmt: skip
 PRESETS = Table("preset", "sliplens.presets", _ROWS)

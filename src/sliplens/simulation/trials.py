@@ -20,7 +20,7 @@ from sliplens.recordings import Dataset, GroundTruth, Recording
 from sliplens.recordings.dataset import load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording
 from sliplens.recordings.trial import SIGNALS
-from sliplens.simulation.filming import Film, batches, prepare_film
+from sliplens.simulation.filming import Film, batches, move_camera, prepare_film
 from sliplens.simulation.loading import Loading, load_grasp
 from sliplens.simulation.nuisances import draw_grasp, draw_unit
 from sliplens.simulation.plan import SimulationRecipe, TrialPlan, make_recipe, plan_trials
@@ -37,9 +37,10 @@ def prepare_trial(plan: TrialPlan, *, change: Callable[[Loading], Loading] | Non
         loading = change(loading)
     unit = draw_unit(recipe.nuisances, markers=sensor.geometry.markers, rng=unit_rng)
     displacement = recipe.resolved_displacement
-    return loading, prepare_film(
+    film = prepare_film(
         sensor, loading=loading, grasp=grasp, day=day, unit=unit, rng=rng, noise=sensor.noise, displacement=displacement
     )
+    return loading, move_camera(film, recipe.nuisances, rng=rng)
 
 
 def simulate_trial(

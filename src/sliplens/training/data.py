@@ -28,9 +28,10 @@ from sliplens.recordings import Dataset, Labels, TrialInfo
 
 @dataclass(frozen=True, kw_only=True)
 class Augmentation:
-    """Slight rotations and shifts, colour, Gaussian noise and Gaussian blur, drawn for each image.
+    """Rotations, shifts, magnifications and mirrorings, colour, Gaussian noise and Gaussian blur, drawn for each image.
 
-    Polak, section 4 ("random image augmentations": rotation, noise and blur; shift and colour are ours).
+    Frame and reference are moved together. Polak, section 4 ("random image augmentations"), has slight rotations, noise
+    and blur; the rest is ours.
     """
 
     rotation_deg: float = 5.0
@@ -38,6 +39,12 @@ class Augmentation:
     shift: float = 0.015
     """Shifts along x and y are uniform within plus and minus this share of the image: a camera never sits twice alike,
     and a network must not know a day by its place."""
+    zoom: float = 0.0
+    """Magnifications are uniform within 1 plus and minus this."""
+    mirror: bool = False
+    """Mirror half of the images."""
+    padding: str = "border"
+    """What `torch.nn.functional.grid_sample` puts beyond the border of an image."""
     colour: float = 0.05
     """Each channel is scaled by 1 plus or minus up to this: white balance."""
     noise_sd: float = 0.03
@@ -61,25 +68,37 @@ class Augmentation:
         angle = (2 * uniform(batch) - 1) * math.radians(self.rotation_deg)
         # the grid spans 2, from -1 to 1
         along, down = 2 * self.shift * (2 * uniform(2, batch) - 1)
-        turn = torch.stack([angle.cos(), -angle.sin(), along, angle.sin(), angle.cos(), down], dim=1).view(-1, 2, 3)
+        scale = 1 + self.zoom * (2 * uniform(batch) - 1) if self.zoom else torch.ones(batch, device=device)
+        side = scale * (1 - 2 * (uniform(batch) < 0.5).float()) if self.mirror else scale
+        cos, sin = angle.cos(), angle.sin()
+        turn = torch.stack([side * cos, -scale * sin, along, side * sin, scale * cos, down], dim=1).view(-1, 2, 3)
         grid = functional.affine_grid(turn, list(images.shape), align_corners=False)
-        images = functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
+        images = functional.grid_sample(images, grid, padding_mode=self.padding, align_corners=False)
         # a blur of images that lie channels last takes a quarter of the time, and the network wants them so
         images = images.contiguous(memory_format=torch.channels_last)
         if float(uniform(1)) < self.blur_probability:
             images = transforms.gaussian_blur(images, [3, 3], [0.1 + (self.blur_sd_px - 0.1) * float(uniform(1))])
         # one camera saw the reference and the frame
-        scale = 1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1).repeat(1, colours // 3, 1, 1)
+        colour = 1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1).repeat(1, colours // 3, 1, 1)
         # in place: images of a batch are large, and the sampled ones are ours
-        images.sub_(self.neutral).mul_(scale).add_(self.neutral)
+        images.sub_(self.neutral).mul_(colour).add_(self.neutral)
         height, width = images.shape[-2:]
         noise = torch.randn((batch, height, width, colours), generator=generator, device=device).permute(0, 3, 1, 2)
         return images.add_(noise.mul_(uniform(batch, 1, 1, 1) * self.noise_sd)).clamp_(0, 1)
 
 
-_AUGMENTATIONS = {"none": None, "thesis": Augmentation(shift=0.0, colour=0.0), "default": Augmentation()}
+_AUGMENTATIONS = {
+    "none": None,
+    "thesis": Augmentation(shift=0.0, colour=0.0),
+    "noise": Augmentation(rotation_deg=0.0, shift=0.0, colour=0.0, blur_probability=0.0),
+    "default": Augmentation(),
+    # the corners of a turned square lie outside of it; mirrored skin is more like skin than its last pixel drawn out
+    "all-directions": Augmentation(rotation_deg=180.0, zoom=0.03, mirror=True, padding="reflection"),
+}
 AUGMENTATIONS = Table("augmentation", "sliplens.augmentations", _AUGMENTATIONS)
-"""What a recipe may ask for; `thesis` has rotation, noise and blur alone, in amounts of ours, for it gives none."""
+"""Augmentations by name. `thesis` has rotation, noise and blur, in amounts of ours; Polak gives none. `noise` has noise
+alone. `all-directions` turns images by any angle, mirrors and magnifies them, for networks that may be pulled in any
+direction."""
 
 
 def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:

@@ -386,8 +386,8 @@ def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n:
         )
     elif friction.mu > _USUAL_FRICTION:
         doubts.append(
-            f"a friction of {friction.mu:.2f} is more than fingertips usually have, up to {_USUAL_FRICTION:g}: the force "
-            "sensor may sit aslant; name the axis that presses with --normal-axis"
+            f"a friction of {friction.mu:.2f} is more than fingertips usually have, up to {_USUAL_FRICTION:g}: the "
+            "force sensor may sit aslant; name the axis that presses with --normal-axis"
         )
     pulls, presses = (np.mean(side > threshold_n) for side in (-forces.normal_n, forces.normal_n))
     if pulls > presses:
