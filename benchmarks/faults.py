@@ -16,6 +16,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -223,12 +224,13 @@ def measure_trial(
     for event in kinds or EVENTS:
         for strength in range(3) if event in EVENTS else ():
             case = EVENTS[event](seen, strength, rng)
-            outcomes.append(_measure_event(case, fine, rate, rng, noise_n, trial=name, fault=event, strength=strength))
+            facts = {"trial": name, "fault": event, "strength": strength}
+            outcomes.append(_measure_event(case, fine, rate=rate, rng=rng, noise_n=noise_n, facts=facts))
     return outcomes
 
 
 def _measure_event(
-    case: Case, fine: FoundLabels, rate: int, rng: np.random.Generator, noise_n: float, **facts: str | int
+    case: Case, fine: FoundLabels, *, rate: int, rng: np.random.Generator, noise_n: float, facts: dict[str, Any]
 ) -> Outcome:
     """Label a trial to which something happened."""
     seen = case.seen

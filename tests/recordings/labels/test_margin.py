@@ -104,11 +104,11 @@ def test_what_is_given_changes_no_label_that_the_forces_show_too(
     assert labels.basis.flags == ()
 
 
-@pytest.mark.parametrize("given", [{"mu": 0.3}, {"slip_s": 5.2, "mu": 1.2}, {"mu": 1.0}])
+@pytest.mark.parametrize(("mu", "slip_s"), [(0.3, None), (1.2, 5.2), (1.0, None)])
 def test_no_valid_label_follows_a_friction_that_contradicts_the_forces(
-    trial: Trial, rng: np.random.Generator, given: dict[str, float]
+    trial: Trial, rng: np.random.Generator, mu: float, slip_s: float | None
 ):
-    settings, forces = LabelSettings(**given), trial.forces(noise_n=0.02, rng=rng)
+    settings, forces = LabelSettings(mu=mu, slip_s=slip_s), trial.forces(noise_n=0.02, rng=rng)
     labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=rng)
     truth = 1 - ratio(trial.frame_time_s) / STATIC
     truth[trial.frame_time_s >= SLIP_S] = 0

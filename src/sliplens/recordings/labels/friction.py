@@ -336,27 +336,18 @@ def _fit_slip(
     draws: int,
 ) -> _Slip:
     """Fit the break of the ratio about the rough time of a slip."""
-    step = typical_step(forces.time_s)
-    pressed = (forces.normal_n > contact_threshold_n) & (forces.time_s <= rough_s + max(_AFTER_S, _AFTER_STEPS * step))
-    for before_s in _BEFORE_S:
-        near = pressed & (forces.time_s >= rough_s - max(before_s, _BEFORE_STEPS * step))
-        before = near & (forces.time_s <= rough_s)
-        if not before.any():
-            raise RecordingError(
-                f"nothing presses before the slip at {rough_s:.2f} s; set it later, or the contact earlier"
-            )
-        pull = forces.tangential_n[before].mean(axis=0)
-        # along the direction of the pull: a projection is not biased by noise
-        ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
-        fit = fit_break(forces.time_s[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
+    options = {"contact_threshold_n": contact_threshold_n, "reach_s": reach_s, "rng": rng, "draws": draws}
+    fit, normal_n = _fit_near(forces, rough_s, before_s=_BEFORE_S[0], **options)
+    for before_s in _BEFORE_S[1:]:
         top = np.abs(means.time_s - fit.time_s) <= _STEP_S
         apart = abs(fit.level - means.ratio[top].max(initial=0.0))
         if reach_s == 0 or apart <= _LIKE_SHARE * fit.level + _LIKE_SIGMAS * means.sigma[top].max(initial=0.0):
             break
+        fit, normal_n = _fit_near(forces, rough_s, before_s=before_s, **options)
     # no resampling of the slip can show the uncertainty of the tare
     (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
     tare = np.hypot(tangential, fit.level * normal)
-    low, high = np.quantile(fit.levels + rng.normal(0, float(tare / forces.normal_n[near].mean()), draws), _BAND)
+    low, high = np.quantile(fit.levels + rng.normal(0, float(tare) / normal_n, draws), _BAND)
     early, late = np.quantile(fit.times_s, _BAND)
     return _Slip(
         time_s=fit.time_s,
@@ -365,6 +356,33 @@ def _fit_slip(
         high=float(max(high, fit.level)),
         sigma_s=float(late - early) / 2,
     )
+
+
+def _fit_near(
+    forces: ContactForces,
+    rough_s: float,
+    *,
+    before_s: float,
+    contact_threshold_n: float,
+    reach_s: float,
+    rng: np.random.Generator,
+    draws: int,
+) -> tuple[Break, float]:
+    """Fit the break to the ratio from some time before a slip on, and take the mean normal force there."""
+    step = typical_step(forces.time_s)
+    near = forces.time_s >= rough_s - max(before_s, _BEFORE_STEPS * step)
+    near &= forces.time_s <= rough_s + max(_AFTER_S, _AFTER_STEPS * step)
+    near &= forces.normal_n > contact_threshold_n
+    before = near & (forces.time_s <= rough_s)
+    if not before.any():
+        raise RecordingError(
+            f"nothing presses before the slip at {rough_s:.2f} s; set it later, or the contact earlier"
+        )
+    pull = forces.tangential_n[before].mean(axis=0)
+    # along the direction of the pull: a projection is not biased by noise
+    ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
+    fit = fit_break(forces.time_s[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
+    return fit, float(forces.normal_n[near].mean())
 
 
 @dataclass(frozen=True, kw_only=True)
