@@ -208,16 +208,6 @@ def test_a_friction_that_no_fingertip_has_is_refused_or_flagged(trial: Trial):
     assert any(flag.startswith("a friction of 9 was given") for flag in friction(9.0).basis.flags)
 
 
-@pytest.mark.parametrize(("times", "doubted"), [(2, False), (3, True)])
-def test_a_friction_that_fingertips_seldom_have_is_flagged(trial: Trial, times: float, doubted: bool):
-    strong = replace(trial, contact_n=trial.contact_n * np.array([1, times, times]))
-    forces = strong.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
-    settings = LabelSettings(normal_axis="x", normal_sign=1)
-    labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=np.random.default_rng(2))
-    # 0.6 times as much
-    assert any("more than fingertips usually have" in flag for flag in labels.basis.flags) == doubted
-
-
 def test_a_normal_force_that_mostly_pulls_is_flagged(trial: Trial):
     forces = trial.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE, sign=-1)
     forces.force_n[trial.time_s > 5.4, 0] += 3.0

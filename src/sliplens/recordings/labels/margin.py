@@ -367,7 +367,6 @@ def _label_screened(
 
 _MOST_LOST = 0.5  # share of the samples between touch and slip that may be faulty
 _PLAUSIBLE_FRICTION = (0.05, 4.0)  # of soft skins on anything dry, wet or greased
-_USUAL_FRICTION = 1.5  # more comes from clean rubber on glass, or from a force sensor that sits aslant
 
 
 def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n: float) -> tuple[str, ...]:
@@ -383,11 +382,6 @@ def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n:
             )
         doubts.append(
             f"a friction of {friction.mu:.3g} was given, and that of a fingertip lies between {low:g} and {high:g}"
-        )
-    elif friction.mu > _USUAL_FRICTION:
-        doubts.append(
-            f"a friction of {friction.mu:.2f} is more than fingertips usually have, up to {_USUAL_FRICTION:g}: the "
-            "force sensor may sit aslant; name the axis that presses with --normal-axis"
         )
     pulls, presses = (np.mean(side > threshold_n) for side in (-forces.normal_n, forces.normal_n))
     if pulls > presses:
