@@ -381,6 +381,8 @@ def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, *, 
             if lag is not None and not lag.doubt:
                 seen = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
                 ax.axvspan(*seen, color=SKY, alpha=0.6, linewidth=0, label=_ONSET[1], zorder=0)
+            for later_s in basis.friction.later_onsets_s:
+                ax.axvline(later_s + shift, color=BLACK, linestyle="-.", linewidth=1.3, label="_slip")
         place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0}
         handles, names = ax.get_legend_handles_labels()
         if ax is not charts[1]:  # what stands in all of them is told once
