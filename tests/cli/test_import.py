@@ -177,8 +177,12 @@ def test_friction_by_hand_is_taken(tmp_path: Path, table: Path, video: Path):
     data = load_dataset(tmp_path / "data")
     basis = there(there(read_header(tmp_path / "data" / "trials" / "cup.parquet").labelling).basis)
     assert (basis.friction.mu, basis.friction.found) == (1.4, "declared")
-    # with more friction than there was the trial never comes near slip
-    assert np.nanmin(data.load(data.trials[0]).safety_margin) > 0.2
+    # with more friction than there was the trial never comes near slip, until it slips all the same
+    labels = data.load(data.trials[0])
+    slip = int(np.argmax(labels.safety_margin == 0))
+    assert np.nanmin(labels.safety_margin[:slip]) > 0.2
+    assert labels.time_s[slip] == pytest.approx(there(basis.friction.onset_s), abs=0.05)
+    assert basis.friction.notes
 
 
 def test_an_interrupted_import_goes_on_where_it_stopped(

@@ -399,6 +399,8 @@ class _MeanRatio:
     """Least ratio that noise leaves possible."""
     tare_sigma: Samples
     """Standard deviation of the ratio for the uncertainty of the tare."""
+    pressed: Bool[np.ndarray, " samples"]
+    """Whether the ratio means anything."""
     pulled: Bool[np.ndarray, " samples"]
     """Whether it is pressed, and the tangential force is no noise."""
 
@@ -426,6 +428,7 @@ def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: 
         sigma=sigma,
         surely=ratio - _DROP_SIGMAS * sigma,
         tare_sigma=tare,
+        pressed=pressed,
         pulled=pressed & (tangential > 3 * noise.tangential),
     )
 
@@ -433,9 +436,12 @@ def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: 
 def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_change: float) -> list[float]:
     """Rough times at which the ratio of a contact suddenly falls from a height that it exceeds nowhere."""
     time, step = means.time_s, max(typical_step(means.time_s), 1e-9)
-    inside = means.pulled & (time >= start_s) & (time <= end_s)
+    span = (time >= start_s) & (time <= end_s)
+    inside, pressed = span & means.pulled, span & means.pressed
     if not inside.any():
         return []
+    # where nothing presses, as before and after it: the end of a contact is no fall
+    ratio = np.interp(time, time[pressed], means.ratio[pressed])
     # the least that it has fallen to within the time of a slip
     count = min(max(1, round(_DROP_S / step)), len(time))
     padded = np.concatenate((np.where(means.ratio > 0, means.ratio, np.inf), np.full(count, np.inf)))
@@ -450,7 +456,7 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
         return mean_force(time, values, at_s, window_s=reach_s)
 
     # the moments at which the ratio falls most steeply, up to the time of a slip after it is seen to fall
-    steep = mean(means.ratio, time - reach_s / 2) - mean(means.ratio, time + reach_s)
+    steep = mean(ratio, time - reach_s / 2) - mean(ratio, time + reach_s)
     beside = max(1, round(reach_s / step))
     around = np.lib.stride_tricks.sliding_window_view(np.pad(steep, beside, mode="edge"), 2 * beside + 1)
     soon = np.lib.stride_tricks.sliding_window_view(np.pad(falling, (count, 0)), count + 1).any(axis=1)
@@ -462,7 +468,7 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
         if highest > float(means.ratio[max(0, top - 2 * beside) : top + 1].max()) * (1 + allowed):
             continue
         places = time[top] + reach_s * np.array([-3.5, -1.0, 1.5, 4.0])
-        earlier, before, after, later = mean(means.ratio, places)
+        earlier, before, after, later = mean(ratio, places)
         normal, pull = (mean(values, places[1:3]) for values in (means.normal_n, means.tangential_n))
         slips = (
             normal[1] > _HELD_SHARE * normal[0],
