@@ -1,4 +1,8 @@
-"""How labels stand up to faults of the force sensor: 14 kinds at three strengths, in simulated trials that are known.
+"""How labels stand up to faults of the force sensor and to what is easily taken for one, in simulated trials.
+
+14 kinds of faults at three strengths, and 10 of events and settings (`contact_events.py`): friction or slip given, a
+fast release, slips that are sudden or that the image hardly shows, a pull that is let go, tilted axes, an image or
+forces at rest.
 
 Each trial is filmed once, seen through noise, offset, lag, turned axes and a wrong sign as in `labels.py`, and labelled
 without a fault and with each. Of the valid labels is told how many are off by more than 3 sigma, or have no truth; of
@@ -10,12 +14,14 @@ over trials.
 import argparse
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from contact_events import EVENTS, Case, near_events, settings_of, tilt
 from labels import FORCE_HZ, LONGEST_LAG_S, Seen, film_trial, spoil
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
@@ -170,8 +176,10 @@ class Outcome:
     refusal: str = ""
 
 
-def measure_trial(seen: Seen, *, rate: int, rng: np.random.Generator, noise_n: float) -> list[Outcome]:
-    """Label a trial without a fault and with each, the same but for it."""
+def measure_trial(
+    seen: Seen, *, rate: int, rng: np.random.Generator, noise_n: float, kinds: Sequence[str] = ()
+) -> list[Outcome]:
+    """Label a trial without a fault and with each, the same but for it; with some kinds alone if they are named."""
     forces, _, _ = spoil(seen, noise_n=noise_n, rng=rng)
     forces = replace(forces, time_s=forces.time_s[::rate], force_n=forces.force_n[::rate])
     time_s = seen.loading.time_s[seen.frames] + rng.uniform(-LONGEST_LAG_S, LONGEST_LAG_S)
@@ -187,8 +195,12 @@ def measure_trial(seen: Seen, *, rate: int, rng: np.random.Generator, noise_n: f
     except RecordingError as refusal:
         print(f"{name} without a fault: {refusal}")
         return []
-    outcomes = [_compare(fine, fine, truth, np.zeros(len(truth), dtype=bool), trial=name, fault="none", strength=0)]
+    outcomes = [
+        _compare(fine, fine.valid, truth, np.zeros(len(truth), dtype=bool), trial=name, fault="none", strength=0)
+    ]
     for fault, spoiled in FAULTS.items():
+        if kinds and fault not in kinds:
+            continue
         for strength in range(3):
             force = forces.force_n.copy()
             wrong = spoiled(force, forces.time_s, strength, rng)
@@ -208,13 +220,40 @@ def measure_trial(seen: Seen, *, rate: int, rng: np.random.Generator, noise_n: f
                 nothing = {"valid": 0, "off": 0, "loose": 0, "kept": 0, "flagged": True}
                 outcomes.append(Outcome(**facts, **nothing, clean=clean, refusal=str(refusal)))
                 continue
-            outcomes.append(_compare(found, fine, truth, near, **facts))
+            outcomes.append(_compare(found, fine.valid, truth, near, **facts))
+    for event in kinds or EVENTS:
+        for strength in range(3) if event in EVENTS else ():
+            case = EVENTS[event](seen, strength, rng)
+            facts = {"trial": name, "fault": event, "strength": strength}
+            outcomes.append(_measure_event(case, fine, rate=rate, rng=rng, noise_n=noise_n, facts=facts))
     return outcomes
+
+
+def _measure_event(
+    case: Case, fine: FoundLabels, *, rate: int, rng: np.random.Generator, noise_n: float, facts: dict[str, Any]
+) -> Outcome:
+    """Label a trial to which something happened."""
+    seen = case.seen
+    forces, normal, _ = spoil(seen, noise_n=noise_n, rng=rng)
+    if case.tilt_deg:
+        forces = replace(forces, force_n=tilt(forces.force_n, normal, case.tilt_deg, rng))
+    forces = replace(forces, time_s=forces.time_s[::rate], force_n=forces.force_n[::rate])
+    frame_s, count = seen.loading.time_s[seen.frames], len(seen.frames)
+    near, truth = near_events(case, frame_s, within_s=_NEAR_S + LONGEST_LAG_S), seen.loading.safety_margin[seen.frames]
+    settings = settings_of(case, friction_change=0.0 if seen.plan.condition == "dry" else 0.1)
+    lag_s = rng.uniform(-LONGEST_LAG_S, LONGEST_LAG_S)
+    before = fine.valid[:count] & np.isfinite(truth) & (truth > 0)
+    try:
+        found = label_trial(frame_s + lag_s, seen.motion, forces, settings=settings, rng=rng)
+    except RecordingError as refusal:
+        nothing = {"valid": 0, "off": 0, "loose": 0, "kept": 0, "flagged": True}
+        return Outcome(**facts, **nothing, clean=int(np.sum(before & ~near)), refusal=str(refusal))
+    return _compare(found, before, truth, near, **facts)
 
 
 def _compare(
     found: FoundLabels,
-    fine: FoundLabels,
+    before: Bool[np.ndarray, " frames"],
     truth: Float[np.ndarray, " frames"],
     near: Bool[np.ndarray, " frames"],
     *,
@@ -224,7 +263,7 @@ def _compare(
 ) -> Outcome:
     valid, sigma = found.valid, found.safety_margin_sigma
     wrong = ~(np.abs(found.safety_margin - truth) <= _SIGMAS * sigma)
-    clean = fine.valid & ~near
+    clean = before & ~near
     return Outcome(
         trial=trial,
         fault=fault,
@@ -267,8 +306,10 @@ def summarise(outcomes: list[Outcome]) -> dict[str, float]:
 def summarise_faults(outcomes: list[Outcome]) -> dict[str, FaultShares]:
     """Shares by fault."""
     shares = {}
-    for fault in ("none", *FAULTS):
+    for fault in ("none", *FAULTS, *EVENTS):
         some = [one for one in outcomes if one.fault == fault]
+        if not some:
+            continue
         strengths = sorted({one.strength for one in some})
         by_strength = (_share([one for one in some if one.strength == at], "off", "valid")[0] for at in strengths)
         shares[fault] = FaultShares(
@@ -293,7 +334,7 @@ def _share(outcomes: list[Outcome], part: str, whole: str) -> tuple[float, float
     return parts.total() / total, float(error)
 
 
-def measure_seed(seed: int, *, dry: int, wet: int, noise_n: float) -> list[Outcome]:
+def measure_seed(seed: int, *, dry: int, wet: int, noise_n: float, kinds: Sequence[str] = ()) -> list[Outcome]:
     """Measure the trials of a seed."""
     rng, outcomes = np.random.default_rng(seed), []
     for release in (False, True):
@@ -302,7 +343,7 @@ def measure_seed(seed: int, *, dry: int, wet: int, noise_n: float) -> list[Outco
         )
         for number, plan in enumerate(plan_trials(recipe)):
             seen, rate = film_trial(plan), (1, _SLOWER)[number % 2]
-            some = measure_trial(seen, rate=rate, rng=rng, noise_n=noise_n)
+            some = measure_trial(seen, rate=rate, rng=rng, noise_n=noise_n, kinds=kinds)
             outcomes += [replace(one, trial=f"{one.trial}-{'released' if release else 'held'}") for one in some]
     return outcomes
 
@@ -315,13 +356,16 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=0.02, help="standard deviation of a force sample, in newtons")
     parser.add_argument("--seed", type=int, default=0, help="of the trials and of what spoils them")
     parser.add_argument("--seeds", type=int, default=1, help="pool so many seeds, from --seed on")
+    parser.add_argument("--kinds", nargs="+", default=(), help="measure these kinds alone")
     parser.add_argument("--verbose", action="store_true", help="list the trials whose labels are off or refused")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     arguments = parser.parse_args()
     outcomes = [
         outcome
         for seed in range(arguments.seed, arguments.seed + arguments.seeds)
-        for outcome in measure_seed(seed, dry=arguments.dry, wet=arguments.wet, noise_n=arguments.noise)
+        for outcome in measure_seed(
+            seed, dry=arguments.dry, wet=arguments.wet, noise_n=arguments.noise, kinds=arguments.kinds
+        )
     ]
     if arguments.verbose:
         for one in outcomes:

@@ -66,10 +66,13 @@ def film_trial(plan: TrialPlan) -> Seen:
     """Simulate a trial and measure the motion of its frames."""
     loading, film = prepare_trial(plan)
     frames = np.arange(SAMPLES_A_FRAME // 2, plan.frames, SAMPLES_A_FRAME)
-    return Seen(plan=plan, loading=loading, frames=frames, motion=measure_motion(map(soften, _draw(film, frames))))
+    return Seen(
+        plan=plan, loading=loading, frames=frames, motion=measure_motion(map(soften, draw_frames(film, frames)))
+    )
 
 
-def _draw(film: Film, frames: np.ndarray) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+def draw_frames(film: Film, frames: np.ndarray) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """Draw frames, one at a time."""
     for index in frames:
         yield film.draw(slice(int(index), int(index) + 1))[0].numpy()
 

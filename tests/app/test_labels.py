@@ -104,7 +104,9 @@ def test_what_is_shown_is_what_label_will_write(data: Dataset, trial: Recording)
     view, labels = page.look(trial.trial), relabel_trial(data, trial.trial)
     shown = np.array([np.nan if margin is None else margin for margin in view.margin])
     np.testing.assert_allclose(shown, labels.safety_margin, atol=1e-5)
-    assert np.flatnonzero(np.diff(np.array(view.valid, dtype=int)) == -1).max() == 29  # valid up to the slip
+    # valid up to the slip at most: the ratio rises on after it, which contradicts it
+    assert np.flatnonzero(np.diff(np.array(view.valid, dtype=int)) == -1).max() <= 29
+    assert any("after the slip at" in flag for flag in view.flags)
     assert (view.contact_s, view.slip_s) == (trial.time_s[5], trial.time_s[30])
     assert [edit.by for edit in view.edits] == ["bo", "bo"]
     assert page.edit_counts == {trial.trial: 2}

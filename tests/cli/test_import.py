@@ -64,6 +64,28 @@ def test_labels_of_an_imported_video_are_those_of_the_simulator(
     assert "kept" in capsys.readouterr().out
 
 
+def test_friction_given_or_not_frames_after_the_slip_are_0_and_a_wrong_one_is_told_everywhere(
+    tmp_path: Path, trial: Recording, table: Path, video: Path, capsys: pytest.CaptureFixture[str]
+):
+    slip = int(np.argmax(trial.safety_margin == 0))
+    mu = float(there(trial.truth).static_friction[slip])
+    for name, given in (("right", mu), ("wrong", 0.5 * mu)):
+        command = ("import", video, "-o", tmp_path / name, "--sensor", "mine", "--forces", table)
+        assert run(*command, "--mu", f"{given:.3f}") == 0
+        flagged = f"at the slip at {trial.time_s[slip]:.1f}" in capsys.readouterr().err
+        data = load_dataset(tmp_path / name)
+        labels = data.read_labels(data.trials[0])
+        after = np.arange(len(trial)) > slip + 1
+        assert np.all(labels.safety_margin[after] == 0)
+        assert not labels.labelled[after].any()
+        assert run("check", tmp_path / name) == 0
+        checked = capsys.readouterr()
+        assert flagged == ("is sound" not in checked.out) == (name == "wrong")
+        assert (f"{given:.2f} was given" in checked.err) == (name == "wrong")
+        page = (tmp_path / name / "trials.html").read_text()
+        assert (f"{given:.2f} was given" in page) == (name == "wrong")
+
+
 def test_bad_samples_of_the_force_sensor_cost_their_frames_and_are_told(
     tmp_path: Path, trial: Recording, table: Path, video: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -155,8 +177,12 @@ def test_friction_by_hand_is_taken(tmp_path: Path, table: Path, video: Path):
     data = load_dataset(tmp_path / "data")
     basis = there(there(read_header(tmp_path / "data" / "trials" / "cup.parquet").labelling).basis)
     assert (basis.friction.mu, basis.friction.found) == (1.4, "declared")
-    # with more friction than there was the trial never comes near slip
-    assert np.nanmin(data.load(data.trials[0]).safety_margin) > 0.2
+    # with more friction than there was the trial never comes near slip, until it slips all the same
+    labels = data.load(data.trials[0])
+    slip = int(np.argmax(labels.safety_margin == 0))
+    assert np.nanmin(labels.safety_margin[:slip]) > 0.2
+    assert labels.time_s[slip] == pytest.approx(there(basis.friction.onset_s), abs=0.05)
+    assert basis.friction.notes
 
 
 def test_an_interrupted_import_goes_on_where_it_stopped(

@@ -13,9 +13,10 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.text import Text
+from there import there
 
 from sliplens.errors import InputError
-from sliplens.plots.audit import choose_along, draw_audit
+from sliplens.plots.audit import audit_facts, choose_along, draw_audit
 from sliplens.plots.contact_sheet import STATE_COLOURS
 from sliplens.plots.style import save_page
 from sliplens.recordings import ContactState, Recording
@@ -205,6 +206,22 @@ def test_what_may_put_the_labels_in_doubt_is_marked(changes, head):
     assert head is None or f"▲ {head}" in words
 
 
+@pytest.mark.parametrize("doubtful", [True, False])
+def test_a_mark_has_its_reason_in_words(doubtful: bool):
+    basis = there(make_labelling().basis)
+    changes: dict[str, Any] = {"lag": Lag(lag_s=0.1, sigma_s=0.01, correlation=0.9)} if doubtful else {}
+    if doubtful:
+        changes["friction"] = replace(basis.friction, low=MU, high=MU, notes=("F_t / F_n reaches 0.62 at 3.10 s",))
+        changes["axes"] = replace(basis.axes, tare_found=Found.ASSUMED)
+    facts = audit_facts(make_trial(), make_labelling(**changes))
+    marked = {fact.head: fact.doubts for fact in facts if fact.doubts}
+    heads = {"Flags", "Tare assumed", "Friction found", "Lag not applied"}
+    assert set(marked) == (heads if doubtful else set())
+    assert all(reason in fact.lines for fact in facts for reason in fact.doubts)
+    words = told(draw_audit(make_trial(), make_labelling(**changes)))
+    assert ("F_t / F_n reaches 0.62 at 3.10 s" in words) == doubtful
+
+
 def test_reason_why_a_lag_cannot_be_told_is_given():
     lag = Lag(lag_s=0.1, sigma_s=0.1, correlation=0.2, doubt="they correlate by 0.20 only")
 
@@ -267,7 +284,7 @@ def test_trial_that_never_slips_has_no_onset():
     figure = draw_audit(make_trial(lowest=0.4), make_labelling(slip_s=None))
 
     assert not [found for ax in charts(figure) for found in onsets(ax)]
-    assert "never slips" in told(figure)
+    assert "no slip found" in told(figure)
 
 
 @pytest.mark.parametrize(("low", "high", "ends"), [(0.517, 0.546, [0.517, 0.546]), (MU, MU, [])])

@@ -35,7 +35,8 @@ class Check:
     def run(self) -> None:
         """Check and say what is wrong, and where, or what is shared."""
         from sliplens.recordings.check import check_dataset
-        from sliplens.recordings.dataset import DATASET_FILE, load_dataset
+        from sliplens.recordings.dataset import DATASET_FILE, load_dataset, trial_path
+        from sliplens.recordings.store import read_header
 
         data = load_dataset(self.data)
         if self.other is not None:
@@ -49,6 +50,14 @@ class Check:
                 "mend or make these trials again"
             )
         held = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
+        labellings = (read_header(trial_path(data.folder, info.trial)).labelling for info in data.trials)
+        bases = [labelling.basis for labelling in labellings if labelling and labelling.basis]
+        # frames at a fault of the force sensor are not valid, and the others are in no doubt for it
+        doubtful = sum(bool(basis.axes.notes or basis.friction.notes or basis.doubts) for basis in bases)
+        if doubtful:
+            about = f"the notes above put labels of {number_of(doubtful, 'trial')} in doubt"
+            say(f"{self.data} is whole: {held}, every hash and law holds, but {about}")
+            return
         say(f"{self.data} is sound: {held}, every hash and law holds")
 
     def _compare(self, data: "Dataset", other: Path) -> None:

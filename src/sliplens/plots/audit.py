@@ -42,7 +42,7 @@ from sliplens.plots.style import (
     signed,
     write_over,
 )
-from sliplens.progress import OnProgress, stage
+from sliplens.progress import OnProgress, number_of, stage
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.labelling import Found, FrictionEstimate, Labelling, Lag
@@ -51,6 +51,8 @@ from sliplens.recordings.store import load_recording, read_frames, read_header
 _MINUS = "\N{MINUS SIGN}"
 _LOOSE = 10.0  # percentage points: beyond, margins 20 points apart are hard to tell apart
 _SEEN_SIGMAS = 5.0  # an image that moves less at the onset does not speak for a slip
+_SEE_FLAGS = "in doubt: see the flags"
+_NO_TARE = "no untouched sample shows it"
 
 
 class Fact(NamedTuple):
@@ -58,8 +60,14 @@ class Fact(NamedTuple):
 
     head: str
     words: list[str]
-    doubtful: bool = False  # whether a label may be wrong for it
+    doubts: tuple[str, ...] = ()
+    """Reasons for which a label may be wrong."""
     indent: str = ""
+
+    @property
+    def lines(self) -> list[str]:
+        """Words and doubts, in the order of the page."""
+        return [*self.words, *self.doubts]
 
 
 def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
@@ -80,9 +88,9 @@ def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
     chosen = [reference.method] if reference.index is None else chosen
     return [
         _tell_frames(recording),
-        *([Fact("Flags", [f"• {flag}" for flag in basis.flags], doubtful=True, indent="   ")] if basis.flags else []),
-        Fact("Axes", [told], any("axis" in note for note in axes.notes)),
-        Fact(f"Tare {_found(axes.tare_found)}", tare, axes.tare_found == Found.ASSUMED),
+        *([Fact("Flags", [], tuple(f"• {flag}" for flag in basis.flags), indent="   ")] if basis.flags else []),
+        Fact("Axes", [told], (_SEE_FLAGS,) if any("axis" in note for note in axes.notes) else ()),
+        Fact(f"Tare {_found(axes.tare_found)}", tare, (_NO_TARE,) if axes.tare_found == Found.ASSUMED else ()),
         _tell_friction(basis.friction, basis.slip_s),
         _tell_lag(recording, basis.lag, applied=basis.lag_applied),
         Fact("Forces", [f"contact from {decimals(basis.contact_threshold_n, 3)} N", means, span]),
@@ -103,7 +111,7 @@ def _tell_given(recording: Recording, labelling: Labelling) -> list[Fact]:
     lost = [", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")]
     return [
         Fact(f"Frames: {counts.get('valid', 0)} of {sum(counts.values())} valid", lost),
-        Fact("Labels", words, doubtful=not labelled),
+        Fact("Labels", words if labelled else [], () if labelled else tuple(words)),
         *([Fact("Known of the whole clip", known)] if known else []),
         Fact("Reference", [which]),
         *([Fact("Notes", notes, indent="   ")] if notes else []),
@@ -132,8 +140,10 @@ def _tell_frames(recording: Recording) -> Fact:
     if sigma is not None and np.isfinite(sigma).any():
         middle, most = 100 * float(np.nanmedian(sigma)), 100 * float(np.nanmax(sigma))
         words.append(f"Γ known to ± {middle:.1f} % (median), {most:.1f} % at worst")
-    usual = sum(counts.get(name, 0) for name in ("valid", "no contact", "after gross slip"))
-    return Fact(f"Frames: {counts['valid']} of {len(states)} valid", words, usual < len(states) or middle > _LOOSE)
+    lost = len(states) - sum(counts.get(name, 0) for name in ("valid", "no contact", "after gross slip"))
+    doubts = [f"{number_of(lost, 'frame')} in contact, before a slip, without a valid label"] if lost else []
+    doubts += [f"beyond ± {_LOOSE:g} %, margins that are far apart look alike"] if middle > _LOOSE else []
+    return Fact(f"Frames: {counts['valid']} of {len(states)} valid", words, tuple(doubts))
 
 
 def _tell_friction(friction: FrictionEstimate, slip_s: float | None) -> Fact:
@@ -141,21 +151,25 @@ def _tell_friction(friction: FrictionEstimate, slip_s: float | None) -> Fact:
     ends = f"{decimals(friction.low, 3)} to {decimals(friction.high, 3)}"
     interval = "taken as exact" if exact else f"68 % interval {ends}"
     image = [] if moved is None else [f"image moves {moved:.1f} σ more at the slip"]  # noqa: RUF001 (sigma is meant)
-    slip = "never slips" if slip_s is None else f"slips at {slip_s:.3f} s on the clock of the forces"
-    unseen = friction.found == Found.INFERRED and (moved is None or moved < _SEEN_SIGMAS)
+    later = "".join(f", and again at {later_s:.3f} s" for later_s in friction.later_onsets_s)
+    slip = "no slip found" if slip_s is None else f"slips at {slip_s:.3f} s{later} on the clock of the forces"
+    doubts = ["its uncertainty is unknown, and no label counts it"] if exact else []
+    if friction.found == Found.INFERRED and (moved is None or moved < _SEEN_SIGMAS):
+        doubts.append("forces alone show the slip: the image hardly moves at it")
     words = [f"μ {decimals(friction.mu, 3)}, {interval}", friction.method, *image, slip]
-    return Fact(f"Friction {_found(friction.found)}", words, exact or unseen)
+    return Fact(f"Friction {_found(friction.found)}", words, (*doubts, *([_SEE_FLAGS] if friction.notes else [])))
 
 
 def _tell_lag(recording: Recording, lag: Lag | None, *, applied: bool) -> Fact:
     head = f"Lag {'applied' if applied else 'not applied'}"
     if lag is None or lag.doubt:
-        return Fact(head, [f"cannot be told: {lag.doubt}" if lag else "not estimated"], doubtful=True)
+        return Fact(head, [], (f"cannot be told: {lag.doubt}" if lag else "not estimated",))
     late = f"camera late by {_milli(lag.lag_s)} ± {_milli(lag.sigma_s)} ms"
     # beyond chance, and as much as half a frame: the labels are those of another frame
     least = max(2 * lag.sigma_s, np.ptp(recording.time_s) / (2 * len(recording)))
     ignored = not applied and abs(lag.lag_s) > least
-    return Fact(head, [late, f"correlation {decimals(lag.correlation, 2)}"], bool(ignored))
+    doubts = ("it is not taken off: labels may be those of the frame beside",) if ignored else ()
+    return Fact(head, [late, f"correlation {decimals(lag.correlation, 2)}"], doubts)
 
 
 def _found(how: Found) -> str:
@@ -367,6 +381,8 @@ def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, *, 
             if lag is not None and not lag.doubt:
                 seen = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
                 ax.axvspan(*seen, color=SKY, alpha=0.6, linewidth=0, label=_ONSET[1], zorder=0)
+            for later_s in basis.friction.later_onsets_s:
+                ax.axvline(later_s + shift, color=BLACK, linestyle="-.", linewidth=1.3, label="_slip")
         place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0}
         handles, names = ax.get_legend_handles_labels()
         if ax is not charts[1]:  # what stands in all of them is told once
@@ -449,13 +465,13 @@ def _tell(figure: Figure, recording: Recording, labelling: Labelling) -> None:
     place_text(figure, _EDGE, 0.47, "   ·   ".join([about, *sources]), fontsize=9, color=GREY, **plain)
     top = _TOP + 0.05
     facts = audit_facts(recording, labelling)
-    if any(fact.doubtful for fact in facts):
+    if any(fact.doubts for fact in facts):
         place_text(figure, _EDGE, _HEIGHT - _FOOT + 0.08, "▲ may put the labels in doubt", fontsize=8, color=VERMILLION)
     for fact in facts:
-        lines = [line for words in fact.words for line in wrap(words, _WRAP, subsequent_indent=fact.indent)]
+        lines = [line for words in fact.lines for line in wrap(words, _WRAP, subsequent_indent=fact.indent)]
         room = max(1, int((_HEIGHT - _FOOT - top) / _LINE - 1.15))
         lines = lines if len(lines) <= room else [*lines[: room - 1], "…"]
-        colour, mark = (VERMILLION, "▲ ") if fact.doubtful else (BLACK, "")
+        colour, mark = (VERMILLION, "▲ ") if fact.doubts else (BLACK, "")
         place_text(figure, _EDGE, top, mark + fact.head, fontsize=9, fontweight="bold", color=colour)
         for row, line in enumerate(lines):
             place_text(figure, _EDGE, top + (row + 1.15) * _LINE, line, fontsize=8, **plain)

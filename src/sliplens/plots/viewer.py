@@ -291,8 +291,8 @@ def describe_trial(trial: Recording, truth: TruthHeader | None, *, split: str = 
     about = [f"- {name}: {_plain(value)}" for name, value in told.items() if value]
     lines = [f"# {_plain(trial.trial)}", *about, "", "## What its labels rest on"]
     for fact in _facts(trial, truth):
-        lines.append(f"\n**{'▲ ' if fact.doubtful else ''}{_plain(fact.head)}**\n")
-        lines += [f"- {_plain(words)}" for words in fact.words if words]
+        lines.append(f"\n**{'▲ ' if fact.doubts else ''}{_plain(fact.head)}**\n")
+        lines += [f"- {_plain(words)}" for words in fact.lines if words]
     return "\n".join(lines)
 
 
@@ -303,7 +303,7 @@ def _facts(trial: Recording, truth: TruthHeader | None) -> list[Fact]:
         return [Fact("Simulated", ["labels are the mechanics' own, without error", moved])]
     labelling = trial.labelling
     if labelling is None:
-        return [Fact("Not told", ["nothing is kept of where they come from"], doubtful=True)]
+        return [Fact("Not told", [], ("nothing is kept of where they come from",))]
     sources = [words for words in (labelling.source, labelling.forces) if words]
     return [Fact("Recorded", sources), *audit_facts(trial, labelling)]
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file
@@ -37,8 +38,9 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
     What puts labels in doubt, such as faults of the force sensor, is told by `on_progress` if it shows notes, and is no
     finding: frames at a fault are not valid. Checked are, for each trial: that its file is there, has the hash of the
     table and is what the table says; that every image can be read; that times rise, forces are finite, labels lie in
-    [0, 1] and are missing only without contact, margin and forces agree, and contact states follow the margin. For the
-    set: that no trial is listed twice, which would put its frames into two splits, and that no file is left over.
+    [0, 1] and are missing only without contact, margin and forces agree, contact states follow the margin, and
+    F_t / F_n stays within the friction by 3 sigma, before a slip and after it. For the set: that no trial is listed
+    twice, which would put its frames into two splits, and that no file is left over.
 
     Raises
     ------
@@ -112,7 +114,36 @@ def _check_laws(recording: Recording) -> Iterator[str]:
     yield from _first(off, "the safety margin is not 1 - F_t / (mu F_n)")
     states = np.array([str(state) for state in recording.contact_state])
     yield from _first((states == ContactState.NO_CONTACT) & labelled, "a frame without contact has a safety margin")
-    yield from _first((states == ContactState.FULL_SLIP) & labelled & (margin > 0), "full slip has a margin above 0")
+    slips = states == ContactState.FULL_SLIP
+    yield from _first(slips & labelled & (margin > 0), "full slip has a margin above 0")
+    yield from _check_friction(recording, slips=slips)
+
+
+_LAW_SIGMAS = 3.0
+_PRESSED_SHARE = 0.25  # of the largest normal force: in a lighter touch F_t / F_n is all noise
+
+
+def _check_friction(recording: Recording, *, slips: Bool[np.ndarray, " frames"]) -> Iterator[str]:
+    """Check that F_t / F_n exceeds the static friction by more than 3 sigma neither before a slip nor after it."""
+    normal, coefficient = recording.normal_force_n, recording.friction_coefficient
+    pressed = normal > _PRESSED_SHARE * np.nanmax(normal, initial=0.0)
+    ratio = np.where(pressed, recording.tangential_force_n / np.where(pressed, normal, 1), np.nan)
+    sigma = np.zeros(len(normal)) if recording.safety_margin_sigma is None else recording.safety_margin_sigma
+    basis = recording.labelling.basis if recording.labelling else None
+    # of the margin, and so of the ratio as a share of the friction: at the slip, where all of it is used, no less
+    sigma = np.maximum(np.nan_to_num(sigma), basis.friction.sigma / basis.friction.mu if basis else 0.0)
+    # the last frame before a slip has the friction that holds until then
+    last = np.maximum.accumulate(np.where(recording.labelled & ~slips, np.arange(len(normal)), -1))
+    most = (coefficient * (1 + _LAW_SIGMAS * sigma))[last] + _ROUNDING
+    beyond = (last >= 0) & (ratio > most)
+    # exact labels may have a friction that changes from frame to frame: until the slip it may have grown
+    estimated = recording.safety_margin_sigma is not None
+    after = beyond & slips & np.isfinite(recording.safety_margin) & estimated
+    for wrong, when in ((beyond & ~slips & recording.labelled, "before a slip"), (after, "after a slip")):
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            allowed = f"the friction {coefficient[last[at]]:.2f} and 3 sigma allow {most[at]:.2f}"
+            yield from _first(wrong, f"F_t / F_n is {ratio[at]:.2f} {when}, and {allowed}; label the trial again")
 
 
 def _first(wrong: np.ndarray, what: str) -> Iterator[str]:

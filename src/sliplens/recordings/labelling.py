@@ -84,6 +84,10 @@ class FrictionEstimate:
     """Standard uncertainty of the onset; None where it is not known."""
     image_sigmas: float | None = None
     """Motion of the image at the onset beyond that before it, in standard deviations; None where not measured."""
+    later_onsets_s: tuple[float, ...] = ()
+    """Gross slips of the contacts after it, at most one each."""
+    notes: tuple[str, ...] = ()
+    """Contradictions with the forces, a sentence each, which count as errors of the friction."""
 
     def __post_init__(self) -> None:
         if not 0 < self.mu <= MOST_FRICTION:
@@ -166,6 +170,7 @@ class Reason(StrEnum):
     NO_CONTACT = "no contact"
     AFTER_GROSS_SLIP = "after gross slip"
     TOO_UNCERTAIN = "too uncertain"
+    CONTRADICTED = "contradicts its forces"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -208,7 +213,7 @@ class LabelBasis:
     @property
     def flags(self) -> tuple[str, ...]:
         """All that puts labels in doubt, a sentence each."""
-        return (*tell_faults(self.faults), *self.axes.notes, *self.doubts)
+        return (*tell_faults(self.faults), *self.axes.notes, *self.friction.notes, *self.doubts)
 
 
 def tell_faults(faults: Sequence[ForceFault]) -> tuple[str, ...]:

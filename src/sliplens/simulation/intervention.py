@@ -6,6 +6,7 @@ the print's jitter move a marker and its place at rest alike: the reference fram
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -19,7 +20,7 @@ from sliplens.errors import ContactError, InputError
 from sliplens.files import RUN_FILE, read_json
 from sliplens.recordings import Recording
 from sliplens.simulation.filming import Film, batches
-from sliplens.simulation.loading import Loading, load_at_margins
+from sliplens.simulation.loading import Loading, load_at_margins, with_friction
 from sliplens.simulation.motion import move_markers
 from sliplens.simulation.nuisances import Nuisances, Pulls, Range, Touch
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
@@ -290,7 +291,7 @@ def film_with_friction(trial: FilmedTrial, friction: Float[np.ndarray, " frames"
 
     Margins are NaN where that cannot be told (`loading.with_friction`): those frames mean nothing.
     """
-    loading, film = prepare_trial(trial.plan, friction=friction)
+    loading, film = prepare_trial(trial.plan, change=partial(with_friction, friction=friction))
     return FilmedTrial(plan=trial.plan, loading=loading, film=film)
 
 

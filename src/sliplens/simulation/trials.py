@@ -2,14 +2,13 @@
 
 import weakref
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 
@@ -22,20 +21,20 @@ from sliplens.recordings.dataset import load_dataset, trial_info, trial_path, wr
 from sliplens.recordings.store import read_header, save_recording
 from sliplens.recordings.trial import SIGNALS
 from sliplens.simulation.filming import Film, batches, move_camera, prepare_film
-from sliplens.simulation.loading import Loading, load_grasp, with_friction
+from sliplens.simulation.loading import Loading, load_grasp
 from sliplens.simulation.nuisances import draw_grasp, draw_unit
 from sliplens.simulation.plan import SimulationRecipe, TrialPlan, make_recipe, plan_trials
 
 
-def prepare_trial(plan: TrialPlan, *, friction: Float[np.ndarray, " frames"] | None = None) -> tuple[Loading, Film]:
-    """Load a trial, with another friction if given (`with_friction`), and make it ready to be drawn."""
+def prepare_trial(plan: TrialPlan, *, change: Callable[[Loading], Loading] | None = None) -> tuple[Loading, Film]:
+    """Load a trial, change its loading if asked, and make it ready to be drawn."""
     recipe, unit_rng = plan.recipe, np.random.default_rng(plan.unit_seed)
     grasp_rng, load_rng, rng = np.random.default_rng(plan.seed).spawn(3)
     day, sensor = plan.day_draw, recipe.sensor
     grasp = draw_grasp(recipe.nuisances, day=day, wet=plan.condition == "wet", rng=grasp_rng)
     loading = load_grasp(grasp, frames=plan.frames, rng=load_rng, release=recipe.release, pulls=recipe.pulls)
-    if friction is not None:
-        loading = with_friction(loading, friction)
+    if change is not None:
+        loading = change(loading)
     unit = draw_unit(recipe.nuisances, markers=sensor.geometry.markers, rng=unit_rng)
     displacement = recipe.resolved_displacement
     film = prepare_film(

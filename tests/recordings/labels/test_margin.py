@@ -14,6 +14,7 @@ from sliplens.recordings.labels import (
     apply_axes,
     estimate_friction,
     label_frames,
+    label_trial,
 )
 
 from .conftest import NORMAL_N, PULL_S, SLIP_S, STATIC, TOUCH_S, Trial, ratio
@@ -62,21 +63,59 @@ def test_states_follow_the_grasp(trial: Trial):
     assert set(states[time >= SLIP_S]) == {ContactState.FULL_SLIP}
 
 
-def test_after_gross_slip_the_margin_never_returns(trial: Trial):
-    # let go after the slip, and pressed anew: whether that contact sticks cannot be known
+def test_after_gross_slip_the_margin_is_0_until_the_contact_is_loaded_anew(trial: Trial):
+    # let go after the slip, and pressed anew; then a dip too short to be a release
     time = trial.time_s
     again = trial.contact_n.copy()
     again[(time > 4.8) & (time < 5.1)] = 0
     again[time >= 5.1, 1:] = 0
-    contact = replace(trial, contact_n=again).contact()
-    labels = label_frames(trial.frame_time_s, contact, friction=FRICTION)
-    pressed = (trial.frame_time_s >= SLIP_S) & (labels.normal_force_n > 1)
-    assert pressed.sum() > 10
-    assert np.all(labels.safety_margin[pressed] == 0)
-    assert {reason for reason, here in zip(labels.reason, pressed, strict=True) if here} == {Reason.AFTER_GROSS_SLIP}
+    short = trial.contact_n.copy()
+    short[(time > 4.8) & (time < 4.88)] = 0
+    released, dipped = (
+        label_frames(trial.frame_time_s, replace(trial, contact_n=force).contact(), friction=FRICTION)
+        for force in (again, short)
+    )
+    after = trial.frame_time_s >= SLIP_S
+    # a frame over the new touch is of both
+    pressed, anew = after & (released.normal_force_n > 1), trial.frame_time_s > 5.12
+    pressed &= trial.frame_time_s < 5.08
+    assert np.all(released.safety_margin[pressed] == 0)
+    assert np.all(released.safety_margin[anew] == 1)
+    assert released.valid[anew].all()
+    assert not released.valid[after & (trial.frame_time_s < 5.08)].any()
     gone = (trial.frame_time_s > 4.85) & (trial.frame_time_s < 5.05)
-    assert np.all(np.isnan(labels.safety_margin[gone]))
-    assert not labels.valid[trial.frame_time_s >= SLIP_S].any()
+    assert np.all(np.isnan(released.safety_margin[gone]))
+    assert not dipped.valid[after].any()
+    assert np.all(dipped.safety_margin[after & (dipped.normal_force_n > 1)] == 0)
+
+
+@pytest.mark.parametrize("mu", [None, STATIC])
+@pytest.mark.parametrize("slip_s", [None, SLIP_S])
+def test_what_is_given_changes_no_label_that_the_forces_show_too(
+    trial: Trial, rng: np.random.Generator, mu: float | None, slip_s: float | None
+):
+    settings = LabelSettings(mu=mu, slip_s=slip_s)
+    forces = trial.forces(noise_n=0.02, rng=rng)
+    labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=rng)
+    after = trial.frame_time_s > SLIP_S + 0.01
+    assert np.all(labels.safety_margin[after] == 0)
+    assert not labels.valid[after].any()
+    assert set(np.array(labels.reason)[after]) == {Reason.AFTER_GROSS_SLIP}
+    assert labels.basis.flags == ()
+
+
+@pytest.mark.parametrize(("mu", "slip_s"), [(0.3, None), (1.2, 5.2), (1.0, None)])
+def test_no_valid_label_follows_a_friction_that_contradicts_the_forces(
+    trial: Trial, rng: np.random.Generator, mu: float, slip_s: float | None
+):
+    settings, forces = LabelSettings(mu=mu, slip_s=slip_s), trial.forces(noise_n=0.02, rng=rng)
+    labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=rng)
+    truth = 1 - ratio(trial.frame_time_s) / STATIC
+    truth[trial.frame_time_s >= SLIP_S] = 0
+    error = np.abs(labels.safety_margin - truth)
+    assert np.all((error <= 3 * labels.safety_margin_sigma)[labels.valid])
+    assert labels.basis.flags
+    assert Reason.CONTRADICTED in reasons(labels)
 
 
 def test_a_frame_is_valid_exactly_where_it_has_no_reason_not_to_be(trial: Trial):

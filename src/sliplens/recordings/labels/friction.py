@@ -1,13 +1,14 @@
 """Static friction of a trial: the ratio of tangential to normal force at which the contact slips as a whole."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.labelling import Found, FrictionEstimate
-from sliplens.recordings.labels.axes import ContactForces, Samples, magnitude, mean_force, typical_step
+from sliplens.recordings.labels.axes import ContactForces, Samples, Times, magnitude, mean_force, typical_step
 
 _REACH_S = 0.08  # how far the break may lie from the rough guess
 _TRIES = 41  # breaks tried over that reach
@@ -127,16 +128,26 @@ _WINDOWS_S = (0.03, 0.1)
 _DROP_SIGMAS = 5.0  # a fall of the averaged ratio by so many standard deviations of its noise is no chance
 _DROP_SHARE = 0.03  # and by so much of the ratio: less is a wobble of the hand that pulls
 _DROP_S = 0.25  # time in which the ratio must have fallen: slip is sudden, letting go is slow
-_PULLED_SHARE = 0.5  # a slip is looked for where the ratio is this share of its largest or more
-# and where the normal force is this share of its largest: in a light touch the ratio is all noise
+# where the normal force is this share of its largest: in a light touch the ratio is all noise
 _PRESSED_SHARE = 0.25
 _STEP_S = 0.06  # time over which the ratio before and after a fall is compared to place it
 _HELD_SHARE = 0.5  # a fall across which less than this share of the normal force stays is letting go, not slip
-_BEFORE_S, _AFTER_S = 0.6, 0.2  # what of the ratio is fitted, before and after its break
+_SUDDEN = 1.5  # a slip falls by so many times what the ratio falls in as long a time before or after it
+# kinetic friction, and the dip of a puller that springs back, is a larger share of static friction than this; a pull
+# that is let go falls to nothing
+_SLIDING_SHARE = 0.3
+_PULL_SHARE = 0.5  # share of the fall of the ratio that the pull falls by: a firmer press alone is no slip
+_APART_S = 0.1  # a load that is lost for less time is the same contact
+# what of the ratio is fitted before its break: the longer knows it better, unless the pull was no parabola so long
+_BEFORE_S = (0.6, 0.25, 0.1)
+_AFTER_S = 0.2  # and after it
+_LIKE_SHARE, _LIKE_SIGMAS = 0.02, 5.0  # a parabola that ends this far from the largest mean ratio there was none
 _BEFORE_STEPS, _AFTER_STEPS = 12, 6  # and of slow samples at least so many
 _BAND = (0.16, 0.84)  # quantiles that hold 68 %
 _SEEN_SIGMAS = 3.0  # an image that moves by so many standard deviations more than before sees the slip
 _QUIET_S = 0.5  # time before the onset that tells how much the image moves without slip
+_LAW_SIGMAS = 3.0  # by more standard deviations a ratio contradicts the friction
+_LAW_SHARE = 0.01  # and by more of the friction: a break lies between samples, and its level is known no better
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,6 +159,23 @@ class ImageMotion:
     """See `measure_motion`; the first value is not used."""
 
 
+def find_contacts(forces: ContactForces, *, contact_threshold_n: float) -> tuple[tuple[float, float], ...]:
+    """Find the spans of time, in seconds, in which the sensor is loaded: each from a touch until it is let go.
+
+    A load below a quarter of the largest is no contact of its own, and one that is lost for less than a tenth of a
+    second goes on.
+    """
+    time = forces.time_s
+    normal = mean_force(time, forces.normal_n, time, window_s=_STEP_S)
+    edges = np.flatnonzero(np.diff(normal > contact_threshold_n, prepend=False, append=False))
+    spans: list[tuple[int, int]] = []
+    for start, end in edges.reshape(-1, 2).tolist():
+        again = bool(spans) and time[start] - time[spans[-1][1] - 1] < _APART_S
+        spans.append((spans.pop()[0] if again else start, end))
+    least = _PRESSED_SHARE * float(normal.max())
+    return tuple((float(time[start]), float(time[end - 1])) for start, end in spans if normal[start:end].max() >= least)
+
+
 def estimate_friction(
     forces: ContactForces,
     *,
@@ -155,99 +183,303 @@ def estimate_friction(
     rng: np.random.Generator,
     image: ImageMotion | None = None,
     slip_s: float | None = None,
+    mu: float | None = None,
+    friction_change: float = 0.0,
     draws: int = 300,
 ) -> FrictionEstimate:
-    """Estimate static friction at the onset of gross slip, with a bootstrap interval.
+    """Estimate static friction at the onset of gross slip, with a bootstrap interval, and when each contact slips.
 
-    The slip is the first sudden fall of F_t / F_n from its height so far while the normal force stays. About it the
-    ratio is fitted by a line that breaks off: rising until the onset, falling after it; mu_s is its value at the break.
-    Where several falls compete, the one that the image moves at wins. Below `contact_threshold_n`, a normal force in
-    newtons, the ratio means nothing. A trial that never slips is a `RecordingError`: its friction is larger than all
-    that was seen, no more.
-    Where somebody knows the onset, `slip_s`, the ratio breaks off there.
+    A slip is a sudden fall of F_t / F_n while the normal force stays, from a height that the contact exceeds neither
+    before nor after it. About the first slip the ratio is fitted by a line that breaks off: rising until the onset,
+    falling after it; mu_s is its value at the break. Where several falls of a contact compete, the first that the image
+    moves at wins, or else the first. Below `contact_threshold_n`, a normal force in newtons, the ratio means nothing.
+    `friction_change` is the relative standard deviation by which friction may change within the trial.
+
+    Friction and slip are independent facts: where `slip_s` sets the onset, in seconds, the ratio breaks off there;
+    where `mu` gives the friction, the slips are found as well. A friction that contradicts the forces, because the
+    ratio exceeds it or slips elsewhere by more than 3 sigma, counts the difference as an error, and its notes give the
+    numbers.
+
+    Raises
+    ------
+    RecordingError
+        If nothing slips and no friction is given: it is larger than all that was measured, no more. If too few samples
+        lie about the slip that is to give the friction, or nothing presses before it.
     """
-    candidates, highest = [slip_s] if slip_s is not None else [], 0.0
-    for window_s in _WINDOWS_S:
-        if not candidates:
-            candidates, highest = _find_falls(forces, window_s=window_s, contact_threshold_n=contact_threshold_n)
-    if not candidates:
+    spans = find_contacts(forces, contact_threshold_n=contact_threshold_n)
+    means = [_mean_ratio(forces, window_s=window_s, contact_threshold_n=contact_threshold_n) for window_s in _WINDOWS_S]
+    rough: list[float] = []
+    for start, end in spans:
+        if slip_s is not None and start <= slip_s <= end:
+            continue
+        falls = (_find_falls(one, start_s=start, end_s=end, friction_change=friction_change) for one in means)
+        times = next(filter(None, falls), [])
+        # a slip that the image does not see is less likely than one that it does
+        seen = [time_s for time_s in times if (_image_sigmas(image, time_s) or 0) >= _SEEN_SIGMAS]
+        rough += (seen or times)[:1]
+    slips = []
+    for time_s in sorted(rough if slip_s is None else [*rough, slip_s]):
+        reach_s = 0.0 if time_s == slip_s else _REACH_S
+        limits = {"contact_threshold_n": contact_threshold_n, "reach_s": reach_s, "draws": draws}
+        try:
+            slips.append(_fit_slip(forces, time_s, means=means[0], **limits, rng=rng))
+        except RecordingError:
+            if mu is None and not slips:
+                raise
+            slips.append(_Slip(time_s=time_s))  # the friction is known without it
+    # the window that shows most surely how far the ratio reaches
+    mean = max(means, key=lambda one: float(one.surely.max()))
+    highest = int(np.argmax(mean.surely))
+    if mu is not None:
+        estimate = FrictionEstimate(mu=mu, low=mu, high=mu)
+    elif not slips:
         raise RecordingError(
-            f"the trial never slips (F_t / F_n reaches {highest:.2f} without breaking off), so its friction is "
-            "unknown; give it with --mu, or in the column mu of a manifest"
+            f"the trial never slips (F_t / F_n reaches {mean.ratio[highest]:.2f} without breaking off), so its "
+            "friction is unknown; give it with --mu, or in the column mu of a manifest"
         )
-    # a slip that the image does not see is a knock at the force sensor, unless no fall is seen
-    seen = [rough for rough in candidates if (_image_sigmas(image, rough) or 0) >= _SEEN_SIGMAS]
-    rough = (seen or candidates)[0]
-    step = typical_step(forces.time_s)
-    near = forces.time_s >= rough - max(_BEFORE_S, _BEFORE_STEPS * step)
-    near &= forces.time_s <= rough + max(_AFTER_S, _AFTER_STEPS * step)
-    near &= forces.normal_n > contact_threshold_n
-    if not np.any(near & (forces.time_s <= rough)):
-        raise RecordingError(f"nothing presses before the slip at {rough:.2f} s; set it later, or the contact earlier")
-    pull = forces.tangential_n[near & (forces.time_s <= rough)].mean(axis=0)
-    # along the direction of the pull: a projection is not biased by noise
-    ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
-    reach_s = _REACH_S if slip_s is None else 0.0
-    fit = fit_break(forces.time_s[near], ratio, about_s=rough, rng=rng, draws=draws, reach_s=reach_s)
+    else:
+        first, method = slips[0], "F_t / F_n at the slip set by hand"
+        if first.mu is None or first.low <= 0:
+            raise RecordingError(
+                f"the slip at {first.time_s:.2f} s tells a friction of {first.mu:.2g} with a 68 % interval from "
+                f"{first.low:.2g} to {first.high:.2g}, which is none; give the coefficient of friction with --mu"
+            )
+        if first.time_s != slip_s:
+            seen = (_image_sigmas(image, first.time_s) or 0) >= _SEEN_SIGMAS
+            method = "break of F_t / F_n" + (", seen in the image" if seen else "")
+        estimate = FrictionEstimate(mu=first.mu, low=first.low, high=first.high, found=Found.INFERRED, method=method)
+    if slips:
+        first, *later = slips
+        estimate = replace(
+            estimate,
+            onset_s=first.time_s,
+            onset_sigma_s=first.sigma_s,
+            image_sigmas=_image_sigmas(image, first.time_s),
+            later_onsets_s=tuple(slip.time_s for slip in later),
+        )
+    notes, error = _find_contradictions(estimate, slips, mean, slip_s=slip_s, friction_change=friction_change)
+    if not notes:
+        return estimate
+    half = float(np.hypot(estimate.sigma, error))
+    low, high = max(0.0, estimate.mu - half), estimate.mu + half
+    return replace(estimate, low=low, high=high, notes=tuple(notes))
+
+
+def _find_contradictions(
+    friction: FrictionEstimate,
+    slips: "Sequence[_Slip]",
+    means: "_MeanRatio",
+    *,
+    slip_s: float | None,
+    friction_change: float,
+) -> tuple[list[str], float]:
+    """Compare a friction with the forces: what contradicts it, and by how much the friction is off for that."""
+    mu, given, ratio, time = friction.mu, friction.found is Found.DECLARED, means.ratio, means.time_s
+    written = f"{mu:.2f}" if given else f"{mu:.2f} ({friction.low:.2f} to {friction.high:.2f})"
+    notes, error = [], 0.0
+    if given and slips and slips[0].mu is not None:
+        first, apart = slips[0], abs(slips[0].mu - mu)
+        if apart > max(_LAW_SIGMAS * (first.high - first.low) / 2, _LAW_SHARE * mu):
+            notes.append(
+                f"F_t / F_n is {first.mu:.2f} ({first.low:.2f} to {first.high:.2f}) at the slip at "
+                f"{first.time_s:.2f} s, and a friction of {written} was given: the difference counts as an error of "
+                "the friction; leave --mu out, or set the slip where F_t / F_n falls with --slip-s"
+            )
+            error = apart
+    highest = int(np.argmax(means.surely))
+    # a friction that comes from these forces has their tare in its own uncertainty
+    sigma, onset_s = float(means.tare_sigma[highest]) if given else friction.sigma, friction.onset_s
+    # on the way to the slip friction may still change, as in the labels' own uncertainty
+    begin = float(time[np.argmax(means.pulled)])
+    far = 1.0 if onset_s is None else abs(float(time[highest]) - onset_s) / max(onset_s - begin, 1e-9)
+    sigma = np.hypot(sigma, friction_change * min(far, 1.0) * mu)
+    if not notes and means.surely[highest] > mu + max(_LAW_SIGMAS * sigma, _LAW_SHARE * mu):
+        when = "before" if onset_s is None or time[highest] < onset_s else "after"
+        where = "nothing slips" if onset_s is None else f"{when} the slip at {onset_s:.2f} s"
+        notes.append(
+            f"F_t / F_n reaches {ratio[highest]:.2f} at {time[highest]:.2f} s, {where}, and the friction is {written}: "
+            "the difference counts as an error of the friction; set the slip where F_t / F_n falls with --slip-s, or "
+            "give the friction with --mu"
+        )
+        error = float(ratio[highest]) - mu
+    if slip_s is not None:
+        before = ratio[(time > slip_s - _DROP_S) & (time <= slip_s) & means.pulled]
+        after = ratio[(time > slip_s) & (time <= slip_s + 2 * _DROP_S) & means.pulled]
+        if len(before) and len(after) and after.min() > (1 - _DROP_SHARE) * before.mean():
+            notes.append(
+                f"F_t / F_n does not fall at the slip that was set to {slip_s:.2f} s: it is {before.mean():.2f} before "
+                f"it and at least {after.min():.2f} after it; set the slip where F_t / F_n falls"
+            )
+    return notes, error
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Slip:
+    """Onset of a slip, and the friction that it shows; without one where the samples about it are too few."""
+
+    time_s: float
+    mu: float | None = None
+    low: float = np.nan
+    high: float = np.nan
+    """Ends of the 68 % interval."""
+    sigma_s: float | None = None
+
+
+def _fit_slip(
+    forces: ContactForces,
+    rough_s: float,
+    *,
+    means: "_MeanRatio",
+    contact_threshold_n: float,
+    reach_s: float,
+    rng: np.random.Generator,
+    draws: int,
+) -> _Slip:
+    """Fit the break of the ratio about the rough time of a slip."""
+    options = {"contact_threshold_n": contact_threshold_n, "reach_s": reach_s, "rng": rng, "draws": draws}
+    fit, normal_n = _fit_near(forces, rough_s, before_s=_BEFORE_S[0], **options)
+    for before_s in _BEFORE_S[1:]:
+        top = np.abs(means.time_s - fit.time_s) <= _STEP_S
+        apart = abs(fit.level - means.ratio[top].max(initial=0.0))
+        if reach_s == 0 or apart <= _LIKE_SHARE * fit.level + _LIKE_SIGMAS * means.sigma[top].max(initial=0.0):
+            break
+        fit, normal_n = _fit_near(forces, rough_s, before_s=before_s, **options)
     # no resampling of the slip can show the uncertainty of the tare
     (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
     tare = np.hypot(tangential, fit.level * normal)
-    low, high = np.quantile(fit.levels + rng.normal(0, float(tare / forces.normal_n[near].mean()), draws), _BAND)
-    if low <= 0:
-        raise RecordingError(
-            f"the slip at {fit.time_s:.2f} s tells a friction of {fit.level:.2g} with a 68 % interval from {low:.2g} "
-            f"to {high:.2g}, which is none; give the coefficient of friction with --mu"
-        )
+    low, high = np.quantile(fit.levels + rng.normal(0, float(tare) / normal_n, draws), _BAND)
     early, late = np.quantile(fit.times_s, _BAND)
-    return FrictionEstimate(
+    return _Slip(
+        time_s=fit.time_s,
         mu=fit.level,
         low=float(min(low, fit.level)),
         high=float(max(high, fit.level)),
-        onset_s=fit.time_s,
-        found=Found.INFERRED,
-        method="F_t / F_n at the slip set by hand"
-        if slip_s is not None
-        else "break of F_t / F_n" + (", seen in the image" if seen else ""),
-        onset_sigma_s=float(late - early) / 2,
-        image_sigmas=_image_sigmas(image, fit.time_s),
+        sigma_s=float(late - early) / 2,
     )
 
 
-def _find_falls(forces: ContactForces, *, window_s: float, contact_threshold_n: float) -> tuple[list[float], float]:
-    """Rough times at which the ratio suddenly falls from its height so far, and the greatest height."""
-    time, step = forces.time_s, max(typical_step(forces.time_s), 1e-9)
+def _fit_near(
+    forces: ContactForces,
+    rough_s: float,
+    *,
+    before_s: float,
+    contact_threshold_n: float,
+    reach_s: float,
+    rng: np.random.Generator,
+    draws: int,
+) -> tuple[Break, float]:
+    """Fit the break to the ratio from some time before a slip on, and take the mean normal force there."""
+    step = typical_step(forces.time_s)
+    near = forces.time_s >= rough_s - max(before_s, _BEFORE_STEPS * step)
+    near &= forces.time_s <= rough_s + max(_AFTER_S, _AFTER_STEPS * step)
+    near &= forces.normal_n > contact_threshold_n
+    before = near & (forces.time_s <= rough_s)
+    if not before.any():
+        raise RecordingError(
+            f"nothing presses before the slip at {rough_s:.2f} s; set it later, or the contact earlier"
+        )
+    pull = forces.tangential_n[before].mean(axis=0)
+    # along the direction of the pull: a projection is not biased by noise
+    ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
+    fit = fit_break(forces.time_s[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
+    return fit, float(forces.normal_n[near].mean())
+
+
+@dataclass(frozen=True, kw_only=True)
+class _MeanRatio:
+    """Forces averaged about each sample, and their ratio where something presses; 0 elsewhere."""
+
+    time_s: Samples
+    normal_n: Samples
+    tangential_n: Samples
+    ratio: Samples
+    sigma: Samples
+    """Standard deviation of the ratio's noise."""
+    surely: Samples
+    """Least ratio that noise leaves possible."""
+    tare_sigma: Samples
+    """Standard deviation of the ratio for the uncertainty of the tare."""
+    pressed: Bool[np.ndarray, " samples"]
+    """Whether the ratio means anything."""
+    pulled: Bool[np.ndarray, " samples"]
+    """Whether it is pressed, and the tangential force is no noise."""
+
+
+def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: float) -> _MeanRatio:
+    time = forces.time_s
     normal = mean_force(time, forces.normal_n, time, window_s=window_s)
     noise = forces.noise_of_means_n(window_s)
-    sigma_n = noise.tangential
-    tangential = magnitude(mean_force(time, forces.tangential_n, time, window_s=window_s), sigma_n=sigma_n)
+    tangential = magnitude(mean_force(time, forces.tangential_n, time, window_s=window_s), sigma_n=noise.tangential)
     pressed = normal > max(contact_threshold_n, _PRESSED_SHARE * normal.max())
     # the window shrinks at the ends, where a single sample's noise is no fall
     pressed &= (time - time[0] >= window_s / 2) & (time[-1] - time >= window_s / 2)
     # what is not touched cannot slip: a knock, where the contact was set by hand
     pressed &= time >= (-np.inf if forces.axes.still_until_s is None else forces.axes.still_until_s)
-    if not pressed.any():
-        return [], 0.0
     safe = np.where(pressed, normal, 1)
     ratio = np.where(pressed, tangential / safe, 0)
-    sigma = np.where(pressed, np.hypot(sigma_n, ratio * noise.normal) / safe, 0)
-    highest = float(ratio[tangential > 3 * sigma_n].max(initial=0))
+    sigma = np.where(pressed, np.hypot(noise.tangential, ratio * noise.normal) / safe, 0)
+    normal_tare, tangential_tare = forces.tare_sigma_n(time)
+    tare = np.where(pressed, np.hypot(tangential_tare, ratio * normal_tare) / safe, 0)
+    return _MeanRatio(
+        time_s=time,
+        normal_n=normal,
+        tangential_n=tangential,
+        ratio=ratio,
+        sigma=sigma,
+        surely=ratio - _DROP_SIGMAS * sigma,
+        tare_sigma=tare,
+        pressed=pressed,
+        pulled=pressed & (tangential > 3 * noise.tangential),
+    )
+
+
+def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_change: float) -> list[float]:
+    """Rough times at which the ratio of a contact suddenly falls from a height that it exceeds nowhere."""
+    time, step = means.time_s, max(typical_step(means.time_s), 1e-9)
+    span = (time >= start_s) & (time <= end_s)
+    inside, pressed = span & means.pulled, span & means.pressed
+    if not inside.any():
+        return []
+    # where nothing presses, as before and after it: the end of a contact is no fall
+    ratio = np.interp(time, time[pressed], means.ratio[pressed])
     # the least that it has fallen to within the time of a slip
     count = min(max(1, round(_DROP_S / step)), len(time))
-    padded = np.concatenate((np.where(pressed, ratio, np.inf), np.full(count, np.inf)))
-    least = np.lib.stride_tricks.sliding_window_view(padded, count + 1).min(axis=1)
-    fall = ratio - least
-    enough = pressed & (ratio >= _PULLED_SHARE * highest) & (tangential > 3 * sigma_n)
-    falls = enough & (fall > np.maximum(_DROP_SIGMAS * np.sqrt(2) * sigma, _DROP_SHARE * ratio))
-    starts = np.flatnonzero(falls & ~np.concatenate(([False], falls[:-1])))
-    ends = np.flatnonzero(falls & ~np.concatenate((falls[1:], [False])))
-    # of each stretch the moment at which the ratio falls most steeply
-    earlier, later = (mean_force(time, ratio, at, window_s=_STEP_S) for at in (time - _STEP_S / 2, time + _STEP_S))
-    steep = earlier - later
-    # a stretch begins before its fall by the time that a fall may take, and may end as it begins
-    tops = [start + int(np.argmax(steep[start : end + count + 1])) for start, end in zip(starts, ends, strict=True)]
-    at = np.unique(time[np.array(tops, dtype=int)])
-    before, after = (mean_force(time, normal, at + way, window_s=_STEP_S) for way in (-_STEP_S, _STEP_S))
-    return at[after > _HELD_SHARE * before].tolist(), highest
+    padded = np.concatenate((np.where(means.ratio > 0, means.ratio, np.inf), np.full(count, np.inf)))
+    fall = means.ratio - np.lib.stride_tricks.sliding_window_view(padded, count + 1).min(axis=1)
+    least = np.maximum(_DROP_SIGMAS * np.sqrt(2) * means.sigma, _DROP_SHARE * means.ratio)
+    falling = inside & (fall > least)
+    if not falling.any():
+        return []
+    reach_s = max(_STEP_S, step)
+
+    def mean(values: Samples, at_s: Times) -> Times:
+        return mean_force(time, values, at_s, window_s=reach_s)
+
+    # the moments at which the ratio falls most steeply, up to the time of a slip after it is seen to fall
+    steep = mean(ratio, time - reach_s / 2) - mean(ratio, time + reach_s)
+    beside = max(1, round(reach_s / step))
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(steep, beside, mode="edge"), 2 * beside + 1)
+    soon = np.lib.stride_tricks.sliding_window_view(np.pad(falling, (count, 0)), count + 1).any(axis=1)
+    tops = np.flatnonzero(soon & (steep > 0) & (steep == around.max(axis=1)))
+    highest = float(means.surely[inside].max())
+    allowed = max(_DROP_SHARE, _LAW_SIGMAS * friction_change)
+    falls = []
+    for top in tops.tolist():
+        if highest > float(means.ratio[max(0, top - 2 * beside) : top + 1].max()) * (1 + allowed):
+            continue
+        places = time[top] + reach_s * np.array([-3.5, -1.0, 1.5, 4.0])
+        earlier, before, after, later = mean(ratio, places)
+        normal, pull = (mean(values, places[1:3]) for values in (means.normal_n, means.tangential_n))
+        slips = (
+            normal[1] > _HELD_SHARE * normal[0],
+            before - after > _PULL_SHARE * least[top],
+            after > _SLIDING_SHARE * before,
+            before - after > _SUDDEN * max(earlier - before, after - later),
+            1 - pull[1] / pull[0] > _PULL_SHARE * (1 - after / before),
+        )
+        if all(slips):
+            falls.append(float(time[top]))
+    return sorted(falls)
 
 
 def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float | None:

@@ -22,7 +22,7 @@ from sliplens.recordings.labels.axes import (
     typical_step,
 )
 from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, MARKED, Screened, faults_at, screen_trial
-from sliplens.recordings.labels.friction import ImageMotion, estimate_friction
+from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, find_contacts
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
 
@@ -91,9 +91,9 @@ _RATE_STEPS = 3.0
 class FoundLabels(Labels):
     """Labels that were found from forces, and all that they rest on.
 
-    After gross slip the margin is 0 and not valid: the friction that then holds is another one, and the margin never
-    silently returns. The friction coefficient is static until the slip, then F_t / F_n, so that in contact every margin
-    is 1 - F_t / (mu F_n).
+    After gross slip the margin is 0 and not valid, until the contact is let go and loaded anew: the friction that then
+    holds is another one. The friction coefficient is static until the slip, then F_t / F_n, so that in contact every
+    margin is 1 - F_t / (mu F_n).
     """
 
     # required here: a keyword needs no default, though the base has one
@@ -126,7 +126,8 @@ def label_frames(
     slip. Noise, tare, friction, lag and a change of the friction on the way to the slip all enter the uncertainty of
     the margin, as independent of each other. A lag that is known but not applied counts as an error of its size.
     Where the friction tells no onset, gross slip begins with the first frame whose forces clearly lie outside the
-    friction cone. A lag that is to be applied, but not known or doubtful, is a `RecordingError`.
+    friction cone. It lasts until the contact is let go and loaded anew. A lag that is to be applied, but not known or
+    doubtful, is a `RecordingError`.
     """
     apply_lag = settings.apply_lag or settings.lag_ms is not None
     if apply_lag and (lag is None or lag.doubt):
@@ -149,7 +150,7 @@ def label_frames(
     # a chord as short as the lag's uncertainty would count the noise of its ends, which `_variance` counts already
     reach = max(unsure, _RATE_STEPS * typical_step(frame_time_s), 1e-9)
     # up to the slip only: beyond it there is no margin to be wrong about, and a window at it would shrink to a sample
-    end = np.minimum(time + reach, onset - window / 2)
+    end = np.where(time < onset, np.minimum(time + reach, onset - window / 2), time + reach)
     early, late = (_used(forces_at(moment), friction, threshold) for moment in (end - 2 * reach, end))
     swing = (late - early) / 2 * unsure / reach
     drift = settings.friction_change * _remaining(time, contact, until_s=onset)
@@ -162,7 +163,8 @@ def label_frames(
     slip_s = friction.onset_s
     if slip_s is None and np.any(outside := reliable & (used > 1 + sigma)):
         slip_s = float(time[np.argmax(outside)])
-    slipped = time >= (np.inf if slip_s is None else slip_s)
+    onsets = () if slip_s is None else (slip_s, *(later_s - window / 2 for later_s in friction.later_onsets_s))
+    slipped = _after_slips(time, onsets, find_contacts(forces, contact_threshold_n=threshold))
     margin = safety_margin(np.where(contact, at.normal_n, 0.0), at.tangential_n, friction.mu)
     margin = np.where(at.missing | at.out_of_range | (fault > 0), np.nan, np.where(slipped & contact, 0.0, margin))
     valid = reliable & ~slipped & (sigma <= LARGEST_SIGMA)
@@ -185,6 +187,7 @@ def label_frames(
             at.out_of_range,
             ~contact,
             slipped,
+            ~valid & bool(friction.notes),
             ~valid,
         ),
         basis=LabelBasis(
@@ -220,18 +223,29 @@ def _variance(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -
 
 
 def _remaining(time_s: Frames, contact: Bool[np.ndarray, " frames"], *, until_s: float) -> Frames:
-    """Share of the way from touch to slip that is still to go: 1 at the touch, 0 from the slip on."""
+    """Distance in time from the slip, as a share of the way from touch to slip, at most 1."""
     if not contact.any():
         return np.zeros(len(time_s))
     touch, end = time_s[np.argmax(contact)], min(until_s, time_s[-1])
-    return np.clip((end - time_s) / max(end - touch, 1e-9), 0, 1)
+    return np.clip(np.abs(end - time_s) / max(end - touch, 1e-9), 0, 1)
+
+
+def _after_slips(
+    time_s: Frames, onsets_s: Sequence[float], contacts: Sequence[tuple[float, float]]
+) -> Bool[np.ndarray, " frames"]:
+    """Whether a contact has slipped before, and was not let go and loaded anew since."""
+    slipped = np.zeros(len(time_s), dtype=bool)
+    for onset_s in onsets_s:
+        anew_s = next((start_s for start_s, _ in contacts if start_s > onset_s), np.inf)
+        slipped |= (time_s >= onset_s) & (time_s < anew_s)
+    return slipped
 
 
 _STATES = (ContactState.NO_CONTACT, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
 _REASONS = (
     *FAULTS[1:],
-    Reason.MISSING_SAMPLES, Reason.OUT_OF_RANGE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.TOO_UNCERTAIN,
-    Reason.NONE,
+    Reason.MISSING_SAMPLES, Reason.OUT_OF_RANGE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.CONTRADICTED,
+    Reason.TOO_UNCERTAIN, Reason.NONE,
 )  # fmt: skip
 _Word = TypeVar("_Word", ContactState, Reason)
 
@@ -322,12 +336,15 @@ def _label_screened(
     threshold = settings.contact_threshold
     if threshold is None:
         threshold = contact_threshold(contact, window_s=typical_step(frame_time_s))
-    if settings.mu is not None:
-        friction = FrictionEstimate(mu=settings.mu, low=settings.mu, high=settings.mu, onset_s=settings.slip_s)
-    else:
-        image = ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion)
-        limits = {"contact_threshold_n": threshold, "slip_s": settings.slip_s}
-        friction = estimate_friction(contact, **limits, rng=rng, image=image)
+    friction = estimate_friction(
+        contact,
+        contact_threshold_n=threshold,
+        rng=rng,
+        image=ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion),
+        slip_s=settings.slip_s,
+        mu=settings.mu,
+        friction_change=settings.friction_change,
+    )
     if friction.onset_s is not None:
         begin = forces.time_s[0] if axes.still_until_s is None else axes.still_until_s
         pull = (screened.recorded.time_s > begin) & (screened.recorded.time_s < friction.onset_s)
