@@ -344,7 +344,7 @@ def _find_unloading(forces: Forces, breaks: Sequence[int]) -> dict[int, bool]:
     time, force = forces.time_s, forces.force_n - axes.tare_n
     normal = axes.sign * turn_matrix(axes)[axes.normal_index]
     near_n = _near(forces.force_n)
-    count, near = _fitted(forces), float(np.linalg.norm(near_n))
+    count, near, least = _fitted(forces), float(np.linalg.norm(near_n)), _JUMP_SHARE * _load(forces.force_n)
     groups: list[list[int]] = []
     for at in breaks:
         if groups and time[at] - time[groups[-1][-1]] <= _LET_GO_S:
@@ -372,7 +372,7 @@ def _find_unloading(forces: Forces, breaks: Sequence[int]) -> dict[int, bool]:
         let_go = float(np.linalg.norm(after)) <= near + _AT_REST * float(np.linalg.norm(before))
         returns = np.any(np.all(np.abs(changes[place + 1 :] + changes[place]) <= near_n, axis=1))
         if course[0, 0] > near and falls and (slips or let_go) and not returns:
-            unloading |= {at: bool(slips and fallen[1] > near and at == group[0]) for at in group}
+            unloading |= {at: bool(slips and fallen[1] > least and at == group[0]) for at in group}
     return unloading
 
 

@@ -183,8 +183,8 @@ def doubt_agreement(
         if correlation < _LEAST_CORRELATION:
             doubts.append(
                 f"image and force do not move together from {time[some][0]:.2f} to {time[some][-1]:.2f} s (correlation "
-                f"{correlation:.2f}, {_LEAST_CORRELATION} is needed); check that the forces are those of this video, and "
-                "that camera and force sensor ran"
+                f"{correlation:.2f}, {_LEAST_CORRELATION} is needed); check that the forces are those of this video, "
+                "and that camera and force sensor ran"
             )
     idle = covered & ~np.any(near, axis=0)
     if near and not doubts and idle.any():
