@@ -265,7 +265,7 @@ def _find_breaks(forces: Forces, *, sees: Sees) -> tuple[list[int], list[float]]
         return [], []
     jumps = find_jumps(forces, load_n=_load(forces.force_n))
     unseen = [at for at, size in jumps if not sees(float(forces.time_s[at]), size)]
-    unloading = _find_unloading(forces, unseen)
+    unloading = _find_unloading(forces, [at for at, _ in jumps], unseen=set(unseen))
     slips = [float(forces.time_s[at]) for at, slips in unloading.items() if slips]
     return [at for at in unseen if at not in unloading], slips
 
@@ -273,6 +273,11 @@ def _find_breaks(forces: Forces, *, sees: Sees) -> tuple[list[int], list[float]]
 def _near(force_n: Samples) -> Axis:
     """Difference that two forces may have which are the same: of lines through a few samples, lengthened to meet."""
     return 6 * _noise(force_n) + 0.5 * _JUMP_SHARE * _load(force_n)
+
+
+def _typical_rate(forces: Forces) -> float:
+    """Median rate at which the force changes, in newtons a second."""
+    return float(np.median(np.linalg.norm(np.diff(forces.force_n, axis=0), axis=1) / np.diff(forces.time_s)))
 
 
 def _find_shifts(forces: Forces, *, sees: Sees) -> tuple[Marks, Samples]:
@@ -287,7 +292,7 @@ def _find_shifts(forces: Forces, *, sees: Sees) -> tuple[Marks, Samples]:
         return marks, shift
     near, sigma = _near(force), _noise(force)
     parts = [_Part.of(forces, start, end) for start, end in pairwise([0, *breaks, len(time)])]
-    rate = float(np.quantile(np.linalg.norm(np.diff(force, axis=0), axis=1) / np.diff(time), 0.5))
+    rate = _typical_rate(forces)
     last, off = parts[0], []
     for part in parts[1:]:
         if off and _is_back(last, off, part, near_n=near, rate_n_s=rate):
@@ -329,13 +334,14 @@ class _Part:
         return cls(start=start, end=end, start_s=float(time[0]), end_s=float(time[-1]), first_n=ends[0], last_n=ends[1])
 
 
-def _find_unloading(forces: Forces, breaks: Sequence[int]) -> dict[int, bool]:
+def _find_unloading(forces: Forces, jumps: Sequence[int], *, unseen: set[int]) -> dict[int, bool]:
     """Find the jumps with which a contact slips or is let go, and tell those at which a slip begins.
 
     A fall of the tangential force at constant normal force is a slip, a fall of both to nothing a release. Neither
-    comes back, at once or with a later jump. Jumps that a release may hold are looked at together.
+    comes back, at once or with a later jump, of which the image may have seen some. Jumps that a release may hold are
+    looked at together.
     """
-    if not breaks:
+    if not unseen:
         return {}
     try:
         axes = infer_axes(forces)
@@ -346,7 +352,7 @@ def _find_unloading(forces: Forces, breaks: Sequence[int]) -> dict[int, bool]:
     near_n = _near(forces.force_n)
     count, near, least = _fitted(forces), float(np.linalg.norm(near_n)), _JUMP_SHARE * _load(forces.force_n)
     groups: list[list[int]] = []
-    for at in breaks:
+    for at in jumps:
         if groups and time[at] - time[groups[-1][-1]] <= _LET_GO_S:
             groups[-1].append(at)
         else:
@@ -356,13 +362,28 @@ def _find_unloading(forces: Forces, breaks: Sequence[int]) -> dict[int, bool]:
         [np.median(part, axis=0) for part in (force[max(0, start - count) : start], force[end : end + count])]
         for start, end in spans
     ]
-    changes = np.array([after - before for before, after in levels])
+    ends = [0, *(group[0] for group in groups), len(time)]
+    starts = [0, *(group[-1] for group in groups)]
+    parts = [_Part.of(forces, start, end) for start, end in zip(starts, ends[1:], strict=True)]
+    rate = _typical_rate(forces)
+
+    def back(leaves: int, comes: int) -> bool:
+        """Whether the second of two groups takes back what the first did."""
+        off = parts[leaves + 1 : comes + 1]
+        return _is_back(parts[leaves], off, parts[comes + 1], near_n=near_n, rate_n_s=rate)
+
     unloading = {}
+    faulty: list[int] = []  # groups that are neither slip nor release
     for place, (group, (start, end), (before, after)) in enumerate(zip(groups, spans, levels, strict=True)):
+        if unseen.isdisjoint(group):
+            continue
+        others = [(left, place) for left in faulty] + [(place, later) for later in range(place + 1, len(groups))]
+        faulty.append(place)
         pull = before - normal * (normal @ before)
         along = pull / max(float(np.linalg.norm(pull)), 1e-12)
-        course = np.concatenate((before[None], force[start:end], after[None])) @ np.stack((normal, along), axis=1)
-        beside = np.linalg.norm(force[start:end] - course[1:-1] @ np.stack((normal, along)), axis=1)
+        basis = np.stack((normal, along))
+        course = np.concatenate((before[None], force[start:end], after[None])) @ basis.T
+        beside = np.linalg.norm(force[start:end] - course[1:-1] @ basis, axis=1)
         fallen = course[0] - course[-1]
         aslant = _ASLANT * abs(fallen[1])
         # no force grows, reverses, or grows again
@@ -370,8 +391,13 @@ def _find_unloading(forces: Forces, breaks: Sequence[int]) -> dict[int, bool]:
         falls &= np.all(course >= -near - aslant) and np.all(beside <= near + aslant)
         slips = abs(fallen[0]) <= near + aslant
         let_go = float(np.linalg.norm(after)) <= near + _AT_REST * float(np.linalg.norm(before))
-        returns = np.any(np.all(np.abs(changes[place + 1 :] + changes[place]) <= near_n, axis=1))
-        if course[0, 0] > near and falls and (slips or let_go) and not returns:
+        if course[0, 0] <= near or not (falls and (slips or let_go)):
+            continue
+        # sliding friction holds no more than static friction: who pulls harder later has not slipped
+        later = np.lib.stride_tricks.sliding_window_view(force[start:], count, axis=0).mean(axis=-1) @ basis.T
+        harder = later[:, 1] / np.maximum(later[:, 0], course[0, 0] / 2) > (course[0, 1] + near) / course[0, 0]
+        if not harder.any() and not any(back(*pair) for pair in others):
+            faulty.remove(place)
             unloading |= {at: bool(slips and fallen[1] > least and at == group[0]) for at in group}
     return unloading
 
