@@ -77,7 +77,8 @@ def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
         return _tell_given(recording, labelling)
     axes, limit, notes = basis.axes, basis.force_range_n, labelling.notes
     pressing = f"normal force is {'+' if axes.sign > 0 else _MINUS}{axes.normal}"
-    told = f"{pressing} (axis {_found(axes.normal_found)}, sign {_found(axes.sign_found)})"
+    turned = f", turned by {axes.tilt_deg:.1f} degrees" if axes.direction else ""
+    told = f"{pressing}{turned} (axis {_found(axes.normal_found)}, sign {_found(axes.sign_found)})"
     still = f"untouched until {decimals(axes.still_until_s, 2)} s"
     noise = [f"± {_three(axes.tare_sigma_n)} N", f"noise of a sample {_three(axes.noise_n)} N"]
     tare = [f"x, y, z: {_three(axes.tare_n, signed)} N", *noise, still]

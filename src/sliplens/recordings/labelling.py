@@ -47,6 +47,10 @@ class ForceAxes:
     """Rate at which the reading of the untouched sensor drifts; 0 where it cannot be told from none."""
     drift_sigma_n_s: Vector = (0.0, 0.0, 0.0)
     """Standard uncertainty of that rate."""
+    direction: Vector | None = None
+    """Unit vector along which pressing points, where the sensor is tilted; None where that is the axis."""
+    direction_sigma: float = 0.0
+    """Standard uncertainty of that direction, in radians."""
     notes: tuple[str, ...] = ()
     """Doubts, a sentence each."""
 
@@ -60,6 +64,13 @@ class ForceAxes:
     def normal_index(self) -> int:
         """Column of the normal axis."""
         return AXES.index(self.normal)
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle between the normal axis and the direction of the press, by which the axes are turned."""
+        if self.direction is None:
+            return 0.0
+        return float(np.rad2deg(np.arccos(np.clip(self.sign * self.direction[self.normal_index], -1, 1))))
 
 
 @dataclass(frozen=True, kw_only=True)

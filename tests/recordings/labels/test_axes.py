@@ -8,7 +8,7 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels import Found, infer_axes
 from sliplens.recordings.labels.axes import apply_axes, magnitude
 
-from .conftest import NORMAL_N, TOUCH_S, Trial
+from .conftest import NORMAL_N, SLIP_S, TOUCH_S, Trial
 
 TARE = (0.7, -0.4, 0.2)
 
@@ -77,10 +77,68 @@ def test_a_recording_that_begins_in_the_press_has_no_still_samples(trial: Trial,
     np.testing.assert_array_equal(axes.tare_n, 0)
 
 
-def test_two_axes_that_press_alike_are_doubtful(trial: Trial):
-    tilted = np.stack((trial.contact_n[:, 0], 0.9 * trial.contact_n[:, 0], trial.contact_n[:, 1]), axis=1)
-    axes = infer_axes(Forces(time_s=trial.time_s, force_n=tilted, source="sensor"))
+def turned(degrees: float, *, about: tuple[float, float, float]) -> np.ndarray:
+    """Rotation about an axis (Rodrigues)."""
+    x, y, z = np.array(about) / np.linalg.norm(about)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.deg2rad(degrees)
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+@pytest.mark.parametrize("degrees", [2, 5, 20, 50])
+@pytest.mark.parametrize("about", [(0, 1, 0), (0, 1, -3), (1, 2, 3)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_tilted_sensor_gives_the_forces_of_a_straight_one(
+    trial: Trial, rng: np.random.Generator, degrees: float, about: tuple[float, float, float], sign: int
+):
+    straight = trial.forces(noise_n=0.02, rng=rng, sign=sign)
+    tilted = Forces(time_s=trial.time_s, force_n=straight.force_n @ turned(degrees, about=about).T + TARE, source="s")
+    axes = infer_axes(tilted)
+    contact = apply_axes(tilted, axes)
+    # the direction is known to 0.02 N / (1.5 N sqrt(60)), those of 250 samples of a press that weigh as much as a full
+    # one: 2e-3; 3 sigma of it and 4 of a mean over 25 samples
+    smooth = [np.convolve(one, np.ones(25) / 25, "same") for one in (contact.normal_n, *contact.tangential_n.T)]
+    normal, pull = smooth[0], np.hypot(*smooth[1:])
+    inside = (trial.time_s > TOUCH_S + 0.6) & (trial.time_s < SLIP_S - 0.1)
+    np.testing.assert_allclose(normal[inside], trial.contact_n[inside, 0], atol=0.03)
+    np.testing.assert_allclose(pull[inside], np.linalg.norm(trial.contact_n[inside, 1:], axis=1), atol=0.03)
+    assert axes.tilt_deg == pytest.approx(
+        np.rad2deg(np.arccos(np.abs(turned(degrees, about=about)[:, 0]).max())), abs=0.4
+    )
+    assert any("degrees off the axis" in note for note in axes.notes) == (axes.tilt_deg > 3)
+
+
+def test_a_tilt_off_a_declared_axis_is_flagged_and_not_turned(trial: Trial):
+    tilted = trial.contact_n @ turned(20, about=(0, 1, 0)).T
+    axes = infer_axes(Forces(time_s=trial.time_s, force_n=tilted, source="sensor"), normal="x", sign=1)
+    assert axes.direction is None
+    assert "points 20 degrees off the axis x that was declared" in axes.notes[0]
+
+
+@pytest.mark.parametrize("pull_s", [0.0, 0.2])
+def test_a_press_that_is_pulled_from_the_touch_on_is_no_tilt(trial: Trial, rng: np.random.Generator, pull_s: float):
+    normal = trial.contact_n[:, 0]
+    pull = 0.5 * np.clip((trial.time_s - TOUCH_S - pull_s) / 2.0, 0, 1) * normal
+    force = np.stack((normal, pull, 0 * pull), axis=1) + rng.normal(0, 0.02, (len(normal), 3))
+    axes = infer_axes(Forces(time_s=trial.time_s, force_n=force, source="sensor"))
+    assert (axes.normal, axes.direction) == ("x", None)
+
+
+def test_two_columns_give_no_tilt(trial: Trial):
+    # a tangential force that is a length has no direction to turn
+    force = np.stack((trial.contact_n[:, 0], 0.9 * trial.contact_n[:, 0], 0 * trial.time_s), axis=1)
+    axes = infer_axes(Forces(time_s=trial.time_s, force_n=force, source="sensor"))
+    assert axes.direction is None
     assert "the normal axis is doubtful: x" in axes.notes[0]
+
+
+def test_moved_samples_give_no_drift(trial: Trial, rng: np.random.Generator):
+    force = trial.contact_n * (trial.time_s < 5)[:, None] + rng.normal(0, 0.02, (len(trial.time_s), 3))
+    force[trial.time_s > 4.0] += 0.2
+    forces = Forces(time_s=trial.time_s, force_n=force, source="sensor")
+    # 0.2 N in the 5 s from the middle of the untouched samples to the end
+    np.testing.assert_allclose(infer_axes(forces).drift_n_s, 0.2 / 5.3, rtol=0.15)
+    np.testing.assert_array_equal(infer_axes(forces, moved_s=4.0).drift_n_s, 0)
 
 
 def test_a_sensor_that_is_never_touched_is_refused(trial: Trial, rng: np.random.Generator):

@@ -8,7 +8,7 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import FoundLabels, LabelSettings, Reason, label_trial
+from sliplens.recordings.labels import FoundLabels, LabelSettings, Reason, infer_axes, label_trial
 from sliplens.recordings.labels.faults import screen_forces
 
 from .conftest import PULL_S, SLIP_S, STATIC, Trial, ratio
@@ -102,27 +102,83 @@ def test_a_sound_trial_has_no_fault_and_the_labels_it_had(trial: Trial, every: i
 
 def test_a_slip_in_a_sample_is_no_step_for_the_image_sees_it(trial: Trial):
     # in conftest the force falls within 30 ms; here from one sample to the next
-    sudden = trial.contact_n.copy()
-    after = trial.time_s >= SLIP_S
-    sudden[after] = trial.contact_n[-1]
+    sudden = sudden_slip(trial)
     frames = np.stack([np.interp(trial.frame_time_s, trial.time_s, column) for column in sudden.T], axis=1)
     motion = 0.7 + np.append(0, 3 * np.linalg.norm(np.diff(frames, axis=0), axis=1))
     slipped = replace(trial, contact_n=sudden, motion=motion)
     labels = label(slipped, spoilt(slipped, lambda _time, _force: None))
     assert labels.basis.faults == ()
     assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.02)
-    # the same forces beside an image that rests at the slip
-    rests = replace(slipped, motion=np.where(np.abs(trial.frame_time_s - SLIP_S) < 0.1, 0.74, motion))
-    found = screen_faults(rests)
-    assert [one.kind for one in found] == [Reason.STEP]
-    assert found[0].start_s == pytest.approx(SLIP_S, abs=0.01)
 
 
-def screen_faults(trial: Trial):
-    try:
-        return label(trial, spoilt(trial, lambda _time, _force: None)).basis.faults
-    except RecordingError:
-        return screen_forces(spoilt(trial, lambda _time, _force: None)).faults
+@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize("axes", ["along an axis", "between axes"])
+def test_a_fall_of_the_pull_at_constant_normal_force_is_a_slip(trial: Trial, axes: str, every: int):
+    slipped = replace(trial, contact_n=sudden_slip(trial))
+    if axes == "along an axis":
+        pull = np.linalg.norm(slipped.contact_n[:, 1:], axis=1)
+        slipped = replace(slipped, contact_n=np.stack((slipped.contact_n[:, 0], pull, 0 * pull), axis=1))
+    rests = replace(slipped, motion=np.where(np.abs(trial.frame_time_s - SLIP_S) < 0.1, 0.7, trial.motion))
+    labels = label(rests, spoilt(rests, lambda _time, _force: None, every=every))
+    assert labels.basis.faults == ()
+    # of 100 samples a second the slip lies anywhere in a hundredth
+    assert labels.basis.slip_s == pytest.approx(SLIP_S, abs=0.012)
+    assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.03)
+    # an image that rests there is flagged; of 100 samples a second so small a fall is no jump that wants a witness
+    flagged = any("the image rests, which was taken for a slip" in flag for flag in labels.basis.flags)
+    assert flagged == (every == 1)
+
+
+def sudden_slip(trial: Trial) -> np.ndarray:
+    """Forces that fall from static to kinetic friction from one sample to the next."""
+    return np.where((trial.time_s >= SLIP_S)[:, None], trial.contact_n[-1], trial.contact_n)
+
+
+@pytest.mark.parametrize("every", [1, 5])
+@pytest.mark.parametrize("length_s", [0.002, 0.02, 0.05, 0.1])
+@pytest.mark.parametrize("slips", [True, False])
+@pytest.mark.parametrize("shape", ["even", "soft"])
+def test_a_fall_of_both_forces_is_a_release(trial: Trial, every: int, length_s: float, slips: bool, shape: str):
+    begin_s = SLIP_S + 0.4 if slips else 4.0
+    left = np.clip(1 - (trial.time_s - begin_s) / length_s, 0, 1)
+    left = left if shape == "even" else left**2 * (3 - 2 * left)
+    forces = spoilt(replace(trial, contact_n=trial.contact_n * left[:, None]), lambda _time, _force: None, every=every)
+    # no image is asked
+    screened = screen_forces(forces)
+    assert screened.faults == ()
+    assert screened.doubts == ()
+    # the zero is where it was, so no drift is read from the end
+    np.testing.assert_array_equal(infer_axes(screened.forces, moved_s=screened.moved_s).drift_n_s, 0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize("what", ["pull", "both"])
+def test_a_fall_that_returns_is_a_fault(trial: Trial, what: str, share: float):
+    # as a slip or a release, but back at once
+    kept = (trial.time_s < AT_S) | (trial.time_s >= AT_S + 0.2)
+    scale = np.where(kept, 1.0, share)[:, None] * np.ones(3)
+    if what == "pull":
+        scale[:, 0] = 1
+    faulty = replace(trial, contact_n=trial.contact_n * scale)
+    faults = screen_forces(spoilt(faulty, lambda _time, _force: None)).faults
+    assert {fault.kind for fault in faults} == {Reason.STEP}
+    assert faults[0].start_s == pytest.approx(AT_S, abs=0.006)
+    assert faults[-1].end_s == pytest.approx(AT_S + 0.2, abs=0.008)
+
+
+def test_a_step_that_may_be_a_slip_names_the_option_that_says_so(trial: Trial):
+    # both axes jump, and the normal force, too: no slip as far as the forces tell
+    jumped = sudden_slip(trial)
+    jumped[trial.time_s >= SLIP_S, 0] += 0.4
+    rests = replace(trial, contact_n=jumped, motion=np.where(trial.frame_time_s > SLIP_S - 0.1, 0.74, trial.motion))
+    forces = spoilt(rests, lambda _time, _force: None)
+    with pytest.raises(RecordingError, match=r"if the contact slips at 4\.50 s, give --slip-s 4\.50") as refusal:
+        label(rests, forces)
+    slip_s = float(str(refusal.value).rsplit("--slip-s ", 1)[1].rstrip(")"))
+    settings = LabelSettings(slip_s=slip_s)
+    labels = label_trial(rests.frame_time_s, rests.motion, forces, settings=settings, rng=np.random.default_rng(2))
+    assert labels.basis.faults == ()
+    assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.03)
 
 
 def test_after_a_step_nothing_is_valid_and_what_is_before_stays(trial: Trial):
@@ -206,6 +262,16 @@ def test_a_friction_that_no_fingertip_has_is_refused_or_flagged(trial: Trial):
     with pytest.raises(RecordingError, match=r"comes out as 12.., and that of a fingertip lies between 0.05 and 4"):
         friction(None)
     assert any(flag.startswith("a friction of 9 was given") for flag in friction(9.0).basis.flags)
+
+
+@pytest.mark.parametrize("given", [True, False])
+@pytest.mark.parametrize(("mu", "doubted"), [(1.4, False), (1.6, True), (3.0, True)])
+def test_a_friction_beyond_that_of_rubber_is_doubted(trial: Trial, given: bool, mu: float, doubted: bool):
+    strong = replace(trial, contact_n=trial.contact_n * np.array([1, mu / STATIC, mu / STATIC]))
+    forces = strong.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
+    settings = LabelSettings(mu=mu if given else None)
+    labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=np.random.default_rng(2))
+    assert any("seldom exceeds 1.5" in flag for flag in labels.basis.flags) == doubted
 
 
 def test_a_normal_force_that_mostly_pulls_is_flagged(trial: Trial):

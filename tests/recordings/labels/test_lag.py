@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -6,6 +7,7 @@ import pytest
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels import Lag, estimate_lag
+from sliplens.recordings.labels.lag import doubt_agreement
 
 from .conftest import FORCE_HZ, FRAME_HZ, Trial
 
@@ -133,3 +135,62 @@ def test_clocks_of_another_zero_are_refused(trial: Trial, rng: np.random.Generat
 def test_a_sensor_that_reads_one_value_tells_no_lag(trial: Trial, rng: np.random.Generator):
     still = Forces(time_s=trial.time_s, force_n=np.ones((len(trial.time_s), 3)), source="sensor")
     assert estimate_lag(trial.frame_time_s, trial.motion, still, rng=rng).doubt != ""
+
+
+def frames_of(trial: Trial, *, until_s: float = np.inf) -> np.ndarray:
+    """Motion of an image with a camera's noise, which rests from a moment on."""
+    rng = np.random.default_rng(3)
+    return np.where(trial.frame_time_s < until_s, trial.motion, trial.motion[1]) + rng.normal(
+        0, 0.01, len(trial.motion)
+    )
+
+
+def twice(trial: Trial, motion: np.ndarray, *, loads: int) -> tuple[np.ndarray, np.ndarray, Forces]:
+    """Two contacts one after the other, let go between them, of which the forces tell some."""
+    span_s = trial.time_s[-1] + 0.5
+    held = trial.contact_n * np.clip((5.3 - trial.time_s) / 0.2, 0, 1)[:, None]
+    force = np.concatenate((held, held if loads == 2 else 0 * held))
+    force = force + np.random.default_rng(4).normal(0, 0.02, force.shape)
+    time = np.concatenate((trial.time_s, trial.time_s + span_s))
+    frame_time = np.concatenate((trial.frame_time_s, trial.frame_time_s + span_s))
+    return frame_time, motion, Forces(time_s=time, force_n=force, source="sensor")
+
+
+def doubts(time_s: np.ndarray, motion: np.ndarray, forces: Forces) -> tuple[str, ...]:
+    lag = estimate_lag(time_s, motion, forces, rng=seed())
+    return doubt_agreement(time_s, motion, forces, lag)
+
+
+@pytest.mark.parametrize("noise_n", [0.002, 0.02])
+def test_an_image_that_moves_as_the_force_changes_is_in_no_doubt(trial: Trial, noise_n: float):
+    forces = trial.forces(noise_n=noise_n, rng=np.random.default_rng(2), tare_n=(1.0, 2.0, -1.0))
+    assert doubts(trial.frame_time_s, frames_of(trial), forces) == ()
+    motion = frames_of(trial)
+    assert doubts(*twice(trial, np.append(motion, motion), loads=2)) == ()
+
+
+@pytest.mark.parametrize("case", ["image rests", "image repeats", "forces rest", "forces of another trial"])
+def test_a_contact_in_which_one_moves_and_the_other_does_not_is_told_with_the_correlation(trial: Trial, case: str):
+    motion, forces = frames_of(trial), trial.forces(noise_n=0.02, rng=np.random.default_rng(2))
+    if case == "image rests":
+        motion = frames_of(trial, until_s=0.0)
+    elif case == "image repeats":
+        motion = np.zeros(len(motion))
+    elif case == "forces rest":
+        force = np.random.default_rng(2).normal(0, 0.02, forces.force_n.shape)
+        forces = replace(forces, force_n=force)
+    else:  # which press and slip at other moments
+        forces = replace(forces, force_n=forces.force_n[::-1].copy())
+    (doubt,) = doubts(trial.frame_time_s, motion, forces)
+    assert re.search(r"do not move together from .* \(correlation -?0\.[012]\d, 0\.3 is needed\)", doubt)
+
+
+@pytest.mark.parametrize("without", ["image", "force"])
+def test_a_second_contact_that_one_of_both_misses_is_told(trial: Trial, without: str):
+    first, rests = frames_of(trial), frames_of(trial, until_s=0.0)
+    if without == "image":
+        (doubt,) = doubts(*twice(trial, np.append(first, rests), loads=2))
+        assert doubt.startswith("image and force do not move together from 6.")
+    else:
+        (doubt,) = doubts(*twice(trial, np.append(first, first), loads=1))
+        assert re.match(r"the image moves as in a contact from 6\.\d+ to 1\d\.\d+ s, and the forces rest", doubt)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
@@ -22,6 +22,15 @@ _MOST = 0.9  # share of the still samples that cannot all be spikes
 _FEW_STILL = 10  # fewer still samples tell no tare
 _STRETCHES = 10  # parts of the still samples whose means are compared
 _DOUBTFUL = 0.6  # a second axis that departs by this share of the first makes the normal axis doubtful
+_FEW_RISING = 4  # fewer samples of a press tell no direction
+_RISE = (0.15, 0.9)  # shares of the load in hold between which the direction of the press is measured
+_TILT_SIGMAS = 3.0  # a press that departs from an axis by so many standard uncertainties is tilted
+_LEAST_TILT_DEG = 0.5  # less moves a margin by 1 % or so
+_TILT_FLAG_DEG = 3.0  # more is flagged: sensors are mounted, and objects pressed, to about so many degrees
+_SHEAR_FLAG_DEG = 10.0  # a press that is pulled, too, is no fault up to here
+# of the tilt: a force that is pulled from the touch on turns by more than its whole angle in the time after the press,
+# that of a tilted sensor not at all
+_MOST_BEND = 0.25
 # of a drift, of the untouched reading at the end or of its slope before the touch: a false one costs good labels
 _DRIFT_SIGMAS, _SLOPE_SIGMAS = 4.0, 3.0
 # of the standard uncertainty of a drift that only the moment before the touch tells: all of it would cost 40 % of the
@@ -116,14 +125,17 @@ def infer_axes(
     tare_n: Vector | None = None,
     touch_s: float | None = None,
     drift_n_s: float | None = None,
+    moved_s: float = np.inf,
 ) -> ForceAxes:
     """Infer what is not declared of how to read a force sensor.
 
     The tare is the mean of the samples before the touch, spikes left out. The normal axis is the one that departs
-    furthest from it, on average, in the first quarter of the contact, when the object is pressed and held but not yet
-    pulled far; its sign makes that positive. A sensor that is pressed from the first sample on looks untouched: declare
-    its tare. Where nothing is ever pressed, axis and sign cannot be inferred: that is a `RecordingError`. `drift_n_s`:
-    standard deviation of the rate at which the zero may drift, where that is known.
+    furthest from it in the press, and its sign makes that positive. While nothing shears, the force of a press keeps
+    its direction: where that is no axis, the sensor is tilted, and its normal is that direction, unless an axis was
+    declared. A force that turns within the press is sheared already, and tells the axis alone. A sensor that is pressed
+    from the first sample on looks untouched: declare its tare. Where nothing is ever pressed, axis and sign cannot be
+    inferred: that is a `RecordingError`. `drift_n_s`: standard deviation of the rate at which the zero may drift, where
+    that is known. `moved_s`: time from which on the samples were moved, to take a step out, and so tell no drift.
     """
     noise = np.asarray(noise_sigma(forces.force_n))
     touch = _find_touch(forces, tare_n=tare_n) if touch_s is None else touch_s
@@ -142,22 +154,28 @@ def infer_axes(
         notes.append("no still samples before contact: the tare is taken as zero; declare it if the sensor has one")
     else:
         (tare, tare_sigma), tare_found = _read_tare(still, noise=noise), Found.INFERRED
+    drift, drift_sigma = np.zeros(3), np.zeros(3)
+    if tare_found is not Found.ASSUMED and np.isfinite(touch):
+        drift, drift_sigma = _find_drift(forces, tare, tare_sigma, noise=noise, until_s=until, moved_s=moved_s)
     press = np.zeros(3)  # the mean force while the object is pressed and held
     if np.isfinite(touch):
         end = touch + _PRESS_SHARE * (forces.time_s[-1] - touch)
         press = np.mean(forces.force_n[(forces.time_s >= touch) & (forces.time_s <= end)], axis=0) - tare
-    axis = AXES[int(np.argmax(np.abs(press)))] if normal is None else normal
+    rise = _measure_rise(forces, tare, tare_sigma, noise=noise, touch_s=touch, drift_n_s=drift)
+    main = press if rise is None or rise.bends else rise.direction
+    axis = AXES[int(np.argmax(np.abs(main)))] if normal is None else normal
     first, second = np.sort(np.abs(press))[[-1, -2]]
-    if normal is None and second > _DOUBTFUL * first:
+    if normal is None and main is press and second > _DOUBTFUL * first:
         notes.append(
             f"the normal axis is doubtful: {axis} departs by {first:.2f} N in the press, another by {second:.2f} N; "
             "declare it"
         )
     # an axis that is none is ForceAxes' to refuse
-    inferred_sign = 1 if axis not in AXES or press[AXES.index(axis)] >= 0 else -1
-    drift, drift_sigma = np.zeros(3), np.zeros(3)
-    if tare_found is not Found.ASSUMED and np.isfinite(touch):
-        drift, drift_sigma = _find_drift(forces, tare, tare_sigma, noise=noise, until_s=until)
+    inferred_sign = 1 if axis not in AXES or main[AXES.index(axis)] >= 0 else -1
+    tilt_deg = 0.0 if rise is None or axis not in AXES else rise.tilt_deg(axis, sign or inferred_sign)
+    turned = rise is not None and not rise.bends and normal is None and sign in (None, inferred_sign) and tilt_deg > 0
+    if rise is not None and tilt_deg > (_SHEAR_FLAG_DEG if rise.bends else _TILT_FLAG_DEG):
+        notes.append(_tilt_note(axis, tilt_deg, turned=turned, bends=rise.bends))
     if drift_n_s is not None:
         drift_sigma = np.full(3, drift_n_s)
     elif np.any(drift_sigma * np.ptp(forces.time_s) > _UNSEEN_LOAD * np.linalg.norm(press)):
@@ -174,6 +192,8 @@ def infer_axes(
     return ForceAxes(
         normal=axis,
         sign=inferred_sign if sign is None else sign,
+        direction=_vector(rise.direction) if turned and rise is not None else None,
+        direction_sigma=rise.sigma if turned and rise is not None else 0.0,
         tare_n=_vector(tare),
         noise_n=_vector(noise),
         tare_sigma_n=_vector(tare_sigma),
@@ -187,7 +207,74 @@ def infer_axes(
     )
 
 
-def _find_drift(forces: Forces, tare_n: Axes, tare_sigma_n: Axes, *, noise: Axes, until_s: float) -> tuple[Axes, Axes]:
+@dataclass(frozen=True, kw_only=True)
+class _Rise:
+    """Direction of the force while the load of a press rises."""
+
+    direction: Axes
+    """Unit vector, in the axes of the sensor as recorded."""
+    sigma: float
+    """Standard uncertainty of the direction, in radians."""
+    bends: bool
+    """Whether the direction changes on the way or soon after: something shears."""
+
+    def tilt_deg(self, axis: str, sign: int) -> float:
+        """Angle to an axis; 0 where it cannot be told from none."""
+        angle = float(np.rad2deg(np.arccos(np.clip(sign * self.direction[AXES.index(axis)], -1, 1))))
+        return angle if angle > max(_LEAST_TILT_DEG, _TILT_SIGMAS * np.rad2deg(self.sigma)) else 0.0
+
+
+def _measure_rise(
+    forces: Forces, tare_n: Axes, tare_sigma_n: Axes, *, noise: Axes, touch_s: float, drift_n_s: Axes
+) -> _Rise | None:
+    """Measure the direction of the force from the touch until it is held; None where no axis or no sample tells it."""
+    time = forces.time_s
+    contact = np.flatnonzero(time >= touch_s)
+    # two columns tell no direction: the tangential force may be a length
+    if len(contact) < _FEW_STILL or not np.ptp(forces.force_n, axis=0).all():
+        return None
+    force = forces.force_n - tare_n - drift_n_s * (time - (time[0] + touch_s) / 2)[:, None]
+    load = np.linalg.norm(mean_force(time, force, time, window_s=_WINDOW_S), axis=1)
+    early = load[contact][time[contact] <= touch_s + _PRESS_SHARE * (time[-1] - touch_s)]
+    level = float(np.median(early[early >= early.max() / 2]))
+    low, high = (level * share for share in _RISE)
+    held = contact[np.argmax(load[contact] >= high)]
+    rising = np.arange(contact[0], held)
+    rising = rising[load[rising] > low]
+    if len(rising) < _FEW_RISING:
+        return None
+    # as long again, once it is pressed
+    holding = np.flatnonzero((time > time[held]) & (time <= 2 * time[held] - time[rising[0]]))
+    if len(holding) < _FEW_RISING:
+        return None
+
+    def direction(part: Int[np.ndarray, " part"]) -> tuple[Axes, float]:
+        """Slope of the force over its length, by least squares, and its standard uncertainty."""
+        weight = float(np.sum(load[part] ** 2))
+        slope = load[part] @ force[part] / weight
+        white = float(np.linalg.norm(noise)) / np.sqrt(weight)
+        zero = float(np.linalg.norm(tare_sigma_n)) * float(np.sum(load[part])) / weight
+        return slope / np.linalg.norm(slope), float(np.hypot(white, zero))
+
+    (press, sigma), (hold, hold_sigma) = direction(rising), direction(holding)
+    tilt = float(np.sqrt(max(0.0, 1 - np.max(np.abs(press)) ** 2)))
+    bend = float(np.linalg.norm(hold - press))
+    bends = bend > max(_TILT_SIGMAS * np.hypot(sigma, hold_sigma), _MOST_BEND * tilt)
+    return _Rise(direction=press, sigma=sigma, bends=bool(bends))
+
+
+def _tilt_note(axis: str, tilt_deg: float, *, turned: bool, bends: bool) -> str:
+    points = f"the force of the press points {tilt_deg:.0f} degrees off the axis {axis}"
+    if turned:
+        return f"{points}, so the axes were turned by that; if the press was oblique, give --normal-axis {axis}"
+    if bends:
+        return f"{points} and turns on the way: the sensor is tilted or something shears; press first, then pull"
+    return f"{points} that was declared; leave out --normal-axis and --normal-sign if the sensor is tilted"
+
+
+def _find_drift(
+    forces: Forces, tare_n: Axes, tare_sigma_n: Axes, *, noise: Axes, until_s: float, moved_s: float
+) -> tuple[Axes, Axes]:
     """Rate at which the zero drifts: to what is read at the end, if nothing touches there, else as before the touch.
 
     With its standard uncertainty: of a trial that is held to its end a moment before the touch is all that tells it.
@@ -199,7 +286,7 @@ def _find_drift(forces: Forces, tare_n: Axes, tare_sigma_n: Axes, *, noise: Axes
     unsure = np.hypot(noise / np.sqrt(ends.sum()), tare_sigma_n)
     # what wanders by more than its noise at the end is touched, or swings
     calm = np.all(np.std(force[ends], axis=0) < _CALM_NOISES * noise + 1e-9)
-    if calm and np.linalg.norm(offset) < _RELEASED_SHARE * np.quantile(away, 0.9):
+    if calm and time[-1] < moved_s and np.linalg.norm(offset) < _RELEASED_SHARE * np.quantile(away, 0.9):
         real = np.abs(offset) > np.maximum(_DRIFT_SIGMAS * unsure, _DRIFT_SHARE * np.quantile(away, 0.9))
         span_s = time[-1] - time[still].mean() if still.any() else np.inf
         return np.where(real, offset / span_s, 0.0), unsure / span_s
@@ -294,12 +381,13 @@ class ContactForces:
         on.
         """
         still = self._split(self.axes.tare_sigma_n)
+        aslant = self.axes.direction_sigma * np.abs(np.interp(time_s, self.time_s, self.normal_n))
         drift = self._split(np.hypot(self.axes.drift_n_s, self.axes.drift_sigma_n_s))
         begin = float(self.time_s[0])
         until = begin if self.axes.still_until_s is None else self.axes.still_until_s
         since = np.maximum(time_s - (begin + until) / 2, 0)
         # of a drift the length counts, for it is the same in all samples
-        tangential = np.hypot(still.tangential, np.sqrt(2) * drift.tangential * since)
+        tangential = np.hypot(np.hypot(still.tangential, np.sqrt(2) * drift.tangential * since), aslant)
         return np.hypot(still.normal, drift.normal * since), tangential
 
     def noise_of_means_n(self, window_s: float) -> NormalTangential:
@@ -313,14 +401,25 @@ class ContactForces:
 
     def _split(self, of_axes: Vector | Axes) -> NormalTangential:
         index = self.axes.normal_index
+        squares = turn_matrix(self.axes) ** 2 @ np.square(of_axes)
         return NormalTangential(
-            normal=float(abs(of_axes[index])), tangential=float(np.sqrt(np.mean(np.delete(of_axes, index) ** 2)))
+            normal=float(np.sqrt(squares[index])), tangential=float(np.sqrt(np.mean(np.delete(squares, index))))
         )
+
+
+def turn_matrix(axes: ForceAxes) -> Float[np.ndarray, "3 3"]:
+    """Rotation that brings the direction of the press onto the normal axis, the shortest there is (Rodrigues)."""
+    onto = axes.sign * np.eye(3)[axes.normal_index]
+    if axes.direction is None:
+        return np.eye(3)
+    about = np.cross(axes.direction, onto)
+    cross = np.cross(np.eye(3), about)
+    return np.eye(3) + cross + cross @ cross / (1 + np.dot(axes.direction, onto))
 
 
 def apply_axes(forces: Forces, axes: ForceAxes) -> ContactForces:
     """Take the tare off and turn the forces into the axes of the contact."""
-    force = forces.force_n - axes.tare_n
+    force = (forces.force_n - axes.tare_n) @ turn_matrix(axes).T
     return ContactForces(
         recorded=forces,
         normal_n=axes.sign * force[:, axes.normal_index],

@@ -11,12 +11,13 @@ from jaxtyping import Float, Int
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import ForceFault, Lag, Reason
-from sliplens.recordings.labels.axes import mean_force, noise_sigma, typical_step
+from sliplens.recordings.labels.axes import infer_axes, mean_force, noise_sigma, turn_matrix, typical_step
 from sliplens.recordings.labels.lag import estimate_lag, force_changes
 from sliplens.recordings.trial import MOST_FORCE_N
 
 Times: TypeAlias = Float[np.ndarray, " times"]
 Samples: TypeAlias = Float[np.ndarray, "samples 3"]
+Axis: TypeAlias = Float[np.ndarray, "3"]
 Marks: TypeAlias = Int[np.ndarray, " samples"]
 Sees: TypeAlias = Callable[[float, float], bool]
 """Whether the image moves as it would at a jump of the force: its time (s) and its size (N)."""
@@ -39,6 +40,10 @@ _JUMP_SIGMAS = 7.0
 _BURST_SIGMAS = 12.0  # of a change from one sample to the next, where there is no room for lines
 # of the load: a smaller jump moves the margin by no more than its usual uncertainty, a kink of a press looks as large
 _JUMP_SHARE, _BURST_SHARE = 0.04, 0.15
+_ASLANT = 0.2  # of a fall of the pull: so much of it may show along the normal, of axes that lie askew by 11 degrees
+_AT_REST = 0.1  # of the load: less is let go, however the zero has drifted
+_LET_GO_S = 0.3  # longest release that looks like jumps
+_SET_S = 0.1  # how far a slip that was set by hand may lie from its jump
 _BRIEF_S = 0.1  # a fault as short as this has ended when the force is back near where it was
 _LONGEST_LAG_S = 0.25  # where a jump may be seen if the lag is not told
 _NO_FLAG = 1e-6  # rounding of a mean of flags that are all 0
@@ -54,6 +59,10 @@ class Screened:
     marks: Marks
     """Place in `FAULTS` of what each recorded sample suffers from; 0 for none."""
     recorded: Forces
+    moved_s: float = np.inf
+    """Time from which on samples were moved back by a step."""
+    doubts: tuple[str, ...] = ()
+    """What was taken for a slip though the image rests, a sentence each."""
 
     @property
     def faults(self) -> tuple[ForceFault, ...]:
@@ -83,8 +92,9 @@ def screen_forces(
 
     Numbers that are none, or of no force (`MOST_FORCE_N`); values that a noisy sensor repeats; clipped tops; spikes,
     which neither side of them explains; and what lies between jumps from one sample to the next that the image does not
-    see, until the force is back: the jumps cancel, or one change of signs, scales or axes undoes both. Without a way
-    back the rest of the trial is marked, and moved back by the jumps to infer the friction from.
+    see, until the force is back: the jumps cancel, or one change of signs, scales or axes undoes both. Of jumps without
+    a way back a fall of the tangential force at constant normal force is a slip, and a fall of both to nothing a
+    release; after any other the rest of the trial is marked, and moved back by the jumps to infer the friction from.
 
     References
     ----------
@@ -105,7 +115,15 @@ def screen_forces(
         if len(good) > 2 * _BESIDE:
             some = replace(forces, time_s=forces.time_s[good], force_n=forces.force_n[good])
             marks[good], shift[good] = find(some)
-    return _leave_out(forces, marks, shift)
+    screened = _leave_out(forces, marks, shift)
+    _, slips = _find_breaks(screened.forces, sees=sees)
+    doubts = tuple(
+        f"the tangential force falls at {at_s:.2f} s while the normal force stays and the image rests, which was taken "
+        "for a slip; if the sensor was knocked, mark the frames from there on as bad and give the friction with --mu"
+        for at_s in slips
+        if not sees(at_s, 0.0)
+    )
+    return replace(screened, doubts=doubts)
 
 
 def screen_trial(
@@ -115,9 +133,13 @@ def screen_trial(
     *,
     lag: Lag | None,
     bad_frames: Sequence[tuple[int, int]] = (),
+    slip_s: float | None = None,
     rng: np.random.Generator,
 ) -> tuple[Screened, Lag]:
-    """Screen the forces of a trial, the image as a witness of their jumps, and estimate the lag if it is None."""
+    """Screen the forces of a trial, the image as a witness of their jumps, and estimate the lag if it is None.
+
+    A jump at `slip_s`, the slip that was set by hand, in seconds, is no fault.
+    """
     at_s = frame_time_s - (0.0 if lag is None else lag.lag_s)
     bad_s = [(float(at_s[first]), float(at_s[last])) for first, last in bad_frames]
     screened = screen_forces(forces, sees=lambda _time_s, _size_n: True, bad_s=bad_s)
@@ -132,7 +154,11 @@ def screen_trial(
     if jumps:
         time = frame_time_s - (0.0 if lag.doubt else lag.lag_s)
         changes = np.append(0.0, np.nan_to_num(force_changes(time, bridged)))
-        sees = image_witness(frame_time_s, image_motion, changes, lag=lag, longest_lag_s=_LONGEST_LAG_S)
+        image = image_witness(frame_time_s, image_motion, changes, lag=lag, longest_lag_s=_LONGEST_LAG_S)
+
+        def sees(time_s: float, size_n: float) -> bool:
+            return (slip_s is not None and abs(time_s - slip_s) <= _SET_S) or image(time_s, size_n)
+
         screened = screen_forces(forces, sees=sees, bad_s=bad_s)
     return screened, lag
 
@@ -184,7 +210,9 @@ def _leave_out(forces: Forces, marks: Marks, shift: Samples | None = None) -> Sc
     force = np.where(marks[:, None] == 0, forces.force_n, forces.force_n - shift)
     good = np.isfinite(force).all(axis=1)
     kept = replace(forces, time_s=forces.time_s[good], force_n=force[good]) if good.any() else forces
-    return Screened(forces=kept, marks=marks, recorded=forces)
+    moved = forces.time_s[good & (marks == _STEP)]
+    moved_s = float(moved[0]) if len(moved) else np.inf
+    return Screened(forces=kept, marks=marks, recorded=forces, moved_s=moved_s)
 
 
 def _find_runs(force_n: Float[np.ndarray, "samples 3"]) -> Marks:
@@ -231,24 +259,40 @@ def _find_spikes(forces: Forces) -> tuple[Marks, Samples]:
     return marks, np.full(force.shape, np.nan)
 
 
-def _find_shifts(forces: Forces, *, sees: Sees) -> tuple[Marks, Samples]:
-    """Stretches between jumps of the force that the image does not see, from the first until the force is back.
+def _find_breaks(forces: Forces, *, sees: Sees) -> tuple[list[int], list[float]]:
+    """Find the samples before which the force jumps unseen, and neither slips nor is let go; and the times of slips."""
+    if not 0 < typical_step(forces.time_s) <= _SLOW_S:
+        return [], []
+    jumps = find_jumps(forces, load_n=_load(forces.force_n))
+    unseen = [at for at, size in jumps if not sees(float(forces.time_s[at]), size)]
+    unloading = _find_unloading(forces, [at for at, _ in jumps], unseen=set(unseen))
+    slips = [float(forces.time_s[at]) for at, slips in unloading.items() if slips]
+    return [at for at in unseen if at not in unloading], slips
 
-    Of a step without a way back its size is told, too.
+
+def _near(force_n: Samples) -> Axis:
+    """Difference that two forces may have which are the same: of lines through a few samples, lengthened to meet."""
+    return 6 * _noise(force_n) + 0.5 * _JUMP_SHARE * _load(force_n)
+
+
+def _typical_rate(forces: Forces) -> float:
+    """Median rate at which the force changes, in newtons a second."""
+    return float(np.median(np.linalg.norm(np.diff(forces.force_n, axis=0), axis=1) / np.diff(forces.time_s)))
+
+
+def _find_shifts(forces: Forces, *, sees: Sees) -> tuple[Marks, Samples]:
+    """Find stretches between jumps of the force that the image does not see, from the first until the force is back.
+
+    Slips and releases are none. Of a step without a way back its size is told, too.
     """
-    time, force, step = forces.time_s, forces.force_n, typical_step(forces.time_s)
+    time, force = forces.time_s, forces.force_n
     marks, shift = np.zeros(len(time), dtype=np.int64), np.full(force.shape, np.nan)
-    if not 0 < step <= _SLOW_S:
-        return marks, shift
-    load = _load(force)
-    breaks = [at for at, size in find_jumps(forces, load_n=load) if not sees(float(time[at]), size)]
+    breaks, _ = _find_breaks(forces, sees=sees)
     if not breaks:
         return marks, shift
+    near, sigma = _near(force), _noise(force)
     parts = [_Part.of(forces, start, end) for start, end in pairwise([0, *breaks, len(time)])]
-    sigma = _noise(force)
-    # two lines through a few samples each, lengthened to their ends
-    near = 6 * sigma + 0.5 * _JUMP_SHARE * load
-    rate = float(np.quantile(np.linalg.norm(np.diff(force, axis=0), axis=1) / np.diff(time), 0.5))
+    rate = _typical_rate(forces)
     last, off = parts[0], []
     for part in parts[1:]:
         if off and _is_back(last, off, part, near_n=near, rate_n_s=rate):
@@ -288,6 +332,74 @@ class _Part:
             for some, at_s in ((slice(count), time[0] - half), (slice(-count, None), time[-1] + half))
         ]
         return cls(start=start, end=end, start_s=float(time[0]), end_s=float(time[-1]), first_n=ends[0], last_n=ends[1])
+
+
+def _find_unloading(forces: Forces, jumps: Sequence[int], *, unseen: set[int]) -> dict[int, bool]:
+    """Find the jumps with which a contact slips or is let go, and tell those at which a slip begins.
+
+    A fall of the tangential force at constant normal force is a slip, a fall of both to nothing a release. Neither
+    comes back, at once or with a later jump, of which the image may have seen some. Jumps that a release may hold are
+    looked at together.
+    """
+    if not unseen:
+        return {}
+    try:
+        axes = infer_axes(forces)
+    except RecordingError:
+        return {}  # nothing is ever loaded
+    time, force = forces.time_s, forces.force_n - axes.tare_n
+    normal = axes.sign * turn_matrix(axes)[axes.normal_index]
+    near_n = _near(forces.force_n)
+    count, near, least = _fitted(forces), float(np.linalg.norm(near_n)), _JUMP_SHARE * _load(forces.force_n)
+    groups: list[list[int]] = []
+    for at in jumps:
+        if groups and time[at] - time[groups[-1][-1]] <= _LET_GO_S:
+            groups[-1].append(at)
+        else:
+            groups.append([at])
+    spans = [(max(1, group[0] - count), min(len(time) - 1, group[-1] + count)) for group in groups]
+    levels = [
+        [np.median(part, axis=0) for part in (force[max(0, start - count) : start], force[end : end + count])]
+        for start, end in spans
+    ]
+    ends = [0, *(group[0] for group in groups), len(time)]
+    starts = [0, *(group[-1] for group in groups)]
+    parts = [_Part.of(forces, start, end) for start, end in zip(starts, ends[1:], strict=True)]
+    rate = _typical_rate(forces)
+
+    def back(leaves: int, comes: int) -> bool:
+        """Whether the second of two groups takes back what the first did."""
+        off = parts[leaves + 1 : comes + 1]
+        return _is_back(parts[leaves], off, parts[comes + 1], near_n=near_n, rate_n_s=rate)
+
+    unloading = {}
+    faulty: list[int] = []  # groups that are neither slip nor release
+    for place, (group, (start, end), (before, after)) in enumerate(zip(groups, spans, levels, strict=True)):
+        if unseen.isdisjoint(group):
+            continue
+        others = [(left, place) for left in faulty] + [(place, later) for later in range(place + 1, len(groups))]
+        faulty.append(place)
+        pull = before - normal * (normal @ before)
+        along = pull / max(float(np.linalg.norm(pull)), 1e-12)
+        basis = np.stack((normal, along))
+        course = np.concatenate((before[None], force[start:end], after[None])) @ basis.T
+        beside = np.linalg.norm(force[start:end] - course[1:-1] @ basis, axis=1)
+        fallen = course[0] - course[-1]
+        aslant = _ASLANT * abs(fallen[1])
+        # no force grows, reverses, or grows again
+        falls = np.all(np.abs(course - np.minimum.accumulate(course)) <= near + aslant)
+        falls &= np.all(course >= -near - aslant) and np.all(beside <= near + aslant)
+        slips = abs(fallen[0]) <= near + aslant
+        let_go = float(np.linalg.norm(after)) <= near + _AT_REST * float(np.linalg.norm(before))
+        if course[0, 0] <= near or not (falls and (slips or let_go)):
+            continue
+        # sliding friction holds no more than static friction: who pulls harder later has not slipped
+        later = np.lib.stride_tricks.sliding_window_view(force[start:], count, axis=0).mean(axis=-1) @ basis.T
+        harder = later[:, 1] / np.maximum(later[:, 0], course[0, 0] / 2) > (course[0, 1] + near) / course[0, 0]
+        if not harder.any() and not any(back(*pair) for pair in others):
+            faulty.remove(place)
+            unloading |= {at: bool(slips and fallen[1] > least and at == group[0]) for at in group}
+    return unloading
 
 
 def _level(

@@ -153,6 +153,79 @@ def force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float
     return np.linalg.norm(np.diff(force, axis=0), axis=1)
 
 
+_LOADED_SHARE = 0.15  # of the load of a trial: what departs further from rest is a contact
+_APART_S = 0.3  # contacts that are closer are one, and the image may move as long about it
+_LEAST_FRAMES = 24  # of fewer, noise alone correlates by as much as a contact does
+_MOVES = (0.98, 0.5)  # quantile of what the image moves in the contacts, and a share of it that shows another contact
+_LEAST_MOVES = 3  # frames
+
+
+def doubt_agreement(
+    frame_time_s: Float[np.ndarray, " frames"], image_motion: Float[np.ndarray, " frames"], forces: Forces, lag: Lag
+) -> tuple[str, ...]:
+    """Tell of contacts in which the image does not move as the force changes, a sentence each.
+
+    A contact is a stretch in which the force departs from that of the untouched sensor; where it never does, the whole
+    trial is compared. Of the correlations of the values and of their logarithms the larger counts: the first is that of
+    press and slip, the second does not break where a single fast change falls between two frames.
+    """
+    time = frame_time_s - lag.lag_s
+    change = np.append(np.nan, force_changes(time, forces))
+    covered = np.isfinite(change)
+    spans = _find_loads(forces)
+    near = [(time >= start - _APART_S) & (time <= end + _APART_S) for start, end in spans]
+    doubts = []
+    for inside in near or [np.ones(len(time), dtype=bool)]:
+        some = inside & covered
+        if some.sum() < _LEAST_FRAMES:
+            continue
+        correlation = _agreement(change[some], image_motion[some])
+        if correlation < _LEAST_CORRELATION:
+            doubts.append(
+                f"image and force do not move together from {time[some][0]:.2f} to {time[some][-1]:.2f} s (correlation "
+                f"{correlation:.2f}, {_LEAST_CORRELATION} is needed); check that the forces are those of this video, "
+                "and that camera and force sensor ran"
+            )
+    idle = covered & ~np.any(near, axis=0)
+    if near and not doubts and idle.any():
+        motion, (quantile, share) = image_motion[covered & ~idle], _MOVES
+        base = float(np.quantile(motion, 0.1))
+        moves = idle & (image_motion - base > share * (float(np.quantile(motion, quantile)) - base))
+        if moves.sum() >= _LEAST_MOVES:
+            at = time[moves]
+            correlation = _agreement(change[idle], image_motion[idle])
+            doubts.append(
+                f"the image moves as in a contact from {at[0]:.2f} to {at[-1]:.2f} s, and the forces rest (correlation "
+                f"{correlation:.2f}); check that the force sensor ran"
+            )
+    return tuple(doubts)
+
+
+def _find_loads(forces: Forces) -> list[tuple[float, float]]:
+    """Stretches, in seconds, in which the force departs from that of the untouched sensor."""
+    axes = infer_axes(forces, normal="x", sign=1)
+    if axes.still_until_s is None:
+        return []
+    time = forces.time_s
+    load = np.linalg.norm(mean_force(time, forces.force_n - axes.tare_n, time, window_s=_LOAD_WINDOW_S), axis=1)
+    loaded = (load > _LOADED_SHARE * float(np.quantile(load, 0.95))) & (time >= axes.still_until_s)
+    edges = np.flatnonzero(np.diff(loaded, prepend=False, append=False)).reshape(-1, 2)
+    spans: list[tuple[float, float]] = []
+    for start, end in edges.tolist():
+        again = bool(spans) and time[start] - spans[-1][1] < _APART_S
+        spans.append((spans.pop()[0] if again else float(time[start]), float(time[end - 1])))
+    return spans
+
+
+def _agreement(change_n: Intervals, motion: Intervals) -> float:
+    """Larger of the correlations of the values and of their logarithms; 0 where either never changes."""
+    values = np.array((np.maximum(change_n, 0), motion))
+    if np.any(np.ptp(values, axis=1) < 1e-9):
+        return 0.0
+    logs = np.log(values + np.maximum(np.median(values, axis=1, keepdims=True), 1e-9))
+    return max(float(np.corrcoef(one)[0, 1]) for one in (values, logs))
+
+
 def _correlations(
     weights: Float[np.ndarray, "draws intervals"],
     motion: Intervals,

@@ -23,6 +23,7 @@ from sliplens.recordings.labels.axes import (
 )
 from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, MARKED, Screened, faults_at, screen_trial
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, find_contacts
+from sliplens.recordings.labels.lag import doubt_agreement
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
 
@@ -278,14 +279,16 @@ def label_trial(
     if lag is None and settings.lag_ms is not None:
         lag = Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0)
     require_inside(settings, frames=len(frame_time_s), time_s=forces.time_s)
-    bad = settings.bad_frames
-    screened, lag = screen_trial(frame_time_s, image_motion, forces, lag=lag, bad_frames=bad, rng=rng)
+    by_hand = {"bad_frames": settings.bad_frames, "slip_s": settings.slip_s}
+    screened, lag = screen_trial(frame_time_s, image_motion, forces, lag=lag, **by_hand, rng=rng)
     try:
         return _label_screened(frame_time_s, image_motion, screened, lag=lag, settings=settings, rng=rng)
     except RecordingError as error:
         if not screened.faults:
             raise
-        raise RecordingError(f"{error} (left out were: {'; '.join(tell_faults(screened.faults))})") from None
+        steps = [fault.start_s for fault in screened.faults if fault.kind is Reason.STEP]
+        slip = f"; if the contact slips at {steps[0]:.2f} s, give --slip-s {steps[0]:.2f}" if steps else ""
+        raise RecordingError(f"{error} (left out were: {'; '.join(tell_faults(screened.faults))}{slip})") from None
 
 
 def require_inside(settings: LabelSettings, *, frames: int, time_s: Frames) -> None:
@@ -324,7 +327,9 @@ def _label_screened(
 ) -> FoundLabels:
     forces = screened.forces
     given = {"normal": settings.normal_axis, "sign": settings.normal_sign, "tare_n": settings.tare}
-    axes = infer_axes(forces, **given, touch_s=settings.contact_s, drift_n_s=settings.drift_rate)
+    axes = infer_axes(
+        forces, **given, touch_s=settings.contact_s, drift_n_s=settings.drift_rate, moved_s=screened.moved_s
+    )
     contact = apply_axes(forces, axes)
     if not np.ptp(contact.tangential_n, axis=0).any():
         # a sensor that measures it has noise, a simulated pull changes
@@ -361,12 +366,18 @@ def _label_screened(
         lag=lag,
         settings=settings,
         screened=screened,
-        doubts=(*_find_doubts(contact, friction, threshold), *_doubt_clocks(frame_time_s, screened.recorded, lag)),
+        doubts=(
+            *screened.doubts,
+            *_find_doubts(contact, friction, threshold),
+            *doubt_agreement(frame_time_s, image_motion, forces, lag),
+            *_doubt_clocks(frame_time_s, screened.recorded, lag),
+        ),
     )
 
 
 _MOST_LOST = 0.5  # share of the samples between touch and slip that may be faulty
 _PLAUSIBLE_FRICTION = (0.05, 4.0)  # of soft skins on anything dry, wet or greased
+_USUAL_FRICTION = 1.5  # dry rubber on glass hardly exceeds it
 
 
 def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n: float) -> tuple[str, ...]:
@@ -382,6 +393,11 @@ def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n:
             )
         doubts.append(
             f"a friction of {friction.mu:.3g} was given, and that of a fingertip lies between {low:g} and {high:g}"
+        )
+    elif friction.mu > _USUAL_FRICTION:
+        doubts.append(
+            f"the friction is {friction.mu:.3g}, and that of a fingertip seldom exceeds {_USUAL_FRICTION:g}: check the "
+            "axis that presses, --normal-axis, and the coefficient, --mu"
         )
     pulls, presses = (np.mean(side > threshold_n) for side in (-forces.normal_n, forces.normal_n))
     if pulls > presses:
