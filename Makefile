@@ -88,8 +88,19 @@ weights: $(INSTALLED) ## train the networks that come with the package: some sev
 		-o runs/weights/average-pair
 	$(BIN)/sliplens simulate runs/weights/pulled-again --preset varied --pulls varied --dry-trials 2040 --days 680 \
 		--test-days 10 --wet-trials 30 --frames-per-trial 60 --seed 7
-	$(BIN)/sliplens train runs/weights/pulled-again -o runs/weights/sequence-pair --recipe sequence \
+	$(BIN)/sliplens train runs/weights/pulled-again -o runs/weights/before-pair --recipe sequence \
 		--start-from runs/weights/average-pair
+# pulls in every direction
+	$(BIN)/sliplens simulate runs/weights/turned --preset varied --dry-trials 3600 --days 1200 --test-days 10 \
+		--wet-trials 10 --seed 11
+	$(BIN)/sliplens train runs/weights/turned -o runs/weights/turned-pair --start-from runs/weights/before-pair \
+		--augmentation all-directions --image-size 112 --epochs 5 --learning-rate 1.5e-3 --seed 11
+	$(BIN)/sliplens train runs/weights/turned -o runs/weights/further-pair --start-from runs/weights/turned-pair \
+		--augmentation all-directions --image-size 112 --epochs 3 --learning-rate 1e-3 --seed 13
+	$(BIN)/sliplens simulate runs/weights/pulled-turned --preset varied --pulls varied --dry-trials 720 --days 240 \
+		--test-days 10 --wet-trials 30 --frames-per-trial 60 --seed 12
+	$(BIN)/sliplens train runs/weights/pulled-turned -o runs/weights/sequence-pair --recipe sequence \
+		--start-from runs/weights/further-pair
 # the networks of the thesis: its days and trials on one sensor, its recipe, as far as two cores reach
 	$(BIN)/sliplens simulate runs/weights/thesis --preset thesis --frames-per-trial 200
 	@set -e; for input in difference raw; do \
