@@ -79,7 +79,7 @@ def test_a_fixed_camera_has_not_moved_in_any_contact(trials: dict[str, Recording
         (by_border, {"degrees": 1.2}),
         (by_border, {"degrees": -3.0}),
     ],
-    ids=str,
+    ids=lambda value: str(getattr(value, "__name__", value)),
 )
 def test_a_camera_that_moves_in_a_contact_is_seen(
     trials: dict[str, Recording], measure: Measure, move: dict[str, float]
