@@ -19,13 +19,14 @@ import numpy as np
 import torch
 
 from sliplens import shear
+from sliplens.live.reading import OFF
 from sliplens.models import load
 from sliplens.models.checkpoint import STRANGE
 from sliplens.simulation import make_recipe, plan_trials
 from sliplens.simulation.trials import prepare_trial
 
 TRAINED = (75.0, 105.0)
-OFF, LOW, SAFE = 0.2, 0.3, 0.7
+LOW, SAFE = 0.3, 0.7
 ROWS: dict[str, tuple[tuple[float, float], Callable[[np.ndarray], np.ndarray]]] = {
     "75 to 105": (TRAINED, lambda images: images),
     "75 to 105, mirrored": (TRAINED, lambda images: images[..., ::-1, :]),

@@ -40,7 +40,8 @@ from scipy.optimize import minimize
 from sliplens.codec import load_record, save_record
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import Check, HealthMonitor, LiveFrame
-from sliplens.live.health import OFF, check_direction, check_novelty, margin_risk, severity
+from sliplens.live.health import check_direction, check_novelty, margin_risk, severity
+from sliplens.live.reading import OFF
 from sliplens.markers import Tracker
 from sliplens.models import Run, load
 from sliplens.models.checkpoint import MANIFEST_FILE, Manifest

@@ -14,8 +14,8 @@ from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.images import require_rgb
 from sliplens.live.contract import LiveSource
-from sliplens.live.health import OFF, check_direction, check_novelty, margin_risk
-from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
+from sliplens.live.health import check_direction, check_novelty, margin_risk
+from sliplens.live.reading import OFF, Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Run
 from sliplens.models.engines import Engine

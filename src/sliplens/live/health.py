@@ -324,8 +324,6 @@ def severity(check: Check) -> float:
     return over / max(under, 1e-6)
 
 
-OFF = 0.2
-"""Error from which on a margin is off."""
 _HARM: dict[str, tuple[float, float]] = {
     "repeated": (0.92, 1.06), "halves": (0.15, 0.02), "frozen": (0.91, 0.56), "saturation": (0.16, 0.36),
     "exposure": (0.47, 1.13), "focus": (0.31, 0.11), "light": (0.28, 0.11), "camera": (0.56, 0.38),
@@ -403,4 +401,4 @@ def _saturated(image: Frame) -> float:
     return float(np.mean(white | (np.maximum(np.maximum(red, green), blue) <= _DARK)))
 
 
-__all__ = ["OFF", "HealthLimits", "HealthMonitor", "margin_risk", "severity"]
+__all__ = ["HealthLimits", "HealthMonitor", "margin_risk", "severity"]

@@ -168,9 +168,11 @@ class Reading:
 
 TARGET = 0.2, 0.4
 """Margins that people keep when they hold something."""
-_OFF, _RISK, _DOUBT = 0.2, 0.1, 0.5
-"""Error whose chance `Reading.risk` is. Beyond the first limit, the chance that the interval leaves for margins outside
-it, the margin is uncertain by that error at least; beyond the second it is more likely wrong than right."""
+OFF = 0.2
+"""Error from which on a margin is off."""
+_RISK, _DOUBT = 0.1, 0.5
+"""Limits of `Reading.risk`, the chance of an error above `OFF`. Beyond the first, the share of margins outside a 90 %
+interval, the margin counts as uncertain by `OFF`; beyond the second it is more likely wrong than right."""
 
 
 class Zone(StrEnum):
@@ -240,7 +242,7 @@ def describe_reading(reading: Reading) -> ReadingWords:
             low, high = _ends(reading, risk=None)
             interval = f"{100 * low:.0f} to {100 * high:.0f} %"
             if _zone(low, high) is not _zone(*_ends(reading, risk=reading.risk)):
-                interval += f", but {100 * _OFF:.0f} points off with a chance of {100 * (reading.risk or 0):.0f} %"
+                interval += f", but {100 * OFF:.0f} points off with a chance of {100 * (reading.risk or 0):.0f} %"
     return ReadingWords(zone=zone, advice=advice, margin=margin, interval=interval, contact=_contact(reading, zone))
 
 
@@ -250,7 +252,7 @@ def _ends(reading: Reading, *, risk: float | None) -> tuple[float, float]:
     if margin is None or low is None or high is None:
         return 0.0, 1.0
     if risk is not None and risk > _RISK:
-        low, high = min(low, max(margin - _OFF, 0.0)), max(high, min(margin + _OFF, 1.0))
+        low, high = min(low, max(margin - OFF, 0.0)), max(high, min(margin + OFF, 1.0))
     return round(low, 2), round(high, 2)
 
 
