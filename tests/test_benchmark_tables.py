@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[1]
-NO_FIGURES = {"fairness"}
-"""What the scripts share; it measures nothing."""
+NO_FIGURES = {"fairness", "contact_events"}
+"""What the scripts share; they measure nothing."""
 
 
 TABLES = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "benchmark_tables.py")))

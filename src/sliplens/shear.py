@@ -5,7 +5,6 @@ from math import atan2, degrees, hypot, inf, radians, sin
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
-from scipy import fft
 
 from sliplens.images import shrink
 
@@ -191,7 +190,7 @@ class ShearEstimator:
         seen = _cut(np.pad(self._plane(frame), _WINDOW), *self._corners, _WINDOW)
         places = _WINDOW - _PATCH + 1
         product, energy = (
-            np.asarray(fft.irfft2(_transform(part) * other, s=(_WINDOW, _WINDOW)))[:, :places, :places]
+            np.asarray(np.fft.irfft2(_transform(part) * other, s=(_WINDOW, _WINDOW)))[:, :places, :places]
             for part, other in ((seen, self._patches), (seen**2, self._weight))
         )
         scale = np.sqrt(np.maximum(energy, 1e-3)) * np.maximum(self._energy, 1e-3)[:, None, None]
@@ -212,7 +211,7 @@ class ShearEstimator:
 
 
 def _transform(patches: Float32[np.ndarray, "*patches side side"]) -> np.ndarray:
-    return np.asarray(fft.rfft2(patches, s=(_WINDOW, _WINDOW)))
+    return np.asarray(np.fft.rfft2(patches, s=(_WINDOW, _WINDOW)))
 
 
 def _cut(plane: Float32[np.ndarray, "height width"], top: np.ndarray, left: np.ndarray, side: int) -> np.ndarray:

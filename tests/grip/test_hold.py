@@ -217,7 +217,14 @@ def test_what_a_slip_teaches_of_the_friction_makes_no_law_forget_the_slip():
     ],
 )
 def test_a_slip_counts_once_and_only_where_the_skin_does_not_spring_back_by_itself(forces, taken_s, counts):
-    holder, now_s = holder_of(Says(force_n=2.5), forces=forces)
+    says = Says()
+    holder, now_s = Holder(says, ceiling_n=4.0), len(forces) * PERIOD_S
+    for number, force_n in enumerate(forces.tolist()):
+        holder.hear(told(0.9), taken_s=number * PERIOD_S)
+        says.force_n = force_n
+        # whatever noise the measured force has
+        holder.answer(number * PERIOD_S, force_n + 0.05 * (-1) ** number)
+    says.force_n = 2.5
     for expected in (counts, False):
         holder.hear(told(0.5, slip=SlipState.SLIP), taken_s=taken_s)
         assert holder.answer(now_s, 2.0).slip is expected

@@ -58,6 +58,7 @@ def table_of_errors(rng: np.random.Generator, **columns: np.ndarray) -> ErrorTab
         "contact_x": rng.uniform(0.4, 0.6, count),
         "contact_y": np.full(count, np.nan),
         "slice": np.full(count, -1),
+        "withheld": np.full(count, ""),
         **dict.fromkeys(("time_s", "sigma", "low_90", "high_90"), np.full(count, np.nan)),
     }
     return ErrorTable(**{**made, **columns})

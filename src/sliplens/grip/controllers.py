@@ -167,7 +167,7 @@ class MarginGrip(ABC):
         # whatever force was measured: below the margin aimed at, a force that falls is one that was measured wrong
         told = np.where(self.acted < self.target, np.maximum(told, seen.command_n), told)
         # a reflex knows no rate
-        told = np.where(slip, np.maximum(told, self.boost * seen.force_n), told)
+        told = np.where(slip, np.maximum(told, self.boost * np.maximum(seen.force_n, seen.command_n)), told)
         return np.maximum(told, self.start_n if seen.time_s < _SETTLED_S else self.least_n)
 
 
@@ -376,8 +376,8 @@ class Holder:
         self._told = [False] * fingers  # whether the readings of each know a friction
         self._heard: list[tuple[Reading, float] | None] = [None] * fingers
         self._gates, self._slip = [SlipGate() for _ in range(fingers)], False
-        self._past: deque[tuple[float, float, float]] = deque(maxlen=_MEMORY)
-        """Times of the last commands, with the grip force and the load that were measured then."""
+        self._past: deque[tuple[float, float, float, float]] = deque(maxlen=_MEMORY)
+        """Times of the last commands; grip force and load measured then, and the command that held until then."""
         self._touched_s: float | None = None
         self._follows_s, self._trouble = -np.inf, None
         self.choose(controller)
@@ -405,12 +405,12 @@ class Holder:
                 if self._knows_friction != all(self._told):
                     self._knows_friction = not self._knows_friction
                     self._suit()
-            (force_n, _), (earlier_n, _) = self._measured(taken_s), self._measured(taken_s - SPRINGS_BACK_S)
             self._slip |= self._gates[finger].update(
                 reading.slip is SlipState.SLIP,
                 since_touch_s=-1.0 if self._touched_s is None else taken_s - self._touched_s,
-                force_n=force_n,
-                earlier_n=earlier_n,
+                # a measured force is too noisy to show that the grip was loosened a little
+                force_n=self._at(taken_s)[2],
+                earlier_n=self._at(taken_s - SPRINGS_BACK_S)[2],
             )
             self._heard[finger] = reading, taken_s
 
@@ -433,9 +433,9 @@ class Holder:
             differs, trouble = self._compare(time_s, force_n)
             if differs and force_n > self._command:
                 force_n = self._command  # no gripper presses harder than it was told so soon after
-            self._past.append((time_s, force_n, load_n))
-            heard = [one if one and time_s - one[1] <= _STALE_S else None for one in self._heard]
-            measured = [self._measured(one[1]) for one in heard if one]
+            self._past.append((time_s, force_n, load_n, self._command))
+            heard = [one if one and time_s - one[1] <= STALE_S else None for one in self._heard]
+            measured = [self._at(one[1])[:2] for one in heard if one]
             then_n, load_n = np.mean(measured, axis=0).tolist() if measured else (force_n, load_n)
             margin, low, true_margin = (
                 np.resize([_value(one[0], name) if one else np.nan for one in heard], (1, 2))
@@ -490,12 +490,13 @@ class Holder:
             )
         return differs, self._trouble
 
-    def _measured(self, time_s: float) -> tuple[float, float]:
-        """Grip force and load at a time; NaN where none was measured."""
+    def _at(self, time_s: float) -> tuple[float, float, float]:
+        """Measured grip force, measured load and command at a time; NaN where there was none."""
         if not self._past or np.isnan(time_s):
-            return np.nan, np.nan
-        times, forces, loads = np.array(self._past).T
-        return float(np.interp(time_s, times, forces)), float(np.interp(time_s, times, loads))
+            return np.nan, np.nan, np.nan
+        times, *rows = np.array(self._past).T
+        force_n, load_n, command_n = (float(np.interp(time_s, times, row)) for row in rows)
+        return force_n, load_n, command_n
 
     def _why(self, change_n: float, *, slip: bool, blind: bool) -> str:
         does = "holds" if abs(change_n) < 1e-3 else "tightens" if change_n > 0 else "loosens"
@@ -515,7 +516,7 @@ def _value(reading: Reading, name: str) -> float:
     return np.nan if value is None else value
 
 
-_STALE_S = 0.5
+STALE_S = 0.5
 """Age from which a reading says nothing of now."""
 _TOUCH_N = 0.02
 """Grip force that is a touch."""

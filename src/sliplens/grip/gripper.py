@@ -73,10 +73,10 @@ class LineGripper:
     `OK force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`, and so is a connection
     that breaks; it is opened again with the next line.
 
-    The first line of a connection is `S #1`. A gripper that ends its answer with `#1` gets a number with every line and
-    repeats it: an answer with another number is late, and thrown away. Any other gripper gets plain lines. As nobody
-    can tell to which of them a late answer belongs, the connection is closed where one does not come in time, and a
-    serial line is then left alone for `silence_s`.
+    The first line of a connection is `S #n`, n = 1 at first. A gripper that ends its answer with `#n` gets a number
+    with every line and repeats it: an answer with another number is late, and thrown away. Any other gripper gets plain
+    lines. Their late answers cannot be matched to a line, so the connection is closed where one does not come in time,
+    and a serial line is then left alone for `silence_s`.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class LineGripper:
         try:
             if self._numbered is None:
                 answer = self._exchange("S", numbered=True)
-                self._numbered = answer[:1] == ["OK"] and answer[-1:] == [f"#{self._number}"]
+                self._numbered = answer[-1:] == [f"#{self._number}"]
             answer = self._exchange(line, numbered=self._numbered)
         except TimeoutError as error:
             # late answers come with their number, if they are no endless line
@@ -165,7 +165,9 @@ class LineGripper:
                 words = (heard := self._line(ends_s)).split()
             except TimeoutError:
                 raise TimeoutError(repr(heard) if heard else "") from None
-            late = self._numbered and words[-1:] != [f"#{self._number}"]
+            # an answer with another number is one to an earlier line
+            other = words[-1:] != [f"#{self._number}"]
+            late = other and (self._numbered or (numbered and "".join(words[-1:]).startswith("#")))
             if words[:1] in (["OK"], ["ERR"]) and not late:
                 return words
 

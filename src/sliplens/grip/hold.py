@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Event
@@ -15,7 +15,16 @@ import numpy as np
 from sliplens.codec import save_result
 from sliplens.errors import InputError
 from sliplens.files import output_folder
-from sliplens.grip.controllers import Answer, AssumedFriction, Controller, Holder, MarginGrip, Oracle, make_controller
+from sliplens.grip.controllers import (
+    STALE_S,
+    Answer,
+    AssumedFriction,
+    Controller,
+    Holder,
+    MarginGrip,
+    Oracle,
+    make_controller,
+)
 from sliplens.grip.gripper import DryRun, Gripper, GripperError, GripperState, GuardedGripper, open_gripper
 from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.source import GripSource, open_grip, usual_network
@@ -60,14 +69,9 @@ class HoldStep:
     """Newest reading of each fingertip; None before the first."""
 
     def __str__(self) -> str:
-        several, blind = len(self.readings) > 1, math.isnan(self.margin)
+        several = len(self.readings) > 1
         words = [
-            (f"fingertip {number}: " if several else "")
-            + (
-                "the newest margin is too old"
-                if blind and reading.margin is not None
-                else str(describe_reading(reading))
-            )
+            (f"fingertip {number}: " if several else "") + str(describe_reading(reading))
             for number, reading in enumerate(self.readings, start=1)
             if reading is not None
         ]
@@ -200,7 +204,7 @@ class _Holding:
         self.troubles: dict[str, None] = {}
         """What the gripper failed at, in the order in which it first did."""
         force_n = self._first_force()
-        self._closes: tuple[float, float] | None = None
+        self._closes: tuple[float, float, float] | None = None
         """Time at which the fingers last moved without any force, and their opening then; None once they pressed."""
         self._holder = Holder(
             controller,
@@ -285,7 +289,12 @@ class _Holding:
             slip=answer.slip,
             why=answer.why,
             trouble=trouble,
-            readings=tuple(self._readings),
+            readings=tuple(
+                replace(one, margin=None, low=None, high=None, withheld="the newest margin is too old")
+                if one is not None and one.margin is not None and now_s - one.captured_s > STALE_S
+                else one
+                for one in self._readings
+            ),
         )
 
     def _first_force(self) -> float:
@@ -314,9 +323,13 @@ class _Holding:
             return
         if self._holder.touched or not self._rows:
             self._closes = None
-        elif self._closes is None or abs(state.width_m - self._closes[1]) > _STUCK_M:
-            self._closes = now_s, state.width_m
-        elif now_s - self._closes[0] > _STUCK_S and self._rows[-1][1].command_n > 0:
+            return
+        since_s, low_m, high_m = self._closes or (now_s, state.width_m, state.width_m)
+        if not low_m - _STUCK_M <= state.width_m <= high_m + _STUCK_M:
+            since_s = now_s
+        # widths that were measured before are noise, not a motion
+        self._closes = since_s, min(low_m, state.width_m), max(high_m, state.width_m)
+        if now_s - since_s > _STUCK_S and self._rows[-1][1].command_n > 0:
             raise GripperError(
                 f"the gripper measures {state.force_n:.2f} N and its fingers do not move, {_STUCK_S:g} s after "
                 f"{self._rows[-1][1].command_n:.2f} N was commanded; without a force sensor, or with forces of the "

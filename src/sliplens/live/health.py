@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 from sliplens.errors import InputError
 from sliplens.live.reading import Check, LiveFrame, small_picture
 from sliplens.markers import MarkerStatus, TrackedFrame
-from sliplens.markers.camera import CAMERA_LIMIT_PX, CameraWatch, block_means
+from sliplens.markers.camera import CAMERA_CURE, CAMERA_LIMIT_PX, CameraWatch, block_means
 from sliplens.models.checkpoint import STRANGE, Estimate, Run
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labels.lag import LEAST_TOUCH, picture_change, soften
@@ -59,7 +59,7 @@ class HealthLimits:
     """Motion of the border by a shift, turn or zoom of the picture that no contact explains, in pixels of a picture 224
     high."""
     halves: float = 4.0
-    """How many times as much one half of the picture may change as the other, which shows its noise alone."""
+    """Largest ratio of the changes of the two halves of the picture where one shows its noise alone."""
     frozen_n: float = 0.15
     """Change of the force since the picture last changed by more than its noise, in newtons."""
     markers: float = 0.15
@@ -227,8 +227,7 @@ class HealthMonitor:
             f"since the reference the picture was shifted by {moved.shift_px:.1f} px, turned by {moved.turn_deg:+.1f} "
             f"degrees and zoomed by {100 * moved.zoom:+.1f} %"
         )
-        cure = "the camera or the skin has moved: fasten it, and take a new reference"
-        return _judge("camera", moved.excess_px, limit, told, cure)
+        return _judge("camera", moved.excess_px, limit, told, CAMERA_CURE)
 
     def _check_markers(self, markers: TrackedFrame) -> Check:
         status = markers.status

@@ -276,6 +276,8 @@ def _contact(reading: Reading, zone: Zone) -> ContactState:
         return ContactState.UNKNOWN
     if reading.slip is SlipState.SLIP:
         return ContactState.UNKNOWN if zone is Zone.UNCERTAIN else ContactState.FULL_SLIP
+    if (reading.risk or 0) > _DOUBT:
+        return ContactState.UNKNOWN
     return ContactState.INCIPIENT_SLIP if low > 0 and high < 1 else ContactState.CONTACT
 
 

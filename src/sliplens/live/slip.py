@@ -145,6 +145,8 @@ class SlipBatch:
         self._slip_s, self._least_px = np.full(contacts, np.nan), np.full(contacts, np.inf)
         self._recoils_at: dict[int, _Recoil] = {}
         """Recoils that are not judged yet, by contact."""
+        self._judged_s = np.full(contacts, np.nan)
+        """Time of the recoil that was judged last."""
 
     def update(self, positions_px: Float[np.ndarray, "contacts markers 2"], time_s: float, /) -> ContactStates:
         """Take the markers of a frame, in the order of `rest_px`, NaN where one is not seen; times must rise."""
@@ -211,7 +213,7 @@ class SlipBatch:
         """
         confirmed_s, newest = np.full(len(self._rest), np.nan), self._frames[-1]
         for row in np.flatnonzero(springs).tolist():
-            if row not in self._recoils_at:
+            if row not in self._recoils_at and self._slip_s[row] != self._judged_s[row]:
                 first = self._frames[-int(self._window[row])]
                 middle = self._inner[row] & first.seen[row]
                 self._recoils_at[row] = _Recoil(
@@ -226,6 +228,7 @@ class SlipBatch:
                 del self._recoils_at[row]
             elif time_s - recoil.time_s >= _CONFIRMED_S:
                 del self._recoils_at[row]
+                self._judged_s[row] = recoil.time_s
                 middle = recoil.inner & newest.seen[row]
                 shear_px = (newest.moved[row] - recoil.hold)[middle].mean(axis=0) if middle.any() else np.zeros(2)
                 carried = float(shear_px @ recoil.shear_px) / max(float(recoil.shear_px @ recoil.shear_px), 1e-9)

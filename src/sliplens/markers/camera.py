@@ -16,7 +16,8 @@ _HALF_PX = SIDE_PX / 2
 CAMERA_LIMIT_PX = 0.8
 """`CameraMotion.excess_px` above which the camera has moved: nearly twice what contacts of a fixed camera reach. Turns
 up to 0.3 degrees and zooms up to 0.5 %, on which networks are trained, stay below it."""
-CAMERA_REASON = "the camera turned, moved or zoomed since the reference; fasten it, and take a new reference"
+CAMERA_CURE = "fasten the camera, and take a new reference"
+CAMERA_REASON = f"the camera turned, moved or zoomed since the reference; {CAMERA_CURE}"
 """Reason to withhold a margin."""
 _LEAST_RADIUS = 0.62
 """Distance of a marker from the middle, in halves of the picture's shorter side, beyond which the model of a contact
@@ -42,7 +43,7 @@ class CameraMotion:
     turn_deg: float
     """Clockwise turn about the middle of the picture, in degrees."""
     zoom: float
-    """Magnification less 1."""
+    """Share by which the picture is magnified."""
     excess_px: float
     """Largest motion of the border by shift, turn or zoom that no contact explains, in pixels of a picture 224 high."""
     free: bool
@@ -210,9 +211,9 @@ class CameraWatch:
             motion = self._border.measure(frame[..., 1].astype(np.float32))  # green, which cameras see best
         if motion is None:
             return None
-        if motion.free or self._last is None or motion.excess_px > self._last.excess_px:
+        if motion.free:
             self._last = motion
-        return self._last
+        return motion if self._last is None or motion.excess_px > self._last.excess_px else self._last
 
 
 class _Level:

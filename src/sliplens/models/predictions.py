@@ -385,6 +385,12 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
             yield grey
     if untouched is None and not _is_recorded(trial):
         trained.require_kind(next(trial.read_frames()), what=trial.files[0] if trial.files else "the first frame")
+    directions = trained.manifest.pull_direction_deg or FULL_CIRCLE
+    if untouched is None and encoding.name == "raw" and directions != FULL_CIRCLE:
+        yield (
+            f"{trial.name}: no reference was given, so neither the direction of the pull nor a motion of the camera is "
+            f"checked; the network was trained on {range_words(directions)} (90 is down)."
+        )
     if untouched is not None or encoding.name == "raw":
         return
     if not encoding.empty_is_black:
@@ -392,7 +398,6 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
             f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
             "name its image with --reference IMAGE, or a frame of it with --reference-frame N"
         )
-    directions = trained.manifest.pull_direction_deg or FULL_CIRCLE
     unseen = (
         f", which hide the direction of the pull; the network was trained on {range_words(directions)} (90 is down)"
     )
@@ -516,7 +521,8 @@ class _Reading(Work):
                 times = capture.time_s[first : first + len(touches)]
                 estimate = follower.update(estimate, times, np.array(touches))
             reasons = zip(estimate.withheld(np.array(touches)), doubts, strict=True)
-            withheld = [doubt or strange for strange, doubt in reasons]
+            # of a strange picture the direction of the shear says nothing
+            withheld = [doubt if doubt == CAMERA_REASON else strange or doubt for strange, doubt in reasons]
             columns = _columns(estimate, capture, first, withheld=withheld) | {"touches": touches}
             for name, values in columns.items():
                 if name in rows:

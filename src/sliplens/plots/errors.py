@@ -118,8 +118,9 @@ def plot_margin_over_time(trials: Mapping[str, ScoredFrames], *, ax: Axes) -> Ax
     ordered = {name: trials[name].where(np.argsort(trials[name].time_s)) for name in inputs_in_order(trials)}
     label = next(iter(ordered.values()))
     ax.plot(label.time_s, 100 * label.safety_margin, color=BLACK, linewidth=2.4, label="true")
+    # of several networks one that withholds shows a gap in its line
     together = zip(*(trial.withheld.tolist() for trial in ordered.values()), strict=False)
-    shade_withheld(label.time_s, [next(filter(None, reasons), "") for reasons in together], ax=ax)
+    shade_withheld(label.time_s, [reasons[0] if all(reasons) else "" for reasons in together], ax=ax)
     for name, trial in ordered.items():
         line = {"color": INPUT_COLOURS.get(name, PURPLE), "marker": "o", "markersize": 3, "linewidth": 1.2}
         read = np.where(trial.withheld == "", 100 * trial.prediction, np.nan)

@@ -106,7 +106,7 @@ def plate_over_time(results: Results) -> Plate | None:
                 of_trial = (one.predictions.trial == trial) & (one.predictions.condition == condition)
                 if of_trial.any():
                     shown[name] = frames = one.predictions.where(of_trial)
-                    values = rows_of(frames.time_s, frames.safety_margin, frames.prediction)
+                    values = rows_of(frames.time_s, frames.safety_margin, frames.prediction, frames.withheld)
                     rows += [(name, trial, *own) for own in values]
             errors.plot_margin_over_time(shown, ax=ax).set_title(condition.capitalize(), parse_math=False)
     told = ", ".join(f"{trial} ({condition})" for condition, trial in chosen.items())
@@ -116,7 +116,7 @@ def plate_over_time(results: Results) -> Plate | None:
         alt=f"True and predicted Γ over time through the test trials {told}",
         caption="Safety margin through one test trial of each condition: the trial whose mean error is the median of "
         f"all, neither the best nor the worst. Shown: {told}.",
-        numbers=named_columns(("input", "trial", "time_s", "safety_margin", "prediction"), rows),
+        numbers=named_columns(("input", "trial", "time_s", "safety_margin", "prediction", "withheld"), rows),
     )
 
 

@@ -192,8 +192,9 @@ class ScoredFrames(Columns):
     high_90: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Ends of the interval that should hold 90 % of the labels; NaN for a network that was not calibrated."""
     withheld: Shaped[np.ndarray, " frames"]
-    """Reason for which `predict` withholds the margin, with the cure; empty where it does not. Scores count these
-    frames all the same, as their labels are known; figures of a trial leave them out."""
+    """Reason for which the network withholds the margin, with the cure; empty where it does not. Direction of the pull
+    and motion of the camera, which `predict` checks too, are not checked. Scores count these frames all the same, as
+    their labels are known; figures of a trial leave them out."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -239,7 +239,8 @@ def estimate_friction(
         )
     else:
         first, method = slips[0], "F_t / F_n at the slip set by hand"
-        if first.mu is None or first.low <= 0:
+        assert first.mu is not None  # a slip without a friction was refused above
+        if first.low <= 0:
             raise RecordingError(
                 f"the slip at {first.time_s:.2f} s tells a friction of {first.mu:.2g} with a 68 % interval from "
                 f"{first.low:.2g} to {first.high:.2g}, which is none; give the coefficient of friction with --mu"
