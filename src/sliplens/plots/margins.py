@@ -87,7 +87,7 @@ def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
     # few frames have a dot each: one alone makes no line
     dot = "o" if len(across) <= 40 else ""
     if np.isfinite(read := 100 * column(rows, "prediction")).any():
-        ax.plot(across, read, color=BLUE, marker=dot, markersize=3, label="read")
+        ax.plot(across, read, color=BLUE, marker=dot, markersize=3, label="predicted")
     if "safety_margin" in rows.column_names and np.isfinite(true := column(rows, "safety_margin")).any():
         ax.plot(across, 100 * true, color=BLACK, linestyle="--", label="true")
     ax.axhline(0, color=GREY, linewidth=0.8)
@@ -96,8 +96,9 @@ def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     low, high = ax.get_ylim()
     ax.set_ylim(min(low, -4), max(high, 104))
-    ax.set_title(rows["trial"][0].as_py(), parse_math=False)
-    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3, borderaxespad=0.2)
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 0.99), ncols=2, borderaxespad=0.2)
+    lines = -(-len(ax.get_legend_handles_labels()[0]) // 2)
+    ax.set_title(rows["trial"][0].as_py(), parse_math=False, pad=6 + 15 * lines)
     return ax
 
 
