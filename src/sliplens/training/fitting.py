@@ -179,7 +179,7 @@ def train(
             frame_size=(info.height, info.width),
             sensor=info.sensor,
             colour=has_colour(data.read_labels(info).reference),
-            pull_direction_deg=trained_directions(config, data, trials[0], start, on_progress=on_progress),
+            pull_direction_deg=trained_directions(config, data, trials[0], start),
             data_hash=data.hash,
             trained_on=[trial.sha256[:12] for some in trials for trial in some],
             start=start,
@@ -268,16 +268,11 @@ def _as_told(config: TrainConfig, data: Dataset, trials: Sequence[Sequence[Trial
 
 
 def trained_directions(
-    config: TrainConfig,
-    data: Dataset,
-    trials: Sequence[TrialInfo],
-    start: Run | None,
-    *,
-    on_progress: OnProgress | None = None,
+    config: TrainConfig, data: Dataset, trials: Sequence[TrialInfo], start: Run | None
 ) -> tuple[float, float] | None:
     """Directions of the pulls that a network is trained on; those of `start` where it stays as it is.
 
-    None, with a note, where too few trials show them.
+    None where too few trials show them: no margin is then withheld for its direction.
     """
     if start is not None and config.learns in _STAYS:
         return start.manifest.pull_direction_deg
@@ -289,11 +284,6 @@ def trained_directions(
     directions = [pull_direction(data.load(info, truth=False)) for info in few]
     told = np.array([direction for direction in directions if direction is not None])
     if len(told) < _LEAST_DIRECTIONS:
-        note(
-            on_progress,
-            "too few training trials show the direction of the pull, so no margin is withheld for another one; add "
-            f"trials with margins below {100 * _PULLED:.0f} %, or train with --augmentation all-directions",
-        )
         return None
     return enclosing_range(told, margin_deg=_DIRECTION_MARGIN_DEG + turned_deg)
 
