@@ -28,6 +28,7 @@ from jaxtyping import Float, Int
 import sliplens as sl
 from sliplens.cli.console import Terminal
 from sliplens.errors import SliplensError
+from sliplens.recordings import Dataset
 from sliplens.results.evaluation import ScoredFrames
 
 TEST_DAYS, TRIALS_A_DAY, FRAMES = 6, 11, 200
@@ -37,7 +38,7 @@ WITHIN = 0.03
 RESAMPLES = 2000
 
 
-def simulate(work: Path, *, seed: int) -> sl.Dataset:
+def simulate(work: Path, *, seed: int) -> Dataset:
     """Simulate the sensor, three training days and the test days, or load what is there."""
     return sl.simulate(
         work / "data",
@@ -52,7 +53,7 @@ def simulate(work: Path, *, seed: int) -> sl.Dataset:
     )
 
 
-def train(work: Path, data: sl.Dataset, options: argparse.Namespace) -> None:
+def train(work: Path, data: Dataset, options: argparse.Namespace) -> None:
     """Train the networks one after the other."""
     for seed in options.seeds:
         for name in options.inputs:
@@ -127,7 +128,7 @@ def close_trials(frames: ScoredFrames) -> set[str]:
     return close
 
 
-def measure(work: Path, data: sl.Dataset, options: argparse.Namespace) -> dict[str, Any]:
+def measure(work: Path, data: Dataset, options: argparse.Namespace) -> dict[str, Any]:
     """Predict test and training trials by every network there is."""
     scores: dict[str, Any] = {"r2": {}, "train_mse": {}, "train_trials_within_3": {}, "epochs": {}}
     within: dict[int, list[set[str]]] = {}
