@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, pairwise
+from math import radians
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_file, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
-from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
+from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, SIDE_PX, BorderMotion
 from sliplens.models.checkpoint import Estimate, Run, open_run, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
@@ -487,13 +488,14 @@ class _Reading(Work):
         # batches are encoded while the ones before are under way; first frame of each, which touch, and doubts of them
         encoded: deque[tuple[int, list[bool], list[str | None]]] = deque()
         shear = None if reference is None else self.trained.shear_estimator(reference)
-        camera, moved = None if reference is None else CameraWatch(reference), False
+        camera = None if reference is None else BorderMotion(reference[..., 1].astype(np.float32))
+        shifted = turned = False
         follower = self.trained.follow() if self.sequence else None
         if follower is not None and capture.time_s is not None:
             require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
 
         def encode() -> Iterator[Tensor]:
-            nonlocal moved
+            nonlocal shifted, turned
             while batch := list(islice(frames, engine.batch_size)):
                 first, images = batch[0][0], [frame for _, frame in batch]
                 if states:
@@ -506,10 +508,13 @@ class _Reading(Work):
                 for at, (touch, frame) in enumerate(zip(touches, images, strict=True), start=first):
                     # a camera that has moved stays so; images of a folder are of any time
                     if camera is not None and (at % _CAMERA_EVERY == 0 or capture.files is not None):
-                        motion = camera.update(frame)
-                        moved = motion is not None and motion.excess_px > CAMERA_LIMIT_PX
+                        motion = camera.measure(frame[..., 1].astype(np.float32))
+                        # a contact moves the border too, but does not turn it
+                        shifted = shifted if touch or motion is None else motion.excess_px > CAMERA_LIMIT_PX
+                        turn_px = 0.0 if motion is None else abs(radians(motion.turn_deg)) * SIDE_PX / 2
+                        turned = turn_px > CAMERA_LIMIT_PX
                     astray = self.trained.doubt_shear(shear.estimate(frame)) if shear is not None and touch else None
-                    doubts.append(CAMERA_REASON if moved else astray)
+                    doubts.append(CAMERA_REASON if shifted or turned else astray)
                 encoded.append((first, touches, doubts))
                 yield self.trained.encode(np.stack(images), reference)
 
