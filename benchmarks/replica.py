@@ -38,7 +38,7 @@ WITHIN = 0.03
 RESAMPLES = 2000
 
 
-def simulate(work: Path, *, seed: int) -> Dataset:
+def simulate(work: Path, *, seed: int, quiet: bool) -> Dataset:
     """Simulate the sensor, three training days and the test days, or load what is there."""
     return sl.simulate(
         work / "data",
@@ -49,7 +49,7 @@ def simulate(work: Path, *, seed: int) -> Dataset:
         dry_trials=(100, 40, 40, *[TRIALS_A_DAY] * TEST_DAYS),
         wet_trials=TRIALS_A_DAY * TEST_DAYS,
         seed=seed,
-        on_progress=Terminal(),
+        on_progress=None if quiet else Terminal(),
     )
 
 
@@ -136,7 +136,8 @@ def measure(work: Path, data: Dataset, options: argparse.Namespace) -> dict[str,
         networks = []
         for seed in options.seeds:
             run = sl.load(work / f"{name}-{seed}")
-            evaluations = {split: sl.evaluate(run, data, split=split, on_progress=Terminal()) for split in options.sets}
+            progress = None if options.json else Terminal()
+            evaluations = {split: sl.evaluate(run, data, split=split, on_progress=progress) for split in options.sets}
             if "test" in evaluations:
                 networks.append(evaluations["test"].predictions)
             if "train" in evaluations:
@@ -170,7 +171,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     try:
-        data = simulate(options.work, seed=options.data_seed)
+        data = simulate(options.work, seed=options.data_seed, quiet=options.json)
         if options.train:
             train(options.work, data, options)
             return
