@@ -509,7 +509,8 @@ class _Reading(Work):
                     # a camera that has moved stays so; images of a folder are of any time
                     if camera is not None and (at % _CAMERA_EVERY == 0 or capture.files is not None):
                         motion = camera.measure(frame[..., 1].astype(np.float32))
-                        # a contact moves the border too, but does not turn it
+                        # a contact shifts and magnifies the border too, but does not turn it: the shift measured before
+                        # a contact holds until it ends
                         shifted = shifted if touch or motion is None else motion.excess_px > CAMERA_LIMIT_PX
                         turn_px = 0.0 if motion is None else abs(radians(motion.turn_deg)) * SIDE_PX / 2
                         turned = turn_px > CAMERA_LIMIT_PX
