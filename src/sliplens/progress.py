@@ -6,8 +6,10 @@ also names them where the callback can show that (`Stages`), as the command line
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TypeAlias, TypeVar, runtime_checkable
 
@@ -127,6 +129,123 @@ def _named(message: str) -> str:
     return found[0] if (found := re.match(r"\S+: ", message)) else ""
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class _Span:
+    """Part of a progress bar that the running loop fills."""
+
+    listener: OnProgress
+    first: int = 0
+    size: int = 0
+    total: int | None = None
+    """Length of the whole bar; None until the outermost loop sets it."""
+
+    def show(self, done: int, total: int) -> None:
+        if self.total is None:
+            self.listener(done, total)
+        elif total:
+            self.listener(self.first + self.size * done // total, self.total)
+
+
+_SPAN: ContextVar[_Span | None] = ContextVar("sliplens_progress", default=None)
+
+
+@contextmanager
+def reporting(listener: OnProgress | None) -> Iterator[None]:
+    """Report progress, stages, files and notes of the enclosed work to a callback.
+
+    Public functions enclose their work in it and pass their parameter `on_progress`; None keeps the callback of the
+    caller. Functions below them call `track`, `open_stage`, `add_note` and `report_file` and take no callback.
+
+    Examples
+    --------
+    >>> from sliplens.progress import reporting, track
+    >>> with reporting(lambda done, total: print(f"{done} of {total}")):
+    ...     squares = [number**2 for number in track([1, 2])]
+    1 of 2
+    2 of 2
+    """
+    before = _SPAN.get()
+    if listener is not None:
+        _SPAN.set(_Span(listener=listener))
+    try:
+        yield
+    finally:
+        _SPAN.set(before)
+
+
+def track(items: Collection[Item], *, sizes: Sequence[int] | None = None) -> Iterator[Item]:
+    """Iterate over items and report each as done when the next one is requested.
+
+    Loops nest: a loop within an item fills the item's part of the bar. `sizes` gives the length of each item's part
+    (its frames, for example), 1 by default.
+    """
+    span = _SPAN.get()
+    if span is None:
+        yield from items
+        return
+    lengths = [1] * len(items) if sizes is None else list(sizes)
+    total, done = sum(lengths), 0
+    try:
+        for item, length in zip(items, lengths, strict=True):
+            if span.total is None:
+                inner = _Span(listener=span.listener, first=done, size=length, total=total)
+            else:
+                first, end = (span.first + span.size * place // max(total, 1) for place in (done, done + length))
+                inner = _Span(listener=span.listener, first=first, size=end - first, total=span.total)
+            _SPAN.set(inner)
+            yield item
+            done += length
+            span.show(done, total)
+    finally:
+        _SPAN.set(span)
+
+
+def report_progress(done: int, total: int) -> None:
+    """Report how many items of the running loop are done, where `track` does not fit."""
+    if (span := _SPAN.get()) is not None:
+        span.show(done, total)
+
+
+@contextmanager
+def open_stage(title: str) -> Iterator[None]:
+    """Show a progress bar of its own for the enclosed work."""
+    listener = current_listener()
+    if isinstance(listener, Stages):
+        with listener.stage(title) as count, reporting(_StageListener(listener, count)):
+            yield
+    else:
+        yield
+
+
+def report_file(path: Path, what: str, *, kept: bool = False) -> None:
+    """Report a file or folder that was written, or `kept` because it was complete already."""
+    if isinstance(listener := current_listener(), Stages):
+        listener.wrote(path, what, kept=kept)
+
+
+def add_note(message: str) -> None:
+    """Report a sentence that the user should know."""
+    if isinstance(listener := current_listener(), Stages):
+        listener.note(message)
+
+
+def current_listener() -> OnProgress | None:
+    """Return the callback that the running work reports to; None without one."""
+    span = _SPAN.get()
+    return None if span is None else span.listener
+
+
+class _StageListener:
+    """Callback of an open stage: counts in its own bar, all else as the callback around it."""
+
+    def __init__(self, outer: Stages, count: OnProgress) -> None:
+        self._count = count
+        self.stage, self.wrote, self.note = outer.stage, outer.wrote, outer.note
+
+    def __call__(self, done: int, total: int, /) -> None:
+        self._count(done, total)
+
+
 def continued(on_progress: OnProgress | None, *, before: int, total: int) -> OnProgress | None:
     """Callback for a part of longer work, which comes after `before` of `total`; None where nobody listens."""
     return None if on_progress is None else lambda done, _: on_progress(before + done, total)
@@ -144,4 +263,21 @@ def ignore(_done: int, _total: int) -> None:
     """Show nothing."""
 
 
-__all__ = ["OnProgress", "Stages", "continued", "counted", "fold_equal", "note", "number_of", "stage", "wrote"]
+__all__ = [
+    "OnProgress",
+    "Stages",
+    "add_note",
+    "continued",
+    "counted",
+    "current_listener",
+    "fold_equal",
+    "note",
+    "number_of",
+    "open_stage",
+    "report_file",
+    "report_progress",
+    "reporting",
+    "stage",
+    "track",
+    "wrote",
+]
