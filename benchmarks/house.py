@@ -1,155 +1,220 @@
-"""How large the house is and how much of it a newcomer meets: lines, modules, public names, examples, loose dicts.
+"""Size and language of the code: lines, modules, names, parameters, and the modules that a frame passes in `predict`.
 
-Counted in the source text, without importing the package. `--json` prints one line of JSON.
+    python benchmarks/house.py --json
+    python benchmarks/house.py --list src/sliplens/live     # each finding below a folder, with its line
+
+The source is parsed without importing the package; `modules_predict_passes` is measured by a prediction.
 """
 
 import argparse
 import ast
 import json
+import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-_PACKAGE = Path(__file__).parents[1] / "src" / "sliplens"
-_MAPPINGS = ("dict", "Mapping", "MutableMapping")
-_ANYTHING = ("Any", "object")
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "sliplens"
+RIDDLES = frozenset(
+    ["one", "own", "told", "known", "found", "kept", "left", "held"]
+    + ["named", "shown", "said", "given", "asked", "looked", "wished", "seen"]
+)
+    [
+        "one",
+        "own",
+        "told",
+        "known",
+        "found",
+        "kept",
+        "left",
+        "held",
+        "named",
+        "shown",
+        "said",
+        "given",
+        "asked",
+        "looked",
+        "wished",
+        "seen",
+    ]
+)
+"""Names that say nothing of their value; counted among variables and parameters."""
+VAGUE_OPENINGS = ("What", "Whether", "As", "The same")
+"""First words of docstrings that cannot be read without the lines around them."""
+_BAGS = ("dict[str, Any]", "dict[str, object]", "Mapping[str, Any]", "Mapping[str, object]")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 @dataclass(frozen=True, kw_only=True)
 class House:
-    """Size of the package."""
+    """Counts of the code below `src/sliplens`, of tests, benchmarks and pages."""
 
     lines: int
     modules: int
-    public_top_level: int
-    """Names in `sliplens.__all__`."""
-    doctests: int
-    """Docstrings with an example that runs."""
-    dicts_across_modules: tuple[str, ...]
-    """Public functions, methods and fields of records whose annotation holds a dict of anything."""
-    largest_cli_module: str
-    largest_cli_lines: int
+    test_lines: int
+    benchmark_lines: int
+    doc_words: int
+    riddles_per_1000: float
+    """Variables and parameters named by a riddle word, in 1,000 lines."""
+    vague_docstrings: int
+    """Docstrings that begin with a word of `VAGUE_OPENINGS`."""
+    most_parameters: int
+    functions_with_on_progress: int
+    functions_with_out: int
+    functions_with_overwrite: int
+    functions_with_device: int
+    names_defined_twice: int
+    """Public classes and functions whose name stands in two or more modules."""
+    dicts_across_functions: int
+    """Functions that take or return `dict[str, Any]` or the like."""
 
 
-def measure(package: Path) -> House:
-    """Read every module of a package.
-
-    Raises
-    ------
-    OSError
-        If a module cannot be read.
-    """
-    texts = {path.relative_to(package): path.read_text(encoding="utf-8") for path in sorted(package.rglob("*.py"))}
-    trees = {path: ast.parse(text) for path, text in texts.items()}
-    lines = {path: len(text.splitlines()) for path, text in texts.items()}
-    commands = [path for path in lines if path.parts[0] == "cli"]
-    largest = max(commands, key=lambda path: lines[path])
-    return House(
-        lines=sum(lines.values()),
-        modules=len(texts),
-        public_top_level=len(exported_names(trees[Path("__init__.py")])),
-        doctests=sum(1 for tree in trees.values() for text in docstrings(tree) if ">>> " in text),
-        dicts_across_modules=tuple(f"{path}: {name}" for path, tree in trees.items() for name in loose_dicts(tree)),
-        largest_cli_module=largest.as_posix(),
-        largest_cli_lines=lines[largest],
-    )
+def sources(folder: Path) -> dict[Path, str]:
+    """Return the text of every module below a folder."""
+    return {path: path.read_text(encoding="utf-8") for path in sorted(folder.rglob("*.py"))}
 
 
-def exported_names(tree: ast.Module) -> list[str]:
-    """Names in a module's `__all__`: string literals, and the keys of a table named in it (`[*TABLE, "name"]`)."""
-    values = {
-        target.id: node.value
-        for node in tree.body
-        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None
-        for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
-        if isinstance(target, ast.Name)
+def functions(tree: ast.Module) -> Iterator[Function]:
+    """Iterate over all functions and methods of a module."""
+    return (node for node in ast.walk(tree) if isinstance(node, Function))
+
+
+def parameters(function: Function) -> list[ast.arg]:
+    """Return all parameters of a function, `self` and `cls` excepted."""
+    arguments = function.args
+    starred = [argument for argument in (arguments.vararg, arguments.kwarg) if argument is not None]
+    every = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs, *starred]
+    return [argument for argument in every if argument.arg not in {"self", "cls"}]
+
+
+def riddles(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Find variables and parameters that are named by a riddle word: line and name."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.arg) and node.arg.lstrip("_") in RIDDLES:
+            yield node.lineno, node.arg
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id.lstrip("_") in RIDDLES:
+            yield node.lineno, node.id
+
+
+def vague_docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Find docstrings, of fields too, that begin with a word of `VAGUE_OPENINGS`: line and first line."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            text = node.value.value.strip()
+            if any(text.startswith((f"{opening} ", f"{opening},")) for opening in VAGUE_OPENINGS):
+                yield node.lineno, text.splitlines()[0]
+
+
+def bags(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Find functions that take or return an untyped dict: line and name."""
+    for function in functions(tree):
+        annotations = [argument.annotation for argument in parameters(function)] + [function.returns]
+        texts = [ast.unparse(annotation) for annotation in annotations if annotation is not None]
+        if any(bag in text for bag in _BAGS for text in texts):
+            yield function.lineno, function.name
+
+
+def public_names(tree: ast.Module) -> set[str]:
+    """Return the public classes and functions that a module defines."""
+    return {
+        node.name for node in tree.body if isinstance(node, ast.ClassDef | Function) and not node.name.startswith("_")
     }
 
-    def names(node: ast.expr) -> Iterator[str]:
-        if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            yield node.value
-        elif isinstance(node, ast.Name) and node.id in values:
-            yield from names(values[node.id])
-        elif isinstance(node, ast.Dict):
-            for key in node.keys:
-                if key is not None:
-                    yield from names(key)
-        else:
-            for child in ast.iter_child_nodes(node):
-                if isinstance(child, ast.expr):
-                    yield from names(child)
 
-    return sorted(set(names(values["__all__"]))) if "__all__" in values else []
-
-
-def docstrings(tree: ast.Module) -> Iterator[str]:
-    """Every docstring of a module: its own, of classes, functions and methods."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | Function) and (text := ast.get_docstring(node)):
-            yield text
-
-
-def loose_dicts(tree: ast.Module) -> Iterator[str]:
-    """Public functions, methods and annotated fields that give or take a dict of anything."""
-
-    def visit(body: list[ast.stmt], prefix: str) -> Iterator[str]:
-        for node in body:
-            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
-                yield from visit(node.body, f"{prefix}{node.name}.")
-            elif isinstance(node, Function) and not node.name.startswith("_"):
-                arguments = node.args
-                everything = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
-                everything += [extra for extra in (arguments.vararg, arguments.kwarg) if extra is not None]
-                annotations = [argument.annotation for argument in everything] + [node.returns]
-                if any(map(is_loose, annotations)):
-                    yield f"{prefix}{node.name}"
-            elif prefix and isinstance(node, ast.AnnAssign) and is_loose(node.annotation):
-                name = ast.unparse(node.target)
-                if not name.startswith("_"):
-                    yield f"{prefix}{name}"
-
-    return visit(tree.body, "")
-
-
-def is_loose(annotation: ast.expr | None) -> bool:
-    """Tell whether an annotation holds `dict[str, Any]`, `Mapping[str, object]` or the like."""
-    if annotation is None:
-        return False
-    if isinstance(annotation, ast.Constant) and isinstance(annotation.value, str):
-        try:
-            annotation = ast.parse(annotation.value, mode="eval").body
-        except SyntaxError:  # a shape, "batch 3 height width"
-            return False
-    return any(
-        isinstance(node, ast.Subscript)
-        and isinstance(node.value, ast.Name)
-        and node.value.id in _MAPPINGS
-        and isinstance(node.slice, ast.Tuple)
-        and isinstance(value := node.slice.elts[-1], ast.Name)
-        and value.id in _ANYTHING
-        for node in ast.walk(annotation)
+def measure(root: Path = ROOT) -> House:
+    """Count the code of a checkout."""
+    package = sources(root / "src" / "sliplens")
+    trees = {path: ast.parse(text) for path, text in package.items()}
+    lines = count_lines(package)
+    every = [function for tree in trees.values() for function in functions(tree)]
+    names = Counter(name for tree in trees.values() for name in public_names(tree))
+    uses = Counter(argument.arg for function in every for argument in parameters(function))
+    return House(
+        lines=lines,
+        modules=len(package),
+        test_lines=count_lines(sources(root / "tests")),
+        benchmark_lines=count_lines(sources(root / "benchmarks")),
+        doc_words=sum(len(path.read_text(encoding="utf-8").split()) for path in (root / "docs").rglob("*.md")),
+        riddles_per_1000=round(1000 * sum(len(list(riddles(tree))) for tree in trees.values()) / lines, 2),
+        vague_docstrings=sum(len(list(vague_docstrings(tree))) for tree in trees.values()),
+        most_parameters=max(len(parameters(function)) for function in every),
+        functions_with_on_progress=uses["on_progress"],
+        functions_with_out=uses["out"],
+        functions_with_overwrite=uses["overwrite"],
+        functions_with_device=uses["device"],
+        names_defined_twice=sum(1 for count in names.values() if count > 1),
+        dicts_across_functions=sum(len(list(bags(tree))) for tree in trees.values()),
     )
+
+
+def count_lines(texts: dict[Path, str]) -> int:
+    """Count the lines of several modules."""
+    return sum(len(text.splitlines()) for text in texts.values())
+
+
+def modules_predict_passes() -> list[str]:
+    """Return the modules whose functions run once more for every further frame that `predict` reads."""
+    import sliplens as sl  # noqa: PLC0415 (torch takes seconds, and the counts need none)
+
+    run = sl.load("chromatouch-pair")
+    frames = np.random.default_rng(0).integers(0, 256, (48, 224, 224, 3), dtype=np.uint8)
+
+    def calls(count: int) -> Counter[str]:
+        passed: Counter[str] = Counter()
+
+        def record(frame: object, event: str, _: object) -> None:
+            name = getattr(frame, "f_globals", {}).get("__name__", "")
+            if event == "call" and name.startswith("sliplens."):
+                passed[name] += 1
+
+        sys.setprofile(record)
+        try:
+            sl.predict(run, frames[:count], reference=frames[0])
+        finally:
+            sys.setprofile(None)
+        return passed
+
+    calls(8)
+    few, many = calls(16), calls(48)
+    return sorted(name for name, count in many.items() if count > few[name])
+
+
+def list_findings(folder: Path) -> None:
+    """Print every riddle, vague docstring, untyped dict and long signature below a folder."""
+    for path, text in sources(folder).items():
+        tree = ast.parse(text)
+        rows = [(line, f"riddle: {name}") for line, name in riddles(tree)]
+        rows += [(line, f"docstring: {first}") for line, first in vague_docstrings(tree)]
+        rows += [(line, f"untyped dict: {name}") for line, name in bags(tree)]
+        for function in functions(tree):
+            if (count := len(parameters(function))) > 12:
+                rows.append((function.lineno, f"{count} parameters: {function.name}"))
+        for line, message in sorted(rows):
+            print(f"{path}:{line}: {message}")
 
 
 def main() -> None:
-    """Print the size of the package."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Print the counts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print one line of JSON")
+    parser.add_argument("--list", type=Path, metavar="FOLDER", help="print each finding below a folder")
     options = parser.parse_args()
-    house = measure(_PACKAGE)
+    if options.list is not None:
+        list_findings(options.list)
+        return
+    passed = modules_predict_passes()
+    facts = asdict(measure()) | {"modules_predict_passes": len(passed)}
     if options.json:
-        facts = asdict(house) | {"dicts_across_modules": len(house.dicts_across_modules)}
-        facts["largest_cli_module"] = facts.pop("largest_cli_lines")
         print(json.dumps(facts))
         return
-    print(f"{house.lines} lines in {house.modules} modules; {house.public_top_level} names at the top level")
-    print(f"{house.doctests} docstrings with an example")
-    print(f"largest module of the command line: {house.largest_cli_module}, {house.largest_cli_lines} lines")
-    print(f"{len(house.dicts_across_modules)} dicts of anything across modules")
-    for name in house.dicts_across_modules:
-        print(f"  {name}")
+    for name, value in facts.items():
+        print(f"{name}: {value}")
+    print("a frame passes", ", ".join(passed))
 
 
 if __name__ == "__main__":
