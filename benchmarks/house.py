@@ -23,25 +23,6 @@ RIDDLES = frozenset(
     ["one", "own", "told", "known", "found", "kept", "left", "held"]
     + ["named", "shown", "said", "given", "asked", "looked", "wished", "seen"]
 )
-    [
-        "one",
-        "own",
-        "told",
-        "known",
-        "found",
-        "kept",
-        "left",
-        "held",
-        "named",
-        "shown",
-        "said",
-        "given",
-        "asked",
-        "looked",
-        "wished",
-        "seen",
-    ]
-)
 """Names that say nothing of their value; counted among variables and parameters."""
 VAGUE_OPENINGS = ("What", "Whether", "As", "The same")
 """First words of docstrings that cannot be read without the lines around them."""
