@@ -20,8 +20,24 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "sliplens"
 RIDDLES = frozenset(
-    ["one", "own", "told", "known", "found", "kept", "left", "held"]
-    + ["named", "shown", "said", "given", "asked", "looked", "wished", "seen"]
+    [
+        "one",
+        "own",
+        "told",
+        "known",
+        "found",
+        "kept",
+        "left",
+        "held",
+        "named",
+        "shown",
+        "said",
+        "given",
+        "asked",
+        "looked",
+        "wished",
+        "seen",
+    ]
 )
 """Names that say nothing of their value; counted among variables and parameters."""
 VAGUE_OPENINGS = ("What", "Whether", "As", "The same")
