@@ -19,12 +19,11 @@ from sliplens.models import Manifest, Run
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results import Explained, ExplainedFrame
 from sliplens.results.explanation import MethodNotes
-from sliplens.results.study import Study, Truth
+from sliplens.results.study import Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
 from sliplens.simulation.intervention import draw_with_markers_back, marker_readings, visible_markers
 from sliplens.study import explain_frames, frames_from_dataset
 from sliplens.study.explaining import network_inputs
-from sliplens.study.pool import _with_truth as pooled_truth
 from sliplens.study.truth import (
     FrameEffects,
     JudgingByTruth,
@@ -447,12 +446,3 @@ def test_frames_of_other_data_are_refused(given, maps, small_dataset):
         refuse(replace(explained, weights_sha256="of others"))
     with pytest.raises(InputError, match="no fill named 'pink'"):
         judge(trained, explained, data, maps=maps, fills=("pink",))
-
-
-def test_pooled_maps_are_held_against_the_truth_as_in_a_study(two_signed):
-    _, explained, truth = two_signed
-    study = Study(explanations={"difference": explained}, truth={"difference": truth})
-    correlations, _ = pooled_truth(study, "difference", "attribution")
-    told = truth.methods["attribution"].shapley
-    assert told is not None
-    assert np.nanmean(correlations) == pytest.approx(told.estimate)

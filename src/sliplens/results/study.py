@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
 from sliplens.codec import UNKNOWN, Columns
@@ -455,39 +454,3 @@ class Study:
     @property
     def _tests(self) -> tuple[Mapping[str, _Test], ...]:
         return self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth
-
-
-@dataclass(frozen=True, kw_only=True)
-class PooledScore:
-    """What removal and the truth say of one method under one fill and unit, over several networks."""
-
-    input: str
-    fill: str
-    unit: str
-    method: str
-    gain: Difference
-    """Symmetric relevance gain, in margin units."""
-    lead: Lead | None
-    """Of the gain over the controls; None for a control."""
-    truth: Difference | None
-    """Signed rank correlation, marker by marker, with the Shapley values; None where no scene can be drawn anew."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PooledScores:
-    """Scores of several studies together, with intervals over networks, days and trials."""
-
-    scores: tuple[PooledScore, ...]
-
-    def frame(self) -> pa.Table:
-        """Arrow table, a row a score: `gain`, `lead` and `truth` with their ends `_low` and `_high`, and over what."""
-        rows = []
-        for one in self.scores:
-            lead = one.lead and one.lead.gap
-            row = {"input": one.input, "fill": one.fill, "unit": one.unit, "method": one.method}
-            for name, gap in (("gain", one.gain), ("lead", lead), ("truth", one.truth)):
-                ends = (None, None, None) if gap is None else (gap.estimate, gap.low, gap.high)
-                row |= dict(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
-            row |= {"strongest_control": one.lead and one.lead.control}
-            rows.append(row | {"networks": one.gain.networks, "days": one.gain.days, "trials": one.gain.units})
-        return pa.Table.from_pylist(rows)
