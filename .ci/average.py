@@ -15,7 +15,7 @@ import torch
 
 from sliplens.errors import SliplensError
 from sliplens.files import output_folder, versions
-from sliplens.models import Run, load, save_checkpoint
+from sliplens.models import Network, load, save_checkpoint
 from sliplens.models.checkpoint import read_manifest
 from sliplens.models.novelty import fit_novelty
 from sliplens.recordings import Dataset, load_dataset
@@ -43,7 +43,7 @@ def average(data: Path, folders: Sequence[Path], out: Path) -> float:
     return read_manifest(out).metrics["validation_mse"]
 
 
-def _average(runs: Sequence[Run], dataset: Dataset, out: Path) -> None:
+def _average(runs: Sequence[Network], dataset: Dataset, out: Path) -> None:
     """Write the average of networks of one kind, calibrated on a data set."""
     first = runs[0]
     validation, train = (

@@ -19,7 +19,7 @@ from torch import Tensor
 from sliplens.codec import RESULT_FILE, load_result, save_result
 from sliplens.files import RUN_FILE, scratch_folder
 from sliplens.grip.readings import ReadingTable
-from sliplens.models import Run, load, save_checkpoint
+from sliplens.models import Network, load, save_checkpoint
 from sliplens.recordings import Recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -47,7 +47,7 @@ def simulate() -> list[Recording]:
     return [simulate_trial(replace(plan, frames=20)) for plan in plans]
 
 
-def read(network: Run, trials: list[Recording]) -> dict[str, np.ndarray]:
+def read(network: Network, trials: list[Recording]) -> dict[str, np.ndarray]:
     """All that a network answers to the frames of some trials."""
     parts: dict[str, list[np.ndarray]] = {}
     for trial in trials:

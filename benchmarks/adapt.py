@@ -23,7 +23,7 @@ import numpy as np
 import sliplens as sl
 from sliplens.errors import SliplensError
 from sliplens.files import hash_json, output_folder, write_json
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, simulate_dataset
 from sliplens.simulation.sensor import Glare, Sensor
@@ -93,7 +93,7 @@ def recorded(data: Dataset, trials: int) -> Dataset:
     return replace(data, trials=tuple(replace(one, split=name) for name, some in split.items() for one in some))
 
 
-def train(plan: Plan, data: Dataset, start: Run) -> Run:
+def train(plan: Plan, data: Dataset, start: Network) -> Network:
     """The network that the owner gets."""
     recipe = get_recipe("adapt")
     changes: dict[str, Any] = {"seed": plan.seed, "image_size": plan.image_size} | plan.changes
@@ -103,7 +103,7 @@ def train(plan: Plan, data: Dataset, start: Run) -> Run:
     return sl.train(recorded(data, plan.trials), recipe="adapt", start_from=start, **changes)
 
 
-def r2(run: Run, frames: FrameSet) -> dict[str, float]:
+def r2(run: Network, frames: FrameSet) -> dict[str, float]:
     """R2 of the margin, dry and wet."""
     return {name: float(one.r2 or 0) for name, one in evaluate_frames(run, frames).conditions.items()}
 

@@ -32,7 +32,7 @@ from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import Units, score_maps, tile_units
 from sliplens.files import machine, versions
 from sliplens.intervals import paired_difference
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import load
 from sliplens.models.engines import prepare
 from sliplens.plots.style import tell_ends
@@ -62,7 +62,7 @@ class Case:
     """Where the truth lies, at the network's size."""
 
 
-def find_cases(trained: Run, data: Dataset, *, options: argparse.Namespace) -> Iterator[Case]:
+def find_cases(trained: Network, data: Dataset, *, options: argparse.Namespace) -> Iterator[Case]:
     """Frames at the wanted margins, of trials spread over the data set; every other trial has every other margin."""
     infos = [info for info in data.trials if info.split == "test"] or list(data.trials)
     step = max(1, len(infos) // options.trials)
@@ -92,7 +92,7 @@ def true_regions(recording: Recording, row: int, *, size: int) -> dict[str, np.n
     return {name: region for name, region in (("markers", markers), ("slip", slips)) if region.any()}
 
 
-def make_maps(trained: Run, case: Case, *, options: argparse.Namespace) -> dict[str, Tensor]:
+def make_maps(trained: Network, case: Case, *, options: argparse.Namespace) -> dict[str, Tensor]:
     """Maps of one frame by name, larger where a pixel supports the change more."""
     model, image, reference = trained.model, case.image[None], case.reference
     added = (case.image - reference).abs().mean(dim=0)
@@ -127,7 +127,7 @@ def unit_weights(model: torch.nn.Module, image: Tensor, names: list[str]) -> lis
     return combine(activations, ones, size=(image.shape[-2], image.shape[-1]))
 
 
-def judge(trained: Run, case: Case, *, options: argparse.Namespace) -> dict[str, dict[str, float]]:
+def judge(trained: Network, case: Case, *, options: argparse.Namespace) -> dict[str, dict[str, float]]:
     """Scores of one frame by map; keys of a score are its name, its fill or region, and its unit."""
     maps = {name: one.float().numpy() for name, one in make_maps(trained, case, options=options).items()}
     scores: dict[str, dict[str, float]] = {name: {} for name in maps}

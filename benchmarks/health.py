@@ -43,7 +43,7 @@ from sliplens.live import Check, HealthMonitor, LiveFrame
 from sliplens.live.health import check_direction, check_novelty, margin_risk, severity
 from sliplens.live.reading import OFF
 from sliplens.markers import Tracker
-from sliplens.models import Run, load
+from sliplens.models import Network, load
 from sliplens.models.checkpoint import MANIFEST_FILE, Manifest
 from sliplens.models.novelty import fit_novelty
 from sliplens.recordings.capture import Forces
@@ -209,7 +209,7 @@ class Shot:
 class Judge:
     """Reads frames of one trial, and checks their health."""
 
-    def __init__(self, run: Run, reference: np.ndarray, *, trial: int) -> None:
+    def __init__(self, run: Network, reference: np.ndarray, *, trial: int) -> None:
         self._run, self._reference, self._trial = run, reference, trial
         self._shear = run.shear_estimator(reference)
 
@@ -322,7 +322,7 @@ def judge_stopped(
                 )  # fmt: skip
 
 
-def judge_trial(run: Run, plan: TrialPlan, *, trial: int, frames: int, other: TrialPlan) -> Iterator[Case]:
+def judge_trial(run: Network, plan: TrialPlan, *, trial: int, frames: int, other: TrialPlan) -> Iterator[Case]:
     """All cases of one trial."""
     rng = np.random.default_rng(plan.seed)
     loading, film = prepare_trial(plan)

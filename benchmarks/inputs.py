@@ -31,7 +31,7 @@ from jaxtyping import Float, Int
 from adapt import SENSORS
 from networks import SETS, draw_in_contact, film_frames, fresh_days, r2, require_disjoint
 from sliplens.errors import SliplensError
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import load
 from sliplens.simulation import SimulationRecipe
 from sliplens.simulation.plan import plan_trials
@@ -59,7 +59,7 @@ def recipes() -> dict[str, SimulationRecipe]:
     return {"chromatouch": varied, **others, "selection": fresh_days(*SETS["selection"])}
 
 
-def read(runs: dict[str, Run], recipe: SimulationRecipe, *, trials: int | None) -> Read:
+def read(runs: dict[str, Network], recipe: SimulationRecipe, *, trials: int | None) -> Read:
     """Draw a few frames of each trial, and have every network read them."""
     rng = np.random.default_rng(0)
     plans = [plan for plan in plan_trials(recipe) if plan.split == "test"]
@@ -84,7 +84,7 @@ def read(runs: dict[str, Run], recipe: SimulationRecipe, *, trials: int | None) 
     )
 
 
-def by_kind(runs: dict[str, Run]) -> dict[str, dict[int, str]]:
+def by_kind(runs: dict[str, Network]) -> dict[str, dict[int, str]]:
     """Names of the networks, by input and backbone, and seed.
 
     Raises
@@ -107,7 +107,7 @@ def by_kind(runs: dict[str, Run]) -> dict[str, dict[int, str]]:
     return found
 
 
-def time_over_first(runs: Sequence[Run]) -> list[float]:
+def time_over_first(runs: Sequence[Network]) -> list[float]:
     """Median time of one image, over that of the first network; the networks take turns on one core."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

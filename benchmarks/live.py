@@ -43,7 +43,7 @@ import sliplens as sl
 from sliplens.app import LivePage
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import LiveFrame, LiveSource, Reading, ReplaySource
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.recordings.source import open_source
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -145,7 +145,7 @@ class Pauses:
 
 
 def measure(
-    frames: np.ndarray, untouched: np.ndarray, *, network: Run, seconds: float, shown: bool, maps: bool
+    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, maps: bool
 ) -> Latencies:
     """Read a repeated grip for a while, with a page or without, and maps on it or not."""
     network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
@@ -235,7 +235,7 @@ class TurnSource(LiveSource):
         self.handed.put(None)
 
 
-def load_at(name: str, image_size: int | None = None) -> Run:
+def load_at(name: str, image_size: int | None = None) -> Network:
     """A network of the package for frames of this camera, at its own image size or another, at which it errs."""
     network = sl.load(name)
     manifest = replace(network.manifest, frame_size=SIZE)
@@ -258,7 +258,7 @@ RATIOS = {
 
 def measure_in_turn(frames: np.ndarray, untouched: np.ndarray, *, rounds: int) -> dict[str, np.ndarray]:
     """Milliseconds from capture to reading by way to read, over the frames of which each has a margin."""
-    ways: dict[str, tuple[Run, dict]] = {"pair_at_224": (load_at("chromatouch-pair", 224), {})}
+    ways: dict[str, tuple[Network, dict]] = {"pair_at_224": (load_at("chromatouch-pair", 224), {})}
     for name in ("difference", "pair"):
         network = load_at(f"chromatouch-{name}")
         for suffix, options in (("", {}), ("_told", {"friction": (0.3, 0.9)}), ("_sequence", {"sequence": True})):
@@ -309,7 +309,7 @@ def slowest_parts_ms(latencies: Latencies) -> dict[str, float]:
 
 
 def measure_pace(
-    frames: np.ndarray, untouched: np.ndarray, *, network: Run, seconds: float, shown: bool
+    frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool
 ) -> dict[str, object]:
     """Latencies at the camera's pace, with a page open or not."""
     begun = time.monotonic()

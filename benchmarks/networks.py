@@ -43,7 +43,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from adapt import SENSORS
 from sliplens.errors import SliplensError
 from sliplens.friction import GRASP_SPREAD, Friction
-from sliplens.models import Estimate, Run
+from sliplens.models import Estimate, Network
 from sliplens.models.checkpoint import Ratio, load
 from sliplens.simulation import PRESETS, SimulationRecipe
 from sliplens.simulation.filming import Film
@@ -152,7 +152,7 @@ def film_frames(
     return frames, film.draw_reference().numpy()
 
 
-def draw(run: Run, plan: TrialPlan, *, rng: np.random.Generator, before_slip: int = 0) -> Seen:
+def draw(run: Network, plan: TrialPlan, *, rng: np.random.Generator, before_slip: int = 0) -> Seen:
     """Draw and encode a few frames of a trial: at random among those with contact, or the last before it slips."""
     loading, film = prepare_trial(plan)
     if before_slip:
@@ -233,7 +233,7 @@ class Read:
         return np.concatenate([one.margin for one in self.told[name]])
 
 
-def read_frames(run: Run, name: str, *, trials: int | None = None, grasp_spread: float | None = None) -> Read:
+def read_frames(run: Network, name: str, *, trials: int | None = None, grasp_spread: float | None = None) -> Read:
     """Read a few frames of each trial of a set, told more or less of its friction."""
     rng, aside = np.random.default_rng(DRAWS[name]), np.random.default_rng(22)
     told: dict[str, list[Estimate]] = {}
@@ -334,7 +334,7 @@ class Followed:
     in_90: np.ndarray
 
 
-def follow(run: Run, plan: TrialPlan) -> Followed:
+def follow(run: Network, plan: TrialPlan) -> Followed:
     """Read all frames of a trial with contact."""
     loading, film = prepare_trial(plan)
     contact = np.flatnonzero(np.isfinite(loading.safety_margin))
@@ -354,7 +354,7 @@ def follow(run: Run, plan: TrialPlan) -> Followed:
     )
 
 
-def follow_all(run: Run, name: str, *, trials: int | None = None) -> list[Followed]:
+def follow_all(run: Network, name: str, *, trials: int | None = None) -> list[Followed]:
     """Read all frames of the trials of a set in order, their pulls varied."""
     plans = plans_of_set(name, trials=trials)
     return [follow(run, replace(plan, recipe=replace(plan.recipe, pulls=PULLS["varied"]))) for plan in plans]
@@ -397,7 +397,7 @@ def sequence_leads(read: Sequence[Followed], other: Sequence[Followed]) -> dict[
     return lead("several_lead_dry", margin, answers, day, ~wet) | lead("several_lead_wet", margin, answers, day, wet)
 
 
-def measure_known(run: Run, *, trials: int | None = None) -> dict[str, Any]:
+def measure_known(run: Network, *, trials: int | None = None) -> dict[str, Any]:
     """How well `known` tells frames of other sensors from those of the network's kind, and how often it is low."""
     if run.novelty is None:
         raise SystemExit("networks.py: this network does not tell how far it knows a frame")
@@ -418,7 +418,7 @@ def measure_known(run: Run, *, trials: int | None = None) -> dict[str, Any]:
     return found
 
 
-def measure_directions(run: Run, name: str, *, trials: int | None = None) -> dict[str, Any]:
+def measure_directions(run: Network, name: str, *, trials: int | None = None) -> dict[str, Any]:
     """R2 of one frame where the same trials are pulled in each direction, and the largest difference between two."""
     scores: dict[str, Any] = {}
     for pull_deg in DIRECTIONS_DEG:

@@ -25,7 +25,7 @@ from jaxtyping import Float
 from limit import SEEN, Samples, read, train
 from networks import SETS, draw_in_contact, film_frames, fresh_days, lead, plans_of_set, r2_over_days, require_disjoint
 from sliplens.errors import SliplensError
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import load
 from sliplens.simulation import PRESETS
 from sliplens.simulation.nuisances import Nuisances
@@ -77,7 +77,7 @@ def training_plans(days: int) -> dict[str, tuple[TrialPlan, ...]]:
     return plans
 
 
-def see(plans: Sequence[TrialPlan], *, seed: int, network: Run | None = None) -> Seen:
+def see(plans: Sequence[TrialPlan], *, seed: int, network: Network | None = None) -> Seen:
     """Draw a few frames with contact of each trial."""
     rng = np.random.default_rng(seed)
     shift, margin, wet, day, answer = [], [], [], [], []

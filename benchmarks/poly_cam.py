@@ -29,7 +29,7 @@ from sliplens.errors import SliplensError
 from sliplens.explainers import Explanation, PolyCam, capture, find_layers
 from sliplens.explainers.explanation import EXACT, effect_rounding, pearson_r, resize, to_masks, top_overlap
 from sliplens.files import machine, versions
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import load
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.simulation import SimulationRecipe, simulate_dataset
@@ -41,7 +41,7 @@ BUDGET = 0.25
 RECIPE = SimulationRecipe(dry_trials=8, wet_trials=0, frames_per_trial=24, seed=7)
 
 
-def pick_inputs(trained: Run, data: Dataset, *, real: Path, count: int) -> tuple[Tensor, Tensor]:
+def pick_inputs(trained: Network, data: Dataset, *, real: Path, count: int) -> tuple[Tensor, Tensor]:
     """Inputs and references: real difference images where the network takes them, then simulated frames."""
     chosen = [frames_from_dataset(trained, data, split="test")]
     if trained.manifest.input == "difference" and real.is_dir():
@@ -152,7 +152,7 @@ def measure(run: Path, images: Tensor, references: Tensor, *, options: argparse.
     }
 
 
-def gpu_milliseconds(trained: Run, image: Tensor, reference: Tensor, *, budget: float) -> float | None:
+def gpu_milliseconds(trained: Network, image: Tensor, reference: Tensor, *, budget: float) -> float | None:
     """Milliseconds an image on a graphics card, warmed up and waited for; None without one."""
     if not torch.cuda.is_available():
         return None

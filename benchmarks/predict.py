@@ -30,7 +30,7 @@ from torch.nn import functional
 import sliplens as sl
 from sliplens.errors import SliplensError
 from sliplens.files import machine, versions
-from sliplens.models import Manifest, Run, build_model
+from sliplens.models import Manifest, Network, build_model
 from sliplens.models.engines import ENGINES, Engine, make_engine
 from sliplens.models.onnx import difference
 from sliplens.recordings.source import open_source
@@ -41,7 +41,7 @@ ENCODED = ((224, 224), (480, 640))
 """Heights and widths of camera frames."""
 
 
-def build(*, size: int, head: str) -> Run:
+def build(*, size: int, head: str) -> Network:
     """Make an untrained network whose batch normalisation has seen images, and whose answers vary with them."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -64,7 +64,7 @@ def build(*, size: int, head: str) -> Run:
         head=head,
     )
     model = model.to(memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
-    return Run(model=model, manifest=manifest)
+    return Network(model=model, manifest=manifest)
 
 
 def clouds(count: int, *, size: int, seed: int) -> Tensor:
@@ -74,7 +74,7 @@ def clouds(count: int, *, size: int, seed: int) -> Tensor:
 
 
 def make_ready(
-    names: Sequence[str], trained: Run, inputs: Tensor
+    names: Sequence[str], trained: Network, inputs: Tensor
 ) -> tuple[dict[str, Engine], dict[str, float], dict[str, str]]:
     """Engines that can be used here, the seconds until each has answered once, and why the others cannot."""
     engines, seconds, missing = {}, {}, {}
@@ -104,7 +104,7 @@ def time_rounds(work: dict[str, Callable[[], object]], *, rounds: int, warm_up: 
     return {name: np.array(times[warm_up:]) for name, times in found.items()}
 
 
-def encoders(trained: Run) -> dict[str, Callable[[], object]]:
+def encoders(trained: Network) -> dict[str, Callable[[], object]]:
     """Encoding of one frame, by the size of the camera's frames."""
     rng, work = np.random.default_rng(0), {}
     encode = partial(trained.encoding.encode, image_size=trained.manifest.image_size)
@@ -114,7 +114,7 @@ def encoders(trained: Run) -> dict[str, Callable[[], object]]:
     return work
 
 
-def parity(trained: Run, engine: Engine, eager: Engine, inputs: Tensor) -> float:
+def parity(trained: Network, engine: Engine, eager: Engine, inputs: Tensor) -> float:
     """Largest difference between the margins of an engine and those of `eager`."""
     return difference(engine.estimate(trained, inputs).margin, eager.estimate(trained, inputs).margin)
 

@@ -26,7 +26,7 @@ from jaxtyping import Float
 from torch import nn
 
 from sliplens.errors import SliplensError
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import load
 from sliplens.simulation import PRESETS, SimulationRecipe, simulate_dataset
 from sliplens.simulation.nuisances import Nuisances
@@ -94,7 +94,7 @@ def r2_by_condition(answers: Answers, margin: Float[np.ndarray, " frames"]) -> d
     }
 
 
-def answered(trained: Run, recipe: SimulationRecipe, folder: Path, *, split: str) -> Answers:
+def answered(trained: Network, recipe: SimulationRecipe, folder: Path, *, split: str) -> Answers:
     """What the network answers to the trials of one split."""
     data = simulate_dataset(folder, recipe)
     frames = load_frames(

@@ -53,7 +53,7 @@ def test_an_engine_agrees_with_the_network(name: str):
 
 def test_a_network_that_answers_with_no_number_fails(monkeypatch: pytest.MonkeyPatch):
     assert "ms a frame" in doctor._network("chromatouch-difference")
-    monkeypatch.setattr(doctor.Run, "predict", lambda _, inputs: inputs.sum(dim=(1, 2, 3)) * float("nan"))
+    monkeypatch.setattr(doctor.Network, "predict", lambda _, inputs: inputs.sum(dim=(1, 2, 3)) * float("nan"))
     with pytest.raises(InputError, match="answers with no number"):
         doctor._network("chromatouch-difference")
 

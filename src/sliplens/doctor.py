@@ -16,7 +16,7 @@ from sliplens.errors import InputError, SliplensError
 from sliplens.files import machine, scratch_folder, shipped_names, versions
 from sliplens.images import list_images, read_image
 from sliplens.live.camera import list_cameras
-from sliplens.models.checkpoint import Run, load
+from sliplens.models.checkpoint import Network, load
 from sliplens.models.engines import ENGINES, prepare
 from sliplens.models.onnx import TOLERANCE
 from sliplens.progress import OnProgress, number_of
@@ -116,7 +116,7 @@ def _graphics_card() -> str:
     return f"{torch.cuda.get_device_name()} counts {sums:.0f}"
 
 
-def _inputs(trained: Run) -> torch.Tensor:
+def _inputs(trained: Network) -> torch.Tensor:
     """Encoded images that any network reads."""
     size = trained.manifest.image_size
     return torch.rand((2, 3, size, size), generator=torch.Generator().manual_seed(0))

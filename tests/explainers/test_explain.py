@@ -9,7 +9,7 @@ import sliplens
 from sliplens.errors import ImageError, InputError
 from sliplens.explainers import GradCam, PolyCam, get_explainer
 from sliplens.explainers.occlusion import marker_regions, markers_in_frame
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import Manifest
 
 SIZE = 64
@@ -19,11 +19,11 @@ UNTOUCHED = np.full((SIZE, SIZE, 3), 7, dtype=np.uint8)
 
 @pytest.fixture
 def trained(network):
-    def with_input(kind: str) -> Run:
+    def with_input(kind: str) -> Network:
         manifest = Manifest(
             backbone="gap", input=kind, image_size=SIZE, frame_size=(SIZE, SIZE), sensor="", data_hash=""
         )
-        return Run(model=network("gap").float(), manifest=manifest)
+        return Network(model=network("gap").float(), manifest=manifest)
 
     return with_input
 

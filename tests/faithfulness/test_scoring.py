@@ -12,7 +12,7 @@ import sliplens
 from sliplens.errors import InputError, SaliencyError
 from sliplens.faithfulness import score_by_deletion
 from sliplens.faithfulness.removal import AREAS
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import Manifest
 
 SIZE = 10
@@ -32,11 +32,11 @@ class Linear(nn.Module):
 
 
 @pytest.fixture
-def run() -> Run:
+def run() -> Network:
     manifest = Manifest(
         backbone="linear", input="amplitude", image_size=SIZE, frame_size=(SIZE, SIZE), sensor="", data_hash=""
     )
-    return Run(model=Linear().eval(), manifest=manifest)
+    return Network(model=Linear().eval(), manifest=manifest)
 
 
 EFFECTS = SLOPES.numpy() * FRAMES.astype(np.float64).mean(axis=-1) / 255
@@ -124,12 +124,12 @@ BOTH_WAYS = np.concatenate([UP, FRAMES])
 
 
 @pytest.fixture
-def curved(run: Run) -> Run:
+def curved(run: Network) -> Network:
     return replace(run, model=Curved().eval())
 
 
 @pytest.fixture
-def captum_maps(curved: Run) -> np.ndarray:
+def captum_maps(curved: Network) -> np.ndarray:
     """Integrated Gradients as Captum gives them, from the untouched sensor."""
     inputs = torch.as_tensor(BOTH_WAYS).permute(0, 3, 1, 2).double() / 255
     method = attr.IntegratedGradients(curved.model)
@@ -137,7 +137,7 @@ def captum_maps(curved: Run) -> np.ndarray:
     return attributions.sum(dim=1).detach().numpy()
 
 
-def test_predictions_of_these_frames_rise_and_fall(curved: Run):
+def test_predictions_of_these_frames_rise_and_fall(curved: Network):
     explanation = sliplens.explain(curved, BOTH_WAYS, method="integrated-gradients")
     assert (explanation.change[:3] > 0).all()
     assert (explanation.change[3:] < 0).all()
@@ -145,7 +145,9 @@ def test_predictions_of_these_frames_rise_and_fall(curved: Run):
 
 @pytest.mark.parametrize("fill", ["reference", "grey", "black", "white", "blur", "noisy-linear"])
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
-def test_an_array_of_captum_and_our_explanation_score_alike(curved: Run, captum_maps: np.ndarray, fill: str, unit: str):
+def test_an_array_of_captum_and_our_explanation_score_alike(
+    curved: Network, captum_maps: np.ndarray, fill: str, unit: str
+):
     ours = sliplens.explain(curved, BOTH_WAYS, method="integrated-gradients")
     # Captum integrates by 200 points of Gauss and Legendre, ours until the sum is complete
     np.testing.assert_allclose(ours.relevance.numpy(), captum_maps, atol=1e-5)
@@ -157,7 +159,7 @@ def test_an_array_of_captum_and_our_explanation_score_alike(curved: Run, captum_
         np.testing.assert_array_equal(control.symmetric_gain, by_record.controls[name].symmetric_gain)
 
 
-def test_a_signed_map_gains_in_every_frame_and_its_negative_loses_as_much(curved: Run, captum_maps: np.ndarray):
+def test_a_signed_map_gains_in_every_frame_and_its_negative_loses_as_much(curved: Network, captum_maps: np.ndarray):
     gain, loss = (
         sliplens.score(curved, BOTH_WAYS, maps, random_orders=1).symmetric_gain for maps in (captum_maps, -captum_maps)
     )
@@ -165,14 +167,14 @@ def test_a_signed_map_gains_in_every_frame_and_its_negative_loses_as_much(curved
     np.testing.assert_allclose(loss, -gain, atol=1e-6)  # single precision of the network's input
 
 
-def test_deletion_takes_an_array_as_it_takes_an_explanation(curved: Run, captum_maps: np.ndarray):
+def test_deletion_takes_an_array_as_it_takes_an_explanation(curved: Network, captum_maps: np.ndarray):
     ours = sliplens.explain(curved, BOTH_WAYS, method="integrated-gradients")
     by_array, by_record = (score_by_deletion(curved, BOTH_WAYS, maps, steps=10) for maps in (captum_maps, ours))
     np.testing.assert_allclose(by_array.predictions, by_record.predictions, atol=1e-3)  # as above
 
 
 @pytest.mark.parametrize("score", [sliplens.score, score_by_deletion])
-def test_an_array_without_negatives_cannot_explain_a_fall_unless_it_is_called_unsigned(score, curved: Run):
+def test_an_array_without_negatives_cannot_explain_a_fall_unless_it_is_called_unsigned(score, curved: Network):
     with pytest.raises(SaliencyError, match=r"map 0 has no number below 0.*give signed=False"):
         score(curved, FRAMES, np.abs(EFFECTS))
     score(curved, FRAMES, np.abs(EFFECTS), signed=False)

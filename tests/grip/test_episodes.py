@@ -34,17 +34,17 @@ from sliplens.grip.controllers import Controller, MarginLaw
 from sliplens.grip.fingertip import MarkerField, draw_film
 from sliplens.grip.readings import FORCES_N, FRICTIONS, MARGINS
 from sliplens.grip.scripts import EPISODE_S, hand_motion
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.results.grip import Grip
 
 
 @cache
-def shipped() -> Run:
+def shipped() -> Network:
     return sl.load(DEFAULT_NETWORK)
 
 
 @pytest.fixture(scope="module")
-def network() -> Run:
+def network() -> Network:
     return shipped()
 
 
@@ -362,7 +362,7 @@ def test_what_slips_taught_counts_in_the_grasps_that_follow_only_of_the_same_obj
     np.testing.assert_array_equal(forgotten.where(forgotten.grasp == 1).mean_force_n, first.mean_force_n)
 
 
-def test_frames_of_a_grip_are_read_in_order_through_pixels(network: Run):
+def test_frames_of_a_grip_are_read_in_order_through_pixels(network: Network):
     eyes = [RenderedEyes(network, seed=11, engine="eager", sequence=way) for way in (False, True)]
     followers, differ = [network.follow() for _ in range(2)], list[float]()
     plant = Plant(pick_object("cup"))

@@ -8,7 +8,7 @@ from small import IMAGE_SIZE, save_untrained
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sliplens.models import Run, load_checkpoint
+from sliplens.models import Network, load_checkpoint
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.onnx import export_onnx
@@ -55,7 +55,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="session")
-def networks(runs: dict[str, Path]) -> dict[str, Run]:
+def networks(runs: dict[str, Path]) -> dict[str, Network]:
     return {head: load_checkpoint(folder) for head, folder in runs.items()}
 
 
@@ -66,7 +66,7 @@ def images() -> Tensor:
 
 
 @pytest.fixture(scope="session")
-def onnx_files(networks: dict[str, Run], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def onnx_files(networks: dict[str, Network], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Each network as it is exported, once."""
     pytest.importorskip("onnxscript")
     folder = tmp_path_factory.mktemp("onnx")

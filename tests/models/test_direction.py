@@ -13,7 +13,7 @@ from sliplens.live.frame_reader import FrameReader
 from sliplens.live.health import HealthMonitor
 from sliplens.live.reading import Reading
 from sliplens.live.sources import open_live
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.shear import FULL_CIRCLE
 
@@ -28,7 +28,7 @@ IN_RANGE = [(90.0, "as it is"), (90.0, "mirrored"), (270.0, "turned")]
 
 
 @pytest.fixture(scope="module")
-def pulled_down() -> Run:
+def pulled_down() -> Network:
     """Network of the package that was trained on pulls of 75 to 105 degrees, whatever its manifest says."""
     network = sl.load("chromatouch-pair")
     return replace(network, manifest=replace(network.manifest, pull_direction_deg=(75.0, 105.0), novelty=None))
@@ -39,7 +39,7 @@ def turned_frames(direction_deg: float, turn: str, *, margins: tuple[float, ...]
     return np.ascontiguousarray(TURNS[turn](reference)), np.ascontiguousarray(TURNS[turn](frames))
 
 
-def read_live(network: Run, reference: np.ndarray, frames: np.ndarray) -> list[Reading]:
+def read_live(network: Network, reference: np.ndarray, frames: np.ndarray) -> list[Reading]:
     """Read frames as a running sensor's, none of them dropped."""
     reader = FrameReader(
         open_live(frames), network, friction=None, same_object=False, sequence=False, smoothing_s=0.0,
@@ -52,7 +52,7 @@ def read_live(network: Run, reference: np.ndarray, frames: np.ndarray) -> list[R
     ]
 
 
-def withheld_by(network: Run, reference: np.ndarray, frames: np.ndarray, *, live: bool) -> list[bool]:
+def withheld_by(network: Network, reference: np.ndarray, frames: np.ndarray, *, live: bool) -> list[bool]:
     if live:
         return [
             any(check.name == "direction" and not check.ok for check in reading.health) and reading.margin is None
@@ -67,7 +67,7 @@ def withheld_by(network: Run, reference: np.ndarray, frames: np.ndarray, *, live
 @pytest.mark.parametrize("live", [False, True], ids=["files", "live"])
 @pytest.mark.parametrize(("direction_deg", "turn"), ASTRAY)
 def test_a_margin_is_withheld_where_the_pull_is_in_another_direction(
-    pulled_down: Run, direction_deg: float, turn: str, live: bool
+    pulled_down: Network, direction_deg: float, turn: str, live: bool
 ):
     reference, frames = turned_frames(direction_deg, turn, margins=(0.02, 0.15, 0.25))
     assert all(withheld_by(pulled_down, reference, frames, live=live))
@@ -75,13 +75,13 @@ def test_a_margin_is_withheld_where_the_pull_is_in_another_direction(
 
 @pytest.mark.parametrize("live", [False, True], ids=["files", "live"])
 @pytest.mark.parametrize(("direction_deg", "turn"), IN_RANGE)
-def test_no_margin_is_withheld_where_it_is_not(pulled_down: Run, direction_deg: float, turn: str, live: bool):
+def test_no_margin_is_withheld_where_it_is_not(pulled_down: Network, direction_deg: float, turn: str, live: bool):
     reference, frames = turned_frames(direction_deg, turn, margins=(0.02, 0.25, 0.6, 1.0))
     assert not any(withheld_by(pulled_down, reference, frames, live=live))
 
 
 @pytest.mark.parametrize("live", [False, True], ids=["files", "live"])
-def test_a_network_of_all_directions_withholds_none(pulled_down: Run, live: bool):
+def test_a_network_of_all_directions_withholds_none(pulled_down: Network, live: bool):
     reference, frames = turned_frames(270.0, "as it is", margins=(0.02,))
     for directions in (FULL_CIRCLE, None):
         network = replace(pulled_down, manifest=replace(pulled_down.manifest, pull_direction_deg=directions))
@@ -101,7 +101,7 @@ def test_difference_images_hide_the_direction_and_a_note_says_so():
 
 @pytest.mark.parametrize(("seat_deg", "fits"), [(90.0, True), (70.0, True), (0.0, False), (270.0, False), (None, True)])
 def test_a_profile_that_sits_otherwise_is_told_once_where_it_is_opened(
-    pulled_down: Run, seat_deg: float | None, fits: bool
+    pulled_down: Network, seat_deg: float | None, fits: bool
 ):
     profile = SensorProfile(name="chromatouch-9", pull_direction_deg=seat_deg)
     reference, frames = turned_frames(90.0, "as it is", margins=(0.5,))
@@ -112,6 +112,6 @@ def test_a_profile_that_sits_otherwise_is_told_once_where_it_is_opened(
 
 
 @pytest.mark.parametrize("directions", [(105.0, 75.0), (-10.0, 20.0), (0.0, 400.0), (370.0, 380.0)])
-def test_a_range_runs_upwards_and_not_further_than_round(pulled_down: Run, directions: tuple[float, float]):
+def test_a_range_runs_upwards_and_not_further_than_round(pulled_down: Network, directions: tuple[float, float]):
     with pytest.raises(ValueError, match="pull_direction_deg"):
         replace(pulled_down.manifest, pull_direction_deg=directions)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
-from sliplens.models import Manifest, Run, load
+from sliplens.models import Manifest, Network, load
 from sliplens.models.backbones import Answers, HistogramRegressor, answer_names
 from sliplens.models.engines import ENGINES, fold_batch_norm, make_engine
 from sliplens.models.novelty import read_features
@@ -29,7 +29,7 @@ def skip_without(name: str) -> None:
         pytest.skip(obstacle)
 
 
-def small_network(*, head: str) -> Run:
+def small_network(*, head: str) -> Network:
     """Seconds to compile: a convolution, batch normalisation and a linear layer."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -46,10 +46,10 @@ def small_network(*, head: str) -> Run:
         torch.nn.init.normal_(model[-1].get_parameter("weight"), std=10)
     whole = HistogramRegressor(model) if head == "histogram" else model
     manifest = Manifest(backbone="small", input="raw", image_size=32, frame_size=(32, 32), sensor="", data_hash="")
-    return Run(model=whole.eval(), manifest=manifest)
+    return Network(model=whole.eval(), manifest=manifest)
 
 
-def assert_alike(name: str, trained: Run, images: Tensor, *, onnx_file: Path | None = None) -> None:
+def assert_alike(name: str, trained: Network, images: Tensor, *, onnx_file: Path | None = None) -> None:
     engine, eager = make_engine(name, trained, onnx_file=onnx_file), make_engine("eager", trained)
     assert eager.estimate(trained, images).margin.std() > 100 * ATOL  # else nothing would be shown
     for batch in (images, images[:1], torch.cat([images] * 4)):
@@ -64,7 +64,7 @@ def assert_alike(name: str, trained: Run, images: Tensor, *, onnx_file: Path | N
 
 
 @pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
-def test_eager_answers_as_the_network(head: str, networks: dict[str, Run], images: Tensor):
+def test_eager_answers_as_the_network(head: str, networks: dict[str, Network], images: Tensor):
     found = make_engine("eager", networks[head]).estimate(networks[head], images)
     expected = networks[head].estimate(images)
     # the same operations on the same numbers
@@ -74,14 +74,14 @@ def test_eager_answers_as_the_network(head: str, networks: dict[str, Run], image
 
 
 @pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
-def test_folded_answers_as_eager(head: str, networks: dict[str, Run], images: Tensor):
+def test_folded_answers_as_eager(head: str, networks: dict[str, Network], images: Tensor):
     assert_alike("folded", networks[head], images)
 
 
 @pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
 @pytest.mark.parametrize("name", ["onnxruntime", "openvino"])
 def test_engines_of_onnx_files_answer_as_eager(
-    name: str, head: str, networks: dict[str, Run], onnx_files: dict[str, Path], images: Tensor
+    name: str, head: str, networks: dict[str, Network], onnx_files: dict[str, Path], images: Tensor
 ):
     skip_without(name)
     assert_alike(name, networks[head], images, onnx_file=onnx_files[head])
@@ -98,7 +98,7 @@ def test_compiled_answers_as_eager(images: Tensor):
     assert_alike("compiled", small_network(head="histogram"), images)
 
 
-def test_answers_of_a_call_outlive_the_next(networks: dict[str, Run], onnx_files: dict[str, Path], images):
+def test_answers_of_a_call_outlive_the_next(networks: dict[str, Network], onnx_files: dict[str, Path], images):
     for name in ("onnxruntime", "openvino"):
         skip_without(name)
         engine = make_engine(name, networks["histogram"], onnx_file=onnx_files["histogram"])
@@ -108,7 +108,7 @@ def test_answers_of_a_call_outlive_the_next(networks: dict[str, Run], onnx_files
         np.testing.assert_array_equal(first.margin, before)
 
 
-def test_folding_leaves_no_batch_normalisation_and_the_network_as_it_was(networks: dict[str, Run]):
+def test_folding_leaves_no_batch_normalisation_and_the_network_as_it_was(networks: dict[str, Network]):
     for trained in networks.values():
         before = {name: value.clone() for name, value in trained.model.state_dict().items()}
         folded = fold_batch_norm(trained.model)
@@ -166,25 +166,25 @@ def test_a_network_that_another_thread_runs_while_one_is_folded_answers_as_befor
     assert not [one for one in folded.modules() if isinstance(one, nn.BatchNorm2d)]
 
 
-def test_an_unknown_engine_is_refused(networks: dict[str, Run]):
+def test_an_unknown_engine_is_refused(networks: dict[str, Network]):
     with pytest.raises(InputError, match="no engine named 'tensorrt'; choose one of eager, folded, compiled,"):
         make_engine("tensorrt", networks["point"])
 
 
-def test_a_missing_package_is_told(networks: dict[str, Run], monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_package_is_told(networks: dict[str, Network], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("sliplens.extras.find_spec", lambda name: None if name == "openvino" else name)
     with pytest.raises(InputError, match=r"needs openvino, which is not .* `pip install \"sliplens\[openvino\]\"`"):
         make_engine("openvino", networks["point"])
 
 
-def test_a_missing_compiler_is_told(networks: dict[str, Run], monkeypatch: pytest.MonkeyPatch):
+def test_a_missing_compiler_is_told(networks: dict[str, Network], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("CXX", raising=False)
     with pytest.raises(InputError, match="needs a C\\+\\+ compiler and there is none"):
         make_engine("compiled", networks["point"])
 
 
-def test_a_file_of_another_network_is_refused(networks: dict[str, Run], onnx_files: dict[str, Path]):
+def test_a_file_of_another_network_is_refused(networks: dict[str, Network], onnx_files: dict[str, Path]):
     with pytest.raises(InputError, match="holds another network"):
         make_engine("onnxruntime", networks["point"], onnx_file=onnx_files["histogram"])
 
@@ -200,7 +200,7 @@ def test_a_file_that_tells_less_than_the_network_is_refused(tmp_path: Path):
         make_engine("onnxruntime", trained, onnx_file=tmp_path / "b.onnx")
 
 
-def test_a_damaged_file_is_told(networks: dict[str, Run], onnx_files: dict[str, Path], tmp_path: Path):
+def test_a_damaged_file_is_told(networks: dict[str, Network], onnx_files: dict[str, Path], tmp_path: Path):
     onnx = pytest.importorskip("onnx")
     model = onnx.load(onnx_files["point"])
     del model.graph.node[3]
@@ -228,7 +228,7 @@ def test_the_fastest_engine_is_that_which_pays(monkeypatch: pytest.MonkeyPatch):
     assert chosen(100_000) == "folded"
 
 
-def test_a_file_that_was_made_before_pays_at_once(networks: dict[str, Run], onnx_files: dict[str, Path]):
+def test_a_file_that_was_made_before_pays_at_once(networks: dict[str, Network], onnx_files: dict[str, Path]):
     skip_without("openvino")
     assert make_engine("auto", networks["point"], frames=1, onnx_file=onnx_files["point"]).name == "openvino"
 

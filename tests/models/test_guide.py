@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sliplens.images import write_png
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.recordings import Dataset
 
 GUIDE = Path(__file__).parents[2] / "docs" / "export.md"
@@ -25,7 +25,7 @@ def test_the_file_is_read_without_sliplens(
     head: str,
     blocks: list[str],
     onnx_files: dict[str, Path],
-    networks: dict[str, Run],
+    networks: dict[str, Network],
     small_dataset: Dataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -64,7 +64,7 @@ def test_the_library_is_used_as_it_says(
     small_dataset: Dataset,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    networks: dict[str, Run],
+    networks: dict[str, Network],
 ):
     pytest.importorskip("onnxscript")
     monkeypatch.chdir(tmp_path)

@@ -12,7 +12,7 @@ from sliplens import __version__
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import import_onnxruntime
 from sliplens.files import to_builtins
-from sliplens.models import Manifest, Run
+from sliplens.models import Manifest, Network
 from sliplens.models import onnx as onnx_file
 from sliplens.models.onnx import difference, export_onnx, require_file_of
 
@@ -35,11 +35,11 @@ class Brightness(nn.Module):
 
 
 @pytest.fixture
-def least() -> Run:
+def least() -> Network:
     manifest = Manifest(
         backbone="brightness", input="raw", image_size=8, frame_size=(8, 8), sensor="none", data_hash="none"
     )
-    return Run(model=Brightness().eval(), manifest=manifest)
+    return Network(model=Brightness().eval(), manifest=manifest)
 
 
 def run(path: Path, images: Tensor) -> list[np.ndarray]:
@@ -50,7 +50,7 @@ def run(path: Path, images: Tensor) -> list[np.ndarray]:
 @pytest.mark.parametrize("head", HEADS)
 @pytest.mark.parametrize("batch", [1, 2, 5])
 def test_the_file_answers_as_the_network(
-    head: str, batch: int, onnx_files: dict[str, Path], networks: dict[str, Run], images: Tensor
+    head: str, batch: int, onnx_files: dict[str, Path], networks: dict[str, Network], images: Tensor
 ):
     # other images and batches than the export itself looks at
     images = images[:batch]
@@ -67,7 +67,9 @@ def test_the_file_answers_as_the_network(
 
 
 @pytest.mark.parametrize("head", HEADS)
-def test_the_file_is_valid_and_tells_how_to_feed_it(head: str, onnx_files: dict[str, Path], networks: dict[str, Run]):
+def test_the_file_is_valid_and_tells_how_to_feed_it(
+    head: str, onnx_files: dict[str, Path], networks: dict[str, Network]
+):
     model = onnx.load(onnx_files[head])
     onnx.checker.check_model(model, full_check=True)
     assert [(one.domain, one.version) for one in model.opset_import] == [("", 18)]
@@ -100,7 +102,7 @@ def test_the_file_names_no_folder_of_whoever_made_it(onnx_files: dict[str, Path]
             assert name.encode() not in data
 
 
-def test_an_export_is_quiet_and_leaves_only_the_file(least: Run, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
+def test_an_export_is_quiet_and_leaves_only_the_file(least: Network, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
     export_onnx(least, tmp_path / "a.onnx")
     captured = capfd.readouterr()
     assert captured.out + captured.err == ""
@@ -109,7 +111,7 @@ def test_an_export_is_quiet_and_leaves_only_the_file(least: Run, tmp_path: Path,
     np.testing.assert_allclose(run(tmp_path / "a.onnx", torch.full((3, 3, 8, 8), 0.25))[0], [0.25] * 3, rtol=1e-6)
 
 
-def test_a_network_that_answers_otherwise_is_refused(least: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_network_that_answers_otherwise_is_refused(least: Network, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = tmp_path / "a.onnx"
     path.write_text("the last good one")
     monkeypatch.setattr(onnx_file, "difference", lambda found, expected: difference(found + 1e-3, expected))
@@ -119,7 +121,7 @@ def test_a_network_that_answers_otherwise_is_refused(least: Run, tmp_path: Path,
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_a_network_that_answers_nothing_is_refused(least: Run, tmp_path: Path):
+def test_a_network_that_answers_nothing_is_refused(least: Network, tmp_path: Path):
     with torch.no_grad():
         least.model.get_parameter("scale").fill_(float("nan"))
     with pytest.raises(ModelError, match="answers nan off"):
@@ -127,12 +129,12 @@ def test_a_network_that_answers_nothing_is_refused(least: Run, tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_network_that_torch_cannot_export_is_refused(least: Run, tmp_path: Path):
+def test_a_network_that_torch_cannot_export_is_refused(least: Network, tmp_path: Path):
     class Branches(Brightness):
         def forward(self, images: Tensor) -> Tensor:
             return super().forward(images) if images.sum() > 0 else super().forward(-images)
 
-    strange = Run(model=Branches().eval(), manifest=least.manifest)
+    strange = Network(model=Branches().eval(), manifest=least.manifest)
     with pytest.raises(ModelError, match=r"cannot export the network \(.+\); train another backbone$"):
         export_onnx(strange, tmp_path / "a.onnx")
     assert not list(tmp_path.iterdir())
@@ -144,14 +146,14 @@ def test_differences_are_relative_only_above_one():
     assert np.isnan(difference(np.zeros(2), np.zeros(3)))
 
 
-def test_without_the_extra_the_cure_is_told(least: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_the_extra_the_cure_is_told(least: Network, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("sliplens.extras.find_spec", lambda name: None if name == "onnxscript" else name)
     with pytest.raises(InputError, match=r"needs onnxscript, which is not .* `pip install \"sliplens\[onnx\]\"`"):
         export_onnx(least, tmp_path / "a.onnx")
 
 
 def test_only_the_file_of_a_network_is_taken_for_it(
-    onnx_files: dict[str, Path], networks: dict[str, Run], tmp_path: Path
+    onnx_files: dict[str, Path], networks: dict[str, Network], tmp_path: Path
 ):
     require_file_of(onnx_files["point"], networks["point"])
     with pytest.raises(InputError, match="holds another network than the run"):

@@ -11,7 +11,7 @@ import sliplens as sl
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers import explain
 from sliplens.faithfulness import FILLS, get_fill
-from sliplens.models import Run, build_model, load_checkpoint, save_checkpoint
+from sliplens.models import Network, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import REFERENCE_SIGNS, with_reference
 from sliplens.recordings import Dataset, Recording
 from sliplens.training import get_recipe
@@ -19,12 +19,12 @@ from sliplens.training.data import get_augmentation
 from sliplens.training.fitting import require_same_kind
 
 
-def begun(folder: Path) -> Run:
+def begun(folder: Path) -> Network:
     """A pair network that begins with the weights of another."""
     other = load_checkpoint(folder)
     model = build_model(head=other.manifest.head, colours=6)
     model.load_state_dict(with_reference(other.model.state_dict(), sign=REFERENCE_SIGNS[other.manifest.input]))
-    return Run(model=model.eval(), manifest=replace(other.manifest, input="pair"))
+    return Network(model=model.eval(), manifest=replace(other.manifest, input="pair"))
 
 
 @pytest.fixture

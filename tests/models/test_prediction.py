@@ -21,7 +21,7 @@ from sliplens.codec import TABLE_SUFFIXES
 from sliplens.errors import ImageError, InputError, RecordingError, ShardError
 from sliplens.images import absolute_difference, write_png
 from sliplens.markers.camera import CAMERA_REASON
-from sliplens.models import Run, load_checkpoint
+from sliplens.models import Network, load_checkpoint
 from sliplens.models.checkpoint import STRANGE_REASON
 from sliplens.models.predictions import Predictions
 from sliplens.models.predictions import predict as predict_source
@@ -37,7 +37,7 @@ TRIAL = "test-wet-7"
 
 
 @pytest.fixture
-def trained(networks: dict[str, Run]) -> Run:
+def trained(networks: dict[str, Network]) -> Network:
     return networks["histogram"]
 
 
@@ -52,12 +52,12 @@ def wet(small_dataset: Dataset) -> Recording:
     return small_dataset.load(small_dataset.select(split="test", condition="wet")[0])
 
 
-def predict(source: Path, trained: Run, path: Path, *, batch_size: int = 5, **options: object) -> dict[str, list]:
+def predict(source: Path, trained: Network, path: Path, *, batch_size: int = 5, **options: object) -> dict[str, list]:
     predict_source(trained, source, out=path, batch_size=batch_size, engine="eager", **options)  # pyright: ignore
     return pq.read_table(path).to_pydict()
 
 
-def one_by_one(trained: Run, frames: np.ndarray, reference: np.ndarray) -> np.ndarray:
+def one_by_one(trained: Network, frames: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """The slow way: each frame by itself."""
     return np.array([trained.estimate(trained.encode(frame[None], reference)).margin[0] for frame in frames])
 
@@ -82,7 +82,9 @@ def write_video(path: Path, frames: np.ndarray) -> Path:
     return path
 
 
-def test_a_data_set_is_predicted_frame_by_frame(trained: Run, small_dataset: Dataset, wet: Recording, tmp_path: Path):
+def test_a_data_set_is_predicted_frame_by_frame(
+    trained: Network, small_dataset: Dataset, wet: Recording, tmp_path: Path
+):
     rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
     assert list(rows) == [
         "trial",
@@ -110,7 +112,7 @@ def test_a_data_set_is_predicted_frame_by_frame(trained: Run, small_dataset: Dat
 
 
 def test_how_sure_the_network_is_comes_from_its_distribution(
-    trained: Run, small_dataset: Dataset, wet: Recording, tmp_path: Path
+    trained: Network, small_dataset: Dataset, wet: Recording, tmp_path: Path
 ):
     rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
     estimate = trained.estimate(trained.encode(wet.frames, wet.reference))
@@ -158,7 +160,7 @@ def test_a_trial_whose_margins_are_all_withheld_has_no_lowest(foreign: Recording
 
 
 def test_a_network_with_one_number_tells_nothing_of_it(
-    networks: dict[str, Run], small_dataset: Dataset, tmp_path: Path
+    networks: dict[str, Network], small_dataset: Dataset, tmp_path: Path
 ):
     rows = predict(small_dataset.folder, networks["point"], tmp_path / "a.parquet", split="test")
     assert {*rows["sigma"], *rows["low_90"], *rows["high_90"]} == {None}
@@ -166,19 +168,21 @@ def test_a_network_with_one_number_tells_nothing_of_it(
 
 
 @pytest.mark.parametrize("batch_size", [1, 7, 64])
-def test_predictions_do_not_depend_on_the_batch(batch_size: int, trained: Run, small_dataset: Dataset, tmp_path: Path):
+def test_predictions_do_not_depend_on_the_batch(
+    batch_size: int, trained: Network, small_dataset: Dataset, tmp_path: Path
+):
     first = predict(small_dataset.folder, trained, tmp_path / "a.parquet", batch_size=5)
     second = predict(small_dataset.folder, trained, tmp_path / "b.parquet", batch_size=batch_size)
     np.testing.assert_allclose(first["prediction"], second["prediction"], atol=1e-5)  # as above
     assert first["frame"] == second["frame"]
 
 
-def test_all_trials_are_predicted_unless_a_split_is_named(trained: Run, small_dataset: Dataset, tmp_path: Path):
+def test_all_trials_are_predicted_unless_a_split_is_named(trained: Network, small_dataset: Dataset, tmp_path: Path):
     rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet")
     assert list(dict.fromkeys(rows["trial"])) == [info.trial for info in small_dataset.trials]
 
 
-def test_the_lowest_margin_is_of_a_frame_that_touches(trained: Run, wet: Recording):
+def test_the_lowest_margin_is_of_a_frame_that_touches(trained: Network, wet: Recording):
     noise = np.random.default_rng(0).integers(-3, 4, (6, *wet.reference.shape))
     untouched = np.clip(wet.reference.astype(int) + noise, 0, 255).astype(np.uint8)
     frames = np.concatenate([untouched, wet.frames[4:]])
@@ -191,7 +195,7 @@ def test_the_lowest_margin_is_of_a_frame_that_touches(trained: Run, wet: Recordi
     assert (told.touching, told.lowest) == (0, int(margins[:6].argmin()))
 
 
-def test_a_folder_of_frames_and_its_differences_are_the_same(trained: Run, wet: Recording, tmp_path: Path):
+def test_a_folder_of_frames_and_its_differences_are_the_same(trained: Network, wet: Recording, tmp_path: Path):
     frames = write_frames(tmp_path / "frames", wet.frames)
     compared = write_frames(tmp_path / "compared", absolute_difference(wet.frames, wet.reference))
     write_png(tmp_path / "untouched.png", wet.reference)
@@ -204,13 +208,13 @@ def test_a_folder_of_frames_and_its_differences_are_the_same(trained: Run, wet: 
     np.testing.assert_allclose(first["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
 
 
-def test_images_have_times_where_their_rate_is_told(trained: Run, wet: Recording, tmp_path: Path):
+def test_images_have_times_where_their_rate_is_told(trained: Network, wet: Recording, tmp_path: Path):
     frames = write_frames(tmp_path / "frames", wet.frames)
     rows = predict(frames, trained, tmp_path / "a.parquet", reference_frame=0, options=ReadOptions(frame_rate=8.0))
     assert rows["time_s"] == [index / 8 for index in range(12)]
 
 
-def test_a_video_is_compared_with_a_frame_of_it_or_an_image(trained: Run, wet: Recording, tmp_path: Path):
+def test_a_video_is_compared_with_a_frame_of_it_or_an_image(trained: Network, wet: Recording, tmp_path: Path):
     video = write_video(tmp_path / "touch.mkv", wet.frames)
     write_png(tmp_path / "third.png", wet.frames[3])
     first = predict(video, trained, tmp_path / "a.parquet", reference_frame=3)
@@ -231,7 +235,7 @@ def test_raw_frames_need_no_reference(raw_run: Path, wet: Recording, tmp_path: P
     assert rows["prediction"] == again["prediction"]
 
 
-def test_what_the_images_were_taken_for_is_noted(trained: Run, wet: Recording, tmp_path: Path):
+def test_what_the_images_were_taken_for_is_noted(trained: Network, wet: Recording, tmp_path: Path):
     frames = write_frames(tmp_path / "frames", wet.frames)
     assert "taken for difference images" in predict_source(trained, frames).notes[0]
     assert not predict_source(trained, frames, reference_frame=0).notes
@@ -255,12 +259,12 @@ def test_grey_frames_are_noted_where_the_network_learned_from_colours(
         assert sum("the frames are grey, and the network was trained on colours" in one for one in notes) == noted
 
 
-def refused(source: Path, trained: Run, kind: type[Exception], message: str, **options: object) -> None:
+def refused(source: Path, trained: Network, kind: type[Exception], message: str, **options: object) -> None:
     with pytest.raises(kind, match=message):
         predict_source(trained, source, **options)  # pyright: ignore[reportArgumentType]
 
 
-def test_what_is_missing_or_too_much_is_told(trained: Run, small_dataset: Dataset, wet: Recording, tmp_path: Path):
+def test_what_is_missing_or_too_much_is_told(trained: Network, small_dataset: Dataset, wet: Recording, tmp_path: Path):
     video, image = write_video(tmp_path / "touch.mkv", wet.frames), tmp_path / "untouched.png"
     write_png(image, wet.reference)
     refused(video, trained, InputError, "named twice", reference=image, reference_frame=0)
@@ -278,7 +282,7 @@ def test_what_is_missing_or_too_much_is_told(trained: Run, small_dataset: Datase
     refused(frames, trained, InputError, "does not take --image-topic", options=ReadOptions(image_topic="/image"))
 
 
-def test_frames_of_another_size_are_refused(trained: Run, wet: Recording, tmp_path: Path):
+def test_frames_of_another_size_are_refused(trained: Network, wet: Recording, tmp_path: Path):
     cut = np.ascontiguousarray(wet.frames[:, :40])
     refused(write_video(tmp_path / "touch.mkv", cut), trained, ImageError, "40 x 48 pixels", reference_frame=0)
     with pytest.raises(ImageError, match="frames are 40 x 48 pixels"):
@@ -286,10 +290,10 @@ def test_frames_of_another_size_are_refused(trained: Run, wet: Recording, tmp_pa
     assert not (tmp_path / "a.parquet").exists()
 
 
-def test_signed_images_need_a_reference(wet: Recording, tmp_path: Path, networks: dict[str, Run]):
+def test_signed_images_need_a_reference(wet: Recording, tmp_path: Path, networks: dict[str, Network]):
     trained = networks["point"]
     manifest = type(trained.manifest)(**{**vars(trained.manifest), "input": "signed"})
-    signed = Run(model=trained.model, manifest=manifest)
+    signed = Network(model=trained.model, manifest=manifest)
     frames = write_frames(tmp_path / "frames", wet.frames)
     refused(frames, signed, InputError, "a network on signed images compares the frames")
     rows = predict(frames, signed, tmp_path / "a.parquet", reference_frame=0)
@@ -311,7 +315,7 @@ def frames_of(recording: Recording, read_frames: Callable[[], Iterator[np.ndarra
     )
 
 
-def test_a_source_that_fails_leaves_what_was_there(trained: Run, wet: Recording, tmp_path: Path):
+def test_a_source_that_fails_leaves_what_was_there(trained: Network, wet: Recording, tmp_path: Path):
     def broken() -> Iterator[np.ndarray]:
         yield from wet.frames[:6]
         raise RecordingError("the disk is gone")
@@ -325,7 +329,7 @@ def test_a_source_that_fails_leaves_what_was_there(trained: Run, wet: Recording,
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_only_one_batch_of_frames_is_held(trained: Run, wet: Recording, tmp_path: Path):
+def test_only_one_batch_of_frames_is_held(trained: Network, wet: Recording, tmp_path: Path):
     alive, most = 0, 0
 
     def die() -> None:
@@ -356,7 +360,7 @@ def test_only_one_batch_of_frames_is_held(trained: Run, wet: Recording, tmp_path
     assert seen == [(done, 60) for done in range(4, 61, 4)]
 
 
-def test_rows_in_memory_are_those_of_the_file(trained: Run, small_dataset: Dataset, tmp_path: Path):
+def test_rows_in_memory_are_those_of_the_file(trained: Network, small_dataset: Dataset, tmp_path: Path):
     written = predict_source(trained, small_dataset, split="test", out=tmp_path / "a.parquet")
     kept = predict_source(trained, small_dataset, split="test")
     assert kept.frame().equals(written.frame(), check_metadata=True)
@@ -372,14 +376,14 @@ def test_rows_in_memory_are_those_of_the_file(trained: Run, small_dataset: Datas
     assert repr(written) == f"Predictions of 24 frames by {written.engine}, in {tmp_path / 'a.parquet'}"
 
 
-def test_an_array_is_a_trial(trained: Run, wet: Recording):
+def test_an_array_is_a_trial(trained: Network, wet: Recording):
     rows = predict_source(trained, wet.frames, reference=wet.reference).frame().to_pydict()
     np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
     assert "file" not in rows
 
 
 def test_a_recording_brings_its_own_reference_and_labels_unless_told_otherwise(
-    trained: Run, small_dataset: Dataset, wet: Recording, tmp_path: Path
+    trained: Network, small_dataset: Dataset, wet: Recording, tmp_path: Path
 ):
     (made := tmp_path / "lerobot").mkdir()
     write_lerobot(small_dataset, made, trials=small_dataset.select(condition="wet"))
@@ -391,7 +395,7 @@ def test_a_recording_brings_its_own_reference_and_labels_unless_told_otherwise(
 
 
 def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_them(
-    trained: Run, small_dataset: Dataset, tmp_path: Path, elsewhere: str
+    trained: Network, small_dataset: Dataset, tmp_path: Path, elsewhere: str
 ):
     def write(path: Path, **options: object) -> Predictions:
         return predict_source(trained, small_dataset.folder, out=path, **own, **options)  # pyright: ignore
@@ -415,7 +419,7 @@ def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_the
         predict_source(trained, frames, on="processes")
 
 
-def test_a_damaged_trial_does_not_lose_the_others(trained: Run, small_dataset: Dataset, tmp_path: Path):
+def test_a_damaged_trial_does_not_lose_the_others(trained: Network, small_dataset: Dataset, tmp_path: Path):
     data = tmp_path / "data"
     shutil.copytree(small_dataset.folder, data)
     good = trial_path(data, TRIAL).read_bytes()

@@ -13,7 +13,7 @@ from there import there
 import sliplens as sl
 from sliplens.errors import CheckpointError, InputError, SliplensError
 from sliplens.live.contract import SourceOptions
-from sliplens.models import Run, load_checkpoint, save_checkpoint
+from sliplens.models import Network, load_checkpoint, save_checkpoint
 from sliplens.models.calibration import Calibration
 from sliplens.models.checkpoint import Estimate
 from sliplens.models.sequence import GAP_S, SequenceHead
@@ -28,7 +28,7 @@ SURE = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
 
 
 @pytest.fixture(scope="module")
-def run(sequence_run: Path) -> Run:
+def run(sequence_run: Path) -> Network:
     return load_checkpoint(sequence_run)
 
 
@@ -42,7 +42,7 @@ def answers(frames: int, *, seed: int = 0) -> Estimate:
     return Estimate(margin=mean, calibration=SURE, probabilities=margin, edges=edges, ratio=ratio)
 
 
-def follow(run: Run, estimate: Estimate, *, pieces: int = 1, touches: np.ndarray | None = None) -> np.ndarray:
+def follow(run: Network, estimate: Estimate, *, pieces: int = 1, touches: np.ndarray | None = None) -> np.ndarray:
     """Margins that are read from the frames in order, so many pieces of them at once; 30 frames a second."""
     follower, rows = run.follow(), np.arange(len(estimate.margin))
     touches = np.ones(len(rows), dtype=bool) if touches is None else touches
@@ -50,13 +50,13 @@ def follow(run: Run, estimate: Estimate, *, pieces: int = 1, touches: np.ndarray
     return np.concatenate([part.margin for part in parts])
 
 
-def test_frames_one_by_one_are_read_as_all_at_once(run: Run):
+def test_frames_one_by_one_are_read_as_all_at_once(run: Network):
     estimate = answers(17)
     assert np.array_equal(follow(run, estimate), follow(run, estimate, pieces=17))
     assert np.array_equal(follow(run, estimate), follow(run, estimate, pieces=4))
 
 
-def test_an_answer_depends_on_the_frames_so_far_alone(run: Run):
+def test_an_answer_depends_on_the_frames_so_far_alone(run: Network):
     first, other = answers(12), answers(12, seed=1)
     mixed = replace(
         first, probabilities=np.concatenate([there(first.probabilities)[:7], there(other.probabilities)[7:]])
@@ -65,7 +65,7 @@ def test_an_answer_depends_on_the_frames_so_far_alone(run: Run):
     assert not np.isclose(follow(run, first)[7:], follow(run, mixed)[7:]).any()
 
 
-def test_memory_counts_and_ends_with_the_contact(run: Run):
+def test_memory_counts_and_ends_with_the_contact(run: Network):
     estimate = answers(6)
     twice = estimate.at(np.r_[0:6, 0:6])
     again = follow(run, twice)
@@ -78,7 +78,7 @@ def test_memory_counts_and_ends_with_the_contact(run: Run):
     assert lifted[6] == estimate.margin[0]
 
 
-def test_a_clock_that_runs_back_begins_anew(run: Run):
+def test_a_clock_that_runs_back_begins_anew(run: Network):
     estimate, follower = answers(6), run.follow()
     touches = np.ones(6, dtype=bool)
     first = follower.update(estimate, 5 + np.arange(6) / 30, touches)
@@ -88,7 +88,7 @@ def test_a_clock_that_runs_back_begins_anew(run: Run):
     )  # times differ by a shift, whose differences round
 
 
-def test_after_a_gap_the_rest_of_a_contact_is_read_frame_by_frame(run: Run):
+def test_after_a_gap_the_rest_of_a_contact_is_read_frame_by_frame(run: Network):
     estimate, follower = answers(18), run.follow()
     times, touches = np.arange(18) / 10, np.ones(18, dtype=bool)
     times[6:] += 30
@@ -102,7 +102,7 @@ def test_after_a_gap_the_rest_of_a_contact_is_read_frame_by_frame(run: Run):
     assert not follower.lost
 
 
-def test_frames_read_one_by_one_after_a_gap_keep_their_own_intervals(run: Run):
+def test_frames_read_one_by_one_after_a_gap_keep_their_own_intervals(run: Network):
     kept, many = there(run.manifest.sequence), answers(12)
     wide = replace(kept.calibration, offsets={"0.9": 0.2})
     narrow = np.exp(-(((there(many.edges)[:-1] - np.linspace(0.3, 0.6, 12)[:, None]) / 0.05) ** 2))
@@ -118,21 +118,21 @@ def test_frames_read_one_by_one_after_a_gap_keep_their_own_intervals(run: Run):
 
 
 @pytest.mark.parametrize(("step_s", "lost"), [(0.5, False), (GAP_S, False), (GAP_S + 0.01, True)])
-def test_memory_holds_as_long_as_was_taught(run: Run, step_s: float, lost: bool):
+def test_memory_holds_as_long_as_was_taught(run: Network, step_s: float, lost: bool):
     estimate, follower = answers(5), run.follow()
     read = follower.update(estimate, 7 + step_s * np.arange(5), np.ones(5, dtype=bool)).margin
     assert follower.lost == lost
     assert np.isclose(read, estimate.margin)[1:].all() == lost
 
 
-def test_a_head_that_learnt_nothing_leaves_answers_as_they_are(run: Run):
+def test_a_head_that_learnt_nothing_leaves_answers_as_they_are(run: Network):
     untaught = replace(run, sequence=SequenceHead(EDGES, RATIO_EDGES).eval())
     estimate = answers(5)
     # bins of less than 1e-6 are lifted to it, 60 of them at most, and floats have 24 bits
     np.testing.assert_allclose(follow(untaught, estimate), estimate.margin, atol=1e-4)
 
 
-def test_frames_are_read_as_the_head_was_taught(run: Run):
+def test_frames_are_read_as_the_head_was_taught(run: Network):
     """Training has whole contacts at once, in torch; reading has one frame after another, in numpy."""
     estimate, head = answers(12), there(run.sequence)
     margin, ratio = (there(one.probabilities).astype("f4") for one in (estimate, there(estimate.ratio)))
@@ -157,13 +157,13 @@ def test_the_gradient_of_a_fresh_head_points_from_the_answer_to_the_label():
     torch.testing.assert_close(head.correction.bias.grad, expected, atol=1e-6, rtol=1e-4)
 
 
-def test_one_frame_is_read_as_before(run: Run, small_dataset: Dataset):
+def test_one_frame_is_read_as_before(run: Network, small_dataset: Dataset):
     trial = small_dataset.load(small_dataset.trials[0])
     alone = sl.predict(replace(run, sequence=None), trial.frames, reference=trial.reference)
     assert sl.predict(run, trial.frames, reference=trial.reference).frame().equals(alone.frame())
 
 
-def test_a_recording_is_read_as_the_follower_reads_it(run: Run, small_dataset: Dataset, tmp_path: Path):
+def test_a_recording_is_read_as_the_follower_reads_it(run: Network, small_dataset: Dataset, tmp_path: Path):
     info = small_dataset.trials[0]
     table = sl.predict(run, small_dataset, split="train", sequence=True).frame()
     rows = table.filter(np.array([name == info.trial for name in table["trial"].to_pylist()]))
@@ -178,7 +178,7 @@ def test_a_recording_is_read_as_the_follower_reads_it(run: Run, small_dataset: D
     assert written["prediction"].equals(table["prediction"])
 
 
-def test_a_table_says_that_it_was_read_in_order(run: Run, small_dataset: Dataset):
+def test_a_table_says_that_it_was_read_in_order(run: Network, small_dataset: Dataset):
     in_order, alone = (sl.predict(run, small_dataset, split="test", sequence=one) for one in (True, False))
     metadata = in_order.frame().schema.metadata
     assert metadata[b"sliplens.sequence"].decode() == there(run.manifest.sequence).weights_sha256
@@ -188,7 +188,7 @@ def test_a_table_says_that_it_was_read_in_order(run: Run, small_dataset: Dataset
 
 
 def test_the_rows_of_a_long_trial_are_written_as_they_come(
-    run: Run, small_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Network, small_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     whole = sl.predict(run, small_dataset, split="test", sequence=True, batch_size=4)
     monkeypatch.setattr("sliplens.models.predictions.LONGEST", 4)
@@ -199,7 +199,7 @@ def test_the_rows_of_a_long_trial_are_written_as_they_come(
     assert [pq.ParquetFile(part).num_row_groups for part in parts] == [3, 3]
 
 
-def test_evaluation_reads_labelled_frames_in_order(run: Run, small_dataset: Dataset):
+def test_evaluation_reads_labelled_frames_in_order(run: Network, small_dataset: Dataset):
     evaluation = sl.evaluate(run, small_dataset, sequence=True)
     assert evaluation.sequence
     found = evaluation.predictions
@@ -211,7 +211,7 @@ def test_evaluation_reads_labelled_frames_in_order(run: Run, small_dataset: Data
         np.testing.assert_allclose(found.prediction[found.trial == name], expected.margin, atol=1e-5)
 
 
-def test_what_cannot_be_followed_is_refused(run: Run, small_dataset: Dataset):
+def test_what_cannot_be_followed_is_refused(run: Network, small_dataset: Dataset):
     with pytest.raises(InputError, match="--recipe sequence"):
         sl.predict("thesis-raw", small_dataset, sequence=True)
     with pytest.raises(InputError, match="leave out one of them"):
@@ -220,7 +220,7 @@ def test_what_cannot_be_followed_is_refused(run: Run, small_dataset: Dataset):
         sl.predict(run, small_dataset.load(small_dataset.trials[0]).frames, sequence=True)
 
 
-def test_frames_that_come_too_seldom_are_refused(run: Run, small_dataset: Dataset):
+def test_frames_that_come_too_seldom_are_refused(run: Network, small_dataset: Dataset):
     trials = small_dataset.select(split="test")
     [capture] = open_source(small_dataset, trial=trials[0].trial)
     seldom = replace(capture, frame_time_s=30 * there(capture.time_s))  # one a second
@@ -236,14 +236,14 @@ def test_frames_that_come_too_seldom_are_refused(run: Run, small_dataset: Datase
         pass
 
 
-def test_each_trial_is_asked_whether_its_frames_come_often_enough(run: Run, small_dataset: Dataset, tmp_path: Path):
+def test_each_trial_is_asked_whether_its_frames_come_often_enough(run: Network, small_dataset: Dataset, tmp_path: Path):
     first, second = (small_dataset.load(info) for info in small_dataset.trials[:2])
     data = save_dataset(tmp_path, first, replace(second, time_s=30 * second.time_s))
     with pytest.raises(SliplensError, match=rf"{second.trial} has a frame each 1 s"):
         sl.predict(run, data, sequence=True)
 
 
-def test_a_damaged_head_is_refused(run: Run, tmp_path: Path):
+def test_a_damaged_head_is_refused(run: Network, tmp_path: Path):
     save_checkpoint(tmp_path, run.model, run.manifest, sequence=run.sequence)
     weights = tmp_path / "sequence.safetensors"
     kept = weights.read_bytes()

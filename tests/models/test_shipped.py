@@ -12,7 +12,7 @@ import sliplens
 from sliplens.errors import InputError
 from sliplens.faithfulness.controls import cascade
 from sliplens.files import find_run, shipped_names
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.recordings import Recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 from sliplens.simulation.plan import PULLS
@@ -55,7 +55,7 @@ def test_it_reads_a_simulated_grip_in_the_right_order(name: str, request: pytest
     inputs = trained.encode(trial.frames[trial.labelled], trial.reference)
     labels = trial.safety_margin[trial.labelled]
 
-    def judge(network: Run) -> tuple[float, float]:
+    def judge(network: Network) -> tuple[float, float]:
         margins = network.predict(inputs).numpy()
         return float(np.asarray(spearmanr(labels, margins))[0]), float(np.mean((margins - labels) ** 2) / labels.var())
 

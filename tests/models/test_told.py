@@ -8,7 +8,7 @@ from scipy import stats
 
 from sliplens.errors import InputError
 from sliplens.friction import Friction
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.calibration import told_probabilities
 
 EDGES, RATIO_EDGES = np.linspace(-0.1, 1.1, 61), np.linspace(-0.1, 1.5, 81)
@@ -83,7 +83,7 @@ def test_a_range_is_as_drawing_many_frictions(friction: tuple[float, float], rng
     assert (found @ MARGINS)[0] == pytest.approx(expected, abs=0.01)
 
 
-def test_a_network_of_two_answers_takes_friction(networks: dict[str, Run], images):
+def test_a_network_of_two_answers_takes_friction(networks: dict[str, Network], images):
     trained = networks["margin-and-ratio"]
     untold, exact = trained.estimate(images), trained.estimate(images, friction=0.6)
     assert untold.ratio is not None
@@ -101,7 +101,7 @@ def test_a_network_of_two_answers_takes_friction(networks: dict[str, Run], image
 
 
 @pytest.mark.parametrize("head", ["point", "histogram"])
-def test_a_network_of_one_answer_refuses_friction(head: str, networks: dict[str, Run], images):
+def test_a_network_of_one_answer_refuses_friction(head: str, networks: dict[str, Network], images):
     with pytest.raises(InputError, match=r"friction was told, but this network answers with the margin alone .*ratio`"):
         networks[head].estimate(images, friction=0.6)
 
@@ -117,7 +117,7 @@ def test_a_network_of_one_answer_refuses_friction(head: str, networks: dict[str,
     ],
 )
 def test_friction_that_is_mostly_beyond_the_training_is_doubted(
-    friction: Friction, doubted: bool, networks: dict[str, Run]
+    friction: Friction, doubted: bool, networks: dict[str, Network]
 ):
     kept = networks["margin-and-ratio"].manifest
     assert kept.traction is not None

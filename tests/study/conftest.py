@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sliplens.models import Run, load_checkpoint
+from sliplens.models import Network, load_checkpoint
 from sliplens.recordings import Dataset
 from sliplens.results.study import Choice, MarkerPlaces
 from sliplens.study import explain_frames
@@ -16,17 +16,17 @@ METHODS = ("grad-cam", "integrated-gradients")
 
 
 @pytest.fixture(scope="session")
-def network(difference_run: Path) -> Run:
+def network(difference_run: Path) -> Network:
     return load_checkpoint(difference_run)
 
 
 @pytest.fixture(scope="session")
-def choice(network: Run, fine_dataset: Dataset) -> Choice:
+def choice(network: Network, fine_dataset: Dataset) -> Choice:
     return choose_frames({"difference": network}, fine_dataset, trials=2, tolerance=1.0)
 
 
 @pytest.fixture(scope="session")
-def material(network: Run, fine_dataset: Dataset, choice: Choice) -> Material:
+def material(network: Network, fine_dataset: Dataset, choice: Choice) -> Material:
     """Six scored frames of two trials, their maps, and a grid of markers that does not move."""
     explainers = study_explainers(METHODS)
     chosen = frames_at(network, fine_dataset, [(frame.trial, frame.frame) for frame in choice.frames])

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explained
 from sliplens.results.study import Choice
@@ -24,8 +24,8 @@ class Says(nn.Module):
         return torch.full((len(images),), self.answer)
 
 
-def says(network: Run, answer: float) -> Run:
-    return Run(model=Says(answer), manifest=network.manifest)
+def says(network: Network, answer: float) -> Network:
+    return Network(model=Says(answer), manifest=network.manifest)
 
 
 def test_each_level_gets_the_frame_whose_label_is_nearest(choice: Choice, fine_dataset: Dataset):
@@ -62,7 +62,7 @@ def test_frames_with_nothing_to_explain_are_not_scored(material: Material):
 # at levels 1 and 0 a constant answer c is wrong by about max(1 - c, c): 0.5 by half, 0.9 by nine tenths
 @pytest.mark.parametrize(("answer", "worst"), [(0.5, 0.5), (0.9, 0.9), (0.2, 0.8)])
 def test_a_trial_qualifies_when_its_worst_answer_is_within_the_tolerance(
-    network: Run, fine_dataset: Dataset, answer: float, worst: float
+    network: Network, fine_dataset: Dataset, answer: float, worst: float
 ):
     # labels lie within 1/39 of a level
     for tolerance, expected in ((worst + 0.03, 3), (worst - 0.03, 0)):
@@ -71,7 +71,7 @@ def test_a_trial_qualifies_when_its_worst_answer_is_within_the_tolerance(
         assert all(abs(one.worst_error["difference"] - worst) < 0.03 for one in found.trials)
 
 
-def test_of_two_networks_the_worse_decides(network: Run, fine_dataset: Dataset):
+def test_of_two_networks_the_worse_decides(network: Network, fine_dataset: Dataset):
     networks = {"difference": says(network, 0.5), "raw": says(network, 0.9)}
     assert choose_frames(networks, fine_dataset, tolerance=0.6).qualified == 0
     assert choose_frames(networks, fine_dataset, tolerance=0.95).qualified == 3
@@ -83,7 +83,7 @@ def test_of_two_networks_the_worse_decides(network: Run, fine_dataset: Dataset):
     assert f"off by {told[0]} and {told[1]} on average" in found.summary
 
 
-def test_where_too_few_qualify_the_text_says_what_was_done(network: Run, fine_dataset: Dataset):
+def test_where_too_few_qualify_the_text_says_what_was_done(network: Network, fine_dataset: Dataset):
     found = choose_frames({"difference": says(network, 0.5)}, fine_dataset, trials=5, tolerance=0.01)
     assert "in 0 of those" in found.summary
     assert "the 3 read best among the others were taken too" in found.summary
@@ -101,12 +101,14 @@ def test_where_too_few_qualify_the_text_says_what_was_done(network: Run, fine_da
         ({"tolerance": 2.0}, "between 0 and 1"),
     ],
 )
-def test_impossible_wishes_are_refused(network: Run, fine_dataset: Dataset, change: dict[str, object], sentence: str):
+def test_impossible_wishes_are_refused(
+    network: Network, fine_dataset: Dataset, change: dict[str, object], sentence: str
+):
     with pytest.raises(InputError, match=sentence):
         choose_frames({"difference": network}, fine_dataset, **change)  # pyright: ignore[reportArgumentType]
 
 
-def test_data_without_frames_near_the_levels_are_refused(network: Run, small_dataset: Dataset):
+def test_data_without_frames_near_the_levels_are_refused(network: Network, small_dataset: Dataset):
     # its labels are elevenths: none lies within 5 % of full stick
     with pytest.raises(RecordingError, match="choose another split or condition"):
         choose_frames({"difference": network}, small_dataset)

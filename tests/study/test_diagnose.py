@@ -14,7 +14,7 @@ import sliplens as sl
 from sliplens.errors import InputError
 from sliplens.files import output_folder
 from sliplens.intervals import Difference
-from sliplens.models import Manifest, Run
+from sliplens.models import Manifest, Network
 from sliplens.plots.style import signed
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.evaluation import ErrorSlice, ErrorTable, ExplainedErrors, FrictionTable
@@ -247,7 +247,7 @@ class Brightness(nn.Module):
 
 
 @pytest.fixture(scope="module")
-def simulated(tmp_path_factory) -> tuple[Run, Dataset]:
+def simulated(tmp_path_factory) -> tuple[Network, Dataset]:
     recipe = SimulationRecipe(dry_trials=3, wet_trials=0, frames_per_trial=20, seed=6)
     folder = tmp_path_factory.mktemp("simulated") / "data"
     with output_folder(folder, stage="simulate", config={"recipe": recipe}) as out:
@@ -256,7 +256,7 @@ def simulated(tmp_path_factory) -> tuple[Run, Dataset]:
         backbone="none", input="amplitude", image_size=56, frame_size=(224, 224), sensor="chromatouch",
         data_hash="none", weights_sha256="of these weights",
     )  # fmt: skip
-    return Run(model=Brightness().eval(), manifest=manifest), load_dataset(folder)
+    return Network(model=Brightness().eval(), manifest=manifest), load_dataset(folder)
 
 
 def test_simulated_frames_are_explained_and_filmed_anew(simulated, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ from sliplens.codec import load_result, save_result
 from sliplens.errors import CheckpointError, InputError, SliplensError
 from sliplens.explainers import EXPLAINERS, Explanation
 from sliplens.files import output_folder
-from sliplens.models import Run, load_checkpoint
+from sliplens.models import Network, load_checkpoint
 from sliplens.recordings import Dataset
 from sliplens.results import Explained, load_explained
 from sliplens.results.faithfulness import DeletionScores
@@ -22,11 +22,11 @@ METHODS = ("grad-cam", "integrated-gradients")
 
 
 @pytest.fixture(scope="module")
-def trained(difference_run: Path) -> Run:
+def trained(difference_run: Path) -> Network:
     return load_checkpoint(difference_run)
 
 
-def explain(trained: Run, data: Dataset, target: Path, **more: object) -> Explained:
+def explain(trained: Network, data: Dataset, target: Path, **more: object) -> Explained:
     chosen = frames_from_dataset(trained, data, levels=(1.0, 0.0))
     config = {"weights_sha256": trained.manifest.weights_sha256}
     with output_folder(target, stage="explain", config=config) as out:
@@ -38,13 +38,13 @@ def explain(trained: Run, data: Dataset, target: Path, **more: object) -> Explai
 
 
 @pytest.fixture(scope="module")
-def explanations(trained: Run, small_dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def explanations(trained: Network, small_dataset: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     target = tmp_path_factory.mktemp("explained") / "maps"
     explain(trained, small_dataset, target)
     return target
 
 
-def test_explanations_come_back_without_loss(trained: Run, small_dataset: Dataset, tmp_path: Path):
+def test_explanations_come_back_without_loss(trained: Network, small_dataset: Dataset, tmp_path: Path):
     written = explain(trained, small_dataset, tmp_path / "maps")
     back = load_explained(tmp_path / "maps")
     assert back.frames == written.frames
@@ -56,7 +56,7 @@ def test_explanations_come_back_without_loss(trained: Run, small_dataset: Datase
         np.testing.assert_array_equal(back.saliency[method], written.saliency[method])
 
 
-def test_the_table_holds_the_networks_answers(trained: Run, explanations: Path):
+def test_the_table_holds_the_networks_answers(trained: Network, explanations: Path):
     back = load_explained(explanations)
     answers = trained.predict(network_inputs(trained, back))
     np.testing.assert_allclose([frame.prediction for frame in back.frames], answers.numpy(), atol=1e-6)
@@ -67,7 +67,7 @@ def made(parts: Path) -> dict[str, int]:
 
 
 def test_an_interrupted_explanation_goes_on_after_the_last_map(
-    trained: Run, small_dataset: Dataset, explanations: Path, tmp_path: Path
+    trained: Network, small_dataset: Dataset, explanations: Path, tmp_path: Path
 ):
     def interrupt(done: int, total: int) -> None:
         assert total == 4
@@ -92,7 +92,7 @@ def test_an_interrupted_explanation_goes_on_after_the_last_map(
 
 
 def test_maps_are_the_same_in_another_process(
-    trained: Run, small_dataset: Dataset, explanations: Path, tmp_path: Path, elsewhere: str
+    trained: Network, small_dataset: Dataset, explanations: Path, tmp_path: Path, elsewhere: str
 ):
     explain(trained, small_dataset, tmp_path / "maps", on=elsewhere)
     first, second = load_explained(explanations), load_explained(tmp_path / "maps")
@@ -101,7 +101,7 @@ def test_maps_are_the_same_in_another_process(
         np.testing.assert_array_equal(first.saliency[method], second.saliency[method])
 
 
-def test_a_map_that_is_not_finite_is_told_and_not_kept(trained: Run, small_dataset: Dataset, tmp_path: Path):
+def test_a_map_that_is_not_finite_is_told_and_not_kept(trained: Network, small_dataset: Dataset, tmp_path: Path):
     def holes(*given: Any, **options: Any) -> Explanation:
         found = EXPLAINERS["grad-cam"](*given, **options)
         found.relevance[:, :2, 0] = torch.nan
@@ -113,7 +113,7 @@ def test_a_map_that_is_not_finite_is_told_and_not_kept(trained: Run, small_datas
     assert not list(tmp_path.glob("trial=*/*"))
 
 
-def test_an_unknown_method_lists_those_there_are(trained: Run, small_dataset: Dataset):
+def test_an_unknown_method_lists_those_there_are(trained: Network, small_dataset: Dataset):
     chosen = frames_from_dataset(trained, small_dataset)
     with pytest.raises(InputError, match="no explainer named 'lime'; choose from grad-cam, integrated-gradients, poly"):
         explain_frames(trained, chosen, methods=("lime",))
@@ -156,7 +156,7 @@ def test_a_folder_of_another_stage_is_refused(tmp_path: Path):
         load_explained(tmp_path / "run")
 
 
-def test_scores_follow_from_the_stored_curves(trained: Run, explanations: Path, tmp_path: Path):
+def test_scores_follow_from_the_stored_curves(trained: Network, explanations: Path, tmp_path: Path):
     explained = load_explained(explanations)
     save_result(score_explained(trained, explained, steps=8), tmp_path)
     scored = load_result(tmp_path, DeletionScores, command="sliplens score")
@@ -176,7 +176,7 @@ def test_explanations_of_another_network_are_refused(raw_run: Path, explanations
         score_explained(load_checkpoint(raw_run), load_explained(explanations))
 
 
-def test_alarms_say_when_the_fill_decides_and_when_no_method_beats_chance(trained: Run, explanations: Path):
+def test_alarms_say_when_the_fill_decides_and_when_no_method_beats_chance(trained: Network, explanations: Path):
     class Stubborn(torch.nn.Module):
         def forward(self, images: torch.Tensor) -> torch.Tensor:
             return torch.full((len(images), 1), 0.7)

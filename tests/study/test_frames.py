@@ -7,22 +7,22 @@ from PIL import Image
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.images import write_png
-from sliplens.models import Run, load_checkpoint
+from sliplens.models import Network, load_checkpoint
 from sliplens.recordings import Dataset
 from sliplens.study import frames_from_dataset, frames_from_folder
 
 
 @pytest.fixture
-def difference(difference_run: Path) -> Run:
+def difference(difference_run: Path) -> Network:
     return load_checkpoint(difference_run)
 
 
 @pytest.fixture
-def raw(raw_run: Path) -> Run:
+def raw(raw_run: Path) -> Network:
     return load_checkpoint(raw_run)
 
 
-def test_frames_are_those_nearest_to_the_levels(difference: Run, small_dataset: Dataset):
+def test_frames_are_those_nearest_to_the_levels(difference: Network, small_dataset: Dataset):
     chosen = frames_from_dataset(difference, small_dataset, levels=(1.0, 0.6, 0.0))
     recording = small_dataset.load(small_dataset.select(split="test", condition="dry")[0])
     for level, label in zip((1.0, 0.6, 0.0), chosen.safety_margin, strict=True):
@@ -31,24 +31,24 @@ def test_frames_are_those_nearest_to_the_levels(difference: Run, small_dataset: 
     assert not chosen.references.any()
 
 
-def test_a_raw_frame_is_compared_with_the_untouched_sensor(raw: Run, small_dataset: Dataset):
+def test_a_raw_frame_is_compared_with_the_untouched_sensor(raw: Network, small_dataset: Dataset):
     chosen = frames_from_dataset(raw, small_dataset, levels=(0.0,))
     recording = small_dataset.load(small_dataset.select(split="test", condition="dry")[0])
     assert torch.equal(chosen.references[0], raw.encoding.empty(recording.reference, image_size=32))
 
 
-def test_levels_outside_the_unit_interval_are_refused(difference: Run, small_dataset: Dataset):
+def test_levels_outside_the_unit_interval_are_refused(difference: Network, small_dataset: Dataset):
     with pytest.raises(InputError, match=r"levels must lie in \[0, 1\], got 100, 80"):
         frames_from_dataset(difference, small_dataset, levels=(100.0, 80.0))
 
 
-def test_a_condition_that_is_not_there_is_refused(difference: Run, small_dataset: Dataset):
+def test_a_condition_that_is_not_there_is_refused(difference: Network, small_dataset: Dataset):
     with pytest.raises(RecordingError, match="no trial with split test and condition oily"):
         frames_from_dataset(difference, small_dataset, condition="oily")
 
 
 def test_difference_images_of_a_folder_are_what_the_data_set_gives(
-    difference: Run, small_dataset: Dataset, difference_folder: Path
+    difference: Network, small_dataset: Dataset, difference_folder: Path
 ):
     chosen = frames_from_folder(difference, difference_folder, labels_in_names=True)
     recording = small_dataset.load(small_dataset.select(split="test", condition="dry")[0])
@@ -57,7 +57,7 @@ def test_difference_images_of_a_folder_are_what_the_data_set_gives(
     np.testing.assert_allclose(chosen.safety_margin, recording.safety_margin[[1, 6, 11]], atol=0.005)
 
 
-def test_camera_frames_with_a_reference_give_the_same(difference: Run, small_dataset: Dataset, tmp_path: Path):
+def test_camera_frames_with_a_reference_give_the_same(difference: Network, small_dataset: Dataset, tmp_path: Path):
     recording = small_dataset.load(small_dataset.select(split="test", condition="dry")[0])
     (tmp_path / "frames").mkdir()
     write_png(tmp_path / "frames" / "a.png", recording.frames[6])
@@ -68,7 +68,7 @@ def test_camera_frames_with_a_reference_give_the_same(difference: Run, small_dat
     assert np.isnan(chosen.safety_margin).all()
 
 
-def test_a_raw_network_needs_the_untouched_sensor(raw: Run, difference_folder: Path):
+def test_a_raw_network_needs_the_untouched_sensor(raw: Network, difference_folder: Path):
     with pytest.raises(
         InputError,
         match=r"is as dark as a difference image .*, and this network reads camera frames",
@@ -77,19 +77,19 @@ def test_a_raw_network_needs_the_untouched_sensor(raw: Run, difference_folder: P
 
 
 @pytest.mark.parametrize("name", ["frame_120.png", "frame_007.png", "frame.png"])
-def test_a_name_without_a_label_is_refused_when_labels_are_asked_for(difference: Run, tmp_path: Path, name: str):
+def test_a_name_without_a_label_is_refused_when_labels_are_asked_for(difference: Network, tmp_path: Path, name: str):
     write_png(tmp_path / name, np.zeros((48, 48, 3), np.uint8))
     with pytest.raises(InputError, match=r"carries no label; its name must end in the safety margin in percent"):
         frames_from_folder(difference, tmp_path, labels_in_names=True)
 
 
-def test_images_of_another_size_are_refused(difference: Run, tmp_path: Path):
+def test_images_of_another_size_are_refused(difference: Network, tmp_path: Path):
     write_png(tmp_path / "a.png", np.zeros((50, 48, 3), np.uint8))
     with pytest.raises(ImageError, match=r"frames such as \S+\.png are 50 x 48 pixels"):
         frames_from_folder(difference, tmp_path)
 
 
-def test_grey_images_are_read_as_on_import(difference: Run, tmp_path: Path):
+def test_grey_images_are_read_as_on_import(difference: Network, tmp_path: Path):
     Image.fromarray(np.full((48, 48), 7, np.uint8)).save(tmp_path / "a.png")
     grey = frames_from_folder(difference, tmp_path)
     write_png(tmp_path / "a.png", np.full((48, 48, 3), 7, np.uint8))

@@ -15,7 +15,7 @@ from sliplens.errors import CheckpointError, InputError
 from sliplens.faithfulness.controls import control_maps
 from sliplens.faithfulness.removal import SHARES, unit_means
 from sliplens.files import output_folder
-from sliplens.models import Manifest, Run
+from sliplens.models import Manifest, Network
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results import Explained, ExplainedFrame
 from sliplens.results.explanation import MethodNotes
@@ -76,11 +76,11 @@ def data(tmp_path_factory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def trained() -> Run:
+def trained() -> Network:
     return run_of(Linear())
 
 
-def run_of(model: nn.Module, *, input: str = "amplitude") -> Run:
+def run_of(model: nn.Module, *, input: str = "amplitude") -> Network:
     manifest = Manifest(
         backbone="none",
         # the size of the difference to the untouched sensor, as it is
@@ -91,15 +91,15 @@ def run_of(model: nn.Module, *, input: str = "amplitude") -> Run:
         data_hash="none",
         weights_sha256="of these weights",
     )
-    return Run(model=model.eval(), manifest=manifest)
+    return Network(model=model.eval(), manifest=manifest)
 
 
 @pytest.fixture(scope="module")
-def explained(trained: Run, data: Dataset) -> Explained:
+def explained(trained: Network, data: Dataset) -> Explained:
     return explain(trained, data)
 
 
-def explain(trained: Run, data: Dataset) -> Explained:
+def explain(trained: Network, data: Dataset) -> Explained:
     chosen = frames_from_dataset(trained, data, levels=LEVELS)
     inputs = trained.encoding.normalise(chosen.images)
     assert isinstance(trained.model, Linear)
@@ -130,20 +130,20 @@ def explain(trained: Run, data: Dataset) -> Explained:
 
 
 @pytest.fixture(scope="module")
-def given(trained: Run, explained: Explained, data: Dataset) -> tuple[Run, Explained, Dataset]:
+def given(trained: Network, explained: Explained, data: Dataset) -> tuple[Network, Explained, Dataset]:
     return trained, explained, data
 
 
 @pytest.fixture(scope="module")
-def maps(trained: Run, explained: Explained) -> dict[str, np.ndarray]:
+def maps(trained: Network, explained: Explained) -> dict[str, np.ndarray]:
     return maps_of(trained, explained)
 
 
-def judge(trained: Run, explained: Explained, data: Dataset, **more: Any) -> JudgingByTruth:
+def judge(trained: Network, explained: Explained, data: Dataset, **more: Any) -> JudgingByTruth:
     return JudgingByTruth(trained=trained, explained=explained, data=data, **more)
 
 
-def maps_of(trained: Run, explained: Explained) -> dict[str, np.ndarray]:
+def maps_of(trained: Network, explained: Explained) -> dict[str, np.ndarray]:
     inputs = network_inputs(trained, explained)
     towards = explained.towards[:, None, None]
     controls = control_maps(trained.model, inputs, torch.zeros_like(inputs))
@@ -158,7 +158,7 @@ def judged(trained, explained, data, maps, tmp_path_factory) -> Truth:
 
 
 @pytest.fixture(scope="module")
-def two_signed(data) -> tuple[Run, Explained, Truth]:
+def two_signed(data) -> tuple[Network, Explained, Truth]:
     """A network to which markers speak for and against the answer, what it answers, and its judgement."""
     trained = run_of(Linear(two_signed=True))
     explained = explain(trained, data)
@@ -372,7 +372,7 @@ def test_a_summary_of_one_trial_names_no_interval(judged):
 
 
 def test_an_interrupted_judgement_goes_on_after_the_last_frame(
-    given: tuple[Run, Explained, Dataset], maps: dict[str, np.ndarray], judged: Truth, tmp_path: Path
+    given: tuple[Network, Explained, Dataset], maps: dict[str, np.ndarray], judged: Truth, tmp_path: Path
 ):
     def interrupt(done: int, total: int) -> None:
         assert total == len(LEVELS)

@@ -28,7 +28,7 @@ from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
 from sliplens.live.recorder import RecordingState
 from sliplens.live.sinks import SinkState
-from sliplens.models.checkpoint import Run
+from sliplens.models.checkpoint import Network
 from sliplens.plots.saliency import full_colour
 from sliplens.recordings.capture import Frame
 
@@ -215,7 +215,7 @@ class Feed:
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="explain")
         # explainers listen inside the network: not in the one that reads
         network = reader.network
-        self._network: Run | None = None if network is None else replace(network, model=deepcopy(network.model))
+        self._network: Network | None = None if network is None else replace(network, model=deepcopy(network.model))
         self._thread = Thread(target=self._run, daemon=True)
         self._mapper = Thread(target=self._map_on, daemon=True)
 

@@ -17,7 +17,7 @@ from sliplens.recordings.options import Budget, ReadOptions
 
 Result = TypeVar("Result")
 NETWORK_HELP = "Folder of a trained network, or the name of one that comes with sliplens."
-Network = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN", help=NETWORK_HELP)]
+NetworkPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(name="run", metavar="RUN", help=NETWORK_HELP)]
 Data = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA", help="Data set to read.")]
 Output = Annotated[Path, tyro.conf.arg(aliases=("-o",))]
 SOURCE_HELP = "Data set, folder of images, video, ROS 2 bag, or whatever `sliplens import` reads."

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sliplens.cli.command import Command, Data, Device, InOrder, Network, Output
+from sliplens.cli.command import Command, Data, Device, InOrder, NetworkPath, Output
 from sliplens.cli.console import print_table, say
 from sliplens.progress import number_of
 
@@ -22,7 +22,7 @@ class Evaluate(Command):
     read from the markers of the same frames stands beside it.
     """
 
-    model: Network
+    model: NetworkPath
     data: Data
     output: Output
     """Folder to make: the table and every prediction."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sliplens.cli.command import Command, Device, Network, On, Output, RetryFailed, require_path
+from sliplens.cli.command import Command, Device, NetworkPath, On, Output, RetryFailed, require_path
 from sliplens.cli.console import print_table, say
 from sliplens.errors import InputError
 
@@ -110,7 +110,7 @@ class Score(Command):
     random order is scored beside every method; one that does not beat it has shown nothing.
     """
 
-    model: Network
+    model: NetworkPath
     explanations: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="EXPLANATIONS")]
     """Folder that `sliplens explain` made."""
     output: Output

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from sliplens.cli.command import Command, Data, Device, Network, Output, RetryFailed
+from sliplens.cli.command import Command, Data, Device, NetworkPath, Output, RetryFailed
 from sliplens.cli.console import say
 from sliplens.cli.report import Report
 from sliplens.cli.simulate import Simulate
@@ -98,7 +98,7 @@ class Diagnose(Command):
     reading, and the same press and pull is filmed anew with other frictions. Ends in sentences, and a page.
     """
 
-    model: Network
+    model: NetworkPath
     data: Data
     output: Output
     """Workspace: a subfolder for the evaluation and one for the diagnosis; the page is report.html in it."""

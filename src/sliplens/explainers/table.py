@@ -18,7 +18,7 @@ from sliplens.explainers.occlusion import KnownMarkers, Occlusion, RegionMethod,
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
 from sliplens.extras import Table
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
 from sliplens.progress import OnProgress
 
@@ -55,7 +55,7 @@ Where the markers of a frame are not known the players are tiles (`shapley`).
 
 
 def explain(
-    run: Run | Path | str,
+    run: Network | Path | str,
     frames: UInt8[np.ndarray, "batch height width 3"],
     *,
     reference: UInt8[np.ndarray, "height width 3"] | None = None,
@@ -139,7 +139,7 @@ def get_explainer(method: str, **options: Any) -> Explainer:
 
 
 def network_images(
-    trained: Run,
+    trained: Network,
     frames: UInt8[np.ndarray, "batch height width 3"],
     reference: UInt8[np.ndarray, "height width 3"] | None,
 ) -> tuple[UInt8[Tensor, "batch colours size size"], Float[Tensor, "colours size size"]]:
@@ -160,7 +160,7 @@ def network_images(
 
 
 def network_inputs(
-    trained: Run, frames: UInt8[np.ndarray, "batch _ _ 3"], reference: UInt8[np.ndarray, "_ _ 3"] | None
+    trained: Network, frames: UInt8[np.ndarray, "batch _ _ 3"], reference: UInt8[np.ndarray, "_ _ 3"] | None
 ) -> tuple[Float[Tensor, "batch colours size size"], Float[Tensor, "colours size size"]]:
     """Inputs of a network and that of the untouched sensor, in [0, 1] on its device."""
     images, empty = network_images(trained, frames, reference)

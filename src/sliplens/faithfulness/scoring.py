@@ -28,7 +28,7 @@ from sliplens.faithfulness.removal import (
     score_maps,
     tile_units,
 )
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
 from sliplens.models.engines import Engine, counting_passes, prepare
 from sliplens.progress import OnProgress
@@ -273,7 +273,7 @@ _TILES_ACROSS = 14
 
 
 def score(
-    run: Run | Path | str,
+    run: Network | Path | str,
     frames: Frames,
     maps: Maps,
     *,
@@ -357,7 +357,7 @@ def score(
 
 
 def score_by_deletion(
-    run: Run | Path | str,
+    run: Network | Path | str,
     frames: Frames,
     maps: Maps,
     *,
@@ -401,7 +401,7 @@ def score_by_deletion(
     return replace(own, control=control)
 
 
-def prepare_passes(trained: Run, inputs: Float[Tensor, "images colours size size"], passes: int) -> Engine:
+def prepare_passes(trained: Network, inputs: Float[Tensor, "images colours size size"], passes: int) -> Engine:
     """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
     some = inputs[:_CHECKED_IMAGES].to(trained.device)
     with counting_passes():

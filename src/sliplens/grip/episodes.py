@@ -22,7 +22,7 @@ from sliplens.grip.plant import PERIOD_S, Episodes, HeldObject, Plant, least_for
 from sliplens.grip.readings import ReadingTable, load_readings, measure_readings, require_calibration
 from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion, next_grasp
 from sliplens.mechanics import stick_ratio
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
 from sliplens.plots.clip import write_clip
 from sliplens.progress import OnProgress, note, number_of, stage, wrote
@@ -59,7 +59,7 @@ def run_episodes(
     *,
     condition: str = "dry",
     episodes: int = 1,
-    network: str | Path | Run = DEFAULT_NETWORK,
+    network: str | Path | Network = DEFAULT_NETWORK,
     rendered: bool = False,
     readings: ReadingTable | None = None,
     error_scale: float = 1.0,
@@ -208,7 +208,7 @@ def _constants(controller: str | Controller) -> dict[str, float]:
     return {name: float(value) for name, value in named.items() if isinstance(value, int | float)}
 
 
-def _readings_of(run: Run, on_progress: OnProgress | None) -> ReadingTable:
+def _readings_of(run: Network, on_progress: OnProgress | None) -> ReadingTable:
     """Readings that come with a network; measured where there are none."""
     readings = load_readings(run)
     if readings is None:
@@ -226,7 +226,7 @@ class _Job:
     held: HeldObject
     scripts: Scripts
     controller: str | Controller
-    run: Run
+    run: Network
     readings: ReadingTable | None
     friction: Friction | Literal["each"] | None
     error_scale: float

@@ -31,7 +31,7 @@ from sliplens.grip.source import GripSource, open_grip, usual_network
 from sliplens.live.contract import LiveSource, Pace, SourceOptions
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading, describe_reading
-from sliplens.models.checkpoint import Run
+from sliplens.models.checkpoint import Network
 from sliplens.results.grip import Hold, HoldSteps
 
 GRIPPERS = {
@@ -83,7 +83,7 @@ def hold_grip(
     source: LiveReader | LiveSource | Path | str | Sequence[LiveReader],
     gripper: Gripper | str,
     *,
-    network: Run | Path | str | None = None,
+    network: Network | Path | str | None = None,
     controller: str | Controller = "margin",
     settings: Mapping[str, float] | None = None,
     ceiling_n: float = 4.0,
@@ -339,7 +339,7 @@ class _Holding:
 
 def _readers(
     source: LiveReader | LiveSource | Path | str | Sequence[LiveReader],
-    network: Run | Path | str | None,
+    network: Network | Path | str | None,
     stack: ExitStack,
 ) -> list[LiveReader]:
     """Readers of the fingertips; one that is made here reads until the stack is left."""

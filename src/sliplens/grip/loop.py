@@ -19,7 +19,7 @@ from sliplens.grip.plant import PERIOD_S, Episodes, Fingers, Plant, PlantState, 
 from sliplens.grip.readings import ReadingTable
 from sliplens.live.slip import SlipBatch
 from sliplens.markers import Tracker
-from sliplens.models import Engine, Run, make_engine
+from sliplens.models import Engine, Network, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.simulation.intervention import NOISE_PX
 
@@ -172,7 +172,7 @@ class RenderedEyes:
 
     def __init__(
         self,
-        run: Run,
+        run: Network,
         *,
         seed: int,
         engine: str | Engine = "auto",

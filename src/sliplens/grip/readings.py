@@ -11,7 +11,7 @@ from sliplens.codec import load_result
 from sliplens.errors import InputError
 from sliplens.files import find_run, shipped_names
 from sliplens.grip.fingertip import Fingertip, draw_film, place_in_grid
-from sliplens.models import Run, make_engine
+from sliplens.models import Network, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.progress import OnProgress
 from sliplens.results.evaluation import ANSWER, MARGIN
@@ -97,14 +97,14 @@ class ReadingTable:
         return cached
 
 
-def require_calibration(run: Run) -> None:
+def require_calibration(run: Network) -> None:
     """Refuse a network that tells no interval to grip by."""
     if run.manifest.calibration is None:
         raise InputError("the network was never calibrated and tells no interval to grip by; train it with validation")
 
 
 def measure_readings(
-    run: Run, *, fingertips: int = 96, seed: int = 0, engine: str = "auto", on_progress: OnProgress | None = None
+    run: Network, *, fingertips: int = 96, seed: int = 0, engine: str = "auto", on_progress: OnProgress | None = None
 ) -> ReadingTable:
     """Measure what a network says of fingertips at every friction, force and margin of the table.
 
@@ -173,7 +173,7 @@ _FOLDER = "readings"
 """Folder beside a network's weights with the table that was measured of it."""
 
 
-def load_readings(run: Run) -> ReadingTable | None:
+def load_readings(run: Network) -> ReadingTable | None:
     """Table that comes with a network of the package; None where there is none of these weights."""
     for name in shipped_names():
         folder = find_run(Path(name)) / _FOLDER

@@ -17,7 +17,7 @@ from sliplens.live.contract import LiveSource
 from sliplens.live.health import check_direction, check_novelty, margin_risk
 from sliplens.live.reading import OFF, Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
 from sliplens.markers import TrackedFrame, Tracker
-from sliplens.models.checkpoint import Run
+from sliplens.models.checkpoint import Network
 from sliplens.models.engines import Engine
 from sliplens.models.predictions import LEVEL
 from sliplens.models.sequence import require_frequent
@@ -121,7 +121,7 @@ class FrameReader:
     def __init__(
         self,
         source: LiveSource,
-        network: Run | None,
+        network: Network | None,
         *,
         friction: FrictionLike | None,
         same_object: bool,

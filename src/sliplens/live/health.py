@@ -12,7 +12,7 @@ from sliplens.errors import InputError
 from sliplens.live.reading import Check, LiveFrame, small_picture
 from sliplens.markers import MarkerStatus, TrackedFrame
 from sliplens.markers.camera import CAMERA_CURE, CAMERA_LIMIT_PX, CameraWatch, block_means
-from sliplens.models.checkpoint import STRANGE, Estimate, Run
+from sliplens.models.checkpoint import STRANGE, Estimate, Network
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labels.lag import LEAST_TOUCH, picture_change, soften
 from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, Shear
@@ -306,7 +306,7 @@ def check_novelty(estimate: Estimate) -> Check | None:
     return _judge("novelty", -float(np.log10(max(known, 1e-30))), -float(np.log10(STRANGE)), told, cure)
 
 
-def check_direction(network: Run, shear: Shear) -> Check:
+def check_direction(network: Network, shear: Shear) -> Check:
     """Check the direction of the shear against the directions of the network's training.
 
     The value is the distance from them in standard deviations (`Shear.excess`), at its limit where `predict` withholds

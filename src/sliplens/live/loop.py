@@ -30,7 +30,7 @@ from sliplens.live.recorder import ForceStream, Recorder, RecordingState
 from sliplens.live.sinks import Sender, SinkState
 from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import Images, ProfiledSource, open_live
-from sliplens.models.checkpoint import Run, open_run
+from sliplens.models.checkpoint import Network, open_run
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
@@ -169,7 +169,7 @@ class LiveReader:
     def __init__(
         self,
         source: "str | Path | Images | Capture | LiveSource" = "simulated",
-        network: Run | Path | str | None = None,
+        network: Network | Path | str | None = None,
         *,
         reference: Path | str | Frame | None = None,
         options: SourceOptions | None = None,
@@ -456,7 +456,7 @@ class LiveReader:
             sender.close()
         self.stop_recording()
 
-    def _make_engine(self, network: Run) -> Engine:
+    def _make_engine(self, network: Network) -> Engine:
         """The engine that was named, or the fastest that pays for the frames to come."""
         rate_hz, seconds = self.source.rate_hz or 30.0, self._seconds or np.inf
         frames = min(self.source.count or np.inf, rate_hz * seconds, _MOST_FRAMES)

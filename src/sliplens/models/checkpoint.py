@@ -100,7 +100,7 @@ def sensor_kind(sensor: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
-class Run:
+class Network:
     """A trained network, in evaluation mode, with what it is and how it was trained."""
 
     model: nn.Module
@@ -116,7 +116,7 @@ class Run:
         weights = sum(values.numel() for values in self.model.parameters())
         intervals = "calibrated intervals" if kept.calibration else "no intervals"
         lines = (
-            f"Run: {kept.backbone} with a {kept.head} head, {weights:,} weights, on {self.device}",
+            f"Network: {kept.backbone} with a {kept.head} head, {weights:,} weights, on {self.device}",
             f"  reads {kept.input} images of {kept.sensor}, frames of {' x '.join(map(str, kept.frame_size))} px "
             f"at {kept.image_size} px",
             f"  tells {kept.target.replace('_', ' ')}, {intervals}",
@@ -523,7 +523,7 @@ def _save_weights(path: Path, model: nn.Module) -> str:
     return hash_file(path)
 
 
-def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
+def load_checkpoint(folder: Path, *, device: str = "cpu") -> Network:
     """Load a checkpoint written by `save_checkpoint`.
 
     `InputError` if the folder or its manifest is missing; `CheckpointError` if the manifest is of another schema, the
@@ -549,7 +549,7 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Run:
     # the networks of the package come without their learning curve
     told = (folder / "curve.parquet").is_file()
     training = load_result(folder, Training, command="sliplens train") if told else None
-    return Run(model=model, manifest=manifest, training=training, sequence=sequence)
+    return Network(model=model, manifest=manifest, training=training, sequence=sequence)
 
 
 def _load_weights(path: Path, model: nn.Module, *, what: str, sha256: str) -> None:
@@ -579,7 +579,7 @@ def read_manifest(run: str | Path) -> Manifest:
     return manifest
 
 
-def load(run: str | Path, *, device: str = "cpu") -> Run:
+def load(run: str | Path, *, device: str = "cpu") -> Network:
     """Load a network: one that comes with the package by its name, or that of a run by its folder.
 
     Parameters
@@ -607,8 +607,8 @@ def load(run: str | Path, *, device: str = "cpu") -> Run:
     return load_checkpoint(find_run(Path(run)), device=device)
 
 
-def open_run(run: object, *, device: str = "cpu") -> Run:
+def open_run(run: object, *, device: str = "cpu") -> Network:
     """Network that a caller named: itself, its folder, or the name of one that comes with sliplens."""
-    if not isinstance(run, Run | Path | str):
+    if not isinstance(run, Network | Path | str):
         raise InputError(f"{type(run).__name__} is no network; give a network, its folder or its name first")
-    return run if isinstance(run, Run) else load(run, device=device)
+    return run if isinstance(run, Network) else load(run, device=device)

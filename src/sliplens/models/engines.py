@@ -26,7 +26,7 @@ from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, Table, import_onnxruntime, import_openvino, missing_packages
 from sliplens.friction import FrictionLike
 from sliplens.models.backbones import Answers, HistogramRegressor, answer_names
-from sliplens.models.checkpoint import Estimate, Run
+from sliplens.models.checkpoint import Estimate, Network
 from sliplens.models.onnx import INPUT, TOLERANCE, convert_network, difference, require_file_of, trial_inputs
 
 RunBatches: TypeAlias = Callable[[Iterable[Tensor]], Iterator[tuple[Tensor, ...]]]
@@ -50,7 +50,7 @@ class Engine:
 
     def estimate(
         self,
-        trained: Run,
+        trained: Network,
         inputs: Float[Tensor, "batch colours size size"] | Iterable[Tensor],
         *,
         friction: FrictionLike | None = None,
@@ -212,7 +212,7 @@ def expecting(model: nn.Module, passes: int) -> Iterator[None]:
 
 def make_engine(
     name: str,
-    trained: Run,
+    trained: Network,
     *,
     frames: int = 1,
     batch_size: int = 8,

@@ -18,7 +18,7 @@ from sliplens.errors import InputError, ModelError
 from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
 from sliplens.files import require_new_file, to_builtins, whole_file
 from sliplens.models.backbones import Answers, answer_names, bin_edges, ratio_edges
-from sliplens.models.checkpoint import Run, open_run
+from sliplens.models.checkpoint import Network, open_run
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -44,7 +44,7 @@ _COMPARED = {
 }
 
 
-def export_onnx(run: Run | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
+def export_onnx(run: Network | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
     """Write a network as an ONNX file, which appears once ONNX Runtime gives the same answers as the network.
 
     Input `image` is float32 (batch, 3, size, size), of a `pair` network (batch, 6, size, size), encoded and normalised;
@@ -116,7 +116,7 @@ def convert_network(
     return program.model_proto
 
 
-def _describe(proto: "ModelProto", trained: Run) -> None:
+def _describe(proto: "ModelProto", trained: Network) -> None:
     # torch notes where in whose source files each node was made
     values = (*proto.graph.input, *proto.graph.output, *proto.graph.value_info, *proto.graph.initializer)
     for part in (proto, proto.graph, *proto.graph.node, *values):
@@ -148,7 +148,7 @@ def _describe(proto: "ModelProto", trained: Run) -> None:
 
 
 @torch.no_grad()
-def check_parity(path: Path, trained: Run) -> None:
+def check_parity(path: Path, trained: Network) -> None:
     """Check that ONNX Runtime answers as the network does, on black, white and noise, alone and in a batch."""
     runtime, network = import_onnxruntime(), Answers(trained.model, trained.feature_layer)
     names, differences = list(answer_names(trained.model, trained.feature_layer)), []
@@ -179,14 +179,14 @@ def difference(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.max(np.abs(found - expected) / np.maximum(np.abs(expected), 1)))
 
 
-def trial_inputs(trained: Run) -> Iterator[Float[Tensor, "batch colours size size"]]:
+def trial_inputs(trained: Network) -> Iterator[Float[Tensor, "batch colours size size"]]:
     """Inputs that a network and its copies are compared on: black, white and noise, alone and in a batch."""
     generator, size = torch.Generator().manual_seed(0), trained.manifest.image_size
     for shape in ((count, trained.encoding.colours, size, size) for count in (1, 7)):
         yield from (torch.zeros(shape), torch.ones(shape), torch.rand(shape, generator=generator))
 
 
-def require_file_of(path: Path, trained: Run) -> None:
+def require_file_of(path: Path, trained: Network) -> None:
     """Check that an ONNX file holds a network, and not another one."""
     require_packages("onnx", extra="onnx", purpose="an ONNX file")
     import onnx  # noqa: PLC0415 (an extra)

@@ -19,7 +19,7 @@ from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_file, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, SIDE_PX, BorderMotion
-from sliplens.models.checkpoint import Estimate, Run, open_run, sensor_kind
+from sliplens.models.checkpoint import Estimate, Network, open_run, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
 from sliplens.parts import require_new_table
@@ -173,7 +173,7 @@ class Predictions:
 
 
 def predict(
-    run: Run | Path | str | Frames | Dataset | Sequence[Capture],
+    run: Network | Path | str | Frames | Dataset | Sequence[Capture],
     source: Path | str | Frames | Dataset | Sequence[Capture] | None = None,
     *,
     reference: Path | str | Frame | None = None,
@@ -260,7 +260,7 @@ def predict(
         raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
     trained = None if source is None else open_run(run, device=device)
     read = run if source is None else source
-    if isinstance(read, Run):
+    if isinstance(read, Network):
         raise InputError("name what to read: a data set, a folder of images, a video, or frames")
     known = None if friction is None else as_friction(friction)
     with stage(on_progress, "Opening the source"):
@@ -344,7 +344,7 @@ def _find_network(trials: Trials, profile: SensorProfile | None) -> tuple[str, s
     return DEFAULT_NETWORK, "which comes with sliplens"
 
 
-def _require_order(trained: Run, trials: Sequence[Capture], *, friction: Friction | None) -> None:
+def _require_order(trained: Network, trials: Sequence[Capture], *, friction: Friction | None) -> None:
     """Refuse to read frames in order where the network was not taught to, or nobody knows when they were taken."""
     trained.follow(friction=friction)
     if any(one.time_s is None for one in trials):
@@ -357,7 +357,7 @@ def _require_order(trained: Run, trials: Sequence[Capture], *, friction: Frictio
         require_frequent(one.time_s, what=one.name)
 
 
-def _assume_reference(trained: Run, trial: Capture) -> Capture:
+def _assume_reference(trained: Network, trial: Capture) -> Capture:
     """Take the first frame of a recording for the untouched sensor, where a network needs it and nobody tells it."""
     if trial.read_reference is not None or not _is_recorded(trial) or trained.encoding.name == "raw":
         return trial
@@ -372,7 +372,7 @@ def _is_recorded(trial: Capture) -> bool:
     return trial.files is None and trial.time_s is not None  # nobody compares frames before they are recorded
 
 
-def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
+def _require_comparable(trained: Network, trial: Capture) -> Iterator[str]:
     """Refuse a trial that the network cannot read; gives what is assumed of one that it can."""
     trained.require_frame_size(trial.frame_size)
     encoding = trained.encoding
@@ -406,7 +406,7 @@ def _require_comparable(trained: Run, trial: Capture) -> Iterator[str]:
     yield f"{trial.name}: no reference was given, so its images were taken for difference images{unseen}."
 
 
-def _compare_markers(trained: Run, trial: Capture) -> str:
+def _compare_markers(trained: Network, trial: Capture) -> str:
     """How far apart the markers are, beside those that a network of a simulated sensor learned from."""
     # together they take seconds to import, and most frames need none of them
     from scipy.spatial import KDTree  # noqa: PLC0415
@@ -425,7 +425,7 @@ def _compare_markers(trained: Run, trial: Capture) -> str:
     return f"; markers are {found_px:.1f} pixels apart, those it learned from {wanted_px:.1f}"
 
 
-def _schema(trained: Run, trials: Sequence[Capture], metadata: dict[str, str]) -> pa.Schema:
+def _schema(trained: Network, trials: Sequence[Capture], metadata: dict[str, str]) -> pa.Schema:
     known = {
         "file": any(trial.files is not None for trial in trials),
         "safety_margin": any(trial.safety_margin is not None for trial in trials),
@@ -448,7 +448,7 @@ def _states(trial: Capture) -> tuple[ContactState, ...]:
 class _Reading(Work):
     """Work on shards of (trial, first frame, number of frames): their rows, as a Parquet file."""
 
-    trained: Run
+    trained: Network
     trials: Trials
     schema: pa.Schema
     friction: Friction | None

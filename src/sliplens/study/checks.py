@@ -26,7 +26,7 @@ from sliplens.faithfulness.controls import (
     total_variation,
 )
 from sliplens.intervals import paired_difference
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.parts import Shard
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
@@ -133,7 +133,7 @@ class Measuring(MethodStage[MapQuality]):
 
 
 def _once_more(
-    trained: Run, data: Dataset, chosen: Sequence[ChosenFrame], *, rng: np.random.Generator
+    trained: Network, data: Dataset, chosen: Sequence[ChosenFrame], *, rng: np.random.Generator
 ) -> tuple[Tensor, Tensor, float]:
     """The frames with more camera noise, and the frames that follow them, as the network gets them; grey levels."""
     infos = {info.trial: info for info in data.trials}

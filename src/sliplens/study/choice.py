@@ -17,7 +17,7 @@ from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, to_network
 from sliplens.faithfulness.removal import Units, marker_units, tile_units
 from sliplens.images import absolute_difference
 from sliplens.markers import track_markers
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.parts import Shard, shard
 from sliplens.plots.style import input_name, listed
 from sliplens.progress import OnProgress, counted, number_of
@@ -35,7 +35,7 @@ _REACH = 0.05
 
 
 def choose_frames(
-    networks: Mapping[str, Run],
+    networks: Mapping[str, Network],
     data: Dataset,
     *,
     split: str = "test",
@@ -123,7 +123,7 @@ class _Candidate:
                 )
 
 
-def _look_at(info: TrialInfo, networks: Mapping[str, Run], data: Dataset, *, tolerance: float) -> _Candidate | None:
+def _look_at(info: TrialInfo, networks: Mapping[str, Network], data: Dataset, *, tolerance: float) -> _Candidate | None:
     recording = data.load(info, truth=False)
     margin = np.where(recording.labelled, recording.safety_margin, np.nan)
     if not np.isfinite(margin).any():
@@ -305,7 +305,7 @@ _TILE_PX = 16
 class Material:
     """Explanations of some frames with all that belongs to them."""
 
-    trained: Run
+    trained: Network
     explained: Explained
     inputs: Float[Tensor, "frames colours size size"]
     """What the network got, in [0, 1]."""
@@ -363,7 +363,7 @@ class MaterialStage(Stage[Result]):
     material: Material
 
     @property
-    def trained(self) -> Run:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def trained(self) -> Network:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Network that was explained."""
         return self.material.trained
 
@@ -398,7 +398,7 @@ def trial_seed(seed: int, number: int) -> int:
 
 
 def gather(
-    trained: Run,
+    trained: Network,
     explained: Explained,
     data: Dataset,
     chosen: tuple[ChosenFrame, ...],
@@ -423,7 +423,7 @@ def gather(
 
 
 def seen_places(
-    trained: Run, chosen: Sequence[ChosenFrame], markers: Mapping[str, MarkerPlaces]
+    trained: Network, chosen: Sequence[ChosenFrame], markers: Mapping[str, MarkerPlaces]
 ) -> list[Float[Tensor, "_markers 2"]]:
     """Where the markers of each frame are, in the network's pixels; those that were not followed are left out."""
     now = [markers[frame.id].now_px for frame in chosen]

@@ -20,7 +20,7 @@ from sliplens.faithfulness.removal import answer_whole
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.files import output_folder, remove
 from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_difference
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import open_run, tell_each
 from sliplens.plots.style import decimals, signed, tell_ends
 from sliplens.progress import OnProgress, counted, note, number_of, stage, wrote
@@ -56,7 +56,7 @@ _LOOKED = ("agreement", "reliability", "network_slipping", "reading_slipping")
 
 
 def diagnose(
-    run: Run | Path | str,
+    run: Network | Path | str,
     data: Dataset | Path | str,
     out: Path | str | None = None,
     *,
@@ -120,9 +120,16 @@ def diagnose(
 
 
 def _diagnose(
-    run: Run, data: Dataset, answers: ScoredFrames, on_progress: OnProgress | None, parts: Path | None, *, trials: int,
-    pairs: int, seed: int,
-) -> Diagnosis:  # fmt: skip
+    run: Network,
+    data: Dataset,
+    answers: ScoredFrames,
+    on_progress: OnProgress | None,
+    parts: Path | None,
+    *,
+    trials: int,
+    pairs: int,
+    seed: int,
+) -> Diagnosis:
     rng = np.random.default_rng(seed)
     with stage(on_progress, "Reading what may explain the errors") as count:
         errors = tabulate_errors(data, answers, on_progress=count)
@@ -329,9 +336,15 @@ def hold_against(
 
 
 def find_contributions(
-    run: Run, explained: Explained, frames: Sequence[StagedFrame], *, pairs: int, seed: int, parts: Path | None = None,
+    run: Network,
+    explained: Explained,
+    frames: Sequence[StagedFrame],
+    *,
+    pairs: int,
+    seed: int,
+    parts: Path | None = None,
     on_progress: OnProgress | None = None,
-) -> list[MarkerContributions]:  # fmt: skip
+) -> list[MarkerContributions]:
     """Shapley values of the markers over redrawn scenes: a marker that takes no part lies where it rested.
 
     The best reading is linear in the markers: what each adds to it is its Shapley value.
@@ -356,7 +369,7 @@ def find_contributions(
 
 
 def tell_friction(
-    run: Run, inputs: Float[torch.Tensor, "frames colours size size"], friction: Float64[np.ndarray, " frames"]
+    run: Network, inputs: Float[torch.Tensor, "frames colours size size"], friction: Float64[np.ndarray, " frames"]
 ) -> Float64[np.ndarray, " frames"]:
     """Answers where each frame's friction is told; NaN of a network that cannot be told, or where one is not known."""
     traction = run.manifest.traction
@@ -368,7 +381,7 @@ def tell_friction(
 
 
 def refilm(
-    run: Run, frames: Sequence[StagedFrame], conditions: Sequence[str], *, on_progress: OnProgress | None = None
+    run: Network, frames: Sequence[StagedFrame], conditions: Sequence[str], *, on_progress: OnProgress | None = None
 ) -> tuple[FrictionTable, UInt8[np.ndarray, "shown size size 3"], str]:
     """Film frames anew with other frictions, and ask the network; gives the table, pictures of one frame, and its name.
 

@@ -17,7 +17,7 @@ from sliplens.errors import InputError, RecordingError
 from sliplens.explainers import EXPLAINERS, Explainer
 from sliplens.explainers.explanation import frame_of
 from sliplens.explainers.table import network_images
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.engines import expecting
 from sliplens.parts import Shard, shard
 from sliplens.plots.saliency import NOMINAL_MARGINS
@@ -55,7 +55,7 @@ class ChosenFrames:
 
 
 def frames_from_dataset(
-    trained: Run,
+    trained: Network,
     data: Dataset,
     *,
     split: str = "test",
@@ -97,7 +97,7 @@ def known_margin(trial: str, margin: Float[np.ndarray, " frames"] | None) -> Flo
     return margin
 
 
-def frames_at(trained: Run, data: Dataset, frames: Sequence[tuple[str, int]]) -> ChosenFrames:
+def frames_at(trained: Network, data: Dataset, frames: Sequence[tuple[str, int]]) -> ChosenFrames:
     """Frames of a data set by trial and number, those of a trial one after another."""
     infos = {info.trial: info for info in data.trials}
     parts = []
@@ -121,7 +121,7 @@ def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
 
 
 def frames_from_folder(
-    trained: Run,
+    trained: Network,
     folder: Path,
     *,
     reference: Path | None = None,
@@ -154,7 +154,7 @@ def frames_from_folder(
 
 
 def _take(
-    trained: Run, opened: Capture, numbers: Sequence[int], *, trial: str, day: int, source: str, condition: str
+    trained: Network, opened: Capture, numbers: Sequence[int], *, trial: str, day: int, source: str, condition: str
 ) -> ChosenFrames:
     names = opened.files or [f"{opened.name}-f{number:04d}" for number in range(opened.frames)]
     trained.require_frame_size(opened.frame_size, what=f"frames such as {names[numbers[0]]}")
@@ -230,7 +230,7 @@ class Explaining(Stage[Explained]):
     piece = _Map
     title = "Explaining frames"
 
-    trained: Run
+    trained: Network
     chosen: ChosenFrames
     explainers: Mapping[str, Explainer]
 
@@ -310,7 +310,7 @@ class Explaining(Stage[Explained]):
 
 
 def explain_frames(
-    trained: Run,
+    trained: Network,
     chosen: ChosenFrames,
     *,
     methods: Sequence[str] = DEFAULT_METHODS,
@@ -369,7 +369,7 @@ def _of_all(names: Sequence[str], count: int) -> str:
     return f"{len(names)} of {number_of(count, 'frame')} ({', '.join(names[:_NAMED])}{more})"
 
 
-def network_inputs(trained: Run, explained: Explained) -> Float[Tensor, "frames colours size size"]:
+def network_inputs(trained: Network, explained: Explained) -> Float[Tensor, "frames colours size size"]:
     """What the network got of explained frames, in [0, 1], on its device."""
     return trained.encoding.normalise(torch.from_numpy(explained.images)).to(trained.device)
 

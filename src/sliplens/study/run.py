@@ -15,7 +15,7 @@ from sliplens.explainers.explanation import CLOSE
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
 from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress, note, number_of, stage, wrote
@@ -68,7 +68,7 @@ from sliplens.training.evaluation import evaluate
 
 _COMMAND = "sliplens study"
 _KINDS: dict[str, type] = {"explain": Explained, "score": DeletionScores, "control": UntrainedMaps, **STAGES}
-Network: TypeAlias = Run | Path | str
+NetworkLike: TypeAlias = Network | Path | str
 _Work: TypeAlias = Callable[[Path, OnProgress], object]
 """Takes a folder for parts, and what is called with the steps done and their number."""
 
@@ -84,7 +84,7 @@ TESTS = ("score", "remedies", "faithfulness", "randomisation", "map-quality", "t
 
 def run_study(
     data: Dataset | Path | str,
-    networks: Network | Sequence[Network] = DEFAULT_NETWORK,
+    networks: NetworkLike | Sequence[NetworkLike] = DEFAULT_NETWORK,
     *,
     out: Path | str | None = None,
     methods: Sequence[str] = STUDY_METHODS,
@@ -204,9 +204,9 @@ def run_study(
     return study
 
 
-def load_networks(networks: Network | Sequence[Network], *, device: str = "cpu") -> dict[str, Run]:
+def load_networks(networks: NetworkLike | Sequence[NetworkLike], *, device: str = "cpu") -> dict[str, Network]:
     """Networks of a study by the input that each reads, in one order whatever order they were named in."""
-    several = [networks] if isinstance(networks, Run | Path | str) else networks
+    several = [networks] if isinstance(networks, Network | Path | str) else networks
     runs = [open_run(network, device=device) for network in several]
     by_input = {run.encoding.name: run for run in runs}
     if twice := [name for name in by_input if sum(run.encoding.name == name for run in runs) > 1]:
@@ -226,7 +226,7 @@ class _Judging(Work):
 
     folder: Path
     data: Dataset
-    networks: Mapping[str, Run]
+    networks: Mapping[str, Network]
     explainers: Mapping[str, Explainer]
     settings: tuple[Setting, ...]
     random_orders: int
@@ -276,7 +276,7 @@ class _Network:
     _ready: dict[str, Stage] = field(default_factory=dict)
 
     @property
-    def run(self) -> Run:
+    def run(self) -> Network:
         return self.study.networks[self.name]
 
     def result(self, stage: str) -> Any:
@@ -376,7 +376,7 @@ class _Stages:
 
     folder: Path
     data: Dataset
-    networks: Mapping[str, Run]
+    networks: Mapping[str, Network]
     explainers: Mapping[str, Explainer]
     seed: int
     overwrite: bool

@@ -28,7 +28,7 @@ from sliplens.faithfulness.scoring import (
     saturated,
 )
 from sliplens.intervals import mean_interval, paired_difference
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.parts import Shard
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import Explained, ExplainedFrame
@@ -62,7 +62,7 @@ _Curves = Mapping[str, Sequence[DeletionTable]]
 """Curve of each frame, by method; random orders among the methods."""
 
 
-def require_same_network(trained: Run, explained: Explained) -> None:
+def require_same_network(trained: Network, explained: Explained) -> None:
     """Refuse explanations of another network."""
     if explained.weights_sha256 != trained.manifest.weights_sha256:
         raise CheckpointError(
@@ -84,7 +84,7 @@ class Deletion(Stage[DeletionScores]):
     piece = _Answers
     title = "Deleting pixels, as the thesis did"
 
-    trained: Run
+    trained: Network
     explained: Explained
     fill: str = "grey"
     steps: int | None = None

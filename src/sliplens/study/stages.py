@@ -11,7 +11,7 @@ import numpy as np
 
 from sliplens.codec import load_result, save_result
 from sliplens.files import scratch_folder
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.engines import counting_passes
 from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress
@@ -31,7 +31,7 @@ class Stage(Work, Generic[Result]):
     title: ClassVar[str]
     """What is done, as a person is told."""
 
-    trained: Run
+    trained: Network
     """Network that the stage asks."""
 
     @property

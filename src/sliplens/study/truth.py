@@ -32,7 +32,7 @@ from sliplens.faithfulness.removal import (
 )
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.intervals import Difference, mean_interval, paired_difference
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.parts import Shard, shard
 from sliplens.plots.style import tell_ends
 from sliplens.progress import OnProgress
@@ -98,7 +98,7 @@ class Places:
         return np.append(values, 0.0)[self.units]
 
 
-def stage_frames(trained: Run, explained: Explained, data: Dataset) -> tuple[StagedFrame, ...]:
+def stage_frames(trained: Network, explained: Explained, data: Dataset) -> tuple[StagedFrame, ...]:
     """Make frames of a study ready to be drawn anew."""
     require_same_network(trained, explained)
     if not data.simulated or explained.source != "simulated":
@@ -132,7 +132,7 @@ def stage_frames(trained: Run, explained: Explained, data: Dataset) -> tuple[Sta
     return tuple(staged[row] for row in range(len(explained.frames)))
 
 
-def redrawing(trained: Run, frames: Sequence[StagedFrame]) -> Redraw:
+def redrawing(trained: Network, frames: Sequence[StagedFrame]) -> Redraw:
     """Draw frames with some of their `markers` put back, as the network gets them, on its device."""
 
     def redraw(image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants colours size size"]:
@@ -340,7 +340,7 @@ class JudgingByTruth(Stage[Truth]):
     piece = FrameEffects
     title = "Putting markers back"
 
-    trained: Run
+    trained: Network
     explained: Explained
     data: Dataset
     maps: Mapping[str, Maps]
@@ -516,7 +516,7 @@ def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Seq
 
 
 def true_curves(
-    trained: Run,
+    trained: Network,
     explained: Explained,
     data: Dataset,
     *,

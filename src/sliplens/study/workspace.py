@@ -20,7 +20,7 @@ from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.faithfulness import get_fill
 from sliplens.files import as_path, output_folder, remove
 from sliplens.images import write_png
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
 from sliplens.plots.saliency import SIGN_COLOURS, draw_panel, full_colour, overlay_jet, overlay_relevance
 from sliplens.plots.style import drawing_style, method_name, percent, reading_words
@@ -50,7 +50,7 @@ _FULL_STICK = 0.9
 
 
 def explain_source(
-    run: Run | Path | str,
+    run: Network | Path | str,
     source: Dataset | Path,
     *,
     reference: Path | None = None,
@@ -164,7 +164,7 @@ def explain_source(
 
 
 def score_explained(
-    run: Run | Path | str,
+    run: Network | Path | str,
     explanations: Explained | Path,
     *,
     fill: str = "grey",
@@ -307,7 +307,7 @@ def _show_first(folder: Path, ids: Sequence[str], on_progress: OnProgress | None
 
 
 def _choose_explainers(
-    trained: Run,
+    trained: Network,
     chosen: ChosenFrames,
     source: Dataset | Callable[[], Sequence[Capture]],
     *,
@@ -324,7 +324,7 @@ def _choose_explainers(
 
 
 def _find_markers(
-    trained: Run, chosen: ChosenFrames, source: Dataset | Callable[[], Sequence[Capture]]
+    trained: Network, chosen: ChosenFrames, source: Dataset | Callable[[], Sequence[Capture]]
 ) -> list[Float[Tensor, "_markers 2"]]:
     """Places of the markers, frame by frame: where the simulator put them, else where they are found."""
     size = trained.manifest.image_size
@@ -347,7 +347,7 @@ _CONFIDENCE = 0.9
 
 
 def explain_trial(
-    run: Run,
+    run: Network,
     recording: Recording,
     *,
     source: str,

@@ -18,7 +18,7 @@ from sliplens.files import output_folder, scratch_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.markers import KINDS, MarkerStatus, track_markers
 from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get_estimator
-from sliplens.models import Run
+from sliplens.models import Network
 from sliplens.models.checkpoint import Estimate, open_run, tell_each
 from sliplens.models.sequence import require_frequent
 from sliplens.progress import OnProgress, counted, note, stage, wrote
@@ -165,7 +165,7 @@ EACH = "each"
 
 
 def evaluate(
-    run: Run | Path | str,
+    run: Network | Path | str,
     data: Dataset | Path | str,
     out: Path | str | None = None,
     *,
@@ -252,7 +252,7 @@ def evaluate(
 
 
 def _evaluate(
-    run: Run,
+    run: Network,
     data: Dataset,
     trials: Sequence[TrialInfo],
     plan: BaselinePlan | None,
@@ -279,7 +279,7 @@ def _evaluate(
     return replace(evaluation, baselines=replace(scores, known_trials=known), baseline_predictions=answers)
 
 
-def find_known(trials: Sequence[TrialInfo], run: Run) -> tuple[TrialInfo, ...]:
+def find_known(trials: Sequence[TrialInfo], run: Network) -> tuple[TrialInfo, ...]:
     """Trials that trained or validated a network, or what it started from; told by the hashes of their files."""
     return tuple(trial for trial in trials if trial.sha256[:12] in run.manifest.trained_on)
 
@@ -304,7 +304,7 @@ def _plan_baselines(
 
 
 def evaluate_frames(
-    run: Run,
+    run: Network,
     frames: FrameSet,
     *,
     split: str = "test",
@@ -396,7 +396,7 @@ def evaluate_frames(
 
 
 def _estimate(
-    run: Run, batches: Iterable[Tensor], friction: Float[np.ndarray, " frames"], *, told: FrictionLike | None
+    run: Network, batches: Iterable[Tensor], friction: Float[np.ndarray, " frames"], *, told: FrictionLike | None
 ) -> Estimate:
     """Answers to frames with these frictions, of which as much is told as `evaluate` says."""
     if told != EACH:
@@ -409,7 +409,7 @@ def _estimate(
 
 
 def _follow_trials(
-    run: Run, estimate: Estimate, trial: Sequence[str], time_s: Float[np.ndarray, " frames"]
+    run: Network, estimate: Estimate, trial: Sequence[str], time_s: Float[np.ndarray, " frames"]
 ) -> Estimate:
     """Read the frames of each trial in the order of their times (`Follower`); all of them touch."""
     assert estimate.probabilities is not None

@@ -21,7 +21,7 @@ from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
 from sliplens.files import output_folder, partial_folder, scratch_folder, versions
 from sliplens.images import has_colour
-from sliplens.models import Manifest, Run, build_model, load_checkpoint, save_checkpoint
+from sliplens.models import Manifest, Network, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import (
     REFERENCE_SIGNS,
     HistogramRegressor,
@@ -90,7 +90,7 @@ def train(
     *,
     input: str | None = None,
     recipe: str = "default",
-    start_from: Run | Path | str | None = None,
+    start_from: Network | Path | str | None = None,
     condition: str | None = None,
     accelerator: Literal["auto", "cpu", "gpu"] = "auto",
     devices: int = 1,
@@ -99,7 +99,7 @@ def train(
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
     **changes: Any,
-) -> Run:
+) -> Network:
     """Train a network on the training trials of a data set, and keep the weights that read its validation trials best.
 
     Interrupted, it goes on after the last whole epoch when it is called again with the same `out`.
@@ -219,7 +219,7 @@ def train(
     return trained
 
 
-def _configure(recipe: str, changes: dict[str, Any], start: Run | None) -> TrainConfig:
+def _configure(recipe: str, changes: dict[str, Any], start: Network | None) -> TrainConfig:
     """Recipe with changes; a network to start from stays of its kind where nothing else is asked for."""
     config = replace(get_recipe(recipe), **changes)
     if start is None:
@@ -268,7 +268,7 @@ def _as_told(config: TrainConfig, data: Dataset, trials: Sequence[Sequence[Trial
 
 
 def trained_directions(
-    config: TrainConfig, data: Dataset, trials: Sequence[TrialInfo], start: Run | None
+    config: TrainConfig, data: Dataset, trials: Sequence[TrialInfo], start: Network | None
 ) -> tuple[float, float] | None:
     """Directions of the pulls that a network is trained on; those of `start` where it stays as it is.
 
@@ -307,7 +307,7 @@ def pull_direction(trial: Recording) -> float | None:
 
 
 def _advise(
-    config: TrainConfig, train: Sequence[TrialInfo], validation: Sequence[TrialInfo], *, start: Run | None
+    config: TrainConfig, train: Sequence[TrialInfo], validation: Sequence[TrialInfo], *, start: Network | None
 ) -> Iterator[str]:
     """Say how many trials to record, where there are few, and what is lost of the network to start from."""
     count = len(train) + len(validation)
@@ -413,7 +413,7 @@ def fit(
     colour: bool | None = None,
     pull_direction_deg: tuple[float, float] | None = None,
     trained_on: Sequence[str] = (),
-    start: Run | None = None,
+    start: Network | None = None,
     trainer: lightning.Trainer | None = None,
     logger: Logger | None = None,
     on_progress: OnProgress | None = None,
@@ -539,7 +539,7 @@ def _save_best(
     begun: Manifest,
     train: FrameSet,
     validation: FrameSet,
-    start: Run | None,
+    start: Network | None,
 ) -> float:
     """Calibrate and save the network of the best epoch; gives its validation error.
 
@@ -564,7 +564,7 @@ def _save_best(
     return float(kept["callbacks"][best.state_key]["current_score"])
 
 
-def _begin(config: TrainConfig, encoding: Encoding, start: Run | None) -> nn.Module:
+def _begin(config: TrainConfig, encoding: Encoding, start: Network | None) -> nn.Module:
     """Network with random weights, or with those of the network that it starts from."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)  # forked, so that the caller's random state is untouched
@@ -602,7 +602,7 @@ def _put_back(network: nn.Module, model: nn.Module) -> None:
 
 
 def _find_novelty(
-    model: nn.Module, config: TrainConfig, train: FrameSet, validation: FrameSet, *, start: Run | None
+    model: nn.Module, config: TrainConfig, train: FrameSet, validation: FrameSet, *, start: Network | None
 ) -> Novelty | None:
     if start is not None and config.learns == "ratio":
         return start.manifest.novelty  # its early layers stay as they were
@@ -627,7 +627,7 @@ def _check_frames(config: TrainConfig, train: FrameSet, validation: FrameSet, pr
         raise InputError(f"trial {min(shared)} is in both training and validation; split by trial")
 
 
-def require_same_kind(start: Run, config: TrainConfig, encoding: str) -> None:
+def require_same_kind(start: Network, config: TrainConfig, encoding: str) -> None:
     """Refuse to start from a network whose weights would mean something else."""
     for name, value in (("input", encoding), ("backbone", config.backbone), ("head", config.head)):
         kept = getattr(start.manifest, name)

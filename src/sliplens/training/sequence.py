@@ -15,7 +15,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import versions, whole_file
-from sliplens.models import Run, make_engine, save_checkpoint
+from sliplens.models import Network, make_engine, save_checkpoint
 from sliplens.models.backbones import HistogramRegressor, bin_centres, histogram_targets
 from sliplens.models.calibration import calibrate_histogram
 from sliplens.models.sequence import (
@@ -80,7 +80,7 @@ class AnsweredTrial:
 
 def fit_sequence(
     config: TrainConfig,
-    start: Run,
+    start: Network,
     data: Dataset,
     trials: tuple[Sequence[TrialInfo], Sequence[TrialInfo]],
     folder: Path,
@@ -150,7 +150,7 @@ def fit_sequence(
 
 
 def _answer(
-    run: Run,
+    run: Network,
     data: Dataset,
     trials: Sequence[TrialInfo],
     folder: Path,
