@@ -1,13 +1,10 @@
-import csv
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sliplens.errors import ImageError, InputError
-from sliplens.images import absolute_difference, read_image
-from sliplens.markers import fit_doublets, interpolate_field, track_markers
+from sliplens.errors import InputError
+from sliplens.markers import interpolate_field, track_markers
 
 AFFINE = st.tuples(*[st.floats(-0.2, 0.2) for _ in range(4)])
 
@@ -76,48 +73,3 @@ def test_a_press_opens_the_field_and_full_slip_drags_it_down(trials):
     centre = press.confidence > 0.5
     assert press.divergence[centre].mean() > 0.02
     assert (slip.displacement_px - press.displacement_px)[centre][:, 1].mean() > 1.5
-
-
-def test_doublets_of_drawn_dots_give_their_displacement_and_sign(dots, grid):
-    places = grid(pitch=32.0, columns=6, rows=5)
-    middle = places.mean(axis=0)
-    moved = places + 0.06 * (places - middle) + (0.5, 2.0)
-    settings = {"radius": 6.3, "edge": 0.9, "size": (180, 230)}
-    difference = absolute_difference(dots(moved, **settings), dots(places, **settings))
-    found = fit_doublets(difference)
-    order = np.linalg.norm(found.rest_px[:, None] + found.displacement_px[:, None] - moved[None], axis=-1).argmin(
-        axis=1
-    )
-    long = np.linalg.norm(moved - places, axis=1)[order] > 2
-    assert long.sum() > 20
-    np.testing.assert_allclose(found.displacement_px[long], (moved - places)[order][long], atol=0.1)
-    np.testing.assert_allclose(found.rest_px[long], places[order][long], atol=0.1)
-
-
-def test_an_image_without_doublets_is_refused(rng):
-    with pytest.raises(ImageError, match=r"doublets|marker seen twice"):
-        fit_doublets(rng.integers(0, 8, (120, 120, 3), dtype=np.uint8))
-
-
-@pytest.mark.real
-def test_real_differences_give_the_measured_displacements(chromatouch_folder):
-    with (chromatouch_folder / "measured_markers.csv").open() as stream:
-        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
-    errors = []
-    for path in sorted((chromatouch_folder / "difference").glob("*.png")):
-        label = path.stem.rsplit("_", 1)[1]
-        if path.stem.startswith("image_51."):
-            continue  # taken before contact: the table's 100 % is the other one
-        found = fit_doublets(read_image(path))
-        middle = found.rest_px + found.displacement_px / 2
-        for row in rows:
-            place = np.array([row["x_ref"], row["y_ref"]])
-            if not 1 <= row["ring"] <= 3 or place.min() < 14 or place.max() > 209 or row[f"corr_{label}"] <= 0.85:
-                continue
-            told = np.array([row[f"dx_{label}"], row[f"dy_{label}"]])
-            distance = np.linalg.norm(middle - place - told / 2, axis=1)
-            assert distance.min() < 6
-            errors.append(found.displacement_px[distance.argmin()] - told)
-    assert len(errors) > 100
-    # the goal of the project: 1 px, over both coordinates
-    assert np.sqrt(np.mean(np.sum(np.square(errors), axis=1))) < 1.0

@@ -12,7 +12,6 @@ from sliplens.images import absolute_difference
 from sliplens.simulation import (
     CHROMATOUCH,
     FLAT_GEL,
-    SimulatedFrames,
     SimulationRecipe,
     plan_trials,
     simulate_dataset,
@@ -22,6 +21,7 @@ from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.geometry import FlatPad
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp
+from sliplens.simulation.trials import prepare_trial
 
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=30, seed=5)
 
@@ -234,24 +234,8 @@ def test_an_interrupted_data_set_resumes_to_the_same_bytes(dataset, tmp_path):
     assert resumed.hash == dataset.hash
 
 
-def test_frames_drawn_on_the_fly_are_those_that_are_stored(dataset):
-    recipe = replace(RECIPE, frames_per_trial=20)
-    frames = SimulatedFrames(plan_trials(recipe), kept_trials=2)
-    stored = [dataset.load(info) for info in dataset.trials]
-    assert len(frames) == 80
-    # out of order, so that trials come and go
-    for index in (0, 79, 21, 40, 19, 60, 20, 78, 5, -1):
-        drawn, trial, number = frames[index], stored[index % 80 // 20], index % 20
-        assert drawn.frame.numpy().tobytes() == trial.frames[number].tobytes()
-        assert drawn.reference.numpy().tobytes() == trial.reference.tobytes()
-        np.testing.assert_array_equal(drawn.safety_margin.numpy(), np.float32(trial.safety_margin[number]))
-        np.testing.assert_array_equal(drawn.normal_force_n.numpy(), np.float32(trial.normal_force_n[number]))
-    with pytest.raises(IndexError):
-        frames[80]
-
-
-def test_a_loader_stacks_frames_drawn_on_the_fly():
-    frames = SimulatedFrames(plan_trials(replace(RECIPE, frames_per_trial=20)))
-    batch = next(iter(torch.utils.data.DataLoader(frames, batch_size=3)))
-    assert batch.frame.shape == (3, 224, 224, 3)
-    assert batch.safety_margin.shape == (3,)
+def test_a_frame_does_not_depend_on_those_drawn_with_it(dataset):
+    plan, stored = plan_trials(replace(RECIPE, frames_per_trial=20))[-1], dataset.load(dataset.trials[-1])
+    _, film = prepare_trial(plan)
+    for number in (19, 0, 7):
+        assert film.draw(slice(number, number + 1))[0].numpy().tobytes() == stored.frames[number].tobytes()

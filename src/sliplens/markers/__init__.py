@@ -1,11 +1,10 @@
 """Markers: found, followed, and what their displacement tells of the grip."""
 
 from sliplens.markers.detect import KINDS, Appearance, MarkerKind, Markers, detect_markers
-from sliplens.markers.doublets import Doublets, fit_doublets
 from sliplens.markers.tracker import Tracker, track_markers
 from sliplens.markers.tracks import DisplacementField, MarkerStatus, TrackedFrame, Tracks, interpolate_field
 
 __all__ = [
-    "KINDS", "Appearance", "DisplacementField", "Doublets", "MarkerKind", "MarkerStatus", "Markers", "TrackedFrame",
-    "Tracker", "Tracks", "detect_markers", "fit_doublets", "interpolate_field", "track_markers",
+    "KINDS", "Appearance", "DisplacementField", "MarkerKind", "MarkerStatus", "Markers", "TrackedFrame",
+    "Tracker", "Tracks", "detect_markers", "interpolate_field", "track_markers",
 ]  # fmt: skip

@@ -4,8 +4,6 @@ from sliplens.simulation.nuisances import Nuisances, Pulls
 from sliplens.simulation.plan import PRESETS, FrameTotals, SimulationRecipe, TrialPlan, make_recipe, plan_trials
 from sliplens.simulation.sensor import CHROMATOUCH, FLAT_GEL, SENSORS, Sensor
 from sliplens.simulation.trials import (
-    SimulatedFrame,
-    SimulatedFrames,
     simulate,
     simulate_dataset,
     simulate_examples,
@@ -13,7 +11,7 @@ from sliplens.simulation.trials import (
 )
 
 __all__ = [
-    "CHROMATOUCH", "FLAT_GEL", "PRESETS", "SENSORS", "FrameTotals", "Nuisances", "Pulls", "Sensor", "SimulatedFrame",
-    "SimulatedFrames", "SimulationRecipe", "TrialPlan", "make_recipe", "plan_trials", "simulate",
+    "CHROMATOUCH", "FLAT_GEL", "PRESETS", "SENSORS", "FrameTotals", "Nuisances", "Pulls", "Sensor",
+    "SimulationRecipe", "TrialPlan", "make_recipe", "plan_trials", "simulate",
     "simulate_dataset", "simulate_examples", "simulate_trial"
 ]  # fmt: skip
