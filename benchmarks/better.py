@@ -22,11 +22,11 @@ import torch
 from torch import Tensor
 
 from sliplens.errors import SliplensError
-from sliplens.explainers import PolyCam, capture, find_layers
-from sliplens.explainers.cam import find_published_layers
+from sliplens.explainers.attribution import combine
+from sliplens.explainers.cam import capture, find_layers, find_published_layers
 from sliplens.explainers.contract import frozen
-from sliplens.explainers.explanation import combine
 from sliplens.explainers.occlusion import marker_regions, markers_in_recording
+from sliplens.explainers.poly_cam import PolyCam
 from sliplens.faithfulness.controls import relevance_mass, relevance_rank
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import Units, score_maps, tile_units

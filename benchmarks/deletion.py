@@ -19,7 +19,8 @@ import torch
 
 from fairness import at_its_best, busy_process
 from sliplens.errors import SliplensError
-from sliplens.faithfulness import deletion_curves, get_fill, random_order
+from sliplens.faithfulness.fills import get_fill
+from sliplens.faithfulness.scoring import deletion_curves, random_order
 from sliplens.models.checkpoint import load
 from sliplens.models.engines import prepare
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial

@@ -16,7 +16,9 @@ import torch
 from torch import Tensor, nn
 from torchvision import models
 
-from sliplens.explainers import EXPLAINERS, GradCam, IntegratedGradients, get_explainer
+from sliplens.explainers.cam import GradCam
+from sliplens.explainers.gradients import IntegratedGradients
+from sliplens.explainers.table import EXPLAINERS, get_explainer
 from sliplens.extras import missing_packages
 from sliplens.files import machine, versions
 from sliplens.models.engines import counting_passes

@@ -26,8 +26,17 @@ from torch import Tensor
 
 from fairness import at_its_best, busy_process
 from sliplens.errors import SliplensError
-from sliplens.explainers import Explanation, PolyCam, capture, find_layers
-from sliplens.explainers.explanation import EXACT, effect_rounding, pearson_r, resize, to_masks, top_overlap
+from sliplens.explainers.attribution import (
+    EXACT,
+    Attribution,
+    effect_rounding,
+    pearson_r,
+    resize,
+    to_masks,
+    top_overlap,
+)
+from sliplens.explainers.cam import capture, find_layers
+from sliplens.explainers.poly_cam import PolyCam
 from sliplens.files import machine, versions
 from sliplens.models import Network
 from sliplens.models.checkpoint import load
@@ -77,7 +86,7 @@ def plain_loop(
     return (time.perf_counter() - started) * total / sum(map(len, effects)), effects
 
 
-def check_effects(explanation: Explanation, effects: list[dict[int, float]], *, change: float) -> float:
+def check_effects(explanation: Attribution, effects: list[dict[int, float]], *, change: float) -> float:
     """Largest difference between weights of the exact map and of the loop, as a share of the layer's largest weight."""
     worst = 0.0
     for level, found in zip(explanation.levels, effects, strict=True):

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 import sliplens as sl
+from sliplens.explainers.attribution import Attribution
 from sliplens.explainers.contract import Comparison, Method
-from sliplens.explainers.explanation import Explanation
 from sliplens.grip.controllers import Observation
 
 data = sl.simulate(dry_trials=4, wet_trials=1, days=4, frames_per_trial=40)
@@ -32,7 +32,7 @@ class Midpoint(Method):
 
     share: float = 0.5
 
-    def _explain(self, comparison: Comparison, *, on_progress: object) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: object) -> Attribution:
         added = comparison.images - comparison.reference
         point = (comparison.reference + self.share * added).requires_grad_()
         [gradient] = torch.autograd.grad(comparison.predict(point).sum(), point)

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.explainers import EXPLAINERS
+from sliplens.explainers.table import EXPLAINERS
 from sliplens.extras import Table
-from sliplens.faithfulness import FILLS
+from sliplens.faithfulness.fills import FILLS
 from sliplens.grip import CONDITIONS, CONTROLLERS
 from sliplens.grip.gripper import ROS_MESSAGES
 from sliplens.live.sinks import SINKS
@@ -79,7 +79,7 @@ def test_a_table_is_walked_without_importing_what_nobody_asks_for(install):
 
 
 def test_a_package_that_imports_sliplens_first_can_add_to_it(install):
-    code = "from sliplens.faithfulness import FILLS\nlist(FILLS)\nROW = FILLS['grey']\n"
+    code = "from sliplens.faithfulness.fills import FILLS\nlist(FILLS)\nROW = FILLS['grey']\n"
     install("sliplens.other", "other = other_rows:ROW", code=code)
     assert Table("fill", "sliplens.other", {})["other"] is FILLS["grey"]
 

@@ -16,7 +16,7 @@ from sliplens.errors import InputError, ShardError
 from sliplens.files import StoredPath, as_path, output_folder, remove
 from sliplens.parts import TRIES, read_status
 from sliplens.recordings import Dataset
-from sliplens.results.explanation import load_explained
+from sliplens.results.explanation import load_explanation
 from sliplens.shards import make_parts, make_table
 from sliplens.study.workspace import explain_source
 
@@ -189,7 +189,7 @@ def test_maps_in_a_store_are_those_on_disk(bucket: str, small_dataset: Dataset, 
     own = {"methods": ("grad-cam",), "levels": (1.0, 0.5)}
     explain_source(difference_run, small_dataset, out=tmp_path / "maps", **own)
     found = explain_source(difference_run, data, out=as_path(f"{bucket}/maps"), **own)
-    expected = load_explained(tmp_path / "maps")
+    expected = load_explanation(tmp_path / "maps")
     assert found.relevance["grad-cam"].tobytes() == expected.relevance["grad-cam"].tobytes()
     assert sorted(contents(as_path(f"{bucket}/maps"))) == sorted(contents(tmp_path / "maps"))
 

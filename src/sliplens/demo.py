@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sliplens.codec import load_record, load_result, save_record, save_result
 from sliplens.errors import InputError
-from sliplens.explainers import RECOMMENDED_METHOD
+from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.files import DIFFERENCE_NETWORK, output_folder, require_folder
 from sliplens.models.checkpoint import load
 from sliplens.progress import OnProgress, stage, wrote

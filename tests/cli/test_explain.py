@@ -12,13 +12,13 @@ from PIL import Image
 
 from sliplens.cli.explain import Explain
 from sliplens.errors import InputError, SliplensError
-from sliplens.explainers import EXPLAINERS
 from sliplens.explainers.occlusion import marker_regions
+from sliplens.explainers.table import EXPLAINERS
 from sliplens.files import read_json
 from sliplens.images import list_images, read_image
 from sliplens.recordings import Dataset
-from sliplens.results import load_explained
-from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
+from sliplens.results import load_explanation
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.study.workspace import draw_explained
 
 QUICK = ("--method", "grad-cam", "occlusion")
@@ -38,7 +38,7 @@ def refused(message: str, *words: object) -> None:
 def test_maps_overlays_and_a_panel(difference_run: Path, small_dataset: Dataset, tmp_path: Path, capsys):
     output = tmp_path / "maps"
     run(difference_run, small_dataset.folder, "-o", output, *QUICK, "--levels", 1, 0)
-    explained = load_explained(output)
+    explained = load_explanation(output)
     assert list(explained.relevance) == ["grad-cam", "occlusion"]
     for method in explained.relevance:
         assert explained.relevance[method].dtype == np.float32
@@ -63,10 +63,10 @@ def test_maps_overlays_and_a_panel(difference_run: Path, small_dataset: Dataset,
     assert "kept" in capsys.readouterr().out
 
 
-def of_relevance(relevance: np.ndarray) -> Explained:
+def of_relevance(relevance: np.ndarray) -> Explanation:
     """Explanations of grey frames 0, 1, ..."""
     frame = {"trial": "t", "condition": "dry", "safety_margin": 0.2, "prediction": 0.2, "reference_prediction": 1.0}
-    return Explained(
+    return Explanation(
         input="difference",
         source="real",
         weights_sha256="",
@@ -105,7 +105,7 @@ def test_a_panel_of_many_frames_shows_a_few_from_the_first_to_the_last(tmp_path:
 
 def test_without_a_method_the_recommended_one_explains(difference_run: Path, difference_folder: Path, tmp_path: Path):
     run(difference_run, "--frames", difference_folder, "-o", tmp_path / "maps")
-    explained = load_explained(tmp_path / "maps")
+    explained = load_explanation(tmp_path / "maps")
     assert list(explained.relevance) == ["shapley"]  # difference images show no markers
     for notes in explained.methods.values():
         assert all(re.match(r"[123] of 3 frames \(frame", warning) for warning in notes.warnings)
@@ -114,7 +114,7 @@ def test_without_a_method_the_recommended_one_explains(difference_run: Path, dif
 def test_colours_of_the_thesis(difference_run: Path, difference_folder: Path, tmp_path: Path):
     output = tmp_path / "maps"
     run(difference_run, "--frames", difference_folder, "-o", output, "--method", "grad-cam", "--colours", "jet")
-    explained = load_explained(output)
+    explained = load_explanation(output)
     frame, saliency = explained.frames[0], explained.saliency["grad-cam"][0]
     picture = read_image(output / "overlays" / "grad-cam" / f"{frame.id}.png").astype(int)
     row, column = np.unravel_index(saliency.argmax(), saliency.shape)
@@ -171,7 +171,7 @@ def test_markers_are_occluded_where_each_frame_has_them(
 
     monkeypatch.setattr("sliplens.study.workspace.markers_in_recording", places)
     run(difference_run, small_dataset.folder, "-o", tmp_path / "maps", "--method", "occlusion-marker")
-    explained = load_explained(tmp_path / "maps")
+    explained = load_explanation(tmp_path / "maps")
     assert asked == [frame.id for frame in explained.frames]
     for number, relevance in enumerate(explained.relevance["occlusion-marker"], start=1):
         regions = marker_regions((32, 32), MARKERS + number).numpy()

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torchvision import models
 
-from sliplens.explainers import IntegratedGradients
+from sliplens.explainers.gradients import IntegratedGradients
 
 SIZE = 64
 

@@ -8,7 +8,9 @@ import torch
 from quick import QUICK, SHORT
 from torch import Tensor, nn
 
-from sliplens.explainers import EXPLAINERS, ExpectedGradients, PolyCam
+from sliplens.explainers.gradients import ExpectedGradients
+from sliplens.explainers.poly_cam import PolyCam
+from sliplens.explainers.table import EXPLAINERS
 from sliplens.faithfulness.controls import control_maps, smooth_maps
 
 pytestmark = pytest.mark.usefixtures("short_guess")

@@ -5,7 +5,7 @@ from torch import nn
 from torchcam.methods import GradCAM, LayerCAM
 
 from sliplens.errors import InputError, ModelError
-from sliplens.explainers import GradCam, HiResCam, LayerCam, capture
+from sliplens.explainers.cam import GradCam, HiResCam, LayerCam, capture
 
 
 def captured(model: nn.Module, images, layer: str):

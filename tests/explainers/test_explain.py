@@ -7,8 +7,10 @@ from dots import draw_dots, make_grid
 
 import sliplens
 from sliplens.errors import ImageError, InputError
-from sliplens.explainers import GradCam, PolyCam, get_explainer
+from sliplens.explainers.cam import GradCam
 from sliplens.explainers.occlusion import marker_regions, markers_in_frame
+from sliplens.explainers.poly_cam import PolyCam
+from sliplens.explainers.table import get_explainer
 from sliplens.models import Network
 from sliplens.models.checkpoint import Manifest
 

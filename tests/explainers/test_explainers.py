@@ -7,19 +7,13 @@ import torch
 from torch import nn
 
 from sliplens.errors import ImageError, ModelError
-from sliplens.explainers import (
-    EXPLAINERS,
-    ExpectedGradients,
-    Explanation,
-    GradCam,
-    HiResCam,
-    IntegratedGradients,
-    LayerCam,
-    Occlusion,
-    PolyCam,
-    SmoothGrad,
-)
+from sliplens.explainers.attribution import Attribution
+from sliplens.explainers.cam import GradCam, HiResCam, LayerCam
+from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
+from sliplens.explainers.occlusion import Occlusion
+from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
+from sliplens.explainers.table import EXPLAINERS
 
 # LRP has laws of its own, in test_lrp.py; what the thesis ran is of f itself, and obeys none: test_thesis.py
 NAMES = [name for name in EXPLAINERS if name != "lrp" and not name.endswith("-thesis")]
@@ -268,8 +262,8 @@ def test_image_equal_to_its_reference_has_nothing_to_explain(name, network, imag
     assert "so there is next to nothing to explain" in explanation.warnings[0]
 
 
-def explanation_of(relevance, *, prediction: float, reference: float) -> Explanation:
-    return Explanation(
+def explanation_of(relevance, *, prediction: float, reference: float) -> Attribution:
+    return Attribution(
         images=torch.zeros(1, 3, len(relevance), len(relevance[0])),
         relevance=torch.tensor([relevance]),
         method="by hand",

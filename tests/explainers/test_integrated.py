@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from sliplens.errors import InputError
-from sliplens.explainers import IntegratedGradients
+from sliplens.explainers.gradients import IntegratedGradients
 
 
 class Linear(nn.Module):

@@ -4,7 +4,7 @@ from torch import nn
 from torchvision import models
 
 from sliplens.errors import ModelError
-from sliplens.explainers import capture, find_layers
+from sliplens.explainers.cam import capture, find_layers
 from sliplens.models import build_model
 
 

@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from sliplens.errors import InputError
-from sliplens.explainers import Lrp
+from sliplens.explainers.gradients import Lrp
 from sliplens.models.backbones import HistogramRegressor
 
 

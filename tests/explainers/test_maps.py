@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from sliplens.explainers.explanation import pearson_r, percentile_bounds, resize, spread, to_masks, top_overlap
+from sliplens.explainers.attribution import pearson_r, percentile_bounds, resize, spread, to_masks, top_overlap
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (7, 7), (5, 9), (112, 112)])

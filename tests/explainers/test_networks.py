@@ -6,7 +6,8 @@ import pytest
 import torch
 from quick import QUICK, SHORT
 
-from sliplens.explainers import EXPLAINERS, PolyCam
+from sliplens.explainers.poly_cam import PolyCam
+from sliplens.explainers.table import EXPLAINERS
 
 pytestmark = pytest.mark.usefixtures("short_guess")
 every_network = pytest.mark.parametrize("name", ["shufflenet", "resnet", "mobilenet", "vgg"])

@@ -3,8 +3,8 @@ import torch
 from torch import nn
 
 from sliplens.errors import InputError
-from sliplens.explainers import IntegratedGradients, Occlusion
-from sliplens.explainers.occlusion import marker_regions, tile_regions
+from sliplens.explainers.gradients import IntegratedGradients
+from sliplens.explainers.occlusion import Occlusion, marker_regions, tile_regions
 
 
 class Linear(nn.Module):

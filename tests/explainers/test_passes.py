@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from sliplens.errors import InputError, ModelError
-from sliplens.explainers import PolyCam
+from sliplens.explainers.poly_cam import PolyCam
 from sliplens.models.engines import ENGINES, counting_passes, prepare
 
 

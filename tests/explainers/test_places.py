@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from sliplens.errors import InputError
-from sliplens.explainers import find_markers
-from sliplens.explainers.occlusion import markers_in_recording
+from sliplens.explainers.occlusion import find_markers, markers_in_recording
 from sliplens.recordings import Recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 

@@ -10,8 +10,9 @@ import torch
 from torch import nn
 
 from sliplens.errors import InputError
-from sliplens.explainers import PolyCam, capture, find_layers
-from sliplens.explainers.explanation import EXACT, check_rounding, effect_rounding
+from sliplens.explainers.attribution import EXACT, check_rounding, effect_rounding
+from sliplens.explainers.cam import capture, find_layers
+from sliplens.explainers.poly_cam import PolyCam
 
 
 @lru_cache

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from sliplens.errors import InputError
-from sliplens.explainers import Likeness, PolyCam
-from sliplens.explainers.explanation import pearson_r, top_overlap
-from sliplens.explainers.poly_cam_budget import GaussianProcess
+from sliplens.explainers.attribution import pearson_r, top_overlap
+from sliplens.explainers.poly_cam import PolyCam
+from sliplens.explainers.poly_cam_budget import GaussianProcess, Likeness
 from sliplens.models import engines as passes
 
 

@@ -4,7 +4,9 @@ import pytest
 import torch
 from torch import nn
 
-from sliplens.explainers import EXPLAINERS, GradCam, IntegratedGradients, SmoothGrad
+from sliplens.explainers.cam import GradCam
+from sliplens.explainers.gradients import IntegratedGradients, SmoothGrad
+from sliplens.explainers.table import EXPLAINERS
 
 # noise as small as a flat network is flat for
 METHODS = dict(EXPLAINERS) | {"smooth-grad": SmoothGrad(samples=4, noise=0.01)}

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from sliplens.errors import InputError
-from sliplens.explainers import get_explainer
 from sliplens.explainers.occlusion import tile_regions
 from sliplens.explainers.shapley import Shapley, shapley_values
+from sliplens.explainers.table import get_explainer
 
 
 def by_definition(value, players: int) -> np.ndarray:

@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from sliplens.errors import ImageError, InputError
-from sliplens.explainers import ExpectedGradients, IntegratedGradients, SmoothGrad
+from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
 
 
 class Square(nn.Module):

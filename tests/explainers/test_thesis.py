@@ -8,9 +8,10 @@ from torchcam.methods import GradCAM
 from torchvision import models
 
 from sliplens.errors import InputError, ModelError
-from sliplens.explainers import PolyCam, capture, get_explainer
-from sliplens.explainers.cam import find_published_layers
-from sliplens.explainers.explanation import spread
+from sliplens.explainers.attribution import spread
+from sliplens.explainers.cam import capture, find_published_layers
+from sliplens.explainers.poly_cam import PolyCam
+from sliplens.explainers.table import get_explainer
 
 PUBLISHED = [
     "conv1",

@@ -4,8 +4,8 @@ import torch
 from known_ends import ends_of
 from torch import nn
 
-from sliplens.explainers import PolyCam
-from sliplens.explainers.explanation import change_of
+from sliplens.explainers.attribution import change_of
+from sliplens.explainers.poly_cam import PolyCam
 from sliplens.faithfulness.controls import (
     centre,
     control_maps,

@@ -5,14 +5,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError, SaliencyError
-from sliplens.faithfulness import (
+from sliplens.faithfulness.fills import get_fill
+from sliplens.faithfulness.scoring import (
     deletion_curves,
     deletion_order,
     deletion_score,
-    get_fill,
+    deletion_steps,
     random_order,
+    saliency_orders,
 )
-from sliplens.faithfulness.scoring import deletion_steps, saliency_orders
 
 
 def mean_of_pixels(images: torch.Tensor) -> torch.Tensor:

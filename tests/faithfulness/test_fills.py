@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from sliplens.errors import InputError
-from sliplens.faithfulness import FILLS, get_fill
-from sliplens.faithfulness.fills import NOISE_SD, noisy_linear
+from sliplens.faithfulness.fills import FILLS, NOISE_SD, get_fill, noisy_linear
 
 ALL = torch.ones(1, 40, 40, dtype=torch.bool)
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sliplens.errors import InputError
-from sliplens.faithfulness import get_fill
+from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import (
     AREAS,
     random_unit_order,

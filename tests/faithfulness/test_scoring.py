@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 import sliplens
 from sliplens.errors import InputError, SaliencyError
-from sliplens.faithfulness import score_by_deletion
 from sliplens.faithfulness.removal import AREAS
+from sliplens.faithfulness.scoring import score_by_deletion
 from sliplens.models import Network
 from sliplens.models.checkpoint import Manifest
 

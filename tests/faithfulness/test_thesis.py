@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from sliplens.faithfulness import deletion_curves, deletion_order, deletion_score, get_fill
+from sliplens.faithfulness.fills import get_fill
+from sliplens.faithfulness.scoring import deletion_curves, deletion_order, deletion_score
 from sliplens.images import read_image
 
 pytestmark = pytest.mark.real

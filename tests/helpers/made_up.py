@@ -12,7 +12,7 @@ from sliplens.files import Machine, Provenance
 from sliplens.recordings import TrialInfo
 from sliplens.recordings.dataset import write_dataset_table
 from sliplens.results.evaluation import Evaluation, LearningCurve, Reliability, ScoredFrames, Training
-from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore
 from sliplens.training.metrics import find_lead_times, risk_coverage, score_predictions
 
@@ -222,8 +222,8 @@ def explained(
     saliency: dict[str, np.ndarray],
     *,
     source: str = "simulated",
-) -> Explained:
-    return Explained(
+) -> Explanation:
+    return Explanation(
         input=name,
         source=source,
         weights_sha256="none",

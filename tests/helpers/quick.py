@@ -2,7 +2,8 @@
 
 import torch
 
-from sliplens.explainers import ExpectedGradients, IntegratedGradients, Occlusion, SmoothGrad
+from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
+from sliplens.explainers.occlusion import Occlusion
 from sliplens.explainers.shapley import Shapley
 
 SHORT = IntegratedGradients(steps=8, max_steps=40)

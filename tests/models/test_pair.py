@@ -9,8 +9,8 @@ import torch
 
 import sliplens as sl
 from sliplens.errors import InputError, ModelError
-from sliplens.explainers import explain
-from sliplens.faithfulness import FILLS, get_fill
+from sliplens.explainers.table import explain
+from sliplens.faithfulness.fills import FILLS, get_fill
 from sliplens.models import Network, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import REFERENCE_SIGNS, with_reference
 from sliplens.recordings import Dataset, Recording

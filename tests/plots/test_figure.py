@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.explainers import Explanation
+from sliplens.explainers.attribution import Attribution
 from sliplens.models.predictions import Predictions
 from sliplens.report import load_results
 from sliplens.results.evaluation import ScoredFrames
@@ -23,10 +23,10 @@ def results(tmp_path_factory):
 
 
 @pytest.fixture
-def explanation() -> Explanation:
+def explanation() -> Attribution:
     relevance = torch.zeros(2, 8, 8)
     relevance[1, 2, 3], relevance[1, 6, 6] = 0.4, -0.4
-    return Explanation(
+    return Attribution(
         images=torch.full((2, 3, 8, 8), 0.5),
         relevance=relevance.requires_grad_(),
         method="grad-cam",

@@ -27,7 +27,7 @@ from sliplens.recordings.source import open_source
 from sliplens.recordings.store import forces_path, read_header
 from sliplens.recordings.trial import SIGNALS
 from sliplens.recordings.trial_writer import import_trial
-from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 rerun = pytest.importorskip("rerun")
@@ -320,11 +320,11 @@ def test_frames_of_any_source_and_explained_ones_are_viewed_alike(trial: Recordi
     np.testing.assert_allclose(numbers(found, "margin/gamma"), 100 * trial.safety_margin[[3, 9]])
 
 
-def explained_of(trial: Recording, frames: list[int]) -> Explained:
+def explained_of(trial: Recording, frames: list[int]) -> Explanation:
     """Maps of some frames of a trial, drawn by chance."""
     relevance = np.random.default_rng(1).normal(0, 1, (len(frames), 224, 224)).astype(np.float32)
     labels = [float(margin) if np.isfinite(margin) else None for margin in trial.safety_margin[frames]]
-    return Explained(
+    return Explanation(
         input="difference",
         source="simulated",
         weights_sha256="",

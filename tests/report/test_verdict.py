@@ -5,7 +5,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sliplens.explainers.explanation import check_slopes
+from sliplens.explainers.attribution import check_slopes
 from sliplens.report import load_results
 from sliplens.report.verdict import Statement, count_alarms, group_alarms, judge
 

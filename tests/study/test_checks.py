@@ -8,7 +8,9 @@ import torch
 from known_ends import ends_of
 from torch import Tensor, nn
 
-from sliplens.explainers import Explanation, IntegratedGradients, get_explainer
+from sliplens.explainers.attribution import Attribution
+from sliplens.explainers.gradients import IntegratedGradients
+from sliplens.explainers.table import get_explainer
 from sliplens.faithfulness.controls import cascade, gini, total_variation
 from sliplens.recordings import Dataset
 from sliplens.results.faithfulness import NEW_WEIGHTS
@@ -21,8 +23,8 @@ from sliplens.study.scoring import Removal, Setting, influences
 class ShowsTheImage:
     """An explainer that never asks the network."""
 
-    def __call__(self, _model: nn.Module, images: Tensor, **_options: object) -> Explanation:
-        return Explanation(
+    def __call__(self, _model: nn.Module, images: Tensor, **_options: object) -> Attribution:
+        return Attribution(
             images=images,
             relevance=images.mean(dim=1),
             method="image",
@@ -61,7 +63,7 @@ def test_a_map_that_only_turns_its_sign_with_the_answers_is_as_similar(material:
     class FollowsTheSign(ShowsTheImage):
         """The image again, as what raises the answer of the trained network and lowers that of every other."""
 
-        def __call__(self, model: nn.Module, images: Tensor, **options: object) -> Explanation:
+        def __call__(self, model: nn.Module, images: Tensor, **options: object) -> Attribution:
             found, sign = super().__call__(model, images, **options), 1 if model is material.trained.model else -1
             return replace(found, relevance=sign * found.relevance, prediction=sign * found.prediction)
 

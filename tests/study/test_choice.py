@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from sliplens.errors import InputError, RecordingError
 from sliplens.models import Network
 from sliplens.recordings import Dataset
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.results.study import Choice
 from sliplens.study.choice import Material, choose_frames, worth_scoring
 
@@ -48,7 +48,7 @@ def test_one_trial_is_shown_whole_and_every_trial_is_scored_at_three_levels(choi
 def test_frames_with_nothing_to_explain_are_not_scored(material: Material):
     explained = material.explained
 
-    def changing_by(*changes: float) -> Explained:
+    def changing_by(*changes: float) -> Explanation:
         frames = zip(explained.frames, changes, strict=True)
         changed = (replace(one, prediction=one.reference_prediction + by) for one, by in frames)
         return replace(explained, frames=tuple(changed))

@@ -9,11 +9,12 @@ import torch
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import CheckpointError, InputError, SliplensError
-from sliplens.explainers import EXPLAINERS, Explanation
+from sliplens.explainers.attribution import Attribution
+from sliplens.explainers.table import EXPLAINERS
 from sliplens.files import output_folder
 from sliplens.models import Network, load_checkpoint
 from sliplens.recordings import Dataset
-from sliplens.results import Explained, load_explained
+from sliplens.results import Explanation, load_explanation
 from sliplens.results.faithfulness import DeletionScores
 from sliplens.study import explain_frames, frames_from_dataset, score_explained
 from sliplens.study.explaining import network_inputs
@@ -26,7 +27,7 @@ def trained(difference_run: Path) -> Network:
     return load_checkpoint(difference_run)
 
 
-def explain(trained: Network, data: Dataset, target: Path, **more: object) -> Explained:
+def explain(trained: Network, data: Dataset, target: Path, **more: object) -> Explanation:
     chosen = frames_from_dataset(trained, data, levels=(1.0, 0.0))
     config = {"weights_sha256": trained.manifest.weights_sha256}
     with output_folder(target, stage="explain", config=config) as out:
@@ -46,7 +47,7 @@ def explanations(trained: Network, small_dataset: Dataset, tmp_path_factory: pyt
 
 def test_explanations_come_back_without_loss(trained: Network, small_dataset: Dataset, tmp_path: Path):
     written = explain(trained, small_dataset, tmp_path / "maps")
-    back = load_explained(tmp_path / "maps")
+    back = load_explanation(tmp_path / "maps")
     assert back.frames == written.frames
     np.testing.assert_array_equal(back.images, written.images)
     np.testing.assert_array_equal(back.pictures, written.pictures)
@@ -57,7 +58,7 @@ def test_explanations_come_back_without_loss(trained: Network, small_dataset: Da
 
 
 def test_the_table_holds_the_networks_answers(trained: Network, explanations: Path):
-    back = load_explained(explanations)
+    back = load_explanation(explanations)
     answers = trained.predict(network_inputs(trained, back))
     np.testing.assert_allclose([frame.prediction for frame in back.frames], answers.numpy(), atol=1e-6)
 
@@ -86,7 +87,7 @@ def test_an_interrupted_explanation_goes_on_after_the_last_map(
 
     explain(trained, small_dataset, tmp_path / "maps", on_progress=look)
     assert before.items() <= seen.items()  # the three maps were not made again
-    first, second = load_explained(explanations), load_explained(tmp_path / "maps")
+    first, second = load_explanation(explanations), load_explanation(tmp_path / "maps")
     for method in METHODS:
         np.testing.assert_array_equal(first.relevance[method], second.relevance[method])
 
@@ -95,14 +96,14 @@ def test_maps_are_the_same_in_another_process(
     trained: Network, small_dataset: Dataset, explanations: Path, tmp_path: Path, elsewhere: str
 ):
     explain(trained, small_dataset, tmp_path / "maps", on=elsewhere)
-    first, second = load_explained(explanations), load_explained(tmp_path / "maps")
+    first, second = load_explanation(explanations), load_explanation(tmp_path / "maps")
     for method in METHODS:
         np.testing.assert_array_equal(first.relevance[method], second.relevance[method])
         np.testing.assert_array_equal(first.saliency[method], second.saliency[method])
 
 
 def test_a_map_that_is_not_finite_is_told_and_not_kept(trained: Network, small_dataset: Dataset, tmp_path: Path):
-    def holes(*given: Any, **options: Any) -> Explanation:
+    def holes(*given: Any, **options: Any) -> Attribution:
         found = EXPLAINERS["grad-cam"](*given, **options)
         found.relevance[:, :2, 0] = torch.nan
         return found
@@ -130,7 +131,7 @@ def change_maps(explanations: Path, tmp_path: Path, **changes: np.ndarray) -> Pa
 def test_a_map_of_another_shape_is_refused(explanations: Path, tmp_path: Path):
     folder = change_maps(explanations, tmp_path, **{"relevance/grad-cam": np.zeros((2, 32, 31), np.float32)})
     with pytest.raises(InputError, match=r"holds float32 of shape \(2, 32, 31\) as 'relevance/grad-cam' where"):
-        load_explained(folder)
+        load_explanation(folder)
 
 
 def test_a_missing_map_is_refused(explanations: Path, tmp_path: Path):
@@ -139,25 +140,25 @@ def test_a_missing_map_is_refused(explanations: Path, tmp_path: Path):
         InputError,
         match=r"holds float32 of shape \(1, 32, 32\) as 'relevance/grad-cam' where",
     ):
-        load_explained(folder)
+        load_explanation(folder)
 
 
 def test_truncated_maps_are_refused(explanations: Path, tmp_path: Path):
     folder = change_maps(explanations, tmp_path)
     (folder / "arrays.npz").write_bytes((folder / "arrays.npz").read_bytes()[:500])
     with pytest.raises(InputError, match=r"arrays\.npz cannot be read as arrays .*; .*`sliplens explain`"):
-        load_explained(folder)
+        load_explanation(folder)
 
 
 def test_a_folder_of_another_stage_is_refused(tmp_path: Path):
     with output_folder(tmp_path / "run", stage="train", config={}) as out:
         (out.folder / "result.json").write_text("{}")
     with pytest.raises(InputError, match="holds no explanations; make them with sliplens explain"):
-        load_explained(tmp_path / "run")
+        load_explanation(tmp_path / "run")
 
 
 def test_scores_follow_from_the_stored_curves(trained: Network, explanations: Path, tmp_path: Path):
-    explained = load_explained(explanations)
+    explained = load_explanation(explanations)
     save_result(score_explained(trained, explained, steps=8), tmp_path)
     scored = load_result(tmp_path, DeletionScores, command="sliplens score")
     assert set(scored.methods) == {*METHODS, "random"}
@@ -173,7 +174,7 @@ def test_scores_follow_from_the_stored_curves(trained: Network, explanations: Pa
 
 def test_explanations_of_another_network_are_refused(raw_run: Path, explanations: Path):
     with pytest.raises(CheckpointError, match="made with another network; explain the frames again with this run"):
-        score_explained(load_checkpoint(raw_run), load_explained(explanations))
+        score_explained(load_checkpoint(raw_run), load_explanation(explanations))
 
 
 def test_alarms_say_when_the_fill_decides_and_when_no_method_beats_chance(trained: Network, explanations: Path):
@@ -181,6 +182,6 @@ def test_alarms_say_when_the_fill_decides_and_when_no_method_beats_chance(traine
         def forward(self, images: torch.Tensor) -> torch.Tensor:
             return torch.full((len(images), 1), 0.7)
 
-    result = score_explained(replace(trained, model=Stubborn()), load_explained(explanations), steps=4)
+    result = score_explained(replace(trained, model=Stubborn()), load_explanation(explanations), steps=4)
     assert "the fill decides in 2 of 2 frames" in result.alarms[0]
     assert "grad-cam does not beat a random order (1.000 against 1.000)" in result.alarms

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from sliplens.codec import load_result, save_result
-from sliplens.faithfulness import deletion_order
+from sliplens.faithfulness.scoring import deletion_order
 from sliplens.results.faithfulness import Remedies
 from sliplens.study import score_explained
 from sliplens.study.choice import Material

@@ -3,7 +3,7 @@ import pytest
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import RecordingError
-from sliplens.explainers import RECOMMENDED_METHOD
+from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.models import load_checkpoint
 from sliplens.results.explanation import Strip
 from sliplens.study.workspace import explain_trial
@@ -29,7 +29,7 @@ def test_a_strip_shows_the_frames_nearest_to_its_levels(strip):
     assert np.array_equal(strip.pictures, make_recording("t").frames[list(strip.shown)])
 
 
-def test_a_strip_is_explained_by_the_recommended_method_of_tiles_where_no_markers_show(strip):
+def test_a_strip_is_explanation_by_the_recommended_method_of_tiles_where_no_markers_show(strip):
     assert strip.method == RECOMMENDED_METHOD.removesuffix("-marker")
 
 

@@ -17,7 +17,7 @@ from sliplens.faithfulness.removal import SHARES, unit_means
 from sliplens.files import output_folder
 from sliplens.models import Manifest, Network
 from sliplens.recordings import Dataset, load_dataset
-from sliplens.results import Explained, ExplainedFrame
+from sliplens.results import ExplainedFrame, Explanation
 from sliplens.results.explanation import MethodNotes
 from sliplens.results.study import Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
@@ -95,18 +95,18 @@ def run_of(model: nn.Module, *, input: str = "amplitude") -> Network:
 
 
 @pytest.fixture(scope="module")
-def explained(trained: Network, data: Dataset) -> Explained:
+def explained(trained: Network, data: Dataset) -> Explanation:
     return explain(trained, data)
 
 
-def explain(trained: Network, data: Dataset) -> Explained:
+def explain(trained: Network, data: Dataset) -> Explanation:
     chosen = frames_from_dataset(trained, data, levels=LEVELS)
     inputs = trained.encoding.normalise(chosen.images)
     assert isinstance(trained.model, Linear)
     # what each pixel adds to the answer
     attribution = (inputs * trained.model.weight).sum(dim=1).detach().numpy()
     answers, empty = trained.predict(inputs), trained.predict(chosen.references)
-    return Explained(
+    return Explanation(
         input="amplitude",
         source=chosen.source,
         frames=tuple(
@@ -130,20 +130,20 @@ def explain(trained: Network, data: Dataset) -> Explained:
 
 
 @pytest.fixture(scope="module")
-def given(trained: Network, explained: Explained, data: Dataset) -> tuple[Network, Explained, Dataset]:
+def given(trained: Network, explained: Explanation, data: Dataset) -> tuple[Network, Explanation, Dataset]:
     return trained, explained, data
 
 
 @pytest.fixture(scope="module")
-def maps(trained: Network, explained: Explained) -> dict[str, np.ndarray]:
+def maps(trained: Network, explained: Explanation) -> dict[str, np.ndarray]:
     return maps_of(trained, explained)
 
 
-def judge(trained: Network, explained: Explained, data: Dataset, **more: Any) -> JudgingByTruth:
+def judge(trained: Network, explained: Explanation, data: Dataset, **more: Any) -> JudgingByTruth:
     return JudgingByTruth(trained=trained, explained=explained, data=data, **more)
 
 
-def maps_of(trained: Network, explained: Explained) -> dict[str, np.ndarray]:
+def maps_of(trained: Network, explained: Explanation) -> dict[str, np.ndarray]:
     inputs = network_inputs(trained, explained)
     towards = explained.towards[:, None, None]
     controls = control_maps(trained.model, inputs, torch.zeros_like(inputs))
@@ -158,7 +158,7 @@ def judged(trained, explained, data, maps, tmp_path_factory) -> Truth:
 
 
 @pytest.fixture(scope="module")
-def two_signed(data) -> tuple[Network, Explained, Truth]:
+def two_signed(data) -> tuple[Network, Explanation, Truth]:
     """A network to which markers speak for and against the answer, what it answers, and its judgement."""
     trained = run_of(Linear(two_signed=True))
     explained = explain(trained, data)
@@ -372,7 +372,7 @@ def test_a_summary_of_one_trial_names_no_interval(judged):
 
 
 def test_an_interrupted_judgement_goes_on_after_the_last_frame(
-    given: tuple[Network, Explained, Dataset], maps: dict[str, np.ndarray], judged: Truth, tmp_path: Path
+    given: tuple[Network, Explanation, Dataset], maps: dict[str, np.ndarray], judged: Truth, tmp_path: Path
 ):
     def interrupt(done: int, total: int) -> None:
         assert total == len(LEVELS)
@@ -431,7 +431,7 @@ def test_half_of_the_effects_are_shuffled(rng):
 def test_frames_of_other_data_are_refused(given, maps, small_dataset):
     trained, explained, data = given
 
-    def refuse(explained: Explained, data: Dataset = data) -> None:
+    def refuse(explained: Explanation, data: Dataset = data) -> None:
         judge(trained, explained, data, maps=maps).make()
 
     with pytest.raises(InputError, match="was recorded: what each marker does is known of simulated frames alone"):

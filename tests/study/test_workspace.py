@@ -7,7 +7,7 @@ import pytest
 
 from sliplens.errors import CheckpointError, InputError
 from sliplens.recordings import Dataset
-from sliplens.results import load_explained
+from sliplens.results import load_explanation
 from sliplens.study import explain_source, score_explained
 
 LEVELS = (1.0, 0.0)
@@ -24,7 +24,7 @@ def test_a_folder_holds_what_is_given_back_without_one(difference_run: Path, sma
     assert told[-1] == (2, 2)
     kept = explain_source(**run, out=tmp_path / "maps")
     np.testing.assert_array_equal(kept.relevance["grad-cam"], explained.relevance["grad-cam"])
-    assert kept.frames == explained.frames == load_explained(tmp_path / "maps").frames
+    assert kept.frames == explained.frames == load_explanation(tmp_path / "maps").frames
     again = explain_source(**run, out=tmp_path / "maps", on_progress=on_progress)
     assert len(told) == 2  # nothing was explained again
     assert again.methods == kept.methods

@@ -18,7 +18,7 @@ from PIL import Image
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from sliplens.errors import SliplensError
-from sliplens.explainers.explanation import CLOSE, Explanation
+from sliplens.explainers.attribution import CLOSE, Attribution
 from sliplens.explainers.occlusion import marker_regions, to_network_px
 from sliplens.explainers.table import RECOMMENDED_METHOD, explain
 from sliplens.files import to_builtins
@@ -390,7 +390,7 @@ def _arrows(markers_px: tuple[np.ndarray, np.ndarray] | None) -> tuple[Arrow, ..
     )
 
 
-def _marker_relevance(explanation: Explanation, picture: Picture) -> tuple[MarkerRelevance, ...]:
+def _marker_relevance(explanation: Attribution, picture: Picture) -> tuple[MarkerRelevance, ...]:
     """Sum of the relevance around each marker."""
     if len(picture.arrows) < 2:
         return ()

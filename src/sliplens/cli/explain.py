@@ -91,7 +91,7 @@ class Explain(Command):
 
 
 def _print_methods() -> None:
-    from sliplens.explainers import EXPLAINERS
+    from sliplens.explainers.table import EXPLAINERS
 
     said = {name: (type(explainer).__doc__ or "").strip() for name, explainer in EXPLAINERS.items()}
     as_published = "as published, the way the thesis ran it"

@@ -41,7 +41,7 @@ class View(SourceCommand):
     def run(self) -> None:
         """Open the viewer, or write its file."""
         from sliplens.plots.viewer import Beside, open_viewer, require_rerun, require_rrd_path, write_rrd
-        from sliplens.results.explanation import is_explained, load_explained
+        from sliplens.results.explanation import is_explanation, load_explanation
 
         require_rerun()
         if self.output is not None:
@@ -50,9 +50,9 @@ class View(SourceCommand):
         table, maps = self.predictions, self.maps
         if self.source.suffix == ".parquet":
             table = self.source
-        elif is_explained(self.source):
+        elif is_explanation(self.source):
             maps = self.source
-        explained = None if maps is None else load_explained(maps)
+        explained = None if maps is None else load_explanation(maps)
         viewed = self._open()
         with Terminal().stage(f"Reading {viewed.trial.trial}") as bar:
             beside = Beside(predictions=table, maps=explained, tracks=self.tracks)
@@ -73,11 +73,11 @@ class View(SourceCommand):
         from sliplens.recordings import load_dataset
         from sliplens.recordings.dataset import DATASET_FILE
         from sliplens.recordings.source import open_source
-        from sliplens.results.explanation import is_explained, load_explained
+        from sliplens.results.explanation import is_explanation, load_explanation
 
         source, trial = self.source, self.trial
-        if is_explained(source):
-            return view_explained(load_explained(source))
+        if is_explanation(source):
+            return view_explained(load_explanation(source))
         if source.suffix == ".parquet":
             source, first = self._source_of(source)
             trial = trial or first

@@ -15,8 +15,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
+from sliplens.explainers.attribution import Attribution, check_slopes, scale_to, spread
 from sliplens.explainers.contract import Comparison, Method, frozen, require_at_least_one
-from sliplens.explainers.explanation import Explanation, check_slopes, scale_to, spread
 from sliplens.progress import OnProgress
 
 
@@ -262,7 +262,7 @@ class _Cam(Method):
     def __post_init__(self) -> None:
         require_at_least_one(type(self).__name__, batch_size=self.batch_size)
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
         layer = self._find_layer(comparison)
         maps, predictions, reference_predictions = [], [], []
         empty = reference_prediction = torch.empty(0)

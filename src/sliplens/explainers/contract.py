@@ -13,7 +13,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from sliplens.errors import ImageError, InputError, ModelError
-from sliplens.explainers.explanation import Explanation, check_maps, frame_of
+from sliplens.explainers.attribution import Attribution, check_maps, frame_of
 from sliplens.models.engines import Engine, prepare
 from sliplens.progress import OnProgress, counted
 
@@ -124,12 +124,12 @@ class Comparison:
         target: str = "f(x) - f(reference)",
         warnings: Iterable[str] = (),
         **others: Any,
-    ) -> Explanation:
+    ) -> Attribution:
         """Record of an explanation, with its warnings; the others are its fields as they are."""
         gap = (relevance.sum(dim=(1, 2)) - self.change).abs().float() if complete else None
         single = relevance.float()
         predictions = {"prediction": self.prediction, "reference_prediction": self.reference_prediction}
-        return Explanation(
+        return Attribution(
             images=self.images.float(),
             relevance=single,
             target=target,
@@ -236,7 +236,7 @@ class Explainer(Protocol):
 
     def __call__(
         self, model: nn.Module, images: Batch, *, reference: Batch | None = None, on_progress: OnProgress | None = None
-    ) -> Explanation:
+    ) -> Attribution:
         """Explain f(x) - f(reference) of a regressor with one output.
 
         Parameters
@@ -266,7 +266,7 @@ class Method(ABC):
 
     def __call__(
         self, model: nn.Module, images: Batch, *, reference: Batch | None = None, on_progress: OnProgress | None = None
-    ) -> Explanation:
+    ) -> Attribution:
         """Explain a batch; see `Explainer` for the arguments and errors."""
         start = time.perf_counter()
         with freeze(model, images, reference=reference) as comparison:
@@ -276,7 +276,7 @@ class Method(ABC):
         return replace(explanation, seconds=time.perf_counter() - start)
 
     @abstractmethod
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
         """Explain the images (`Comparison.explanation`); gradients are on."""
 
 

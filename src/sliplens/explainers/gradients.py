@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor, fx, nn
 
 from sliplens.errors import InputError
+from sliplens.explainers.attribution import Attribution, check_slopes, frame_of, with_reference_of
 from sliplens.explainers.contract import Comparison, Method, black_frames, freeze, require_at_least_one
-from sliplens.explainers.explanation import Explanation, check_slopes, frame_of, with_reference_of
 from sliplens.extras import require_packages
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.engines import fold_batch_norm
@@ -49,7 +49,7 @@ class IntegratedGradients(Method):
     A network that reads the mean brightness, and an image with one bright pixel:
 
     >>> import torch
-    >>> from sliplens.explainers import IntegratedGradients
+    >>> from sliplens.explainers.gradients import IntegratedGradients
     >>> network = torch.nn.Sequential(torch.nn.AdaptiveAvgPool3d(1), torch.nn.Flatten())
     >>> images = torch.zeros(1, 3, 2, 2)
     >>> images[0, :, 0, 1] = 1.0
@@ -81,7 +81,7 @@ class IntegratedGradients(Method):
         if not self.tolerance > 0:
             raise InputError(f"integrated gradients' tolerance is {self.tolerance}; give a share above 0")
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
         black, slopes = comparison, []
         if self.black:
             black = replace(comparison, references=black_frames(comparison.references))
@@ -181,7 +181,7 @@ class ExpectedGradients(Method):
     integrated: IntegratedGradients = field(default_factory=IntegratedGradients)
     """How each line is integrated."""
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
         def behind(index: int) -> Comparison:
             """What an image is compared with, checked as images are, and brought to the network's type."""
             image = comparison.images[index]
@@ -235,7 +235,7 @@ class SmoothGrad(Method):
         if not self.noise >= 0:
             raise InputError(f"SmoothGrad's noise is {self.noise}; give a standard deviation of at least 0")
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
         change = comparison.change.tolist()
 
         def smoothed(index: int) -> Tensor:
@@ -288,7 +288,7 @@ class Lrp(Method):
 
     batch_size: int = 32
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
         require_packages("zennit", extra="lrp", purpose="LRP")
         prediction = comparison.prediction
         copy = fold_batch_norm(comparison.model)

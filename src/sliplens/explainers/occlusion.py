@@ -11,8 +11,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sliplens.errors import InputError
+from sliplens.explainers.attribution import Attribution, frame_of
 from sliplens.explainers.contract import Comparison, Method, require_at_least_one
-from sliplens.explainers.explanation import Explanation, frame_of
 from sliplens.markers import detect_markers
 from sliplens.progress import OnProgress
 from sliplens.recordings import Recording
@@ -166,7 +166,7 @@ class Occlusion(RegionMethod):
         require_at_least_one(self._name, batch_size=self.batch_size)
 
     @torch.no_grad()
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
         tiles = -(-comparison.images.shape[-2] // self.tile_px) * -(-comparison.images.shape[-1] // self.tile_px)
         engine = comparison.prepare(len(comparison.images) * tiles)  # markers are about as many
 

@@ -10,11 +10,9 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from sliplens.errors import InputError
-from sliplens.explainers.cam import Layer, capture, find_layers, find_published_layers
-from sliplens.explainers.contract import Comparison, Method, black_frames
-from sliplens.explainers.explanation import (
+from sliplens.explainers.attribution import (
     Approximation,
-    Explanation,
+    Attribution,
     Level,
     change_of,
     check_approximations,
@@ -26,6 +24,8 @@ from sliplens.explainers.explanation import (
     scale_to,
     to_masks,
 )
+from sliplens.explainers.cam import Layer, capture, find_layers, find_published_layers
+from sliplens.explainers.contract import Comparison, Method, black_frames
 from sliplens.explainers.poly_cam_budget import ChannelSearch, GaussianProcess, Likeness, mask_kernel
 from sliplens.models.engines import Engine
 from sliplens.progress import OnProgress
@@ -168,7 +168,7 @@ class PolyCam(Method):
     that have no part in it, and cost no pass."""
     budget: float = 1.0
     """Share of the channels to measure at first, in (0, 1]; 1 for the exact map. The other channels' weights are
-    estimated, and `Explanation.approximations` says what the map is expected to have in common with the exact one."""
+    estimated, and `Attribution.approximations` says what the map is expected to have in common with the exact one."""
     likeness: Likeness | None = Likeness()  # noqa: RUF009 (frozen)
     """What that should be: channels are measured until it is expected. None to stop at the budget."""
     engine: str = "auto"
@@ -189,7 +189,7 @@ class PolyCam(Method):
             raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
 
     @torch.no_grad()
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
         """Progress counts the channels of every image."""
         change = comparison.change.tolist()
         layers = self._find_layers(comparison)

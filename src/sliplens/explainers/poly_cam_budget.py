@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from sliplens.errors import InputError
-from sliplens.explainers.explanation import ALIKE_R, ALIKE_TOP, FLOOR, Approximation, layer_map, pearson_r, top_overlap
+from sliplens.explainers.attribution import ALIKE_R, ALIKE_TOP, FLOOR, Approximation, layer_map, pearson_r, top_overlap
 
 _GRID = 14  # cells a side on which masks are compared; more cells told nothing more
 _LENGTH = 3.0  # of the kernel, in median distances between masks

@@ -11,8 +11,8 @@ from scipy.special import comb
 from torch import Tensor
 
 from sliplens.errors import InputError
+from sliplens.explainers.attribution import Attribution
 from sliplens.explainers.contract import Comparison
-from sliplens.explainers.explanation import Explanation
 from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import RegionMethod
 from sliplens.progress import OnProgress
@@ -170,7 +170,7 @@ class Shapley(RegionMethod):
     seed: int = 0
 
     @torch.no_grad()
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Explanation:
+    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
         with torch.enable_grad():
             gradients = _GUESS._explain(comparison, on_progress=None).relevance.double().cpu()
         engine = comparison.prepare(2 * self.pairs * len(comparison.images))

@@ -10,9 +10,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sliplens.errors import ImageError, InputError, SliplensError
+from sliplens.explainers.attribution import Attribution
 from sliplens.explainers.cam import GradCam, HiResCam, LayerCam
 from sliplens.explainers.contract import Explainer
-from sliplens.explainers.explanation import Explanation
 from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, Lrp, SmoothGrad
 from sliplens.explainers.occlusion import KnownMarkers, Occlusion, RegionMethod, find_markers, markers_in_frame
 from sliplens.explainers.poly_cam import PolyCam
@@ -62,7 +62,7 @@ def explain(
     method: str | Explainer | None = None,
     on_progress: OnProgress | None = None,
     **options: Any,
-) -> Explanation:
+) -> Attribution:
     """Explain why a network reads these safety margins rather than that of the untouched sensor.
 
     Parameters
@@ -89,7 +89,7 @@ def explain(
     Examples
     --------
     >>> import numpy as np
-    >>> from sliplens.explainers import explain
+    >>> from sliplens.explainers.table import explain
     >>> touched = np.zeros((1, 224, 224, 3), dtype=np.uint8)
     >>> touched[:, 80:120, 90:150] = 90
     >>> explanation = explain("chromatouch-difference", touched, method="grad-cam")
@@ -126,7 +126,7 @@ def get_explainer(method: str, **options: Any) -> Explainer:
 
     Examples
     --------
-    >>> from sliplens.explainers import get_explainer
+    >>> from sliplens.explainers.table import get_explainer
     >>> get_explainer("occlusion", tile_px=8).tile_px
     8
     """

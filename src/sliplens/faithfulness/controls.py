@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
+from sliplens.explainers.attribution import change_of, combine, frame_of, local_change, pearson_r
 from sliplens.explainers.cam import capture, recall_layers
-from sliplens.explainers.explanation import change_of, combine, frame_of, local_change, pearson_r
 from sliplens.intervals import paired_difference
 from sliplens.results.explanation import require_saliency
 from sliplens.results.faithfulness import CHANCE, Lead

@@ -9,7 +9,7 @@ from torch.nn import functional
 from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import InputError
-from sliplens.explainers.explanation import frame_of
+from sliplens.explainers.attribution import frame_of
 from sliplens.extras import Table
 
 NOISE_SD = 0.01
@@ -185,7 +185,7 @@ def get_fill(name: str) -> Fill:
     Examples
     --------
     >>> import torch
-    >>> from sliplens.faithfulness import get_fill
+    >>> from sliplens.faithfulness.fills import get_fill
     >>> images = torch.ones(1, 3, 1, 2)
     >>> paint = get_fill("grey")(images, None, 0)
     >>> paint(torch.tensor([0]), torch.tensor([[[True, False]]]))[0, 0]

@@ -112,7 +112,7 @@ class Faithfulness:
     Examples
     --------
     >>> import numpy as np
-    >>> from sliplens.faithfulness import Faithfulness
+    >>> from sliplens.faithfulness.removal import Faithfulness
     >>> first, last, random = [[0, 0.4, 0.4]], [[0, 0.0, 0.4]], [[0, 0.2, 0.4]]
     >>> faithfulness = Faithfulness(areas=np.array([0, 0.5, 1.0]), curves=np.array([first, last, random]))
     >>> faithfulness.symmetric_gain, faithfulness.at(0.5)[0]

@@ -14,8 +14,7 @@ from scipy.stats import kendalltau
 from torch import Tensor
 
 from sliplens.errors import InputError, SaliencyError
-from sliplens.explainers import Explanation
-from sliplens.explainers.explanation import CLOSE
+from sliplens.explainers.attribution import CLOSE, Attribution
 from sliplens.explainers.table import network_inputs
 from sliplens.faithfulness.controls import control_maps
 from sliplens.faithfulness.fills import Fill, get_fill
@@ -83,7 +82,7 @@ def deletion_score(
     Examples
     --------
     >>> import numpy as np
-    >>> from sliplens.faithfulness import deletion_score
+    >>> from sliplens.faithfulness.scoring import deletion_score
     >>> deletion_score(np.array(0.9), np.array([0.9, 0.4])).round(2)  # nothing destroyed; half of the range
     array([1.  , 0.25])
     """
@@ -96,7 +95,7 @@ def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarra
     Examples
     --------
     >>> import numpy as np
-    >>> from sliplens.faithfulness import deletion_order
+    >>> from sliplens.faithfulness.scoring import deletion_order
     >>> deletion_order(np.array([[0.1, 0.9], [0.5, 0.1]]))
     array([1, 2, 3, 0])
     """
@@ -142,7 +141,8 @@ def deletion_curves(
 
     >>> import numpy as np
     >>> import torch
-    >>> from sliplens.faithfulness import deletion_curves, deletion_order, get_fill
+    >>> from sliplens.faithfulness.fills import get_fill
+    >>> from sliplens.faithfulness.scoring import deletion_curves, deletion_order
     >>> image = torch.zeros(1, 3, 2, 2)
     >>> image[0, :, 0] = 1.0
     >>> order = deletion_order(image[0, 0].numpy())[None]
@@ -266,8 +266,8 @@ def controls_win(scores: Mapping[str, Faithfulness], controls: Mapping[str, Fait
 
 
 Frames: TypeAlias = UInt8[np.ndarray, "images height width 3"]
-Maps: TypeAlias = Explanation | Float[np.ndarray, "maps rows columns"]
-"""Explanation of the frames, or a number for each pixel of the network's input, whose meaning `signed` names."""
+Maps: TypeAlias = Attribution | Float[np.ndarray, "maps rows columns"]
+"""Attribution of the frames, or a number for each pixel of the network's input, whose meaning `signed` names."""
 _CHECKED_IMAGES = 4
 _TILES_ACROSS = 14
 
@@ -301,9 +301,9 @@ def score(
     maps
         What `explain` gave; or an array (frames, size, size) of one number a pixel of the network's input.
     signed
-        Meaning of an array. True: above zero where a pixel raises the prediction, as `Explanation.relevance` and the
+        Meaning of an array. True: above zero where a pixel raises the prediction, as `Attribution.relevance` and the
         attributions of Captum, summed over the colours. Pixels then rank by sign(f(x) - f(reference)) times the map,
-        as those of an `Explanation` do. False: larger where a pixel matters more, whichever way the prediction went,
+        as those of an `Attribution` do. False: larger where a pixel matters more, whichever way the prediction went,
         as a saliency in [0, 1].
     fill
         What removed pixels become, a row of `FILLS`; `reference`, the untouched sensor, is the one that networks know.
@@ -322,7 +322,7 @@ def score(
     """
     fill_of_name, trained = get_fill(fill), open_run(run)
     inputs, empty = network_inputs(trained, frames, reference)
-    method = maps.method if isinstance(maps, Explanation) else "maps"
+    method = maps.method if isinstance(maps, Attribution) else "maps"
     whole, untouched = (trained.predict(images).double().numpy() for images in (inputs, empty[None]))
     towards = np.sign(whole - untouched)
     influence = {method: _influence(maps, inputs, towards=towards, signed=signed)}
@@ -412,7 +412,7 @@ def _influence(
     maps: Maps, inputs: Tensor, *, towards: Float[np.ndarray, " images"], signed: bool
 ) -> Float64[np.ndarray, "images height width"]:
     """Rank the pixels by what works towards the prediction, `towards` the sign of f(x) - f(reference)."""
-    of_record = isinstance(maps, Explanation)
+    of_record = isinstance(maps, Attribution)
     values = maps.influence.double().cpu().numpy() if of_record else maps.astype(np.float64)
     if len(values) != len(inputs):
         raise SaliencyError(f"there are {len(values)} maps of {len(inputs)} frames; explain the frames that are scored")

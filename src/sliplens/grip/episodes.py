@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
-from sliplens.explainers import explain, get_explainer
+from sliplens.explainers.table import explain, get_explainer
 from sliplens.files import DEFAULT_NETWORK, output_folder, remove, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import Controller, make_controller

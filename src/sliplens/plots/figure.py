@@ -34,7 +34,7 @@ from sliplens.plots.style import (
     written_whole,
 )
 from sliplens.results.evaluation import Diagnosis
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import DeletionScores, RemovalScores, is_control
 from sliplens.results.study import Study, Truth
 
@@ -74,7 +74,7 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     --------
     >>> import numpy as np
     >>> import sliplens as sl
-    >>> from sliplens.faithfulness import Faithfulness
+    >>> from sliplens.faithfulness.removal import Faithfulness
     >>> curves = np.array([[[0, 0.4, 0.4]], [[0, 0.0, 0.4]], [[0, 0.2, 0.4]]])
     >>> figure = sl.plot(Faithfulness(areas=np.array([0, 0.5, 1.0]), curves=curves))
     >>> [line.get_label() for line in figure.axes[0].lines]
@@ -91,7 +91,7 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     return figure
 
 
-def _explanation(explanation: Any, ax: Axes, index: int) -> None:
+def _attribution(explanation: Any, ax: Axes, index: int) -> None:
     # tensors answer NumPy's protocol once they are on the CPU and carry no gradient
     image, relevance = (
         _array(values)[_of(len(values), index)] for values in (explanation.frames, explanation.relevance)
@@ -105,7 +105,7 @@ def _explanation(explanation: Any, ax: Axes, index: int) -> None:
     ax.set_title(f"{method_name(explanation.method)}: why {read} rather than {compared}\norange lowers, blue raises")
 
 
-def _explained(explained: Explained, ax: Axes, index: int) -> None:
+def _explanation(explained: Explanation, ax: Axes, index: int) -> None:
     method, place = methods_in_order(explained.saliency)[0], _of(len(explained.frames), index)
     ax.imshow(overlay_saliency(explained.pictures[place], stretch_saliency(explained.saliency[method][place])))
     ax.set_axis_off()
@@ -218,8 +218,8 @@ def _of(count: int, index: int) -> int:
 DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Evaluation": lambda result, ax, _: plot_answers(result.predictions, sorted(result.conditions), ax=ax),
     "Training": lambda result, ax, _: plot_learning_curves({result.input: result}, ax=ax),
+    "Attribution": _attribution,
     "Explanation": _explanation,
-    "Explained": _explained,
     "Faithfulness": _faithfulness,
     "DeletionScores": _deletion,
     "RemovalScores": _removal,

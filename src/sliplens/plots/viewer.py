@@ -48,7 +48,7 @@ from sliplens.recordings.store import (
     stream_frames,
 )
 from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS, Labels, labels_of_margins
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 
 if TYPE_CHECKING:
     from rerun import AsComponents, ComponentColumn, RecordingStream
@@ -78,7 +78,7 @@ class Beside:
 
     predictions: Path | None = None
     """Table that `sliplens predict` or `sliplens evaluate` wrote (Parquet)."""
-    maps: Explained | None = None
+    maps: Explanation | None = None
     tracks: Path | None = None
     """Table that `sliplens track` wrote."""
 
@@ -113,7 +113,7 @@ def view_capture(capture: Capture) -> Viewed:
     )
 
 
-def view_explained(explained: Explained) -> Viewed:
+def view_explained(explained: Explanation) -> Viewed:
     """Frames that were explained, one after another, as their network saw them."""
     from sliplens.recordings.source import open_source  # noqa: PLC0415 (readers of video come with it)
 
@@ -401,7 +401,7 @@ class _Log:
         size = self.rerun.Radius.ui_points(radius)
         self.fixed(entity, self.rerun.Points2D.from_fields(colors=[rgba(colour)], radii=[size]))
 
-    def maps(self, maps: Explained, files: Sequence[str]) -> None:
+    def maps(self, maps: Explanation, files: Sequence[str]) -> None:
         """Log the maps of the trial's frames, each until the next frame, on one scale."""
         rerun, trial = self.rerun, self.trial
         numbers = {f"{trial.trial}-f{at:04d}": at for at in range(len(trial))}

@@ -58,7 +58,7 @@ from sliplens.report.plates import (
     told_frame,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import Explained, ExplainedFrame, Strip
+from sliplens.results.explanation import ExplainedFrame, Explanation, Strip
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores, is_control
 from sliplens.results.study import StateFrame, States, Truth
 
@@ -119,7 +119,7 @@ def plate_methods(results: Results) -> Plate | None:
     )
 
 
-def plate_states(results: Results, explained: Explained) -> Plate | None:
+def plate_states(results: Results, explained: Explanation) -> Plate | None:
     """Draw every method across the states of one trial (thesis, Figs. 15 and 16); None without frames to show."""
     methods = [method for method in shown_methods(results) if method in explained.saliency]
     real = explained.source == "real"
@@ -148,7 +148,7 @@ def plate_strip(strip: Strip) -> Plate:
     )
 
 
-def _poly_cam(explained: Explained | None) -> str | None:
+def _poly_cam(explained: Explanation | None) -> str | None:
     """Poly-CAM of ours where it was run, else as the thesis ran it; None without a map of either."""
     maps = () if explained is None else explained.saliency
     return next((method for method in ("poly-cam", POLY_CAM) if method in maps), None)
@@ -164,7 +164,9 @@ def plate_poly_cam(results: Results) -> Plate | None:
     return _plate(explained, shown_frames(results, explained), [method], name=name, what=what)
 
 
-def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *, name: str, what: str) -> Plate | None:
+def _plate(
+    explained: Explanation, frames: list[ShownFrame], methods: list[str], *, name: str, what: str
+) -> Plate | None:
     if not frames:
         return None
     trials = {explained.frames[one.index].trial for one in frames}
@@ -197,7 +199,7 @@ def _plate(explained: Explained, frames: list[ShownFrame], methods: list[str], *
     )
 
 
-def _tell_blank(explained: Explained, frames: list[ShownFrame], methods: list[str]) -> str:
+def _tell_blank(explained: Explanation, frames: list[ShownFrame], methods: list[str]) -> str:
     blank = sum(not explained.saliency[method][one.index].any() for method in methods for one in frames)
     if not blank:
         return ""
@@ -205,7 +207,7 @@ def _tell_blank(explained: Explained, frames: list[ShownFrame], methods: list[st
     return f" {maps} no colour: there the method finds nothing that speaks for the answer."
 
 
-def _measured(explained: Explained, method: str, frame: ShownFrame) -> tuple[Any, ...]:
+def _measured(explained: Explanation, method: str, frame: ShownFrame) -> tuple[Any, ...]:
     """Numbers of a map drawn: where its weight lies, and on how much of the image."""
     own = explained.frames[frame.index]
     saliency = explained.saliency[method][frame.index].astype(np.float64)
@@ -296,7 +298,7 @@ def plate_highlighted(results: Results) -> Plate | None:
     )
 
 
-def _illustrate(explained: Explained, scored: DeletionScores, method: str, index: int) -> Plate:
+def _illustrate(explained: Explanation, scored: DeletionScores, method: str, index: int) -> Plate:
     curve, own = scored.curves[method], explained.frames[index]
     steps = _steps(curve, explained, index)
     cells = [
@@ -333,7 +335,7 @@ def _illustrate(explained: Explained, scored: DeletionScores, method: str, index
     )
 
 
-def _materials(results: Results) -> Iterator[tuple[Explained, DeletionScores, int]]:
+def _materials(results: Results) -> Iterator[tuple[Explanation, DeletionScores, int]]:
     """Maps, scores and the frame to show of each input that has all three, raw images last."""
     for name in inputs_in_order(results.inputs)[::-1]:
         explained, scored = explained_of(results, name), results.scores.get((name, results.study.source))
@@ -344,7 +346,7 @@ def _materials(results: Results) -> Iterator[tuple[Explained, DeletionScores, in
             yield explained, scored, index
 
 
-def _steps(curve: DeletionCurve, explained: Explained, index: int) -> list[tuple[int, float, float]]:
+def _steps(curve: DeletionCurve, explained: Explanation, index: int) -> list[tuple[int, float, float]]:
     """Pixels gone, answer and score at the steps nearest to `SHARES`."""
     row = curve.frame_ids.index(explained.frames[index].id)
     share = curve.pixels_removed / explained.image_size**2
@@ -355,7 +357,7 @@ def _steps(curve: DeletionCurve, explained: Explained, index: int) -> list[tuple
 
 
 def _removed(
-    explained: Explained, method: str, index: int, steps: list[tuple[int, float, float]], *, fill: str
+    explained: Explanation, method: str, index: int, steps: list[tuple[int, float, float]], *, fill: str
 ) -> list[Cell]:
     saliency, own = explained.saliency[method][index], explained.frames[index]
     # as the network saw it: made brighter, a difference would no longer compare with the fill
@@ -377,7 +379,7 @@ def _without(
 
 
 def _steps_told(
-    explained: Explained, method: str, index: int, steps: list[tuple[int, float, float]]
+    explained: Explanation, method: str, index: int, steps: list[tuple[int, float, float]]
 ) -> list[tuple[Any, ...]]:
     own = explained.frames[index]
     return [
@@ -386,7 +388,7 @@ def _steps_told(
     ]
 
 
-def _tell_fall(explained: Explained, index: int, steps: list[tuple[int, float, float]]) -> str:
+def _tell_fall(explained: Explanation, index: int, steps: list[tuple[int, float, float]]) -> str:
     parts = [
         f"{percent(share)} gone y {percent(one[1])}, D {one[2]:.2f}"
         for share, one in zip(SHARES, steps, strict=True)
@@ -574,7 +576,7 @@ def _painted(
     return overlay_relevance(picture, values / full_colour(values, percentile=percentile))
 
 
-def _spread_out(ids: list[str], explained: Explained, places: dict[str, int]) -> list[str]:
+def _spread_out(ids: list[str], explained: Explanation, places: dict[str, int]) -> list[str]:
     """Pick a few frames from high to low margin, by their labels."""
     known = [one for one in ids if explained.frames[places[one]].safety_margin is not None]
     ranked = sorted(known, key=lambda one: -(explained.frames[places[one]].safety_margin or 0.0))
@@ -583,7 +585,7 @@ def _spread_out(ids: list[str], explained: Explained, places: dict[str, int]) ->
     return [ranked[place] for place in np.linspace(0, len(ranked) - 1, _TRUTH_FRAMES).round().astype(int)]
 
 
-def _best_methods(truth: Truth, explained: Explained) -> list[str]:
+def _best_methods(truth: Truth, explained: Explanation) -> list[str]:
     """Methods whose maps correlate best with the Shapley values, as the verdict has it."""
     known = {name: found.shapley for name in explained.relevance if (found := truth.methods.get(name)) is not None}
     likeness = {name: gap.estimate for name, gap in known.items() if gap is not None and not is_control(name)}

@@ -27,7 +27,7 @@ from sliplens.plots.style import (
     written_whole,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import DeletionCurve
 
 CELL_IN = 1.5
@@ -193,12 +193,12 @@ class ShownFrame:
     index: int
 
 
-def explained_of(results: Results, name: str) -> Explained | None:
+def explained_of(results: Results, name: str) -> Explanation | None:
     """Find the explained frames of the study's source."""
     return results.explanations.get((name, results.study.source))
 
 
-def shown_frames(results: Results, explained: Explained) -> list[ShownFrame]:
+def shown_frames(results: Results, explained: Explanation) -> list[ShownFrame]:
     """Frames of one trial from full stick to full slip; without a choice, those a panel would show."""
     places = {frame.id: index for index, frame in enumerate(explained.frames)}
     choice = results.study.choice
@@ -212,7 +212,7 @@ def shown_frames(results: Results, explained: Explained) -> list[ShownFrame]:
 
 
 def bright_pictures(
-    explained: Explained, indices: Sequence[int]
+    explained: Explanation, indices: Sequence[int]
 ) -> tuple[dict[int, UInt8[np.ndarray, "height width 3"]], str]:
     """Pictures of some frames, and what to call them; differences are made brighter all alike, to be seen."""
     factor, name = picture_brightness(explained.input, [explained.pictures[index] for index in indices])
@@ -226,7 +226,7 @@ def picture_brightness(name: str, pictures: Iterable[UInt8[np.ndarray, "height w
     return factor, "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"
 
 
-def told_frame(explained: Explained, curves: dict[str, DeletionCurve]) -> int | None:
+def told_frame(explained: Explanation, curves: dict[str, DeletionCurve]) -> int | None:
     """Pick the frame that deletion is shown on: the first of those scored whose label is nearest to 20 %."""
     scored = {name for curve in curves.values() for name in curve.frame_ids}
     labels = {

@@ -9,7 +9,7 @@ from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import Diagnosis, Evaluation, Simulation, Training, describe_simulation
-from sliplens.results.explanation import Explained, Strip, load_explained
+from sliplens.results.explanation import Explanation, Strip, load_explanation
 from sliplens.results.faithfulness import DeletionScores
 from sliplens.results.grip import Grip
 from sliplens.results.study import ASKED_FILE, STAGES, TABLES, Asked, Choice, Study
@@ -40,7 +40,7 @@ class Results:
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     """By input ("raw", "difference")."""
     diagnoses: dict[str, Diagnosis] = field(default_factory=dict)
-    explanations: dict[tuple[str, str], Explained] = field(default_factory=dict)
+    explanations: dict[tuple[str, str], Explanation] = field(default_factory=dict)
     scores: dict[tuple[str, str], DeletionScores] = field(default_factory=dict)
     """By input and source ("simulated", "real")."""
     grip: Grip | None = None
@@ -85,7 +85,7 @@ def load_results(workspace: Path) -> Results:
         if run.stage == "simulate":
             result = describe_simulation(load_dataset(folder))
         elif run.stage == "explain":
-            result = load_explained(folder)
+            result = load_explanation(folder)
         elif kind := (_OF_A_COMMAND | STAGES).get(run.stage):
             command = run.stage if run.stage in _OF_A_COMMAND else "study"
             result = load_result(folder, kind, command=f"sliplens {command}")

@@ -40,7 +40,7 @@ from sliplens.report.comparisons import (
     thesis_row,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import (
     CHANCE,
     DeletionScores,
@@ -503,7 +503,7 @@ def _thesis_seconds(method: str, among: Collection[str]) -> str:
     return decimals(SECONDS.get(thesis_row(method, among) or ""), 3)
 
 
-def _seconds_of(explained: Explained, method: str) -> str:
+def _seconds_of(explained: Explanation, method: str) -> str:
     return decimals(explained.methods[method].seconds_per_frame if method in explained.methods else None, 3)
 
 

@@ -41,7 +41,7 @@ from sliplens.report.comparisons import (
     voting_settings,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import CHANCE, DeletionScores, Lead, RemovalScores
 from sliplens.results.grip import Grip
 from sliplens.results.study import Localisation, Truth
@@ -375,7 +375,7 @@ def _what_deletion_measures(results: Results) -> Statement:
     return Statement(topic="How far to trust D", text=text, tone="caution")
 
 
-def _real_touch(explained: Explained) -> Statement:
+def _real_touch(explained: Explanation) -> Statement:
     topic = f"Real touch, {input_name(explained.input).lower()}"
     labelled = [(one.safety_margin, one.prediction) for one in explained.frames if one.safety_margin is not None]
     trials = len({one.trial for one in explained.frames if one.safety_margin is not None})

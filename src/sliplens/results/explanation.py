@@ -38,7 +38,7 @@ class MethodNotes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explained(OfNetwork):
+class Explanation(OfNetwork):
     """Explanations of some frames by several methods."""
 
     weights_sha256: str
@@ -87,7 +87,7 @@ class Explained(OfNetwork):
             rows.setdefault(frame.trial, []).append(row)
         return rows
 
-    def take(self, rows: Sequence[int]) -> "Explained":
+    def take(self, rows: Sequence[int]) -> "Explanation":
         """Explanations of some of the frames, by their numbers."""
         chosen = list(rows)
         return replace(
@@ -129,13 +129,13 @@ def require_saliency(
     return saliency
 
 
-def is_explained(folder: Path) -> bool:
+def is_explanation(folder: Path) -> bool:
     """Whether a folder is one that `sliplens explain` wrote."""
     path = folder / RUN_FILE
     return path.is_file() and load_record(path, Provenance, command="sliplens explain").stage == "explain"
 
 
-def load_explained(folder: Path) -> Explained:
+def load_explanation(folder: Path) -> Explanation:
     """Read a folder that `sliplens explain` wrote.
 
     Raises
@@ -145,9 +145,9 @@ def load_explained(folder: Path) -> Explained:
         finite.
     """
     require_folder(folder, what="the explanations")
-    if not is_explained(folder):
+    if not is_explanation(folder):
         raise InputError(f"{folder} holds no explanations; make them with sliplens explain")
-    return load_result(folder, Explained, command="sliplens explain")
+    return load_result(folder, Explanation, command="sliplens explain")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
 from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, PIXEL, Evaluation, OfNetwork
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import DeletionScores, Lead, Remedies, RemovalScores
 
 REGIONS = ("markers", "slip_annulus", "edges")
@@ -412,7 +412,7 @@ class Study:
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     choice: Choice | None = None
     states: States | None = None
-    explanations: dict[str, Explained] = field(default_factory=dict)
+    explanations: dict[str, Explanation] = field(default_factory=dict)
     deletion: dict[str, DeletionScores] = field(default_factory=dict)
     remedies: dict[str, Remedies] = field(default_factory=dict)
     faithfulness: dict[str, RemovalScores] = field(default_factory=dict)

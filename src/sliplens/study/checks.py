@@ -12,7 +12,10 @@ from jaxtyping import Float, Float32, Float64
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
-from sliplens.explainers import Explainer, Explanation, IntegratedGradients, PolyCam
+from sliplens.explainers.attribution import Attribution
+from sliplens.explainers.contract import Explainer
+from sliplens.explainers.gradients import IntegratedGradients
+from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
 from sliplens.faithfulness.controls import (
     cascade,
@@ -359,7 +362,7 @@ class Untrained(MaterialStage[UntrainedMaps]):
         return UntrainedMaps(input=explained.input, source=explained.source, maps=maps)
 
 
-def _influence(explanation: Explanation) -> Maps:
+def _influence(explanation: Attribution) -> Maps:
     """What the method ranks pixels by, towards the network's own target: the sign of another's says nothing."""
     return explanation.influence.double().cpu().numpy()
 

@@ -11,9 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.errors import ImageError, InputError, RecordingError
-from sliplens.explainers import EXPLAINERS, Explainer, Likeness, PolyCam, get_explainer
-from sliplens.explainers.explanation import CLOSE
+from sliplens.explainers.attribution import CLOSE
+from sliplens.explainers.contract import Explainer
 from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, to_network_px
+from sliplens.explainers.poly_cam import PolyCam
+from sliplens.explainers.poly_cam_budget import Likeness
+from sliplens.explainers.table import EXPLAINERS, get_explainer
 from sliplens.faithfulness.removal import Units, marker_units, tile_units
 from sliplens.images import absolute_difference
 from sliplens.markers import track_markers
@@ -22,7 +25,7 @@ from sliplens.parts import Shard, shard
 from sliplens.plots.style import input_name, listed
 from sliplens.progress import OnProgress, counted, number_of
 from sliplens.recordings import Dataset, Recording, TrialInfo
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkerPlaces, MarkerTable, ShownFrame, States
 from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
 from sliplens.study.explaining import frames_at, nearest_frame, network_inputs, require_methods
@@ -306,7 +309,7 @@ class Material:
     """Explanations of some frames with all that belongs to them."""
 
     trained: Network
-    explained: Explained
+    explained: Explanation
     inputs: Float[Tensor, "frames colours size size"]
     """What the network got, in [0, 1]."""
     references: Float[Tensor, "frames colours size size"]
@@ -377,7 +380,7 @@ class MethodStage(MaterialStage[Result]):
             yield shard(method, trial=method, frames=1, recipe="method", shown="")
 
 
-def worth_scoring(chosen: Iterable[ChosenFrame], explained: Explained) -> tuple[ChosenFrame, ...]:
+def worth_scoring(chosen: Iterable[ChosenFrame], explained: Explanation) -> tuple[ChosenFrame, ...]:
     """The frames to score in which there is something to explain: the answer changed by `CLOSE` or more.
 
     That is less than the networks err by, so that the sign of a smaller change, along which maps are ranked, is chance:
@@ -399,7 +402,7 @@ def trial_seed(seed: int, number: int) -> int:
 
 def gather(
     trained: Network,
-    explained: Explained,
+    explained: Explanation,
     data: Dataset,
     chosen: tuple[ChosenFrame, ...],
     *,

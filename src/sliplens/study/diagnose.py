@@ -13,7 +13,7 @@ from torch.nn.functional import adaptive_avg_pool2d
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
-from sliplens.explainers.explanation import frame_of
+from sliplens.explainers.attribution import frame_of
 from sliplens.explainers.shapley import shapley_values
 from sliplens.extras import require_packages
 from sliplens.faithfulness.removal import answer_whole
@@ -35,7 +35,7 @@ from sliplens.results.evaluation import (
     FrictionTable,
     ScoredFrames,
 )
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_limit, reading_slope
 from sliplens.study.explaining import explain_frames, frames_at, network_inputs
 from sliplens.study.truth import StagedFrame, find_places, rank_correlation, redrawing, reliability_of, stage_frames
@@ -337,7 +337,7 @@ def hold_against(
 
 def find_contributions(
     run: Network,
-    explained: Explained,
+    explained: Explanation,
     frames: Sequence[StagedFrame],
     *,
     pairs: int,

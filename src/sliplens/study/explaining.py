@@ -14,9 +14,9 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.explainers import EXPLAINERS, Explainer
-from sliplens.explainers.explanation import frame_of
-from sliplens.explainers.table import network_images
+from sliplens.explainers.attribution import frame_of
+from sliplens.explainers.contract import Explainer
+from sliplens.explainers.table import EXPLAINERS, network_images
 from sliplens.models import Network
 from sliplens.models.engines import expecting
 from sliplens.parts import Shard, shard
@@ -27,7 +27,7 @@ from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.results.evaluation import ANSWER, SHARE
-from sliplens.results.explanation import Explained, ExplainedFrame, MethodNotes, require_saliency
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes, require_saliency
 from sliplens.study.stages import Find, Stage
 
 DEFAULT_LEVELS = NOMINAL_MARGINS
@@ -224,7 +224,7 @@ _FEW_MAPS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explaining(Stage[Explained]):
+class Explaining(Stage[Explanation]):
     """Maps of chosen frames, a shard of (method, frame) each."""
 
     piece = _Map
@@ -277,14 +277,14 @@ class Explaining(Stage[Explained]):
         shown = (255 * frame_of(self.inputs)).round().to(torch.uint8).permute(0, 2, 3, 1)
         return shown.contiguous().cpu().numpy()
 
-    def join(self, pieces: Sequence[_Map]) -> Explained:
+    def join(self, pieces: Sequence[_Map]) -> Explanation:
         """Maps of all frames, with what the network reads from them."""
         trained, chosen, frames = self.trained, self.chosen, len(self.chosen.ids)
         maps = {method: pieces[at * frames : (at + 1) * frames] for at, method in enumerate(self.explainers)}
         # the same answers for every method: asked once, on all frames
         estimate, untouched = trained.estimate(self.inputs), trained.predict(chosen.references).tolist()
         withheld = estimate.withheld(np.ones(frames, dtype=bool))  # who explains a frame holds it to touch something
-        return Explained(
+        return Explanation(
             input=trained.encoding.name,
             source=chosen.source,
             weights_sha256=trained.manifest.weights_sha256,
@@ -320,7 +320,7 @@ def explain_frames(
     retry_failed: bool = False,
     on_map: OnMap | None = None,
     on_progress: OnProgress | None = None,
-) -> Explained:
+) -> Explanation:
     """Explain frames with several methods.
 
     `parts` is a folder that keeps each map as soon as it is there, so that an interrupted run loses at most one a
@@ -369,7 +369,7 @@ def _of_all(names: Sequence[str], count: int) -> str:
     return f"{len(names)} of {number_of(count, 'frame')} ({', '.join(names[:_NAMED])}{more})"
 
 
-def network_inputs(trained: Network, explained: Explained) -> Float[Tensor, "frames colours size size"]:
+def network_inputs(trained: Network, explained: Explanation) -> Float[Tensor, "frames colours size size"]:
     """What the network got of explained frames, in [0, 1], on its device."""
     return trained.encoding.normalise(torch.from_numpy(explained.images)).to(trained.device)
 

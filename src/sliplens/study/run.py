@@ -10,8 +10,8 @@ from typing import Any, TypeAlias
 
 from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
-from sliplens.explainers import Explainer
-from sliplens.explainers.explanation import CLOSE
+from sliplens.explainers.attribution import CLOSE
+from sliplens.explainers.contract import Explainer
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
@@ -20,7 +20,7 @@ from sliplens.models.checkpoint import open_run
 from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress, note, number_of, stage, wrote
 from sliplens.recordings import Dataset, load_dataset
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import NEW_WEIGHTS, DeletionScores
 from sliplens.results.study import (
     ASKED_FILE,
@@ -67,7 +67,7 @@ from sliplens.study.truth import TRUE_FILL, TRUTH_PAIRS, JudgingByTruth, true_cu
 from sliplens.training.evaluation import evaluate
 
 _COMMAND = "sliplens study"
-_KINDS: dict[str, type] = {"explain": Explained, "score": DeletionScores, "control": UntrainedMaps, **STAGES}
+_KINDS: dict[str, type] = {"explain": Explanation, "score": DeletionScores, "control": UntrainedMaps, **STAGES}
 NetworkLike: TypeAlias = Network | Path | str
 _Work: TypeAlias = Callable[[Path, OnProgress], object]
 """Takes a folder for parts, and what is called with the steps done and their number."""

@@ -13,16 +13,19 @@ from scipy.stats import kendalltau
 from torch import Tensor
 
 from sliplens.errors import CheckpointError, InputError
-from sliplens.faithfulness import deletion_curves, deletion_score, get_fill, random_order
 from sliplens.faithfulness.controls import control_maps, lead_over_controls
+from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, Units, answer_whole, score_maps
 from sliplens.faithfulness.scoring import (
     controls_win,
+    deletion_curves,
+    deletion_score,
     deletion_steps,
     fill_decides,
     flat_maps,
     follows_last_step,
     prepare_passes,
+    random_order,
     rankings_disagree,
     saliency_orders,
     saturated,
@@ -31,7 +34,7 @@ from sliplens.intervals import mean_interval, paired_difference
 from sliplens.models import Network
 from sliplens.parts import Shard
 from sliplens.progress import OnProgress, continued
-from sliplens.results.explanation import Explained, ExplainedFrame
+from sliplens.results.explanation import ExplainedFrame, Explanation
 from sliplens.results.faithfulness import (
     CHANCE,
     Agreement,
@@ -62,7 +65,7 @@ _Curves = Mapping[str, Sequence[DeletionTable]]
 """Curve of each frame, by method; random orders among the methods."""
 
 
-def require_same_network(trained: Network, explained: Explained) -> None:
+def require_same_network(trained: Network, explained: Explanation) -> None:
     """Refuse explanations of another network."""
     if explained.weights_sha256 != trained.manifest.weights_sha256:
         raise CheckpointError(
@@ -85,7 +88,7 @@ class Deletion(Stage[DeletionScores]):
     title = "Deleting pixels, as the thesis did"
 
     trained: Network
-    explained: Explained
+    explained: Explanation
     fill: str = "grey"
     steps: int | None = None
     """The image's height if None."""
@@ -262,7 +265,7 @@ class RemedialDeletion(MaterialStage[Remedies]):
         )
 
 
-def _orders(explained: Explained, *, seed: int) -> dict[str, Int[np.ndarray, "frames pixels"]]:
+def _orders(explained: Explanation, *, seed: int) -> dict[str, Int[np.ndarray, "frames pixels"]]:
     """Pixels of each frame by method, most salient first, and a random order."""
     rng, shape = np.random.default_rng(seed), (explained.image_size, explained.image_size)
     orders = {name: saliency_orders(maps, shape) for name, maps in explained.saliency.items()}
@@ -280,7 +283,7 @@ def _split(
     method: str,
     removed: Int[np.ndarray, " steps"],
     answers: Float64[np.ndarray, "frames answers"],
-    explained: Explained,
+    explained: Explanation,
 ) -> list[DeletionTable]:
     rows = zip(explained.frames, answers, strict=True)
     return [_curve(method, frame, removed, own[1:], own[0]) for frame, own in rows]
@@ -293,7 +296,7 @@ def _score(curves: Sequence[DeletionTable]) -> MethodScore:
     )
 
 
-def _stopped(grey: DeletionScores, explained: Explained) -> _Curves:
+def _stopped(grey: DeletionScores, explained: Explanation) -> _Curves:
     """Cut each curve after the step at which all pixels above the threshold are gone, the first step at least."""
     counts = {name: (maps > _STOP).sum(axis=(1, 2)) for name, maps in explained.saliency.items()}
     median = np.median(np.stack(list(counts.values())), axis=0)
@@ -307,7 +310,7 @@ def _stopped(grey: DeletionScores, explained: Explained) -> _Curves:
     return stopped
 
 
-def _inserted(curves: Sequence[DeletionTable], explained: Explained) -> list[DeletionTable]:
+def _inserted(curves: Sequence[DeletionTable], explained: Explanation) -> list[DeletionTable]:
     """Read deletion of the least salient pixels backwards, the whole image last."""
     turned = []
     for curve, frame in zip(curves, explained.frames, strict=True):
@@ -558,7 +561,7 @@ def ranking_alarms(curves: Curves) -> list[str]:
     return [*rankings_disagree(by_fill), *alarms]
 
 
-def _table(curves: Curves, explained: Explained) -> RemovalTable:
+def _table(curves: Curves, explained: Explanation) -> RemovalTable:
     frames, tables = explained.frames, []
     of_frames: dict[str, Any] = {"frame_id": [frame.id for frame in frames], "day": [frame.day for frame in frames]}
     of_frames |= {"trial": [frame.trial for frame in frames]}

@@ -15,7 +15,7 @@ from sliplens.models import Network
 from sliplens.models.engines import counting_passes
 from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.shards import Crew, MakePart, Work, make_parts
 
 Result = TypeVar("Result")
@@ -97,7 +97,7 @@ class Stage(Work, Generic[Result]):
             return self.join([read(one) for one in shards()])
 
 
-def trial_shards(explained: Explained, *about: str, maps: int = 1) -> Iterator[Shard]:
+def trial_shards(explained: Explanation, *about: str, maps: int = 1) -> Iterator[Shard]:
     """A shard of (*about, trial) for each trial of explained frames, of so many maps a frame."""
     for number, (trial, rows) in enumerate(explained.trials.items()):
         # the folder of the parts is one of these explanations and options alone (`files.output_folder`)
@@ -106,7 +106,7 @@ def trial_shards(explained: Explained, *about: str, maps: int = 1) -> Iterator[S
 
 
 def join_trials(
-    explained: Explained, pieces: Sequence[Mapping[str, np.ndarray]], *, axis: int = 0
+    explained: Explanation, pieces: Sequence[Mapping[str, np.ndarray]], *, axis: int = 0
 ) -> dict[str, np.ndarray]:
     """Arrays of all frames, whose axis is named, from those of each trial (`trial_shards`)."""
     order = np.argsort([row for rows in explained.trials.values() for row in rows])

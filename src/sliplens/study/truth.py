@@ -11,10 +11,10 @@ from scipy.stats import spearmanr
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.explanation import change_of
+from sliplens.explainers.attribution import change_of
 from sliplens.explainers.shapley import shapley_values
-from sliplens.faithfulness import get_fill
 from sliplens.faithfulness.controls import lead_over_controls, relevance_mass, relevance_rank
+from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import (
     RANDOM_ORDERS,
     SHARES,
@@ -38,7 +38,7 @@ from sliplens.plots.style import tell_ends
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
-from sliplens.results.explanation import Explained
+from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import CHANCE, is_control
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
 from sliplens.simulation.intervention import (
@@ -98,7 +98,7 @@ class Places:
         return np.append(values, 0.0)[self.units]
 
 
-def stage_frames(trained: Network, explained: Explained, data: Dataset) -> tuple[StagedFrame, ...]:
+def stage_frames(trained: Network, explained: Explanation, data: Dataset) -> tuple[StagedFrame, ...]:
     """Make frames of a study ready to be drawn anew."""
     require_same_network(trained, explained)
     if not data.simulated or explained.source != "simulated":
@@ -341,7 +341,7 @@ class JudgingByTruth(Stage[Truth]):
     title = "Putting markers back"
 
     trained: Network
-    explained: Explained
+    explained: Explanation
     data: Dataset
     maps: Mapping[str, Maps]
     """Influences by method, controls included."""
@@ -517,7 +517,7 @@ def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Seq
 
 def true_curves(
     trained: Network,
-    explained: Explained,
+    explained: Explanation,
     data: Dataset,
     *,
     maps: Mapping[str, Maps],

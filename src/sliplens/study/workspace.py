@@ -15,9 +15,11 @@ from torch import Tensor
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, SliplensError
-from sliplens.explainers import EXPLAINERS, RECOMMENDED_METHOD, ExpectedGradients, Explainer, get_explainer
+from sliplens.explainers.contract import Explainer
+from sliplens.explainers.gradients import ExpectedGradients
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
-from sliplens.faithfulness import get_fill
+from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD, get_explainer
+from sliplens.faithfulness.fills import get_fill
 from sliplens.files import as_path, output_folder, remove
 from sliplens.images import write_png
 from sliplens.models import Network
@@ -29,7 +31,7 @@ from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import open_source
-from sliplens.results.explanation import Explained, Strip, StripReadings, load_explained
+from sliplens.results.explanation import Explanation, Strip, StripReadings, load_explanation
 from sliplens.results.faithfulness import DeletionScores
 from sliplens.study.choice import STUDY_BUDGET, study_explainers, with_markers, without_markers
 from sliplens.study.explaining import (
@@ -69,7 +71,7 @@ def explain_source(
     colours: Literal["signed", "jet"] = "signed",
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
-) -> Explained:
+) -> Explanation:
     """Explain frames of a data set along the safety margin, or all frames of a folder or recording.
 
     Parameters
@@ -160,12 +162,12 @@ def explain_source(
             remove(output.parts / "parts")  # not before: what fails above goes on from them
             del explained  # it is read once more, and is large
     wrote(on_progress, out, what, kept=output.complete)
-    return load_explained(out)
+    return load_explanation(out)
 
 
 def score_explained(
     run: Network | Path | str,
-    explanations: Explained | Path,
+    explanations: Explanation | Path,
     *,
     fill: str = "grey",
     steps: int | None = None,
@@ -195,7 +197,7 @@ def score_explained(
     """
     get_fill(fill)
     trained = open_run(run, device=device)
-    explained = explanations if isinstance(explanations, Explained) else load_explained(explanations)
+    explained = explanations if isinstance(explanations, Explanation) else load_explanation(explanations)
     require_same_network(trained, explained)
     title = f"Deleting pixels ({explained.input}, {explained.source})"
     work = Deletion(trained=trained, explained=explained, fill=fill, steps=steps, seed=seed)
@@ -222,7 +224,7 @@ _WIDEST = 12
 """Frames of a panel at most, which can still be seen on a screen."""
 
 
-def draw_explained(explained: Explained, folder: Path, *, colours: Literal["signed", "jet"]) -> None:
+def draw_explained(explained: Explanation, folder: Path, *, colours: Literal["signed", "jet"]) -> None:
     """Write an overlay of every map (`overlays/METHOD/FRAME.png`), and of a few frames all side by side (`panel.png`).
 
     These are all frames, or of many `_WIDEST`, spread evenly over them in their order.

@@ -184,7 +184,7 @@ class Approximation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explanation:
+class Attribution:
     """Why a network predicts f(x) rather than f(reference), for a batch of images."""
 
     images: Float[Tensor, "batch colours height width"]
