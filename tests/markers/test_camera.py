@@ -6,11 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
+from sliplens.live import SimulatedSource
 from sliplens.markers import Tracker
 from sliplens.markers.camera import CAMERA_LIMIT_PX, BorderMotion, CameraMotion, CameraWatch, marker_camera_motion
 from sliplens.recordings import Recording
+from sliplens.recordings.labels.lag import picture_change, soften
 
 Measure = Callable[[np.ndarray, np.ndarray], CameraMotion | None]
+Pressed = tuple[np.ndarray, np.ndarray, list[np.ndarray]]
 
 
 def warp(image: np.ndarray, *, degrees: float = 0.0, zoom: float = 1.0, shift: float = 0.0) -> np.ndarray:
@@ -91,17 +94,62 @@ def test_a_camera_that_moves_in_a_contact_is_seen(
         assert motion.excess_px > CAMERA_LIMIT_PX
 
 
-def test_what_a_contact_hides_holds_from_before_it(trials: dict[str, Recording]):
+@pytest.fixture(scope="module", params=["chromatouch", "flat-gel"])
+def pressed(request: pytest.FixtureRequest) -> Pressed:
+    """Reference, an untouched frame, and frames of a wet contact up to full slip."""
+    loads_n = [(0.0, 0.0), (0.3, 0.0), (0.8, 0.0), (1.5, 0.0), (2.5, 0.6), (2.5, 1.2), (3.0, 1.5)]
+    frames, source = [], SimulatedSource(request.param, friction=0.5, rate_hz=1000.0, seed=1)
+    with source:
+        stream = source.frames()
+        for normal_n, pull_n in loads_n:
+            source.load(normal_force_n=normal_n, tangential_force_n=pull_n)
+            next(stream)
+            frames.append(next(stream).image)
+    assert source.reference is not None
+    return source.reference, frames[0], frames[1:]
+
+
+def border_excesses(pressed: Pressed, *, before: dict[str, float], during: dict[str, float]) -> list[float]:
+    """Excess of an untouched frame, then of the contact, where a camera moves before the contact or in it."""
+    reference, untouched, contact = pressed
+    watch = CameraWatch(reference)
+    frames = [warp(untouched, **before), *(warp(frame, **before, **during) for frame in contact)]
+    motions = [watch.update(frame, touches=picture_change(soften(frame), soften(reference)) >= 7) for frame in frames]
+    return [np.nan if motion is None else motion.excess_px for motion in motions]
+
+
+def test_without_markers_a_healthy_wet_contact_raises_no_alarm(pressed: Pressed):
+    assert max(border_excesses(pressed, before={}, during={})) < CAMERA_LIMIT_PX
+
+
+@pytest.mark.parametrize("move", [{"shift": 4.0}, {"zoom": 1.03}], ids=str)
+def test_without_markers_a_shift_before_the_contact_holds_until_its_end(pressed: Pressed, move: dict[str, float]):
+    assert min(border_excesses(pressed, before=move, during={})) > CAMERA_LIMIT_PX
+    reference, untouched, _ = pressed
+    watch = CameraWatch(reference)
+    watch.update(warp(untouched, **move), touches=True)
+    motion = watch.update(untouched, touches=False)
+    assert motion is not None
+    assert motion.excess_px < CAMERA_LIMIT_PX
+
+
+@pytest.mark.parametrize("degrees", [3.0, -3.0])
+def test_without_markers_a_turn_in_the_contact_is_alarmed(pressed: Pressed, degrees: float):
+    untouched, *contact = border_excesses(pressed, before={}, during={"degrees": degrees})
+    assert untouched < CAMERA_LIMIT_PX < min(contact[:-1])  # a press that turns the border itself may hide a turn
+
+
+def test_with_markers_a_shift_is_seen_in_every_frame(trials: dict[str, Recording]):
     trial = trials["chromatouch"]
-    watch, moved = CameraWatch(trial.reference), {"shift": 4.0}
-    seen = [watch.update(warp(frame, **moved)) for frame in (untouched(trial), *touching(trial))]
-    assert all(motion is not None and motion.excess_px > CAMERA_LIMIT_PX for motion in seen)
-    back = watch.update(untouched(trial))
-    assert back is not None
-    assert back.excess_px < CAMERA_LIMIT_PX
+    watch, tracker = CameraWatch(trial.reference), Tracker(trial.reference)
+    for frame in (untouched(trial), *touching(trial)):
+        moved = warp(frame, shift=6.0)
+        motion = watch.update(moved, tracker.update(moved), touches=True)
+        assert motion is not None
+        assert motion.excess_px > CAMERA_LIMIT_PX
 
 
 def test_a_border_without_texture_shows_no_motion(rng: np.random.Generator):
     plain = np.clip(128 + rng.normal(0, 2, (224, 224, 3)), 0, 255).astype(np.uint8)
     plain[90:130, 90:130] = 20
-    assert CameraWatch(plain).update(warp(plain, degrees=3.0)) is None
+    assert CameraWatch(plain).update(warp(plain, degrees=3.0), touches=True) is None

@@ -102,6 +102,15 @@ def test_after_a_gap_the_rest_of_a_contact_is_read_frame_by_frame(run: Network):
     assert not follower.lost
 
 
+def test_frames_whose_margin_is_withheld_leave_nothing_in_memory(run: Network):
+    estimate, times, touches = answers(12), np.arange(12) / 10, np.ones(12, dtype=bool)
+    believed = ~np.isin(np.arange(12), (0, 4, 5, 9))
+    read = run.follow().update(estimate, times, touches, believed=believed).margin
+    without = run.follow().update(estimate.at(np.flatnonzero(believed)), times[believed], touches[believed]).margin
+    np.testing.assert_allclose(read[believed], without, atol=1e-6)
+    assert np.array_equal(read[~believed], estimate.margin[~believed])
+
+
 def test_frames_read_one_by_one_after_a_gap_keep_their_own_intervals(run: Network):
     kept, many = there(run.manifest.sequence), answers(12)
     wide = replace(kept.calibration, offsets={"0.9": 0.2})

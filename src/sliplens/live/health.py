@@ -123,10 +123,11 @@ class HealthMonitor:
         both = (self._soft > _SEEN) & (soft > _SEEN) & (self._soft < _BRIGHT) & (soft < _BRIGHT)
         ratio = np.log2(np.where(both, soft, 1) / np.where(both, self._soft, 1))
         gain = float(np.median(ratio[both])) if both.any() else 0.0
+        touch = self._check_touch(soft, gain)
         slow = {
             "focus": lambda: self._check_focus(_green(frame.small), gain),
             "light": lambda: self._check_light(ratio - gain, both),
-            "camera": lambda: self._check_camera(frame, markers),
+            "camera": lambda: self._check_camera(frame, markers, touches=touch.ok),
         }
         # markers tell the camera's motion at once, the border takes as long as the other two
         at_once = () if markers is None else (slow.pop("camera")(),)
@@ -142,8 +143,7 @@ class HealthMonitor:
         ]
         if markers is not None:
             checks.append(self._check_markers(markers))
-        checks.append(self._check_touch(soft, gain))
-        return tuple(checks)
+        return (*checks, touch)
 
     def _check_sometimes(self, checks: Mapping[str, Callable[[], Check]], time_s: float) -> Iterable[Check]:
         """Checks of what changes slowly, of which a frame brings one anew, and all that would else be too old."""
@@ -218,8 +218,8 @@ class HealthMonitor:
         told = f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference"
         return _judge("light", worst, self.limits.light, told, "look after the lamps, or take a new reference")
 
-    def _check_camera(self, frame: LiveFrame, markers: TrackedFrame | None) -> Check:
-        limit, moved = self.limits.camera_px, self._camera.update(frame.small, markers)
+    def _check_camera(self, frame: LiveFrame, markers: TrackedFrame | None, *, touches: bool) -> Check:
+        limit, moved = self.limits.camera_px, self._camera.update(frame.small, markers, touches=touches)
         if moved is None:
             told = "the border of the picture shows too little to tell whether the camera has moved"
             return _judge("camera", 0.0, limit, told, "")

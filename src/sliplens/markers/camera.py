@@ -1,12 +1,15 @@
 """Motion of the camera against the untouched sensor, apart from what a contact does to the skin."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import hypot, radians
 
 import numpy as np
 from jaxtyping import Complex, Float, Float32
+from scipy.ndimage import affine_transform
 
 from sliplens.markers.tracks import TrackedFrame
 from sliplens.recordings.capture import Frame
+from sliplens.recordings.labels.lag import LEAST_TOUCH
 
 Plane = Float32[np.ndarray, "height width"]
 
@@ -38,8 +41,10 @@ them by 0.43 px at most, and on 120 drawn ones of `health-choose`."""
 class CameraMotion:
     """Similarity that moves the reference onto a frame, and how far it is beyond what a contact explains."""
 
-    shift_px: float
-    """Length of the shift, in pixels of a picture 224 high."""
+    x_px: float
+    """Shift to the right, in pixels of a picture 224 high."""
+    y_px: float
+    """Shift downwards, in the same unit."""
     turn_deg: float
     """Clockwise turn about the middle of the picture, in degrees."""
     zoom: float
@@ -47,7 +52,17 @@ class CameraMotion:
     excess_px: float
     """Largest motion of the border by shift, turn or zoom that no contact explains, in pixels of a picture 224 high."""
     free: bool
-    """Whether no contact was seen to move the skin, so that all of the motion is the camera's."""
+    """True where no contact moves the skin, so that all of the motion is the camera's."""
+
+    @property
+    def shift_px(self) -> float:
+        """Length of the shift, in pixels of a picture 224 high."""
+        return hypot(self.x_px, self.y_px)
+
+    @property
+    def turn_px(self) -> float:
+        """Motion of the border by the turn, in pixels of a picture 224 high."""
+        return abs(radians(self.turn_deg)) * _HALF_PX
 
 
 def marker_camera_motion(markers: TrackedFrame) -> CameraMotion | None:
@@ -103,7 +118,8 @@ def _as_motion(
     lengths = float(abs(fitted[0])), float(abs(fitted[1].real)), float(abs(fitted[1].imag))
     excess = max(length - share * healthy_px for length, share in zip(lengths, shares, strict=True))
     return CameraMotion(
-        shift_px=lengths[0],
+        x_px=float(fitted[0].real),
+        y_px=float(fitted[0].imag),
         turn_deg=float(np.degrees(fitted[1].imag / _HALF_PX)),
         zoom=float(fitted[1].real / _HALF_PX),
         excess_px=max(0.0, excess),
@@ -129,6 +145,8 @@ _SCALES = 56, 112
 """Blocks of pixels along the picture's side in which the border is compared, from coarse to fine."""
 _PARTS, _STRAYS = 8, 2
 """Parts of the border, and how many of them may move otherwise than the others."""
+_TOUCH_BLOCKS = 28
+"""Blocks along the picture's side in which a contact is looked for."""
 _REACH_PX = 24
 _STEPS = 2
 _TEXTURE = 3.0
@@ -174,15 +192,30 @@ class BorderMotion:
         free = length_px < _LIGHT_PX or misfit_px < _STILL_PX + _ALIKE_SHARE * length_px
         return _as_motion(fitted, 0.0 if free else misfit_px, _NO_SHARES if free else _BORDER_SHARES, free=free)
 
+    def explains(self, plane: Plane, motion: CameraMotion) -> bool:
+        """Return True where the reference, moved so, differs from a picture by less than a contact changes it."""
+        level, factor = self._levels[-1]
+        blocks = block_means(plane * np.float32(self._level / _brightness(plane)), factor)
+        similarity, middle = 1 + motion.zoom + 1j * radians(motion.turn_deg), (np.array(blocks.shape) - 1) / 2
+        back = 1 / similarity
+        to_reference = np.array([[back.real, back.imag], [-back.imag, back.real]])  # of (row, column)
+        shift = np.array([motion.y_px, motion.x_px]) * (self._half / _HALF_PX / factor)
+        offset = middle - to_reference @ (middle + shift)
+        moved = affine_transform(level.plane, to_reference, offset, order=1, mode="nearest")
+        difference = block_means(blocks - moved, max(1, min(blocks.shape) // _TOUCH_BLOCKS))
+        return float(np.quantile(np.abs(difference), 0.98)) < LEAST_TOUCH  # as `picture_change`
+
 
 def _brightness(plane: Plane) -> float:
     return max(1.0, float(np.median(plane[::4, ::4])))
 
 
 class CameraWatch:
-    """Camera's motion over the frames of a sensor: what was seen before a contact holds until that is let go.
+    """Camera's motion over the frames of one sensor.
 
-    Markers show it, where they are followed and enough of them are seen beyond the contact, else parts of the border.
+    Markers show it in every frame, where they are followed and enough of them lie beyond the contact. Parts of the
+    border show it otherwise. A contact shifts and magnifies the border too, but does not turn it: in a contact only a
+    turn counts, and a shift or zoom measured before the contact holds until the contact ends.
 
     Parameters
     ----------
@@ -195,25 +228,45 @@ class CameraWatch:
     >>> from sliplens.markers.camera import CameraWatch
     >>> pixels = np.random.default_rng(0).integers(60, 200, (28, 28, 3), dtype=np.uint8)
     >>> untouched = np.kron(pixels, np.ones((8, 8, 1), dtype=np.uint8))
-    >>> moved = CameraWatch(untouched).update(np.roll(untouched, 2, axis=1))
+    >>> moved = CameraWatch(untouched).update(np.roll(untouched, 2, axis=1), touches=False)
     >>> round(moved.shift_px, 1), moved.excess_px > 0.6
     (2.0, True)
     """
 
     def __init__(self, reference: Frame) -> None:
-        self._border = BorderMotion(reference[..., 1].astype(np.float32))
-        self._last: CameraMotion | None = None
+        self._border = BorderMotion(_green(reference))
+        self._untouched: CameraMotion | None = None
+        """Newest motion of a frame without a contact."""
 
-    def update(self, frame: Frame, markers: TrackedFrame | None = None) -> CameraMotion | None:
-        """Take the next frame; gives the motion that counts, None where neither markers nor the border show any."""
+    def update(self, frame: Frame, markers: TrackedFrame | None = None, *, touches: bool) -> CameraMotion | None:
+        """Measure the motion in the next frame; None where neither markers nor the border show any.
+
+        `touches`: True where the frame differs from the reference as by a contact. A camera that moved makes it differ,
+        too: a frame that the motion alone explains counts as untouched.
+        """
         motion = None if markers is None else marker_camera_motion(markers)
-        if motion is None:
-            motion = self._border.measure(frame[..., 1].astype(np.float32))  # green, which cameras see best
-        if motion is None:
-            return None
-        if motion.free:
-            self._last = motion
-        return motion if self._last is None or motion.excess_px > self._last.excess_px else self._last
+        if motion is not None:
+            touches = not motion.free
+        else:
+            plane = _green(frame)
+            motion = self._border.measure(plane)
+            if motion is None:
+                return None
+            touches = touches and not self._border.explains(plane, motion)
+            if not touches:
+                lengths = motion.shift_px, abs(motion.zoom) * _HALF_PX, motion.turn_px
+                motion = replace(motion, excess_px=max(lengths))
+            elif motion.free:  # else `measure` has left shift and zoom out, and what a contact may turn
+                motion = replace(motion, excess_px=motion.turn_px)
+        if not touches:
+            self._untouched = motion
+        before = self._untouched
+        return motion if before is None or motion.excess_px > before.excess_px else before
+
+
+def _green(frame: Frame) -> Plane:
+    """Return the green channel, which cameras resolve best."""
+    return frame[..., 1].astype(np.float32)
 
 
 class _Level:
@@ -228,6 +281,7 @@ class _Level:
         sector = np.floor((bearing / (2 * np.pi) + 1) * _PARTS).astype(int) % _PARTS
         sector[wide:-wide, wide:-wide] = -1
         sector[[0, -1]] = sector[:, [0, -1]] = -1
+        self.plane = plane
         down, along = np.gradient(plane)
         self._stride, middle = width + 2 * _REACH_PX, ((width - 1) + 1j * (height - 1)) / 2
         inside = np.nonzero(sector >= 0)

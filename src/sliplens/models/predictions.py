@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, pairwise
-from math import radians
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,7 @@ from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_file, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
-from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, SIDE_PX, BorderMotion
+from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
 from sliplens.models.checkpoint import Estimate, Network, open_run, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
@@ -488,14 +487,13 @@ class _Reading(Work):
         # batches are encoded while the ones before are under way; first frame of each, which touch, and doubts of them
         encoded: deque[tuple[int, list[bool], list[str | None]]] = deque()
         shear = None if reference is None else self.trained.shear_estimator(reference)
-        camera = None if reference is None else BorderMotion(reference[..., 1].astype(np.float32))
-        shifted = turned = False
+        camera, moved = None if reference is None else CameraWatch(reference), False
         follower = self.trained.follow() if self.sequence else None
         if follower is not None and capture.time_s is not None:
             require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
 
         def encode() -> Iterator[Tensor]:
-            nonlocal shifted, turned
+            nonlocal moved
             while batch := list(islice(frames, engine.batch_size)):
                 first, images = batch[0][0], [frame for _, frame in batch]
                 if states:
@@ -508,27 +506,23 @@ class _Reading(Work):
                 for at, (touch, frame) in enumerate(zip(touches, images, strict=True), start=first):
                     # a camera that has moved stays so; images of a folder are of any time
                     if camera is not None and (at % _CAMERA_EVERY == 0 or capture.files is not None):
-                        motion = camera.measure(frame[..., 1].astype(np.float32))
-                        # a contact shifts and magnifies the border too, but does not turn it: the shift measured before
-                        # a contact holds until it ends
-                        shifted = shifted if touch or motion is None else motion.excess_px > CAMERA_LIMIT_PX
-                        turn_px = 0.0 if motion is None else abs(radians(motion.turn_deg)) * SIDE_PX / 2
-                        turned = turn_px > CAMERA_LIMIT_PX
+                        motion = camera.update(frame, touches=touch)
+                        moved = motion is not None and motion.excess_px > CAMERA_LIMIT_PX
                     astray = self.trained.doubt_shear(shear.estimate(frame)) if shear is not None and touch else None
-                    doubts.append(CAMERA_REASON if shifted or turned else astray)
+                    doubts.append(CAMERA_REASON if moved else astray)
                 encoded.append((first, touches, doubts))
                 yield self.trained.encode(np.stack(images), reference)
 
         for answers in engine.answers(encode()):
             first, touches, doubts = encoded.popleft()
             estimate = self.trained.to_estimate(*answers, friction=self.friction)
-            if follower is not None:
-                assert capture.time_s is not None  # `_require_order`
-                times = capture.time_s[first : first + len(touches)]
-                estimate = follower.update(estimate, times, np.array(touches))
             reasons = zip(estimate.withheld(np.array(touches)), doubts, strict=True)
             # of a strange picture the direction of the shear says nothing
             withheld = [doubt if doubt == CAMERA_REASON else strange or doubt for strange, doubt in reasons]
+            if follower is not None:
+                assert capture.time_s is not None  # `_require_order`
+                times, believed = capture.time_s[first : first + len(touches)], [reason is None for reason in withheld]
+                estimate = follower.update(estimate, times, np.array(touches), believed=np.array(believed))
             columns = _columns(estimate, capture, first, withheld=withheld) | {"touches": touches}
             for name, values in columns.items():
                 if name in rows:

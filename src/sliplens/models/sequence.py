@@ -176,7 +176,12 @@ class Follower:
         """Whether there was a gap in this contact, so that its frames are read by themselves."""
 
     def update(
-        self, estimate: "Estimate", time_s: Float[np.ndarray, " frames"], touches: Bool[np.ndarray, " frames"]
+        self,
+        estimate: "Estimate",
+        time_s: Float[np.ndarray, " frames"],
+        touches: Bool[np.ndarray, " frames"],
+        *,
+        believed: Bool[np.ndarray, " frames"] | None = None,
     ) -> "Estimate":
         """The next frames as they are read after those before.
 
@@ -184,17 +189,19 @@ class Follower:
         touches. A frame that nothing touches keeps its answer, and what was before it is forgotten; so is what was
         before a clock that runs back. After a gap (`GAP_S`) the rest of the contact keeps its answers too: nobody knows
         what happened meanwhile, and to a head that does not know the largest pull, what slides seems to hold.
+        `believed`: False for frames whose margin is withheld; they keep their answer and leave nothing in memory.
         """
         assert estimate.probabilities is not None
         assert estimate.ratio is not None
         margin, ratio = (values.astype(np.float32) for values in (estimate.probabilities, estimate.ratio.probabilities))
         summary = self._head.summarize(margin, ratio)
         correction, followed = np.zeros_like(margin), np.zeros(len(margin), dtype=bool)
+        counts = touches if believed is None else touches & believed
         for row, (now_s, touched) in enumerate(zip(time_s.tolist(), touches.tolist(), strict=True)):
             if not touched or now_s < self._time_s:
                 self.forget()
             self.lost |= now_s - self._time_s > GAP_S + ROUNDING_S
-            if not touched or self.lost:
+            if not counts[row] or self.lost:
                 continue
             elapsed_s = LONGEST_S if isnan(self._time_s) else now_s - self._time_s
             [told] = self._head.tell(summary[row : row + 1], np.array([elapsed_s]), peak=self._peak)
