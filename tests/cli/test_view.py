@@ -45,7 +45,7 @@ def test_a_table_of_predictions_finds_its_frames(small_dataset: Dataset, tmp_pat
             View(source=table, output=output).run()
             assert name_of(output) == "test-wet-7"
             continue
-        with pytest.raises(InputError, match=r"which is not there; name the source first, and the table with --predic"):
+        with pytest.raises(InputError, match=r"which does not exist; name the source first, and the table with --predic"):
             View(source=table, output=tmp_path / "b.rrd").run()
     View(source=small_dataset.folder, trial="test-wet-7", predictions=table, output=tmp_path / "b.rrd").run()
 
@@ -94,7 +94,7 @@ def test_without_an_output_the_viewer_opens(small_dataset: Dataset, monkeypatch:
         stream.save(tmp_path / "sent.rrd")
 
     monkeypatch.setattr(rerun.RecordingStream, "connect_grpc", connect)
-    monkeypatch.setattr("sliplens.plots.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
+    monkeypatch.setattr("sliplens.live.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
     View(source=small_dataset.folder, trial="test-wet-7").run()
     assert name_of(tmp_path / "sent.rrd") == "test-wet-7"
     # whoever opens it is told what it tells others

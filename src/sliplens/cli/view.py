@@ -13,14 +13,14 @@ from sliplens.files import require_new_file
 from sliplens.progress import number_of
 
 if TYPE_CHECKING:
-    from sliplens.plots.viewer import Viewed
+    from sliplens.live.viewer import ViewedTrial
 
 _SOURCE = f"{SOURCE_HELP} Or a table of `sliplens predict`, which names its source, or a folder of `sliplens explain`."
 
 
 @dataclass(frozen=True, kw_only=True)
 class View(SourceCommand):
-    """Look at a trial in the Rerun viewer: frames, differences, forces, labels, predictions, maps on one clock.
+    """Show a trial in the Rerun viewer: frames, differences, forces, labels, predictions, maps on one clock.
 
     Needs the extra `view`: pip install "sliplens[view]". The viewer opens on this machine and listens to it alone. Or
     name a file to write (-o), to be opened with `rerun FILE.rrd` wherever Rerun is installed.
@@ -40,7 +40,7 @@ class View(SourceCommand):
 
     def run(self) -> None:
         """Open the viewer, or write its file."""
-        from sliplens.plots.viewer import Beside, open_viewer, require_rerun, require_rrd_path, write_rrd
+        from sliplens.live.viewer import Overlays, open_viewer, require_rerun, require_rrd_path, write_rrd
         from sliplens.results.explanation import is_explanation, load_explanation
 
         require_rerun()
@@ -55,21 +55,21 @@ class View(SourceCommand):
         explained = None if maps is None else load_explanation(maps)
         viewed = self._open()
         with Terminal().stage(f"Reading {viewed.trial.trial}") as bar:
-            beside = Beside(predictions=table, maps=explained, tracks=self.tracks)
+            overlays = Overlays(predictions=table, maps=explained, tracks=self.tracks)
             if self.output is None:
-                open_viewer(viewed, beside=beside, on_progress=bar)
+                open_viewer(viewed, overlays=overlays, on_progress=bar)
             else:
-                write_rrd(viewed, self.output, beside=beside, on_progress=bar)
-        told = f"{viewed.trial.trial}, {number_of(len(viewed.trial), 'frame')}"
+                write_rrd(viewed, self.output, overlays=overlays, on_progress=bar)
+        about = f"{viewed.trial.trial}, {number_of(len(viewed.trial), 'frame')}"
         if self.output is None:
-            say(f"{told}, are in the Rerun viewer")
-            say("the viewer tells its makers that it is used, not what is seen; `rerun analytics disable` ends that")
+            say(f"{about}, are in the Rerun viewer")
+            say("the viewer reports to its makers that it is used, not what it shows: see `rerun analytics disable`")
         else:
-            wrote(self.output, f"{told}; open it with `rerun {self.output}`")
+            wrote(self.output, f"{about}; open it with `rerun {self.output}`")
 
-    def _open(self) -> "Viewed":
-        """Trial of whatever was named."""
-        from sliplens.plots.viewer import view_capture, view_explained, view_stored
+    def _open(self) -> "ViewedTrial":
+        """Prepare the trial of the source."""
+        from sliplens.live.viewer import view_capture, view_explained, view_stored
         from sliplens.recordings import load_dataset
         from sliplens.recordings.dataset import DATASET_FILE
         from sliplens.recordings.source import open_source
@@ -88,7 +88,7 @@ class View(SourceCommand):
         return view_capture(self.call(open_source, source=source, trial=trial, whole=False)[0])
 
     def _source_of(self, table: Path) -> tuple[Path, str | None]:
-        """What a table of predictions was read from, and its first trial."""
+        """Find the source of a table of predictions, and its first trial."""
         from sliplens.codec import open_parquet
 
         with open_parquet(table, {"trial": "texts"}, cure="name a table that sliplens predict wrote") as file:
@@ -96,7 +96,7 @@ class View(SourceCommand):
             trials = next(file.iter_batches(1, columns=["trial"]), None)
         if not Path(named).exists() or not named:
             raise InputError(
-                f"{table} was read from {named or 'a source that it does not tell'}, which is not there; name the "
-                f"source first, and the table with --predictions {table}"
+                f"{table} was predicted from {named or 'an unknown source'}, which does not exist; name the source "
+                f"first, and the table with --predictions {table}"
             )
         return Path(named), None if trials is None else trials["trial"][0].as_py()

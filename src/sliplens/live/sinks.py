@@ -20,7 +20,7 @@ import numpy as np
 from sliplens.errors import InputError
 from sliplens.extras import Table, require_packages
 from sliplens.files import to_builtins
-from sliplens.images import encode_jpeg
+from sliplens.images import encode_jpeg, encode_png
 from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
 from sliplens.progress import number_of
@@ -217,48 +217,70 @@ def _new_file(address: str, *, kind: str) -> Path:
     return path
 
 
-class RerunFile:
-    """Readings and frames for the Rerun viewer, in a file.
+class RerunSink:
+    """Readings and frames for the Rerun viewer.
 
     Its entities are `margin`, `interval/low`, `interval/high`, `words` and `frame`.
 
     Parameters
     ----------
-    path
-        File to write, which ends in .rrd.
+    connect
+        Opens the stream that it is given: to a file, or to a running viewer.
+    lossless
+        If True, frames are stored as PNG, else as JPEG.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(
+        self, connect: Callable[[Any], None], *, application: str = "sliplens-live", lossless: bool = False
+    ) -> None:
         require_packages("rerun", extra="sinks", purpose="--sink rerun")
         import rerun  # noqa: PLC0415 (an extra, and large)
 
-        self._rerun, self._stream = rerun, rerun.RecordingStream("sliplens-live")
-        self._stream.save(str(path))
+        self._rerun, self._lossless = rerun, lossless
+        self.stream = rerun.RecordingStream(application)
+        connect(self.stream)
+
+    def set_frame(self, number: int, time_s: float) -> None:
+        """Set number and time of the frame that is logged next."""
+        # Rerun would cut off what is less than a nanosecond
+        self.stream.set_time("time", duration=np.timedelta64(round(1e9 * time_s), "ns"))
+        self.stream.set_time("frame", sequence=number)
+
+    def log(self, entity: str, value: Any, *, static: bool = False) -> None:
+        """Log a value of Rerun's at the frame that was set, or for all frames."""
+        self.stream.log(entity, value, static=static)
+
+    def log_image(self, entity: str, image: Frame, *, static: bool = False) -> None:
+        """Log an image."""
+        if self._lossless:
+            picture = self._rerun.EncodedImage(contents=encode_png(image), media_type="image/png")
+        else:
+            picture = self._rerun.Image(image).compress(jpeg_quality=_QUALITY)
+        self.log(entity, picture, static=static)
 
     def send(self, reading: Reading, image: Frame | None, /) -> None:
-        """Log what is known, on the clock of the source."""
+        """Log a reading on the clock of the source; one without a time is left out."""
         if not np.isfinite(reading.time_s):
             return
-        stream, rerun = self._stream, self._rerun
-        stream.set_time("time", duration=reading.time_s)
-        stream.set_time("frame", sequence=reading.number)
+        self.set_frame(reading.number, reading.time_s)
         for entity, value in (
             ("margin", reading.margin), ("interval/low", reading.low), ("interval/high", reading.high),
         ):  # fmt: skip
-            # what is withheld ends the line, and is no longer shown as the newest
-            stream.log(entity, rerun.Clear(recursive=False) if value is None else rerun.Scalars(value))
-        stream.log("words", rerun.TextLog(str(describe_reading(reading))))
+            # a withheld margin ends the line, and is no longer shown as the newest
+            self.log(entity, self._rerun.Clear(recursive=False) if value is None else self._rerun.Scalars(value))
+        self.log("words", self._rerun.TextLog(str(describe_reading(reading))))
         if image is not None:
-            stream.log("frame", rerun.Image(image).compress(jpeg_quality=_QUALITY))
+            self.log_image("frame", image)
 
     def close(self) -> None:
-        """Write what waits, and end the file."""
-        self._stream.flush()
-        self._stream.disconnect()
+        """Write what waits, and end the stream."""
+        self.stream.flush()
+        self.stream.disconnect()
 
 
 def _open_rerun(address: str) -> Sink:
-    return RerunFile(_new_file(address, kind="rerun"))
+    path = _new_file(address, kind="rerun")
+    return RerunSink(lambda stream: stream.save(str(path)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -538,7 +560,7 @@ class Sender:
 
 
 __all__ = [
-    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "Datagrams", "FoxgloveTopics", "JsonLines", "RerunFile",
+    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "Datagrams", "FoxgloveTopics", "JsonLines", "RerunSink",
     "RosTopic", "Sender", "Sink", "SinkState", "ZenohRos", "ZenohTopics", "encode_reading", "open_sink", "parse_zenoh",
     "reading_schema",
 ]  # fmt: skip

@@ -17,8 +17,8 @@ from there import there
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.images import decode_png
-from sliplens.plots import viewer as viewer_process
-from sliplens.plots.viewer import Beside, open_viewer, view_capture, view_explained, view_stored, write_rrd
+from sliplens.live import viewer as viewer_process
+from sliplens.live.viewer import Overlays, open_viewer, view_capture, view_explained, view_stored, write_rrd
 from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
@@ -97,7 +97,7 @@ def written(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder / "new" / "a.rrd",
         on_progress=lambda done, total: told.append((done, total)),
     )
-    assert told == [(8, FRAMES), (16, FRAMES), (FRAMES, FRAMES)]
+    assert told == [(done, FRAMES) for done in range(1, FRAMES + 1)]
     assert [path.name for path in (folder / "new").iterdir()] == ["a.rrd"]
     return folder / "new" / "a.rrd"
 
@@ -108,7 +108,7 @@ def simulated(written: Path) -> dict[str, list[pa.RecordBatch]]:
 
 
 def test_frames_come_back_pixel_by_pixel(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
-    np.testing.assert_array_equal(pictures(simulated, "camera/frame"), trial.frames)
+    np.testing.assert_array_equal(pictures(simulated, "frame"), trial.frames)
     np.testing.assert_array_equal(pictures(simulated, "reference"), trial.reference[None])
     assert rows(simulated, "reference", "EncodedImage:blob").time_ns is None
 
@@ -128,12 +128,12 @@ def test_differences_are_those_of_signed_numbers_times_one_factor(
 
 def test_every_frame_has_its_time_and_its_number(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
     parts = {
-        "camera/frame": "EncodedImage:blob",
+        "frame": "EncodedImage:blob",
         "difference": "EncodedImage:blob",
-        "camera/zones": "SegmentationImage:buffer",
-        "camera/markers": "Points2D:positions",
-        "camera/displacements": "Arrows2D:vectors",
-        "margin/gamma": "Scalars:scalars",
+        "frame/zones": "SegmentationImage:buffer",
+        "frame/markers": "Points2D:positions",
+        "frame/displacements": "Arrows2D:vectors",
+        "label/margin": "Scalars:scalars",
     }
     for entity, component in parts.items():
         found = rows(simulated, entity, component)
@@ -147,18 +147,18 @@ def test_labels_and_forces_are_those_of_the_recording(trial: Recording, simulate
         "force/normal": trial.normal_force_n,
         "force/tangential": trial.tangential_force_n,
         "force/limit": trial.friction_coefficient * trial.normal_force_n,
-        "ratio/static_friction": there(trial.truth).static_friction,
-        "margin/gamma": 100 * trial.safety_margin,
-        "margin/stick_ratio": 100 * trial.stick_ratio,
+        "ratio/friction": there(trial.truth).static_friction,
+        "label/margin": trial.safety_margin,
+        "label/stick_ratio": trial.stick_ratio,
     }
     for entity, values in expected.items():
         np.testing.assert_array_equal(numbers(simulated, entity), values)
-    assert np.isnan(numbers(simulated, "margin/gamma")).any()  # before the contact there is none
+    assert np.isnan(numbers(simulated, "label/margin")).any()  # before the contact there is none
     # Gamma = 1 - (F_t / F_n) / mu wherever there is one
     ratio, known = numbers(simulated, "ratio/tangential_to_normal"), np.isfinite(trial.safety_margin)
     gamma = np.clip(1 - ratio / trial.friction_coefficient, 0, 1)
     np.testing.assert_allclose(gamma[known], trial.safety_margin[known], atol=1e-9)
-    assert "margin/band/high" not in simulated
+    assert "label/high" not in simulated
 
 
 def test_states_begin_where_they_change(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
@@ -172,15 +172,15 @@ def test_states_begin_where_they_change(trial: Recording, simulated: dict[str, l
 
 def test_truth_lies_over_the_pixels_it_belongs_to(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
     truth = there(trial.truth)
-    found = rows(simulated, "camera/zones", "SegmentationImage:buffer").values
+    found = rows(simulated, "frame/zones", "SegmentationImage:buffer").values
     maps = np.stack([np.array(one, dtype=np.uint8).reshape(trial.reference.shape[:2]) for (one,) in found])
     np.testing.assert_array_equal(maps, truth.contact_map)
     # a pixel's centre is a whole number here, and a half more in Rerun
-    markers = np.array(rows(simulated, "camera/markers", "Points2D:positions").values, dtype=np.float32)
+    markers = np.array(rows(simulated, "frame/markers", "Points2D:positions").values, dtype=np.float32)
     np.testing.assert_allclose(markers, truth.marker_px + 0.5, atol=1e-4)
     # arrows go from rest to where the marker is
     begin, way = (
-        np.array(rows(simulated, "camera/displacements", f"Arrows2D:{name}").values, dtype=np.float32)
+        np.array(rows(simulated, "frame/displacements", f"Arrows2D:{name}").values, dtype=np.float32)
         for name in ("origins", "vectors")
     )
     np.testing.assert_allclose(begin, np.broadcast_to(truth.marker_rest_px + 0.5, begin.shape), atol=1e-4)
@@ -202,7 +202,8 @@ def test_a_trial_and_its_layout_are_told(trial: Recording, written: Path, simula
         if "ViewBlueprint:space_origin" in batch.schema.names
         for (value,) in batch.column("ViewBlueprint:space_origin").to_pylist()
     }
-    shown = {"camera", "difference", "reference", "state", "force", "ratio", "margin", "about"}
+    # the margins of labels and predictions share the chart at the root
+    shown = {"frame", "difference", "reference", "state", "force", "ratio", "", "about"}
     assert {origin.strip("/") for origin in origins} == shown
 
 
@@ -224,18 +225,17 @@ def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
     data = save_dataset(tmp_path / "data", bare)
     write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
-    np.testing.assert_array_equal(numbers(found, "margin/gamma"), 100 * margin)
+    np.testing.assert_array_equal(numbers(found, "label/margin"), margin)
     np.testing.assert_array_equal(numbers(found, "force/normal"), normal)
-    high, low = (numbers(found, f"margin/band/{name}") for name in ("high", "low"))
-    np.testing.assert_allclose((high + low) / 2, 100 * margin, rtol=1e-12)
-    np.testing.assert_allclose((high - low) / 2, 100 * sigma, rtol=1e-9)
-    # what friction holds is known, whether it is the static one is not
+    high, low = (numbers(found, f"label/{name}") for name in ("high", "low"))
+    np.testing.assert_allclose((high + low) / 2, margin, rtol=1e-12)
+    np.testing.assert_allclose((high - low) / 2, sigma, rtol=1e-9)
     np.testing.assert_array_equal(numbers(found, "ratio/friction"), trial.friction_coefficient)
-    assert not {"ratio/static_friction", "camera/markers", "camera/zones", "sensor/force"} & set(found)
+    assert not {"frame/zones", "sensor/force"} & set(found)
     label = rows(found, "state/label", "StateChange:state")
     last = np.searchsorted(there(label.frame), np.arange(FRAMES), side="right") - 1
     np.testing.assert_array_equal([label.values[at] == ["valid"] for at in last], valid & np.isfinite(margin))
-    np.testing.assert_array_equal(pictures(found, "camera/frame"), trial.frames)
+    np.testing.assert_array_equal(pictures(found, "frame"), trial.frames)
 
 
 def test_a_trial_where_nothing_is_known_can_be_looked_at(trial: Recording, tmp_path: Path):
@@ -250,7 +250,7 @@ def test_a_trial_where_nothing_is_known_can_be_looked_at(trial: Recording, tmp_p
     data = save_dataset(tmp_path / "data", bare)
     write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
-    assert np.isnan(numbers(found, "margin/gamma")).all()
+    assert np.isnan(numbers(found, "label/margin")).all()
     assert not pictures(found, "difference").any()
 
 
@@ -272,16 +272,16 @@ def test_what_networks_and_trackers_say_stands_on_the_clock_of_the_frames(trial:
     tracks = pa.table({"trial": [trial.trial] * len(flat), **place, "x_px": flat[:, 0], "y_px": flat[:, 1]})
     pq.write_table(tracks, tmp_path / "tracks.parquet")
     maps = explained_of(trial, [3, 4, 9])
-    beside = Beside(predictions=tmp_path / "margins.parquet", maps=maps, tracks=tmp_path / "tracks.parquet")
-    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd", beside=beside)
+    overlays = Overlays(predictions=tmp_path / "margins.parquet", maps=maps, tracks=tmp_path / "tracks.parquet")
+    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd", overlays=overlays)
     found = read_rrd(tmp_path / "a.rrd")
-    read = rows(found, "margin/read", "Scalars:scalars")
+    read = rows(found, "margin", "Scalars:scalars")
     np.testing.assert_array_equal(read.frame, frames)
-    np.testing.assert_allclose(numbers(found, "margin/read"), 100 * margin)
-    np.testing.assert_allclose(numbers(found, "margin/read/low"), 100 * (margin - 0.1))
-    assert "margin/read/high" not in found
+    np.testing.assert_allclose(numbers(found, "margin"), margin)
+    np.testing.assert_allclose(numbers(found, "interval/low"), margin - 0.1)
+    assert not any("Scalars:scalars" in batch.schema.names for batch in found["interval/high"])
     np.testing.assert_array_equal(read.time_ns, np.round(1e9 * trial.time_s[frames]).astype(np.int64))
-    followed = rows(found, "camera/followed", "Points2D:positions").values
+    followed = rows(found, "frame/followed", "Points2D:positions").values
     moving = [points for points in followed if points is not None]
     assert [len(points) for points in moving][5] == 2
     np.testing.assert_allclose(moving[4], positions[4] + 0.5, atol=1e-3)
@@ -297,13 +297,13 @@ def test_what_is_of_another_trial_is_refused(trial: Recording, tmp_path: Path):
     data = save_dataset(tmp_path / "data", trial)
     nothing = {"trial": ["other"], "frame": [0], "prediction": [0.5], "low_90": [0.1], "high_90": [0.9]}
     pq.write_table(pa.table(nothing), tmp_path / "margins.parquet")
-    for beside, words in (
-        (Beside(predictions=tmp_path / "margins.parquet"), f"has no frame of {trial.trial}; it has other"),
-        (Beside(maps=explained_of(replace(trial, trial="other"), [3])), "of no frame of"),
-        (Beside(tracks=tmp_path / "margins.parquet"), "lacks the column"),
+    for overlays, words in (
+        (Overlays(predictions=tmp_path / "margins.parquet"), f"has no frame of {trial.trial}; it has other"),
+        (Overlays(maps=explained_of(replace(trial, trial="other"), [3])), "of no frame of"),
+        (Overlays(tracks=tmp_path / "margins.parquet"), "lacks the column"),
     ):
         with pytest.raises(InputError, match=words):
-            write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd", beside=beside)
+            write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd", overlays=overlays)
     assert not (tmp_path / "a.rrd").exists()
 
 
@@ -311,13 +311,13 @@ def test_frames_of_any_source_and_explained_ones_are_viewed_alike(trial: Recordi
     (capture,) = open_source(trial.frames, reference=trial.reference)
     write_rrd(view_capture(capture), tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
-    np.testing.assert_array_equal(pictures(found, "camera/frame"), trial.frames)
+    np.testing.assert_array_equal(pictures(found, "frame"), trial.frames)
     np.testing.assert_array_equal(pictures(found, "reference"), trial.reference[None])
     maps = explained_of(trial, [3, 9])
-    write_rrd(view_explained(maps), tmp_path / "b.rrd", beside=Beside(maps=maps))
+    write_rrd(view_explained(maps), tmp_path / "b.rrd", overlays=Overlays(maps=maps))
     found = read_rrd(tmp_path / "b.rrd")
-    np.testing.assert_array_equal(pictures(found, "camera/frame"), maps.pictures)
-    np.testing.assert_allclose(numbers(found, "margin/gamma"), 100 * trial.safety_margin[[3, 9]])
+    np.testing.assert_array_equal(pictures(found, "frame"), maps.pictures)
+    np.testing.assert_allclose(numbers(found, "label/margin"), trial.safety_margin[[3, 9]])
 
 
 def explained_of(trial: Recording, frames: list[int]) -> Explanation:
@@ -388,7 +388,7 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
     np.testing.assert_array_equal(np.array(late.values), force)
     if applied:  # half a frame at 15 a second
         assert shift == pytest.approx(LAG_S, abs=1 / 30)
-    np.testing.assert_array_equal(numbers(found, "ratio/static_friction"), labelling.basis.friction.mu)
+    np.testing.assert_array_equal(numbers(found, "ratio/friction"), labelling.basis.friction.mu)
     (text,) = rows(found, "about", "TextDocument:text").values[0]
     # as it was typed, not as Markdown reads it
     assert r"- object: paper\_cup\*" in text
@@ -459,18 +459,18 @@ def test_an_open_viewer_is_given_what_a_file_is(
         stream.save(tmp_path / "sent.rrd")
 
     monkeypatch.setattr(rerun.RecordingStream, "connect_grpc", connect)
-    monkeypatch.setattr("sliplens.plots.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
+    monkeypatch.setattr("sliplens.live.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
     data = save_dataset(tmp_path / "data", trial)
     open_viewer(view_stored(data, data.trials[0]))
     sent = read_rrd(tmp_path / "sent.rrd")
     assert set(sent) == set(simulated)
-    np.testing.assert_array_equal(pictures(sent, "camera/frame"), trial.frames)
+    np.testing.assert_array_equal(pictures(sent, "frame"), trial.frames)
 
 
 def test_no_viewer_opens_for_a_trial_that_is_not_there(
     monkeypatch: pytest.MonkeyPatch, trial: Recording, tmp_path: Path
 ):
-    monkeypatch.setattr("sliplens.plots.viewer.start_viewer", lambda: pytest.fail("a viewer was started"))
+    monkeypatch.setattr("sliplens.live.viewer.start_viewer", lambda: pytest.fail("a viewer was started"))
     data = save_dataset(tmp_path / "data", trial)
     trial_path(data.folder, trial.trial).unlink()
     with pytest.raises(RecordingError, match="does not exist; make the data set again"):
@@ -534,6 +534,6 @@ def test_a_viewer_that_finds_no_screen_is_told_with_its_reason(stand_in: StandIn
 def test_a_viewer_that_never_answers_is_ended(monkeypatch: pytest.MonkeyPatch, stand_in: StandIn):
     monkeypatch.setattr(viewer_process, "_PATIENCE_S", 0.5)
     begun = stand_in("import time; time.sleep(60)")
-    with pytest.raises(InputError, match=r"did not start \(it said nothing\)"):
+    with pytest.raises(InputError, match=r"did not start \(it gave no reason\)"):
         viewer_process.start_viewer()
     assert begun[0].process.returncode is not None

@@ -1,0 +1,510 @@
+"""A recorded trial in the Rerun viewer: frames, forces, labels, predictions, maps and markers on one clock."""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from itertools import islice, pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from jaxtyping import Float
+from matplotlib.colors import to_rgba
+
+from sliplens.codec import open_parquet
+from sliplens.errors import InputError
+from sliplens.extras import require_packages
+from sliplens.images import absolute_difference
+from sliplens.live.reading import Reading
+from sliplens.live.sinks import RerunSink
+from sliplens.plots.audit import Fact, audit_facts, end_of_ratio, force_ratio
+from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
+from sliplens.plots.saliency import full_colour, overlay_relevance
+from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name, written_whole
+from sliplens.progress import OnProgress, reporting, track, visible
+from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo
+from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.dataset import trial_path
+from sliplens.recordings.store import forces_path, load_forces, load_recording, read_header, stream_frames
+from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS, GroundTruth, Labels, labels_of_margins
+from sliplens.results.explanation import Explanation
+
+if TYPE_CHECKING:
+    from rerun.blueprint import Blueprint
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewedTrial:
+    """A trial to show, its frames read one at a time."""
+
+    trial: Recording
+    """Times, labels and the truth of a simulated trial."""
+    read_frames: Callable[[], Iterator[Frame]]
+    split: str = ""
+    forces: Forces | None = None
+    files: tuple[str, ...] = ()
+    """Names of the images of a folder."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overlays:
+    """Results to show beside the frames of a trial."""
+
+    predictions: Path | None = None
+    """Table that `sliplens predict` or `sliplens evaluate` wrote (Parquet)."""
+    maps: Explanation | None = None
+    tracks: Path | None = None
+    """Table that `sliplens track` wrote."""
+
+
+def view_stored(data: Dataset, info: TrialInfo) -> ViewedTrial:
+    """Prepare a trial of a data set for the viewer; only simulated trials are loaded whole, for their truth."""
+    path = trial_path(data.folder, info.trial)
+    trial = load_recording(path, pixels=read_header(path).truth is not None)
+    return ViewedTrial(
+        trial=trial,
+        read_frames=partial(stream_frames, path) if trial.truth is None else lambda: iter(trial.frames),
+        split=info.split,
+        forces=load_forces(forces_path(data.folder, info.trial)) if info.forces_sha256 else None,
+    )
+
+
+def view_capture(capture: Capture) -> ViewedTrial:
+    """Prepare a recording of any source for the viewer; its first frame is the reference where it names none."""
+    count, labels = len(capture), capture.labels or labels_of_margins(np.full(len(capture), np.nan))
+    reference = next(capture.read_frames()) if capture.read_reference is None else capture.read_reference()
+    return ViewedTrial(
+        trial=Recording(
+            **{field.name: getattr(capture, field.name) for field in fields(TrialFacts)},
+            **{field.name: getattr(labels, field.name) for field in fields(Labels)},
+            time_s=np.arange(count) / capture.frame_rate_hz if capture.time_s is None else capture.time_s,
+            reference=reference,
+            frames=np.broadcast_to(reference, (count, *reference.shape)),
+        ),
+        read_frames=capture.read_frames,
+        forces=capture.forces,
+        files=capture.files or (),
+    )
+
+
+def view_explained(explained: Explanation) -> ViewedTrial:
+    """Prepare explained frames for the viewer, as their network saw them."""
+    from sliplens.recordings.source import open_source  # noqa: PLC0415 (readers of video come with it)
+
+    (capture,) = open_source(explained.pictures)
+    first = explained.frames[0]
+    margins = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in explained.frames]
+    capture = replace(
+        capture,
+        trial=first.trial,
+        condition=first.condition,
+        day=first.day,
+        labels=labels_of_margins(np.array(margins)),
+    )
+    return replace(view_capture(capture), files=tuple(f"{frame.id}.png" for frame in explained.frames))
+
+
+def require_rrd_path(path: Path) -> None:
+    """Check that a file is named as one of the Rerun viewer."""
+    if path.suffix.lower() != ".rrd":
+        raise InputError(f"{path} does not end in .rrd; name a file of the Rerun viewer, such as trial.rrd")
+
+
+def require_rerun() -> ModuleType:
+    """Import Rerun, which only the viewer needs."""
+    require_packages("rerun", extra="view", purpose="the viewer")
+    import rerun  # noqa: PLC0415 (an extra, and large)
+
+    if not hasattr(rerun, "StateChange"):
+        raise InputError(
+            f"Rerun is too old for the viewer ({rerun.__version__}); upgrade it with "
+            '`pip install --upgrade "sliplens[view]"`'
+        )
+    if not rerun.RecordingStream("sliplens").is_enabled():
+        raise InputError("the environment variable RERUN switches Rerun off; unset it")
+    return rerun
+
+
+def write_rrd(
+    viewed: ViewedTrial, path: Path, *, overlays: Overlays = Overlays(), on_progress: OnProgress | None = None
+) -> None:
+    """Write a trial as a file of the Rerun viewer; it appears when complete."""
+    require_rrd_path(path)
+    require_rerun()
+    with written_whole(path) as part, reporting(on_progress):
+        part.touch()  # Rerun reports a file that cannot be written in its own way
+        failure = f"{path} could not be written; see what space is left"
+        _play_into(viewed, lambda stream: stream.save(part), overlays, failure=failure)
+
+
+def open_viewer(viewed: ViewedTrial, *, overlays: Overlays = Overlays(), on_progress: OnProgress | None = None) -> None:
+    """Open a trial in a Rerun viewer of its own, which stays when this process ends."""
+    require_rerun()
+    address = start_viewer()
+    with reporting(on_progress):
+        failure = "the Rerun viewer was closed too early; leave it open"
+        _play_into(viewed, lambda stream: stream.connect_grpc(address), overlays, failure=failure)
+
+
+def _play_into(viewed: ViewedTrial, connect: Callable[[Any], None], overlays: Overlays, *, failure: str) -> None:
+    sink = RerunSink(connect, application="sliplens", lossless=True)
+    try:
+        play_trial(viewed, sink, overlays)
+        sink.stream.flush()
+    except RuntimeError as error:
+        raise InputError(f"{failure} ({error})") from None
+    finally:
+        sink.stream.disconnect()
+
+
+# colours that are read on a dark ground and on a light one: the viewer has both, so nothing is black
+_LINES = {
+    "force/normal": ("F_n (N)", BLUE),
+    "force/tangential": ("F_t (N)", VERMILLION),
+    "force/limit": ("μ F_n (N)", GREY),
+    "ratio/tangential_to_normal": ("F_t / F_n", BLUE),
+    "ratio/friction": ("friction coefficient", GREEN),
+    "label/margin": ("true Γ", SKY),
+    "label/high": ("true Γ + \N{GREEK SMALL LETTER SIGMA}", PURPLE),
+    "label/low": ("true Γ \N{MINUS SIGN} \N{GREEK SMALL LETTER SIGMA}", PURPLE),
+    "label/stick_ratio": ("stick ratio", ORANGE),
+    "margin": ("predicted Γ", VERMILLION),
+    "interval/high": ("upper end of its 90 % interval", VERMILLION),
+    "interval/low": ("lower end of its 90 % interval", VERMILLION),
+}
+"""Name and colour of the numbers of a frame, by entity."""
+_SENSOR_LINES = {"x (N), as recorded": VERMILLION, "y (N), as recorded": GREEN, "z (N), as recorded": BLUE}
+_LABEL_COLOURS = {"valid": GREEN, "not valid": GREY}
+_STATE_COLOURS = {str(state): GREY if colour == "white" else colour for state, colour in STATE_COLOURS.items()}
+_ZONE_OPACITY = 0.3
+_SAMPLED_FRAMES = 32  # from which the brightness of all differences is chosen
+_HALF_PX = 0.5  # a pixel's centre is a whole number here, and a half more in Rerun
+_SAMPLES_TOGETHER = 10_000
+
+
+def _rgba(colour: str) -> list[int]:
+    return [round(255 * part) for part in to_rgba(colour)]
+
+
+def play_trial(viewed: ViewedTrial, sink: RerunSink, overlays: Overlays) -> None:
+    """Send a trial, the results beside it and the viewer's layout to a sink, a frame in memory at a time."""
+    trial, rerun = viewed.trial, require_rerun()
+    readings = {} if overlays.predictions is None else _load_readings(trial, overlays.predictions)
+    followed = {} if overlays.tracks is None else _load_tracks(trial, overlays.tracks)
+    maps = {} if overlays.maps is None else _find_maps(viewed, overlays.maps)
+    sampled = np.stack(list(islice(viewed.read_frames(), 0, None, -(-len(trial) // _SAMPLED_FRAMES))))
+    factor = brightening([absolute_difference(sampled, trial.reference)])
+    numbers = _frame_numbers(trial)
+    methods = () if overlays.maps is None else tuple(overlays.maps.methods)
+
+    sink.stream.send_recording_name(trial.trial)
+    sink.stream.send_blueprint(_lay_out(viewed, factor, numbers["ratio/friction"], methods))
+    about = _describe_trial(viewed)
+    sink.log("about", rerun.TextDocument(about, media_type=rerun.MediaType.MARKDOWN), static=True)
+    sink.log_image("reference", trial.reference, static=True)
+    _set_styles(sink, rerun, trial, [*numbers, *(["margin", "interval/high", "interval/low"] if readings else [])])
+    if viewed.forces is not None:
+        _log_samples(sink, rerun, trial, viewed.forces)
+    _log_states(sink, rerun, trial)
+    for number, frame in zip(track(range(len(trial))), viewed.read_frames(), strict=True):
+        time_s = float(trial.time_s[number])
+        if number in readings:
+            sink.send(replace(readings[number], time_s=time_s), frame)
+        else:
+            sink.set_frame(number, time_s)
+            sink.log_image("frame", frame)
+        sink.log_image("difference", brighten(absolute_difference(frame, trial.reference), factor))
+        for entity, values in numbers.items():
+            sink.log(entity, rerun.Scalars(values[number]))
+        if number in followed:
+            sink.log("frame/followed", rerun.Points2D(followed[number]))
+        if trial.truth is not None:
+            _log_truth(sink, rerun, trial.truth, number)
+        for method in methods:
+            if number in maps:
+                sink.log_image(f"map/{method}", maps[number][method])
+            elif number - 1 in maps:  # a map describes its own frame alone
+                sink.log(f"map/{method}", rerun.Clear(recursive=False))
+
+
+def _set_styles(sink: RerunSink, rerun: ModuleType, trial: Recording, lines: Iterable[str]) -> None:
+    """Send names and colours of lines, markers and zones."""
+    for entity in lines:
+        name, colour = _LINES[entity]
+        width = 1.0 if entity.endswith(("high", "low")) else 2.0
+        sink.log(entity, rerun.SeriesLines(names=name, colors=[_rgba(colour)], widths=width), static=True)
+    for entity, points_colour, radius in (("frame/followed", GREEN, 2.5), ("frame/markers", YELLOW, 2.0)):
+        points = rerun.Points2D.from_fields(colors=[_rgba(points_colour)], radii=[rerun.Radius.ui_points(radius)])
+        sink.log(entity, points, static=True)
+    if trial.truth is not None:
+        arrows = rerun.Arrows2D.from_fields(colors=[_rgba(YELLOW)], radii=[rerun.Radius.ui_points(1.0)])
+        sink.log("frame/displacements", arrows, static=True)
+        zones = [(OUTSIDE, "no contact", [0] * 4), (SLIPS, "slips", _rgba(ORANGE)), (STICKS, "sticks", _rgba(SKY))]
+        sink.log("frame/zones", rerun.AnnotationContext(zones), static=True)
+
+
+def _log_states(sink: RerunSink, rerun: ModuleType, trial: Recording) -> None:
+    """Log when the contact changes its state, and when labels begin and cease to be valid."""
+    lanes = {"state/contact": ([str(state) for state in trial.contact_state], _STATE_COLOURS)}
+    if trial.valid is not None:
+        lanes["state/label"] = (["valid" if valid else "not valid" for valid in trial.labelled], _LABEL_COLOURS)
+    for entity, (states, colours) in lanes.items():
+        style = rerun.StateConfiguration(values=list(colours), colors=[_rgba(colour) for colour in colours.values()])
+        sink.log(entity, style, static=True)
+        for number, (before, state) in enumerate(pairwise(["", *states])):
+            if state != before:
+                sink.set_frame(number, float(trial.time_s[number]))
+                sink.log(entity, rerun.StateChange(state=state))
+
+
+def _log_truth(sink: RerunSink, rerun: ModuleType, truth: GroundTruth, number: int) -> None:
+    """Log contact and stick zone, and the markers with their displacements, of a frame of a simulated trial."""
+    places = truth.marker_px[number]
+    sink.log("frame/zones", rerun.SegmentationImage(truth.contact_map[number], opacity=_ZONE_OPACITY))
+    sink.log("frame/markers", rerun.Points2D(places + _HALF_PX))
+    rest = truth.marker_rest_px
+    sink.log("frame/displacements", rerun.Arrows2D(vectors=places - rest, origins=rest + _HALF_PX))
+
+
+def _log_samples(sink: RerunSink, rerun: ModuleType, trial: Recording, forces: Forces) -> None:
+    """Log the samples of the force sensor, on the clock of the camera if its lag was applied to the labels."""
+    basis = trial.labelling.basis if trial.labelling else None
+    lag_s = basis.lag.lag_s if basis and basis.lag and basis.lag_applied else 0.0
+    colours = [_rgba(colour) for colour in _SENSOR_LINES.values()]
+    style = rerun.SeriesLines(names=list(_SENSOR_LINES), colors=colours, widths=[1.0] * len(colours))
+    sink.log("sensor/force", style, static=True)
+    for begin in range(0, len(forces.time_s), _SAMPLES_TOGETHER):
+        part = slice(begin, begin + _SAMPLES_TOGETHER)
+        # rounded here: Rerun cuts off, and a third of a second could come back a nanosecond short
+        time_ns = np.round(1e9 * (forces.time_s[part] + lag_s)).astype("timedelta64[ns]")
+        columns = rerun.Scalars.columns(scalars=forces.force_n[part])
+        sink.stream.send_columns("sensor/force", [rerun.TimeColumn("time", duration=time_ns)], columns)
+
+
+def _frame_numbers(trial: Recording) -> dict[str, Float[np.ndarray, " frames"]]:
+    """Forces and labels of every frame, by entity."""
+    normal, margin, sigma = trial.normal_force_n, trial.safety_margin, trial.safety_margin_sigma
+    basis = trial.labelling.basis if trial.labelling else None
+    if trial.truth is not None:
+        friction = trial.truth.static_friction
+    else:
+        friction = trial.friction_coefficient if basis is None else np.full(len(trial), basis.friction.mu)
+    numbers = {
+        "force/normal": normal,
+        "force/tangential": trial.tangential_force_n,
+        "force/limit": trial.friction_coefficient * normal,
+        "ratio/tangential_to_normal": force_ratio(trial),
+        "ratio/friction": friction,
+        "label/margin": margin,
+        "label/stick_ratio": trial.stick_ratio,
+    }
+    return numbers if sigma is None else numbers | {"label/high": margin + sigma, "label/low": margin - sigma}
+
+
+def _load_readings(trial: Recording, path: Path) -> dict[int, Reading]:
+    """Load the predictions of a trial, by frame."""
+    rows = _rows_of(trial, path, _PREDICTION_KINDS, command="sliplens predict").to_pylist()
+    return {
+        row["frame"]: Reading(
+            number=row["frame"],
+            time_s=np.nan,
+            captured_s=np.nan,
+            margin=row["prediction"],
+            low=row["low_90"],
+            high=row["high_90"],
+        )
+        for row in rows
+    }
+
+
+def _load_tracks(trial: Recording, path: Path) -> dict[int, Float[np.ndarray, "markers 2"]]:
+    """Load the places of the markers seen in each frame of a trial."""
+    rows = _rows_of(trial, path, _TRACK_KINDS, command="sliplens track")
+    frames = rows["frame"].to_numpy()
+    points = np.stack([rows[name].to_numpy().astype(np.float64) for name in ("x_px", "y_px")], axis=-1) + _HALF_PX
+    visible_points = np.isfinite(points).all(axis=1)
+    return {int(number): points[(frames == number) & visible_points] for number in np.unique(frames)}
+
+
+_PREDICTION_KINDS = {
+    "trial": "texts", "frame": "whole numbers", "prediction": "numbers", "low_90": "numbers", "high_90": "numbers",
+}  # fmt: skip
+_TRACK_KINDS = {"trial": "texts", "frame": "whole numbers", "x_px": "numbers", "y_px": "numbers"}
+
+
+def _rows_of(trial: Recording, path: Path, kinds: dict[str, str], *, command: str) -> pa.Table:
+    """Load the rows of a table that belong to a trial, in the order of its frames."""
+    with open_parquet(path, kinds, cure=f"name a table that {command} wrote") as file:
+        table = file.read(columns=list(kinds))
+    names = table["trial"].unique().to_pylist()
+    rows = table.filter(pc.field("trial") == trial.trial).sort_by("frame")
+    if not len(rows):
+        raise InputError(f"{path} has no frame of {trial.trial}; it has {', '.join(map(str, names[:3]))}")
+    last = rows["frame"][-1].as_py()
+    if rows["frame"][0].as_py() < 0 or last >= len(trial):
+        raise InputError(f"{path} has frame {last} of {trial.trial}, which has {len(trial)}; predict it anew")
+    return rows
+
+
+def _find_maps(viewed: ViewedTrial, maps: Explanation) -> dict[int, dict[str, Frame]]:
+    """Draw the maps of the trial's frames, by frame and method, each method on one scale."""
+    trial = viewed.trial
+    numbers = {f"{trial.trial}-f{number:04d}": number for number in range(len(trial))}
+    # names of files go first: of maps alone the files are the frames that were explained
+    numbers |= {Path(name).stem: number for number, name in enumerate(viewed.files)}
+    rows = {numbers[frame.id]: row for row, frame in enumerate(maps.frames) if frame.id in numbers}
+    if not rows:
+        raise InputError(f"the maps are of no frame of {trial.trial}; they are of {maps.frames[0].id} and others")
+    scales = {method: full_colour(maps.relevance[method]) for method in maps.methods}
+    return {
+        number: {
+            method: overlay_relevance(maps.pictures[row], maps.relevance[method][row] / scale)
+            for method, scale in scales.items()
+        }
+        for number, row in rows.items()
+    }
+
+
+def _lay_out(
+    viewed: ViewedTrial, factor: float, friction: Float[np.ndarray, " frames"], methods: Sequence[str]
+) -> "Blueprint":
+    """Lay out the views of a trial; `factor` multiplies the brightness of its differences."""
+    rrb, trial = require_rerun().blueprint, viewed.trial
+    height, width = trial.reference.shape[:2]
+    bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
+    camera, difference, reference = (
+        rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds)
+        for origin, name in (
+            ("frame", f"camera T_n{': contact, stick zone, markers' if trial.truth else ''}"),
+            ("difference", f"difference |T_n \N{MINUS SIGN} T_0| {TIMES} {factor:g}"),
+            ("reference", "reference T_0"),
+        )
+    )
+
+    def chart(origin: str, name: str, legend: str = "RightBottom", **settings: Any) -> object:
+        corner, across = rrb.PlotLegend(corner=legend), rrb.TimeAxis(link="LinkToGlobal")
+        return rrb.TimeSeriesView(origin=origin, name=name, axis_x=across, plot_legend=corner, **settings)
+
+    contents = ["/margin", "/interval/**", "/label/**"]
+    margins = "safety margin Γ (1 sticks, 0 slips), stick ratio"
+    charts = [chart("/", margins, "LeftBottom", contents=contents, axis_y=rrb.ScalarAxis(range=(-0.05, 1.05)))]
+    if np.isfinite(trial.normal_force_n).any():
+        highest = float(np.max(friction, where=np.isfinite(friction), initial=0))
+        span = rrb.ScalarAxis(range=(0.0, end_of_ratio(force_ratio(trial), highest)))
+        charts += [chart("force", "forces (N)"), chart("ratio", "F_t / F_n in contact, beside friction", axis_y=span)]
+    if viewed.forces is not None:
+        charts.append(chart("sensor", "force sensor, as recorded (N)"))
+    # a map is as large as the network's image, whatever the camera's
+    maps = [
+        rrb.Spatial2DView(origin=f"map/{method}", name=f"map by {method_name(method)}, at its frame")
+        for method in methods
+    ]
+    states = rrb.StateTimelineView(origin="state", name="contact state")
+    about = rrb.TextDocumentView(origin="about", name="about this trial")
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(camera, difference, *([rrb.Tabs(*maps)] if maps else [])),
+            rrb.Vertical(states, *charts, row_shares=[0.6, *(1 for _ in charts)]),
+            rrb.Vertical(about, reference, row_shares=[2, 1]),
+            column_shares=[2, 3, 1.4],
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        # the first frame shows an untouched fingertip, so it plays
+        rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="off"),
+        auto_views=False,
+    )
+
+
+def _describe_trial(viewed: ViewedTrial) -> str:
+    """Write in Markdown what a trial is, and what its labels rest on."""
+    trial, split = viewed.trial, viewed.split
+    height, width = trial.reference.shape[:2]
+    span = float(trial.time_s[-1] - trial.time_s[0])
+    facts = {
+        "sensor": trial.sensor,
+        "object": trial.object,
+        "condition": trial.condition,
+        "day": str(trial.day),
+        "split": split,
+        "frames": f"{len(trial):,} of {width} × {height} pixels in {span:.2f} s",  # noqa: RUF001 (times is meant)
+    }
+    lines = [f"# {_escape(trial.trial)}", *(f"- {name}: {_escape(value)}" for name, value in facts.items() if value)]
+    lines += ["", "## What its labels rest on"]
+    labelling = trial.labelling
+    if trial.truth is not None:
+        nominal = "nominal" if trial.truth.displacement == "calibrated" else "exact"
+        model = f"markers moved as {trial.truth.displacement}: the stick zone is {nominal}"
+        basis = [Fact("Simulated", ["labels are the mechanics' own, without error", model])]
+    elif labelling is None:
+        basis = [Fact("Unknown", [], ("their origin was not recorded",))]
+    else:
+        sources = [words for words in (labelling.source, labelling.forces) if words]
+        basis = [Fact("Recorded", sources), *audit_facts(trial, labelling)]
+    for fact in basis:
+        lines.append(f"\n**{'▲ ' if fact.doubts else ''}{_escape(fact.head)}**\n")
+        lines += [f"- {_escape(words)}" for words in fact.lines if words]
+    return "\n".join(lines)
+
+
+def _escape(text: str) -> str:
+    """Escape what Markdown would take for markup: names in files may hold anything."""
+    return re.sub(r"([\\`*_{}\[\]<>#|~])", r"\\\1", visible(text.removeprefix("• ")))
+
+
+_LOOPBACK = "127.0.0.1"
+_PATIENCE_S = 30.0  # a graphics driver may take its time
+_GRACE_S = 1.0
+
+
+def start_viewer() -> str:
+    """Start a viewer that outlives this process; gives the address to which data are sent."""
+    with socket.socket() as free:
+        free.bind((_LOOPBACK, 0))
+        port = free.getsockname()[1]
+    # rerun.spawn would have the viewer listen on every network of the machine, and seeks it on the PATH only
+    command = [sys.executable, "-m", "rerun_cli", "--bind", _LOOPBACK, "--port", str(port), "--expect-data-soon"]
+    with tempfile.TemporaryFile() as log:
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
+        give_up = time.monotonic() + _PATIENCE_S
+        while time.monotonic() < give_up and process.poll() is None:
+            if _listens(port) and _stays(process):
+                return f"rerun+http://{_LOOPBACK}:{port}/proxy"
+            time.sleep(0.05)
+        if process.poll() is None:
+            if hasattr(os, "killpg"):  # the viewer is a child of the process that was started
+                os.killpg(process.pid, signal.SIGTERM)
+            process.kill()
+            process.wait()
+        log.seek(0)
+        words = log.read().decode(errors="replace").strip().splitlines()
+    why = words[-1].strip() if words else "it gave no reason"
+    raise InputError(f"the Rerun viewer did not start ({why}); write a file with --output and open it elsewhere")
+
+
+def _listens(port: int) -> bool:
+    try:
+        socket.create_connection((_LOOPBACK, port), timeout=0.2).close()
+    except OSError:
+        return False
+    return True
+
+
+def _stays(process: subprocess.Popen[bytes]) -> bool:
+    """Check that a viewer that listens also finds a screen: it looks for one only then."""
+    try:
+        process.wait(_GRACE_S)
+    except subprocess.TimeoutExpired:
+        return True
+    return False
