@@ -72,7 +72,7 @@ def test_a_data_set_comes_back_from_other_formats(
 
 
 def test_a_failure_leaves_nothing_behind(small_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def fail(data: Dataset, folder: Path, **_: object) -> None:
+    def fail(_data: Dataset, _trials: object, folder: Path) -> None:
         (folder / "half").write_text("")
         raise InputError("the disk is full")
 

@@ -484,12 +484,12 @@ def _robot(folder: Path) -> None:
     info["video_path"] = "{video_key}-{file_index}.mkv"
     (robot / "meta" / "info.json").write_text(json.dumps(info))
     (path,) = robot.glob("meta/episodes/*/*.parquet")
-    table = pq.read_table(path).select(["episode_index", "length", "data/chunk_index", "data/file_index"])
+    table = pq.read_table(path, columns=["episode_index", "length", "data/chunk_index", "data/file_index"])
     for name, values in (("chunk_index", [0, 0]), ("file_index", [0, 1]), ("from_timestamp", [0.0, 0.0])):
         table = table.append_column(f"videos/observation.images.tactile/{name}", pa.array(values))
     pq.write_table(table, path)
-    (path,) = robot.glob("data/*/*.parquet")
-    pq.write_table(pq.read_table(path, columns=["timestamp", "episode_index", "observation.force"]), path)
+    for path in robot.glob("data/*/*.parquet"):
+        pq.write_table(pq.read_table(path, columns=["timestamp", "episode_index", "observation.force"]), path)
     for index in range(2):
         trial = make_recording(f"trial-{index}", seed=index)
         write_video(trial, robot / f"observation.images.tactile-{index}.mkv")

@@ -29,7 +29,7 @@ from sliplens.parts import read_status
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import trial_path
-from sliplens.recordings.formats.lerobot_export import write_lerobot
+from sliplens.recordings.exporting import export_lerobot
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import ContactState
 
@@ -385,8 +385,8 @@ def test_an_array_is_a_trial(trained: Network, wet: Recording):
 def test_a_recording_brings_its_own_reference_and_labels_unless_told_otherwise(
     trained: Network, small_dataset: Dataset, wet: Recording, tmp_path: Path
 ):
-    (made := tmp_path / "lerobot").mkdir()
-    write_lerobot(small_dataset, made, trials=small_dataset.select(condition="wet"))
+    made = tmp_path / "lerobot"
+    export_lerobot(small_dataset, made, trials=[info.trial for info in small_dataset.select(condition="wet")])
     rows = predict(made, trained, tmp_path / "a.parquet")
     np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
     assert rows["safety_margin"] == [None, *wet.safety_margin[1:].tolist()]

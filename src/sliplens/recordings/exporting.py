@@ -1,12 +1,12 @@
 """Data sets for other programs: LeRobot data sets and MCAP files, complete or absent."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from sliplens.files import output_folder
-from sliplens.progress import OnProgress, number_of, stage, wrote
-from sliplens.recordings.dataset import Dataset, load_dataset
+from sliplens.progress import OnProgress, number_of, open_stage, report_file, reporting
+from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,11 @@ def export_lerobot(
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Export:
-    """Write trials as a LeRobot v3.0 data set, one episode a trial, without loss; see `write_lerobot`.
+    """Write trials as a LeRobot v3.0 data set, one episode a trial, without loss.
+
+    `observation.force` is (F_t, 0, F_n) in newtons. LeRobot has one frame rate and counts time in frames of it; the
+    measured times are in `observation.time_s`. Trials of a split follow each other, because a split is a range of
+    episodes. `meta/sliplens` has the rest of each trial, from which `import_recordings` restores the data set.
 
     Parameters
     ----------
@@ -43,8 +47,16 @@ def export_lerobot(
         If `out` holds something else, or there is no such trial.
     RecordingError
         If a trial is damaged, or sizes of frames or frame rates differ.
+
+    References
+    ----------
+    https://huggingface.co/docs/lerobot/lerobot-dataset-v3
     """
-    return _export("lerobot", data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
+    from sliplens.recordings.formats.lerobot_export import write_lerobot  # noqa: PLC0415 (PyAV comes with it)
+
+    with reporting(on_progress):
+        run_file = "meta/sliplens/run.json"
+        return _export(write_lerobot, data, Path(out), trials=trials, overwrite=overwrite, run_file=run_file)
 
 
 def export_mcap(
@@ -55,12 +67,21 @@ def export_mcap(
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Export:
-    """Write trials as `TRIAL.mcap`, files of ROS 2 messages, without loss; see `write_mcap`.
+    """Write trials as `TRIAL.mcap`, files of ROS 2 messages, without loss.
+
+    Frames are PNG images in `/tactile/image`, labels are in `/tactile/labels` and forces in `/tactile/wrench`. Stamps
+    are the times of the trial, rounded to nanoseconds. ROS takes a stamp of 0 for none and has no negative ones: where
+    a trial begins before 1 s, all stamps are later by the whole seconds `stamp_offset_s` in the metadata of the file.
+    Attachments have the rest of the trial, from which `import_recordings` restores it.
 
     Parameters
     ----------
-    data, out, trials
-        As `export_lerobot` takes them; frames may be of any size and rate.
+    data
+        Data set, or its folder.
+    out
+        Folder to make.
+    trials
+        Names of trials; all if None. Their frames may have any size and rate.
 
     Raises
     ------
@@ -69,36 +90,30 @@ def export_mcap(
     RecordingError
         If a trial is damaged, or its times do not fit into stamps of ROS (2**31 seconds).
     """
-    return _export("mcap", data, Path(out), trials=trials, overwrite=overwrite, on_progress=on_progress)
+    from sliplens.recordings.formats.mcap import write_mcap  # noqa: PLC0415 (ROS messages come with it)
+
+    with reporting(on_progress):
+        return _export(write_mcap, data, Path(out), trials=trials, overwrite=overwrite, run_file="run.json")
 
 
 def _export(
-    name: str,
+    write: Callable[[Dataset, Sequence[TrialInfo], Path], None],
     data: Dataset | Path | str,
     out: Path,
     *,
     trials: Sequence[str] | None,
     overwrite: bool,
-    on_progress: OnProgress | None,
+    run_file: str,
 ) -> Export:
-    # Pillow, PyAV and ROS come with them
-    if name == "lerobot":
-        from sliplens.recordings.formats.lerobot_export import write_lerobot as write  # noqa: PLC0415
-
-        run_file = "meta/sliplens/run.json"  # it reads `meta` by name
-    else:
-        from sliplens.recordings.formats.mcap import write_mcap as write  # noqa: PLC0415
-
-        run_file = "run.json"  # tools for MCAP open single files
     data = data if isinstance(data, Dataset) else load_dataset(data)
-    chosen = data.trials if not trials else tuple(data.find(name) for name in dict.fromkeys(trials))
-    config = {"format": name, "data_hash": data.hash, "trials": [info.trial for info in chosen]}
+    chosen = tuple(data.find(trial) for trial in dict.fromkeys(trials)) if trials else data.trials
+    config = {"format": write.__name__, "data_hash": data.hash, "trials": [info.trial for info in chosen]}
     with output_folder(
         out, stage="export", config=config, overwrite=overwrite, run_file=run_file, resumable=False
     ) as output:
         if not output.complete:
-            with stage(on_progress, "Writing frames") as count:
-                write(data, output.folder, trials=chosen, on_progress=count)
+            with open_stage("Writing frames"):
+                write(data, chosen, output.folder)
     frames = sum(info.frames for info in chosen)
-    wrote(on_progress, out, f"{number_of(len(chosen), 'trial')}, {number_of(frames, 'frame')}", kept=output.complete)
+    report_file(out, f"{number_of(len(chosen), 'trial')}, {number_of(frames, 'frame')}", kept=output.complete)
     return Export(folder=out, trials=tuple(info.trial for info in chosen), frames=frames)

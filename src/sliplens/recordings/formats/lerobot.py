@@ -1,7 +1,7 @@
 """LeRobot v3 data sets of a tactile camera and a force sensor."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from math import floor, prod
@@ -23,12 +23,15 @@ from sliplens.files import read_json
 from sliplens.images import telling_damage
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.images import open_encoded, rgb_pixels
-from sliplens.recordings.formats.stored import ExportedTrial
+from sliplens.recordings.formats.stored import restore_trials
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.formats.video import display_turn, open_video, read_display_turn, require_size
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.store import load_forces
 
+CAMERA = "observation.images.tactile"
+"""Feature of the images that `export_lerobot` writes."""
+COMPANION = Path("meta", "sliplens")
+"""Folder in an exported data set with all of its trials but the images."""
 _COPY = "copy the data set again"
 _NO_VIDEO = "copy the data set again, with its videos"
 _LATEST_S = 1e7  # of a stamp in a video: four months
@@ -38,21 +41,21 @@ _FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
 
 @dataclass(frozen=True, kw_only=True)
 class Episode:
-    """Where an episode lies."""
+    """Place of an episode in the files."""
 
     index: int
     length: int
     """Frames."""
     data_file: Path
     video_file: Path | None
-    """None where frames lie in the data file."""
+    """None where the frames are in the data file."""
     video_start_s: float
-    """Stamp, in the video, of the first frame."""
+    """Stamp of the first frame in the video."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Feature:
-    """One of the features that `meta/info.json` lists; what it may tell besides is believed where it is used."""
+    """Feature that `meta/info.json` lists; names and info are checked where they are used."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -63,7 +66,7 @@ class Feature:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What `meta/info.json` says."""
+    """Contents of `meta/info.json`."""
 
     folder: Path
     fps: Annotated[float, msgspec.Meta(gt=0)]
@@ -94,7 +97,7 @@ def read_layout(folder: Path) -> Layout:
 
 
 def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
-    """Episodes of a data set and where their frames from a camera lie, in their order."""
+    """Find the episodes of a data set and the files with their frames from a camera, in their order."""
     in_video = layout.features[camera_key].dtype == "video"
     columns: dict[str, str] = dict.fromkeys(
         ("episode_index", "length", "data/chunk_index", "data/file_index"), "whole numbers"
@@ -118,21 +121,21 @@ def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
                 f"{folder} begins episode {index} at {video[2]:g} s of a video; copy the data set again"
             )
         data = {"chunk_index": chunk, "file_index": file}
-        where = {"video_key": camera_key, **dict(zip(data, video, strict=False))}
+        places = {"video_key": camera_key, **dict(zip(data, video, strict=False))}
         episodes.append(
             Episode(
                 index=index,
                 length=length,
                 data_file=_expand(layout, layout.data_path, data),
-                video_file=_expand(layout, layout.video_path or "", where) if in_video else None,
+                video_file=_expand(layout, layout.video_path or "", places) if in_video else None,
                 video_start_s=float(video[2]) if in_video else 0.0,
             )
         )
     return episodes
 
 
-def _expand(layout: Layout, template: str, values: dict[str, Any]) -> Path:
-    """Fill in a template of `info.json`; it comes from outside, so `str.format` would trust it with too much."""
+def _expand(layout: Layout, template: str, values: Mapping[str, int | str]) -> Path:
+    """Fill in a template of `info.json`; not by `str.format`, which lets a hostile file reach attributes."""
     path = _FIELD.sub(lambda field: f"{values.get(field[1], '{}')}".rjust(int(field[2] or 0), "0"), template)
     parts = {*PurePosixPath(path).parts, *PureWindowsPath(path).parts}
     outside = PurePosixPath(path).is_absolute() or PureWindowsPath(path).anchor or ".." in parts
@@ -144,58 +147,10 @@ def _expand(layout: Layout, template: str, values: dict[str, Any]) -> Path:
     return layout.folder / path
 
 
-@dataclass(frozen=True, kw_only=True)
-class Rows:
-    """Rows of an episode, in their order."""
-
-    layout: Layout
-    episode: Episode
-    table: pa.Table
-
-    def vectors(self, key: str) -> Float[np.ndarray, "frames numbers"]:
-        """A feature of several floating-point numbers a frame."""
-        width = prod(self.layout.features[key].shape)
-        column = self.table.column(key).combine_chunks()
-        numbers = column.flatten() if hasattr(column, "flatten") else column
-        if len(numbers) != len(self.table) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
-            raise RecordingError(
-                f"{key} of {self.episode.data_file} does not hold {width} numbers a frame, as meta/info.json says; "
-                "copy the data set again"
-            )
-        return numbers.to_numpy().astype(np.float64).reshape(-1, width)
-
-    def values(self, key: str, fits: Callable[[pa.DataType], bool], what: str) -> np.ndarray:
-        """A feature of one value a frame, as exact as it is stored."""
-        column = self.table.column(key)
-        if not fits(column.type):
-            raise RecordingError(f"{key} of {self.episode.data_file} does not hold {what}; copy the data set again")
-        return column.to_numpy()
-
-    def numbers(self, key: str) -> Float[np.ndarray, " frames"]:
-        """A feature of one number a frame."""
-        return self.values(key, pa.types.is_floating, "numbers").astype(np.float64)
-
-    def words(self, key: str) -> tuple[str, ...]:
-        """A feature whose whole numbers count through words that `meta/info.json` lists."""
-        codes = self.values(key, pa.types.is_integer, "whole numbers")
-        info = self.layout.features[key].info
-        words = info.get("values") if isinstance(info, dict) else None
-        if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
-            raise RecordingError(
-                f"meta/info.json of {self.layout.folder} does not list the values of {key}; copy the data set again"
-            )
-        if codes.min() < 0 or codes.max() >= len(words):
-            raise RecordingError(
-                f"{key} of {self.episode.data_file} leads beyond the {len(words)} values that meta/info.json lists; "
-                "copy the data set again"
-            )
-        return tuple(words[code] for code in codes)
-
-
-def read_rows(layout: Layout, episodes: list[Episode], columns: dict[str, str]) -> Iterator[Rows]:
-    """Rows of episodes one after another, with columns of some kinds; those of one file share what was read of it."""
-    wanted = {"episode_index": "whole numbers", **columns}
-    read = lru_cache(maxsize=1)(partial(read_parquet, columns=wanted, cure=_COPY, error=RecordingError))
+def read_tables(episodes: list[Episode], columns: Mapping[str, str]) -> Iterator[tuple[Episode, pa.Table]]:
+    """Read the rows of episodes one after another, with columns of some kinds; each data file is read once."""
+    kinds = {"episode_index": "whole numbers", **columns}
+    read = lru_cache(maxsize=1)(partial(read_parquet, columns=kinds, cure=_COPY, error=RecordingError))
     for episode in episodes:
         path = episode.data_file
         rows = read(path).filter(pc.field("episode_index") == episode.index)
@@ -204,11 +159,22 @@ def read_rows(layout: Layout, episodes: list[Episode], columns: dict[str, str]) 
                 f"{path} has {rows.num_rows} frames of episode {episode.index}, its metadata say {episode.length}; "
                 "leave the episode out, or copy the data set again"
             )
-        yield Rows(layout=layout, episode=episode, table=rows)
+        yield episode, rows
+
+
+def read_vectors(rows: pa.Table, key: str, *, width: int, path: Path) -> Float[np.ndarray, "frames numbers"]:
+    """Return a feature of several floating-point numbers a frame."""
+    column = rows.column(key).combine_chunks()
+    numbers = column.flatten() if hasattr(column, "flatten") else column
+    if len(numbers) != len(rows) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
+        raise RecordingError(
+            f"{key} of {path} does not hold {width} numbers a frame, as meta/info.json says; copy the data set again"
+        )
+    return numbers.to_numpy().astype(np.float64).reshape(-1, width)
 
 
 def read_video_header(path: Path) -> tuple[tuple[int, int], tuple[str, ...]]:
-    """Height and width of the frames of a video, and what is said of its coding."""
+    """Return height and width of the frames of a video, and a note if it is lossy."""
     with open_video(path, missing=_NO_VIDEO) as (_, video):
         codec = video.codec_context.codec
         note = f"Frames are coded with loss ({codec.canonical_name}), which moves markers a little."
@@ -217,32 +183,32 @@ def read_video_header(path: Path) -> tuple[tuple[int, int], tuple[str, ...]]:
 
 
 def video_frames(
-    path: Path, wanted_s: Float[np.ndarray, " frames"], *, tolerance_s: float, frame_size: tuple[int, int]
+    path: Path, stamps_s: Float[np.ndarray, " frames"], *, tolerance_s: float, frame_size: tuple[int, int]
 ) -> Iterator[Frame]:
     """Decode the frames nearest to some stamps of a video."""
     with open_video(path, missing=_NO_VIDEO) as (container, video):
-        shown = _decode_from(container, video, float(wanted_s[0]) - tolerance_s)
-        current, following = next(shown, None), next(shown, None)
-        for wanted in wanted_s:
-            while current and following and abs(following[0] - wanted) < abs(current[0] - wanted):
-                current, following = following, next(shown, None)
-            if current is None or abs(current[0] - wanted) > tolerance_s:
+        decoded = _decode_from(container, video, float(stamps_s[0]) - tolerance_s)
+        current, following = next(decoded, None), next(decoded, None)
+        for stamp in stamps_s:
+            while current and following and abs(following[0] - stamp) < abs(current[0] - stamp):
+                current, following = following, next(decoded, None)
+            if current is None or abs(current[0] - stamp) > tolerance_s:
                 raise RecordingError(
-                    f"{path} has no frame at {wanted:.3f} s; it is cut off, or was not written with this data set"
+                    f"{path} has no frame at {stamp:.3f} s; it is cut off, or was not written with this data set"
                 )
             frame = current[1]
             turn = display_turn(frame, where=path)
             height, width = turn.size(frame.height, frame.width)
             if (height, width) != frame_size:
                 raise RecordingError(
-                    f"{path} has frames of {height} x {width} pixels at {wanted:.3f} s, its header says "
+                    f"{path} has frames of {height} x {width} pixels at {stamp:.3f} s, its header says "
                     f"{frame_size[0]} x {frame_size[1]}; leave the episode out"
                 )
             yield turn.apply(frame.to_ndarray(format="rgb24"))
 
 
 def image_frames(episode: Episode, key: str) -> tuple[tuple[int, int], Callable[[], Iterator[Frame]]]:
-    """Size of the frames of an episode that lie in a Parquet file, and how they are read."""
+    """Return the size of the frames of an episode in a Parquet file, and how to read them."""
     read = partial(_stored_images, episode.data_file, key, episode.index)
     first = next(read(frame_size=None), None)
     if first is None:
@@ -253,17 +219,17 @@ def image_frames(episode: Episode, key: str) -> tuple[tuple[int, int], Callable[
 
 def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int, int] | None) -> Iterator[Frame]:
     index = 0
-    told: dict[str, Any] = {"cure": _COPY, "error": RecordingError}
     columns = {"episode_index": "whole numbers", key: "values"}
-    with open_parquet(path, columns, **told) as file, telling_parquet(path, **told):
+    damage = telling_parquet(path, cure=_COPY, error=RecordingError)
+    with open_parquet(path, columns, cure=_COPY, error=RecordingError) as file, damage:
         # without this, each episode would cost all that share its file
         import pyarrow.dataset as ds  # noqa: PLC0415 (takes a second, and other formats are read without)
 
         (fragment,) = ds.dataset(path).get_fragments()
         groups = [group.id for group in fragment.subset(pc.field("episode_index") == episode).row_groups]
         for batch in file.iter_batches(batch_size=16, row_groups=groups, columns=list(columns)):
-            own = batch.column("episode_index").to_numpy() == episode
-            for cell in batch.filter(pa.array(own)).column(key).to_pylist():
+            inside = batch.column("episode_index").to_numpy() == episode
+            for cell in batch.filter(pa.array(inside)).column(key).to_pylist():
                 where = f"frame {index} of {key}, episode {episode} of {path},"
                 data = cell.get("bytes") if isinstance(cell, dict) else None
                 if not isinstance(data, bytes) or not data:
@@ -279,17 +245,16 @@ def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int,
 
 
 def decode_image(data: bytes, *, where: str) -> Frame:
-    """Pixels of a PNG or JPEG."""
-    words = f"{where} cannot be read as PNG or JPEG"
-    told = telling_damage(words, "copy the data set again", kind=RecordingError)
-    with told, open_encoded(data, where=where) as image:
+    """Decode a PNG or JPEG."""
+    damage = telling_damage(f"{where} cannot be read as PNG or JPEG", _COPY, kind=RecordingError)
+    with damage, open_encoded(data, where=where) as image:
         return rgb_pixels(image)
 
 
 def _decode_from(
     container: InputContainer, stream: VideoStream, start_s: float
 ) -> Iterator[tuple[float, av.VideoFrame]]:
-    """Frames with their stamps, from a key frame at or before `start_s`."""
+    """Decode frames with their stamps, from a key frame at or before `start_s`."""
     stream.thread_type = "AUTO"
     if stream.time_base is not None:
         container.seek(max(floor(start_s / stream.time_base), 0), stream=stream)
@@ -298,146 +263,78 @@ def _decode_from(
             yield frame.time, frame
 
 
-CAMERA, TIME, FORCE = "observation.images.tactile", "observation.time_s", "observation.force"
-FORCE_AXES = ("tangential_n", "across_n", "normal_n")
-NUMBERS = {
-    name: f"observation.{name}"
-    for name in ("friction_coefficient", "safety_margin", "safety_margin_sigma", "stick_ratio")
-}
-"""Features of one number, by the labels they hold."""
-VALID, STATE, REASON = "observation.valid", "observation.contact_state", "observation.invalid_reason"
-KEPT = Path("meta", "sliplens")
-"""Folder of what LeRobot has no place for; its `trials.jsonl` has a line an episode."""
-KEPT_REFERENCE, KEPT_FORCES = "reference-{:06d}.png", "forces-{:06d}.parquet"
-_COLUMNS = [TIME, FORCE, *NUMBERS.values(), VALID, STATE, REASON]
-
-
-def read_kept(layout: Layout) -> tuple[ExportedTrial, ...] | None:
-    """Read what is kept of the trials, one an episode; None where nothing is."""
-    path = layout.folder / KEPT / "trials.jsonl"
-    try:
-        lines = path.read_text(encoding="utf-8").rstrip("\n").split("\n")
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path} cannot be read ({error}); copy the data set again") from None
-    trials = tuple(ExportedTrial.parse(line, where=f"line {number + 1} of {path}") for number, line in enumerate(lines))
-    if len({trial.facts.trial for trial in trials}) < len(trials):
-        raise RecordingError(f"{path} names a trial twice; copy the data set again")
-    missing = [key for key in (CAMERA, *_COLUMNS) if key not in layout.features]
-    if missing:
-        raise RecordingError(
-            f"meta/info.json of {layout.folder} lacks {', '.join(missing)}; copy the data set again, or remove {path} "
-            "to read it without labels"
-        )
-    return trials
-
-
-def kept_captures(layout: Layout, trials: tuple[ExportedTrial, ...]) -> list[Capture]:
-    """Trials of a data set as they were exported."""
-    episodes = read_episodes(layout, camera_key=CAMERA)
-    exported = [(index, trial.frames) for index, trial in enumerate(trials)]
-    if [(one.index, one.length) for one in episodes] != exported:
-        path = layout.folder / KEPT / "trials.jsonl"
-        raise RecordingError(
-            f"the episodes of {layout.folder} are no longer those that {path} tells of; export the trials again, or "
-            "remove that file to read the data set without labels"
-        )
-    rows = read_rows(layout, episodes, dict.fromkeys(_COLUMNS, "values"))
-    return [_capture(one, trials[one.episode.index]) for one in rows]
-
-
-def _capture(rows: Rows, trial: ExportedTrial) -> Capture:
-    folder, index = rows.layout.folder, rows.episode.index
-    size, read_frames = image_frames(rows.episode, CAMERA)
-    source = f"{trial.facts.trial}, episode {index} of {folder}"
-    path = folder / KEPT / KEPT_REFERENCE.format(index)
-    try:
-        png = path.read_bytes()
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the data set again") from None
-    sampled = folder / KEPT / KEPT_FORCES.format(index)
-    forces = load_forces(sampled) if trial.force_samples else None
-    if forces is not None and len(forces.time_s) != trial.force_samples:
-        raise RecordingError(
-            f"{sampled} has {len(forces.time_s)} samples of {trial.facts.trial}, {trial.force_samples} were exported; "
-            "copy the data set again"
-        )
-    force = rows.vectors(FORCE)
-    if force.shape[1] != len(FORCE_AXES):
-        raise RecordingError(f"{FORCE} of {source} has {force.shape[1]} numbers, not 3; copy the data set again")
-    numbers = {name: rows.numbers(key) for name, key in {"time_s": TIME, **NUMBERS}.items()}
-    return trial.capture(
-        {**numbers, "tangential_force_n": force[:, 0].copy(), "normal_force_n": force[:, 2].copy()},
-        states=rows.words(STATE),
-        valid=rows.values(VALID, pa.types.is_boolean, "true and false"),
-        reasons=rows.words(REASON),
-        source=source,
-        frame_size=size,
-        read_frames=read_frames,
-        forces=forces,
-        reference=decode_image(png, where=f"{path}"),
-    )
-
-
 _TACTILE = re.compile(r"tactile|touch|gel|digit|tactip|fingertip|skin", re.IGNORECASE)
 _FORCE = re.compile(r"force|wrench|(?<![a-z])f_?t(?![a-z])", re.IGNORECASE)
 _TORQUE = re.compile(r"torque|moment|(?<![a-z])[tm]_?[xyz](?![a-z])", re.IGNORECASE)
 
 
 def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
-    """Read a data set, one trial an episode; those that `write_lerobot` exported as they were, if no feature is named.
+    """Read a data set, one trial an episode; one that `export_lerobot` wrote is restored, unless a feature is named.
 
     Frames and forces are rows of one table and have its times. Frames of a video are those shown within half a frame of
     their row's time.
     """
     layout = read_layout(folder)
-    if options.camera_key is None and options.force_key is None and (kept := read_kept(layout)) is not None:
-        return kept_captures(layout, kept)
+    if options.camera_key is None and options.force_key is None and (folder / COMPANION).is_dir():
+        return _restore_episodes(layout)
     camera, notes = _choose_camera(layout, options.camera_key)
     force = _choose_force(layout, options.force_key)
     if force is None:
         notes.append("There are no forces: no feature of 3 or 6 numbers is named like one.")
     video_header = cache(read_video_header)  # episodes share files
     captures = []
-    episodes = read_episodes(layout, camera_key=camera)
     columns = {"timestamp": "numbers", **({force: "values"} if force else {})}
-    for rows in read_rows(layout, episodes, columns):
-        one, own_notes, forces = rows.episode, (), None
-        time = rows.table.column("timestamp").to_numpy().astype(np.float64)
-        source = f"episode {one.index} of {layout.folder}"
+    for episode, rows in read_tables(read_episodes(layout, camera_key=camera), columns):
+        time, loss = rows.column("timestamp").to_numpy().astype(np.float64), ()
+        source, forces = f"episode {episode.index} of {layout.folder}", None
         if force is not None:
-            forces = Forces(time_s=time, force_n=rows.vectors(force)[:, :3].copy(), source=f"{force} of {source}")
-        if one.video_file is None:
-            size, read_frames = image_frames(one, camera)
+            width = prod(layout.features[force].shape)
+            force_n = read_vectors(rows, force, width=width, path=episode.data_file)[:, :3].copy()
+            forces = Forces(time_s=time, force_n=force_n, source=f"{force} of {source}")
+        if episode.video_file is None:
+            size, read_frames = image_frames(episode, camera)
         else:
-            size, own_notes = video_header(one.video_file)
-            tolerance_s, shown_s = 0.5 / layout.fps, one.video_start_s + time
-            read_frames = partial(video_frames, one.video_file, shown_s, tolerance_s=tolerance_s, frame_size=size)
+            size, loss = video_header(episode.video_file)
+            stamps_s, tolerance_s = episode.video_start_s + time, 0.5 / layout.fps
+            read_frames = partial(video_frames, episode.video_file, stamps_s, tolerance_s=tolerance_s, frame_size=size)
         captures.append(
             Capture(
-                trial=trial_name(f"{layout.folder.resolve().name}-{one.index:06d}"),
+                trial=trial_name(f"{layout.folder.resolve().name}-{episode.index:06d}"),
                 source=f"{camera} of {source}",
                 frame_time_s=time,
                 frame_size=size,
                 read_frames=read_frames,
                 forces=forces,
-                notes=(*notes, *own_notes),
+                notes=(*notes, *loss),
             )
         )
     return captures
 
 
-def _choose_camera(layout: Layout, named: str | None) -> tuple[str, list[str]]:
+def _restore_episodes(layout: Layout) -> list[Capture]:
+    """Read the trials of an exported data set as they were."""
+    if CAMERA not in layout.features:
+        raise RecordingError(
+            f"meta/info.json of {layout.folder} lacks {CAMERA}; copy the data set again, or remove "
+            f"{layout.folder / COMPANION} to read it without labels"
+        )
+    images = []
+    for episode, _ in read_tables(read_episodes(layout, camera_key=CAMERA), {}):
+        size, read_frames = image_frames(episode, CAMERA)
+        images.append((f"episode {episode.index} of {layout.folder}", episode.length, size, read_frames))
+    return restore_trials(layout.folder / COMPANION, images)
+
+
+def _choose_camera(layout: Layout, name: str | None) -> tuple[str, list[str]]:
     cameras = [
         key
         for key, feature in layout.features.items()
         if feature.dtype in {"video", "image"} and not _is_depth(feature)
     ]
-    if named is not None:
-        if named not in cameras:
-            raise RecordingError(f"{layout.folder} has no camera {named}; it has {_listed(cameras)}")
-        return named, []
+    if name is not None:
+        if name not in cameras:
+            raise RecordingError(f"{layout.folder} has no camera {name}; it has {_list_keys(cameras)}")
+        return name, []
     tactile = [key for key in cameras if _TACTILE.search(key)]
     if len(tactile) == 1:
         return tactile[0], []
@@ -446,52 +343,47 @@ def _choose_camera(layout: Layout, named: str | None) -> tuple[str, list[str]]:
     if not cameras:
         raise RecordingError(f"{layout.folder} has no camera; record one, as video or images")
     raise RecordingError(
-        f"{layout.folder} has cameras {_listed(cameras)}, of which {_listed(tactile)} could be tactile; "
+        f"{layout.folder} has cameras {_list_keys(cameras)}, of which {_list_keys(tactile)} could be tactile; "
         "name one with --camera-key"
     )
 
 
-def _choose_force(layout: Layout, named: str | None) -> str | None:
+def _choose_force(layout: Layout, name: str | None) -> str | None:
     fitting = [
         key
         for key, feature in layout.features.items()
         if feature.dtype.startswith("float") and feature.shape in ((3,), (6,))
     ]
-    if named is not None:
-        if named not in layout.features:
-            raise RecordingError(f"{layout.folder} has no feature {named}; 3 or 6 numbers have {_listed(fitting)}")
-        if named not in fitting:
-            feature = layout.features[named]
+    if name is not None:
+        if name not in layout.features:
+            raise RecordingError(f"{layout.folder} has no feature {name}; 3 or 6 numbers have {_list_keys(fitting)}")
+        if name not in fitting:
+            feature = layout.features[name]
             raise RecordingError(
-                f"{named} of {layout.folder} is {feature.dtype} of shape {list(feature.shape)}; a force has 3 or 6 "
+                f"{name} of {layout.folder} is {feature.dtype} of shape {list(feature.shape)}; a force has 3 or 6 "
                 "floating-point numbers"
             )
-        found = [named]
+        forces = [name]
     else:
         # what was commanded is not what was felt
-        found = [key for key in fitting if _FORCE.search(key) and not key.startswith("action")]
-        if len(found) > 1:
-            raise RecordingError(f"{layout.folder} has forces {_listed(found)}; name one with --force-key")
-    if not found:
+        forces = [key for key in fitting if _FORCE.search(key) and not key.startswith("action")]
+        if len(forces) > 1:
+            raise RecordingError(f"{layout.folder} has forces {_list_keys(forces)}; name one with --force-key")
+    if not forces:
         return None
-    first = _names(layout.features[found[0]].names)[:3]
-    if any(_TORQUE.search(name) for name in first):
-        raise RecordingError(f"{found[0]} of {layout.folder} begins with {', '.join(first)}; forces must come first")
-    return found[0]
-
-
-def _names(names: object) -> list[str]:
-    """Names of the numbers of a feature, in the two shapes there are: a list, or lists by group."""
+    # names of the numbers are a list, or lists by group
+    names = layout.features[forces[0]].names
     groups = names.values() if isinstance(names, dict) else [names]
-    return [str(name) for group in groups if isinstance(group, list) for name in group]
+    first = [str(name) for group in groups if isinstance(group, list) for name in group][:3]
+    if any(_TORQUE.search(name) for name in first):
+        raise RecordingError(f"{forces[0]} of {layout.folder} begins with {', '.join(first)}; forces must come first")
+    return forces[0]
 
 
 def _is_depth(feature: Feature) -> bool:
-    details = (feature.info, feature.video_info)
-    return any(
-        found.get("is_depth_map") or found.get("video.is_depth_map") for found in details if isinstance(found, dict)
-    )
+    details = [each for each in (feature.info, feature.video_info) if isinstance(each, dict)]
+    return any(each.get("is_depth_map") or each.get("video.is_depth_map") for each in details)
 
 
-def _listed(keys: list[str]) -> str:
+def _list_keys(keys: list[str]) -> str:
     return ", ".join(keys) or "none"

@@ -1,10 +1,9 @@
 """ROS 2 bags (MCAP or sqlite3) of a tactile camera and a force-torque sensor."""
 
 import os
-import sys
 from array import array
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
@@ -19,24 +18,14 @@ import numpy as np
 from jaxtyping import Float, Int64
 from PIL import Image
 
-from sliplens.errors import RecordingError, SliplensError
+from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.extras import require_packages
-from sliplens.files import require_file
+from sliplens.files import require_file, scratch_folder
 from sliplens.images import telling_damage, upright_size
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats.images import open_encoded, rgb_pixels
-from sliplens.recordings.formats.mcap import (
-    IMAGE,
-    LABELS,
-    NUMBERS,
-    REFERENCE,
-    TOPICS,
-    TRIAL,
-    WRENCH,
-    WRENCH_TIMES,
-    trial_types,
-)
-from sliplens.recordings.formats.stored import FORMAT, ExportedTrial
+from sliplens.recordings.formats.mcap import IMAGE, TOPICS, WRENCH, extract_attachments, trial_types
+from sliplens.recordings.formats.stored import restore_trials
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.options import ReadOptions
 
@@ -50,7 +39,7 @@ _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 
 
 def image_size(message: Any, *, where: str) -> tuple[int, int]:
-    """Height and width of an image, in pixels, without decoding it."""
+    """Return height and width of an image, in pixels, without decoding it."""
     if message.__msgtype__ == COMPRESSED:
         with _open_compressed(message, where=where) as image:
             return upright_size(image)
@@ -74,10 +63,10 @@ def image_size(message: Any, *, where: str) -> tuple[int, int]:
 
 
 def image_pixels(message: Any, *, where: str) -> Frame:
-    """Pixels of an image as RGB; grey is repeated in all three channels."""
+    """Decode an image as RGB; grey is repeated in all three channels."""
     if message.__msgtype__ == COMPRESSED:
-        told = telling_damage(f"{where} is damaged", "cut the bag before it", kind=RecordingError)
-        with _open_compressed(message, where=where) as image, told:
+        damage = telling_damage(f"{where} is damaged", "cut the bag before it", kind=RecordingError)
+        with _open_compressed(message, where=where) as image, damage:
             return rgb_pixels(image)
     height, width = image_size(message, where=where)
     channels = _CHANNELS[message.encoding]
@@ -91,11 +80,11 @@ def image_pixels(message: Any, *, where: str) -> Frame:
 
 @contextmanager
 def _open_compressed(message: Any, *, where: str) -> Iterator[Image.Image]:
-    """Image with its header read; one that would expand too far (a decompression bomb) is refused."""
+    """Open an image and read its header; one that would expand too far (a decompression bomb) is refused."""
     # `format` is free text, and drivers differ in it
-    words = f"{where}, of format {message.format[:40]!r}, cannot be read as JPEG or PNG"
-    told = telling_damage(words, "record it again, or as one of these", kind=RecordingError)
-    with told, open_encoded(message.data, where=where) as image:
+    text = f"{where}, of format {message.format[:40]!r}, cannot be read as JPEG or PNG"
+    damage = telling_damage(text, "record it again, or as one of these", kind=RecordingError)
+    with damage, open_encoded(message.data, where=where) as image:
         yield image
 
 
@@ -106,13 +95,13 @@ MOST_TIMES = 100
 
 
 class ExpandsTooFarError(Exception):
-    """Says what expands too far, for a sentence that begins with the bag."""
+    """Data that expand to more than they may; the message continues a sentence that begins with the bag."""
 
 
 @cache
 def bounded_reader() -> "type[Reader]":
-    """`rosbags.rosbag2.Reader`, but it raises `ExpandsTooFarError` before memory or disk are filled."""
-    mcap, reader = _own_copy("rosbags.rosbag2.storage_mcap"), _own_copy("rosbags.rosbag2.reader")
+    """Return `rosbags.rosbag2.Reader`, changed to raise `ExpandsTooFarError` before memory or disk are filled."""
+    mcap, reader = _load_copy("rosbags.rosbag2.storage_mcap"), _load_copy("rosbags.rosbag2.reader")
     sqlite = import_module("rosbags.rosbag2.storage_sqlite3")
     zstd, lz4 = mcap.zstd, import_module("lz4.frame")
 
@@ -146,7 +135,8 @@ def bounded_reader() -> "type[Reader]":
     return reader.Reader
 
 
-def _own_copy(name: str) -> Any:
+def _load_copy(name: str) -> Any:
+    """Load a module a second time, so that its changes stay here."""
     spec = find_spec(name)
     if spec is None or spec.loader is None:
         raise ImportError(f"{name} is not there")
@@ -158,8 +148,8 @@ def _own_copy(name: str) -> Any:
 def _expand_chunk(data: bytes, decompressor: Any, size: int, *, frames: int | None = None) -> bytes:
     if size > MOST_BYTES:
         raise _beyond("a chunk", MOST_BYTES)
-    lie = ExpandsTooFarError(f"a chunk expands to more than the {size:,} bytes that it claims")
-    return _expand(data, decompressor, most=size, refusal=lie, frames=frames)
+    refusal = ExpandsTooFarError(f"a chunk expands to more than the {size:,} bytes that it claims")
+    return _expand(data, decompressor, most=size, refusal=refusal, frames=frames)
 
 
 def _require_room(chunks: Iterable[Any]) -> None:
@@ -167,23 +157,22 @@ def _require_room(chunks: Iterable[Any]) -> None:
     # at the same moment what begins counts before what ends
     begins = [(chunk.message_start_time, 0, chunk.uncompressed_size) for chunk in chunks]
     ends = [(max(chunk.message_start_time, chunk.message_end_time), 1, -chunk.uncompressed_size) for chunk in chunks]
-    for held in accumulate(size for _, _, size in sorted(begins + ends)):
-        if held > MOST_BYTES:
+    for total in accumulate(size for _, _, size in sorted(begins + ends)):
+        if total > MOST_BYTES:
             raise _beyond("a chunk, or chunks of the same moment together,", MOST_BYTES)
 
 
 def _expand(
     data: bytes, decompressor: Any, *, most: int, refusal: ExpandsTooFarError, frames: int | None = None
 ) -> bytes:
-    """Expand frames that follow each other, all or so many, to no more bytes than that."""
+    """Expand compressed frames that follow each other, at most `frames` of them, to `most` bytes or fewer."""
     parts, room, done = [], most + 1, 0
     while data and done != frames:
-        frame = decompressor()
-        given = data
-        while not frame.eof and (given or not frame.needs_input):
-            parts.append(frame.decompress(given, max_length=room))
+        frame, rest = decompressor(), data
+        while not frame.eof and (rest or not frame.needs_input):
+            parts.append(frame.decompress(rest, max_length=room))
             room -= len(parts[-1])
-            given = b""
+            rest = b""
             if room <= 0:
                 raise refusal
         if not frame.eof:
@@ -193,7 +182,7 @@ def _expand(
 
 
 class _BoundedFile:
-    """A file that is expanded while it is read."""
+    """File that is expanded while it is read."""
 
     def __init__(self, file: Any, *, most: int) -> None:
         self._file, self._room, self._most = file, most, most
@@ -220,35 +209,31 @@ _STORAGE = (".mcap", ".db3")
 
 
 def bag_topics(path: Path) -> dict[str, str]:
-    """Topics of a bag and the types of their messages."""
+    """List the topics of a bag with the types of their messages."""
     with open_bag(path) as bag:
         return {connection.topic: connection.msgtype for connection in bag.connections}
 
 
-def bag_messages(
-    path: Path, topics: Collection[str], *, kinds: Mapping[str, str] | None = None
-) -> Iterator[tuple[str, int, Any]]:
-    """Topic, time of arrival in nanoseconds and content of each message, in the order of recording.
+def bag_messages(path: Path, topics: Mapping[str, str]) -> Iterator[tuple[str, int, Any]]:
+    """Iterate over topic, time of arrival in nanoseconds and content of messages, in the order of recording.
 
+    `topics` has the type of each topic: a second channel of the same topic could hold anything, and is passed over.
     Definitions that the bag brings along are not used, for `rosbags` turns them into code. Message data are views of
-    the bytes read: a large header claims nothing. Where `kinds` tells the type of a topic, messages of another are
-    passed over: a second channel of the same topic could hold anything.
+    the bytes read: a large header claims nothing.
     """
     with open_bag(path) as bag:
-        types, kinds = trial_types(), kinds or {}
-        wanted = [
-            one for one in bag.connections if one.topic in topics and kinds.get(one.topic, one.msgtype) == one.msgtype
-        ]
-        if not wanted:  # to rosbags none means all
+        types = trial_types()
+        chosen = [each for each in bag.connections if topics.get(each.topic) == each.msgtype]
+        if not chosen:  # to rosbags none means all
             return
-        for connection, time_ns, data in bag.messages(wanted):
+        for connection, time_ns, data in bag.messages(chosen):
             yield connection.topic, time_ns, types.deserialize_cdr(memoryview(data), connection.msgtype)
 
 
 @contextmanager
 def open_bag(path: Path) -> Iterator["Reader"]:
-    """Open a bag to read it, as `bag_topics` and `bag_messages` do; they tell of its errors."""
-    require_packages("rosbags", extra="ros", purpose="a ROS 2 bag")
+    """Open a bag; whatever its readers raise inside becomes a `RecordingError`."""
+    require_packages("mcap", "rosbags", extra="ros", purpose="a ROS 2 bag")
     _require_bag(path)
     for file in [file for file in path.iterdir() if file.suffix in _STORAGE] if path.is_dir() else [path]:
         require_file(file)
@@ -265,9 +250,9 @@ def open_bag(path: Path) -> Iterator["Reader"]:
         ) from None
     # a damaged byte may lead rosbags, sqlite or YAML into any error there is, from KeyError to MemoryError
     except Exception as error:
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise RecordingError(
-            f"{path} is not a readable ROS 2 bag ({said}); copy it again, or mend it with `mcap recover`"
+            f"{path} is not a readable ROS 2 bag ({text}); copy it again, or mend it with `mcap recover`"
         ) from None
 
 
@@ -296,121 +281,55 @@ def _require_whole_pages(file: Path) -> None:
         raise RecordingError(f"{file} is cut off; copy it again")
 
 
-def read_trial_bag(path: Path, topics: dict[str, str]) -> Capture | None:
-    """Read a bag that `write_mcap` wrote, bit by bit as its data set was; None where it is another one."""
-    if topics.get(TRIAL) != TOPICS[TRIAL]:
-        return None
-    text = next((message.data for _, _, message in bag_messages(path, {TRIAL}, kinds=TOPICS)), "")
-    # either is enough: the other may be what is damaged
-    if FORMAT not in text and topics.get(LABELS) != TOPICS[LABELS]:
-        return None
-    about = ExportedTrial.parse(text, where=f"{TRIAL} of {path}")
-    needed = {REFERENCE, IMAGE, LABELS} | ({WRENCH, WRENCH_TIMES} if about.force_samples else set())
-    missing = [topic for topic in sorted(needed) if topics.get(topic) != TOPICS[topic]]
-    if missing:
-        raise RecordingError(
-            f"{path} lacks {', '.join(f'{topic} ({TOPICS[topic]})' for topic in missing)}; export the trial again"
-        )
-    found, size = _scan(path, needed, images=IMAGE, kinds=TOPICS)
-    _require_whole(found, about, path)
-    numbers: dict[str, np.ndarray] = dict(zip(NUMBERS, found[LABELS].table(len(NUMBERS)).T.copy(), strict=True))
-    valid, states, reasons = zip(*found[LABELS].words, strict=True)
-    forces = None
-    if about.force_samples:
-        sampled_s = found[WRENCH_TIMES].table(1)[:, 0]
-        forces = Forces(time_s=sampled_s, force_n=found[WRENCH].table(3), source=about.force_source)
-    return about.capture(
-        numbers,
-        states=states,
-        valid=np.array(valid),
-        reasons=reasons,
-        source=f"{about.facts.trial} of {path}",
-        frame_size=size,
-        read_frames=partial(_read_frames, path, IMAGE, kinds=TOPICS),
-        forces=forces,
-        reference=found[REFERENCE].image,
-    )
-
-
 @dataclass(kw_only=True)
 class _Topic:
-    """What the messages of a topic hold besides pixels of frames; stamps of an hour at 1 kHz are 58 MB."""
+    """Stamps and forces of the messages of a topic; stamps of an hour at 1 kHz are 58 MB."""
 
     header_ns: array = field(default_factory=lambda: array("q"))
     bag_ns: array = field(default_factory=lambda: array("q"))
-    numbers: array = field(default_factory=lambda: array("d"))
-    words: list[tuple[bool, str, str]] = field(default_factory=list)
-    image: Frame | None = None
+    force_n: array = field(default_factory=lambda: array("d"))
 
     def times(self, clock: str) -> Int64[np.ndarray, " messages"]:
         return np.array(self.header_ns if clock == "header" else self.bag_ns, dtype=np.int64)
 
-    def table(self, width: int) -> Float[np.ndarray, "rows width"]:
-        return np.array(self.numbers, dtype=np.float64).reshape(-1, width)
+    def forces(self) -> Float[np.ndarray, "messages 3"]:
+        return np.array(self.force_n, dtype=np.float64).reshape(-1, 3)
 
 
-def _scan(
-    path: Path, topics: Collection[str], *, images: str, kinds: Mapping[str, str] | None = None
-) -> tuple[dict[str, _Topic], tuple[int, int] | None]:
-    """Stamps, forces and labels, and the size of the frames, but no pixel of one."""
-    found, size = defaultdict(_Topic), None
-    for name, bag_ns, message in bag_messages(path, topics, kinds=kinds):
-        topic = found[name]
+def _scan(path: Path, topics: Mapping[str, str], *, images: str) -> tuple[dict[str, _Topic], tuple[int, int]]:
+    """Read stamps, forces and the size of the frames, but no pixel of one."""
+    scanned, size = defaultdict(_Topic), None
+    for name, bag_ns, message in bag_messages(path, topics):
+        topic = scanned[name]
         if name == images:
             where = f"frame {len(topic.bag_ns)} of {images} in {path}"
             before, size = size, image_size(message, where=where)
             if before is not None and before != size:
-                cure = "cut the bag there" if kinds is None else "export the trial again"
                 raise RecordingError(
-                    f"{where} is {size[0]} x {size[1]} pixels, those before it are {before[0]} x {before[1]}; {cure}"
+                    f"{where} is {size[0]} x {size[1]} pixels, those before it are {before[0]} x {before[1]}; cut the "
+                    "bag there"
                 )
-        elif message.__msgtype__ == TOPICS[WRENCH]:
-            force = message.wrench.force
-            topic.numbers.extend((force.x, force.y, force.z))
-        elif name == LABELS:
-            topic.numbers.extend(getattr(message, number) for number in NUMBERS)
-            # few words, and often
-            topic.words.append(
-                (bool(message.valid), sys.intern(message.contact_state), sys.intern(message.invalid_reason))
-            )
-        elif name == WRENCH_TIMES:
-            topic.numbers.extend(message.time_s.tolist())
         else:
-            topic.image = image_pixels(message, where=f"{REFERENCE} of {path}")
+            force = message.wrench.force
+            topic.force_n.extend((force.x, force.y, force.z))
         stamp = message.header.stamp
         topic.header_ns.append(stamp.sec * 1_000_000_000 + stamp.nanosec)
         topic.bag_ns.append(bag_ns)
-    return found, size
+    if size is None:
+        raise RecordingError(f"{images} of {path} has no frame; leave it out or record it again")
+    return scanned, size
 
 
-def _read_frames(path: Path, images: str, *, kinds: Mapping[str, str] | None = None) -> Iterator[Frame]:
-    for index, (_, _, message) in enumerate(bag_messages(path, {images}, kinds=kinds)):
+def _read_frames(path: Path, images: str, kind: str) -> Iterator[Frame]:
+    for index, (_, _, message) in enumerate(bag_messages(path, {images: kind})):
         yield image_pixels(message, where=f"frame {index} of {images} in {path}")
 
 
-def _require_whole(found: dict[str, _Topic], about: ExportedTrial, path: Path) -> None:
-    """Check that all that was promised is there, and that labels belong to their frames."""
-    counts = {
-        "reference frames": (len(found[REFERENCE].bag_ns), 1),
-        "frames": (len(found[IMAGE].bag_ns), about.frames),
-        "labels": (len(found[LABELS].bag_ns), about.frames),
-        "wrenches": (len(found[WRENCH].bag_ns), about.force_samples),
-        "times of wrenches": (len(found[WRENCH_TIMES].numbers), about.force_samples),
-    }
-    for name, (count, promised) in counts.items():
-        if count != promised:
-            raise RecordingError(f"{path} has {count} {name}, {TRIAL} promises {promised}; export the trial again")
-    apart = found[IMAGE].times("header") != found[LABELS].times("header")
-    if apart.any():
-        at = int(np.argmax(apart))
-        raise RecordingError(f"label {at} of {path} has another stamp than its frame; export the trial again")
-
-
-_IMAGES, _WRENCHES = (RAW, COMPRESSED), ("geometry_msgs/msg/WrenchStamped",)
+_IMAGES, _WRENCHES = (RAW, COMPRESSED), (TOPICS[WRENCH],)
 
 
 def read_rosbag(path: Path, options: ReadOptions) -> Capture:
-    """Read a bag as one trial; one that `write_mcap` exported as it was, where no topic is named.
+    """Read a bag as one trial; one that `export_mcap` wrote is restored, unless a topic is named.
 
     A first pass reads stamps and sizes; pixels are decoded when frames are read. Frames
     and forces share one clock, that of the message headers; where a header has no stamp, or the two topics have clocks
@@ -418,60 +337,75 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     Times are seconds since the first frame or force: since the epoch, double precision would round them to 0.2 us.
     """
     topics, wrench_topic = bag_topics(path), options.wrench_topic
-    if options.image_topic is None and wrench_topic is None and (trial := read_trial_bag(path, topics)) is not None:
-        return trial
+    if options.image_topic is None and wrench_topic is None and topics.get(IMAGE) == TOPICS[IMAGE]:
+        with scratch_folder() as copy:
+            if (capture := _restore_trial(path, copy)) is not None:
+                return capture
     images = _choose(topics, options.image_topic, types=_IMAGES, what="images", path=path)
     wrenches = _choose(topics, wrench_topic, types=_WRENCHES, what="wrenches", path=path)
     if images is None:
         raise RecordingError(
             f"{path} has no topic with images ({' or '.join(_IMAGES)}); record the camera too "
-            f"(it has {_listed(topics)})"
+            f"(it has {_list_topics(topics)})"
         )
-    found, size = _scan(path, {images, wrenches} - {None}, images=images)
+    chosen = [name for name in (images, wrenches) if name is not None]
+    scanned, size = _scan(path, {name: topics[name] for name in chosen}, images=images)
     notes = []
     if wrenches is None:
         notes.append(f"There are no forces: the bag has no topic of {_WRENCHES[0]}.")
-    elif wrench_topic is None and wrenches not in found:
+    elif wrench_topic is None and wrenches not in scanned:
         notes.append(f"There are no forces: {wrenches} has no message.")
         wrenches = None
-    if size is None:
-        raise RecordingError(f"{images} of {path} has no frame; leave it out or record it again")
-    clock, why = _choose_clock({name: found[name] for name in (images, wrenches) if name in found})
-    times = {name: topic.times(clock) for name, topic in found.items()}
+    clock, why = _choose_clock({name: scanned[name] for name in chosen if name in scanned})
+    times = {name: topic.times(clock) for name, topic in scanned.items()}
     zero = min(series[0] for series in times.values())
     forces = None
     if wrenches is not None:
         time_s = (times.get(wrenches, np.zeros(0)) - zero) / 1e9
-        forces = Forces(time_s=time_s, force_n=found[wrenches].table(3), source=f"{wrenches} of {path}")
+        forces = Forces(time_s=time_s, force_n=scanned[wrenches].forces(), source=f"{wrenches} of {path}")
     return Capture(
         trial=trial_name(path.stem if path.is_file() else path.resolve().name),
         source=f"{images} of {path}",
         frame_time_s=(times[images] - zero) / 1e9,
         frame_size=size,
-        read_frames=partial(_read_frames, path, images),
+        read_frames=partial(_read_frames, path, images, topics[images]),
         forces=forces,
         notes=(*notes, *why),
     )
 
 
-def _choose(topics: dict[str, str], named: str | None, *, types: tuple[str, ...], what: str, path: Path) -> str | None:
-    """Topic that was named, or the only one of these types."""
+def _restore_trial(path: Path, copy: Path) -> Capture | None:
+    """Read a bag that `write_mcap` wrote, bit by bit as its data set was; None where it is another one."""
+    if path.is_dir() or path.suffix != ".mcap":
+        return None
+    try:
+        with open_bag(path):
+            if not extract_attachments(path, copy):
+                return None
+        scanned, size = _scan(path, {IMAGE: TOPICS[IMAGE]}, images=IMAGE)
+        read_frames = partial(_read_frames, path, IMAGE, TOPICS[IMAGE])
+        (capture,) = restore_trials(copy, [(str(path), len(scanned[IMAGE].bag_ns), size, read_frames)])
+    except InputError as error:
+        raise RecordingError(str(error).replace(str(copy), str(path))) from None
+    return capture
+
+
+def _choose(topics: dict[str, str], name: str | None, *, types: tuple[str, ...], what: str, path: Path) -> str | None:
+    """Return the topic `name`, or the only one of some types."""
     fitting = {topic: kind for topic, kind in topics.items() if kind in types}
-    if named is not None:
-        if named not in topics:
-            raise RecordingError(f"{path} has no topic {named}; it has {_listed(topics)}")
-        if named not in fitting:
-            raise RecordingError(
-                f"{named} of {path} holds {topics[named]}, no {what}; name one of {' or '.join(types)}"
-            )
-        return named
+    if name is not None:
+        if name not in topics:
+            raise RecordingError(f"{path} has no topic {name}; it has {_list_topics(topics)}")
+        if name not in fitting:
+            raise RecordingError(f"{name} of {path} holds {topics[name]}, no {what}; name one of {' or '.join(types)}")
+        return name
     if len(fitting) > 1:
-        raise RecordingError(f"{path} has {len(fitting)} topics with {what}, {_listed(fitting)}; name one of them")
+        raise RecordingError(f"{path} has {len(fitting)} topics with {what}, {_list_topics(fitting)}; name one of them")
     return next(iter(fitting), None)
 
 
 def _choose_clock(topics: dict[str, _Topic]) -> tuple[str, list[str]]:
-    """Clock that all topics have, "header" or "bag", and a note where it is not the header's."""
+    """Choose the clock that all topics have, "header" or "bag", with a note where it is not the header's."""
     for name, topic in topics.items():
         missing = topic.header_ns.count(0)
         if missing:
@@ -492,5 +426,5 @@ def _meet(clock: str, *topics: _Topic) -> bool:
     return bool(frames[0] <= wrenches[-1] and wrenches[0] <= frames[-1])
 
 
-def _listed(topics: dict[str, str]) -> str:
+def _list_topics(topics: dict[str, str]) -> str:
     return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(topics.items())) or "no topic"

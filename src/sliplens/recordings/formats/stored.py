@@ -1,44 +1,38 @@
-"""Data sets of sliplens as recordings; and what trials say of themselves in the formats of others."""
+"""Data sets of sliplens as recordings, and the copy without images that exports carry along."""
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import fields, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
-import msgspec
 import numpy as np
-from jaxtyping import Float
 
-from sliplens.codec import from_builtins, to_builtins
 from sliplens.errors import InputError, RecordingError
-from sliplens.files import parse_json
+from sliplens.files import hash_file, require_file
 from sliplens.images import encode_png
 from sliplens.recordings.capture import Capture, Forces, Frame
-from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
-from sliplens.recordings.formats.tables import trial_name
-from sliplens.recordings.labelling import Labelling
-from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames
-from sliplens.recordings.trial import LABEL_SIGNALS, ContactState, Labels, Recording, TrialFacts
+from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_info, trial_path, write_dataset_table
+from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames, write_trial
+from sliplens.recordings.trial import Labels, Recording, TrialFacts
 
-STATES = {str(state): state for state in ContactState}
-"""Contact states by their words."""
+_BATCH = 16  # frames that are encoded side by side
 
 
 def read_stored(folder: Path) -> list[Capture]:
-    """Read a data set, one capture a trial, with its labels, its reference frame, and all it says of itself.
+    """Read a data set, one capture a trial, with its labels and its reference frame.
 
-    Forces are the samples that were kept on import, else, as for a simulated trial, those of the frames: the pull along
-    x, pressing along z.
+    Forces are the samples that the import stored. Where there are none, as for a simulated trial, they are the forces
+    of the frames: the tangential force along x, the normal force along z.
     """
     data = load_dataset(folder)
     return [read_stored_trial(data, info) for info in data.trials]
 
 
 def read_stored_trial(data: Dataset, info: TrialInfo, *, samples: bool = True) -> Capture:
-    """Read one trial of a data set as `read_stored` does, with the samples of its forces or without."""
+    """Read one trial of a data set as `read_stored` does, with or without the samples of its forces."""
     path = trial_path(data.folder, info.trial)
     stored = load_recording(path, pixels=False)
     return Capture(
@@ -47,7 +41,7 @@ def read_stored_trial(data: Dataset, info: TrialInfo, *, samples: bool = True) -
         frame_time_s=stored.time_s,
         frame_size=(info.height, info.width),
         read_frames=partial(stream_frames, path),
-        forces=_forces(data, info, stored) if samples else None,
+        forces=_read_forces(data, info, stored) if samples else None,
         labels=stored,
         reference=stored.reference,
         split=info.split,
@@ -55,131 +49,97 @@ def read_stored_trial(data: Dataset, info: TrialInfo, *, samples: bool = True) -
     )
 
 
-def _forces(data: Dataset, info: TrialInfo, stored: Recording) -> Forces | None:
+def _read_forces(data: Dataset, info: TrialInfo, stored: Recording) -> Forces | None:
     if info.forces_sha256:
         return load_forces(forces_path(data.folder, info.trial))
     pull, press = stored.tangential_force_n, stored.normal_force_n
-    known = np.isfinite(pull) & np.isfinite(press)
-    if not known.any():
+    measured = np.isfinite(pull) & np.isfinite(press)
+    if not measured.any():
         return None
-    samples = np.stack([pull, np.zeros_like(pull), press], axis=-1)[known]
-    return Forces(time_s=stored.time_s[known], force_n=samples, source=f"the frames of {info.trial}")
+    samples = np.stack([pull, np.zeros_like(pull), press], axis=-1)[measured]
+    return Forces(time_s=stored.time_s[measured], force_n=samples, source=f"the frames of {info.trial}")
 
 
-FORMAT, VERSION = "sliplens trial", 2
-"""What the text of an exported trial calls itself."""
-EXPORTED_OPTIONAL = ("safety_margin_sigma", "valid", "reason")
-"""Labels that a trial may lack, though the formats of others have room for them."""
-_BATCH = 16  # frames that are encoded side by side
-_LONGEST = 2**24  # characters of a text that is parsed; those of a trial are some thousands
-
-
-def exported_labels(labels: Labels) -> dict[str, np.ndarray]:
-    """A value a frame of each label; those that a trial lacks follow from what it has, or are not known."""
-    known = np.isfinite(labels.safety_margin)
-    missing = {"safety_margin_sigma": np.full(len(known), np.nan), "valid": known, "reason": ("",) * len(known)}
-    found = {name: getattr(labels, name) for name in (*LABEL_SIGNALS, *EXPORTED_OPTIONAL)}
-    states = [str(state) for state in labels.contact_state]
-    found = {name: missing[name] if values is None else values for name, values in found.items()}
-    return {name: np.asarray(values) for name, values in {**found, "contact_state": states}.items()}
-
-
-def encode_batches(frames: Iterator[Frame]) -> Iterator[tuple[list[Frame], Iterator[bytes]]]:
-    """Frames and their PNG, those of a batch encoded side by side."""
+def encode_batches(frames: Iterator[Frame]) -> Iterator[tuple[list[Frame], list[bytes]]]:
+    """Iterate over batches of frames and their PNG images; the images of a batch are encoded in threads."""
     with ThreadPoolExecutor() as pool:
         while batch := list(islice(frames, _BATCH)):
-            yield batch, pool.map(encode_png, batch)
+            yield batch, list(pool.map(encode_png, batch))
 
 
-@dataclass(frozen=True, kw_only=True)
-class ExportedTrial:
-    """What a trial is, and how much of each kind belongs to it, beside its frames in a format of others."""
+def fill_labels(labels: Labels) -> Labels:
+    """Return labels with uncertainty, validity and reason, which a trial may lack: NaN, valid where a margin is, ""."""
+    count, has_margin = len(labels.safety_margin), np.isfinite(labels.safety_margin)
+    sigma, valid, reason = labels.safety_margin_sigma, labels.valid, labels.reason
+    return replace(
+        labels,
+        safety_margin_sigma=np.full(count, np.nan) if sigma is None else sigma,
+        valid=has_margin if valid is None else valid,
+        reason=("",) * count if reason is None else reason,
+    )
 
-    format: str = FORMAT
-    version: int = VERSION
-    facts: TrialFacts
-    split: str
-    simulated: bool
-    frames: int
-    force_samples: int
-    """0 where no force is known."""
-    force_source: str
-    optional: tuple[str, ...]
-    """Those of `EXPORTED_OPTIONAL` that the labels have."""
-    labelling: Labelling | None
 
-    def __post_init__(self) -> None:
-        if trial_name(self.facts.trial) != self.facts.trial:
-            raise ValueError("no proper name of a trial")
-        if self.frames <= 0 or self.force_samples < 0 or not set(self.optional) <= set(EXPORTED_OPTIONAL):
-            raise ValueError("no proper counts of frames, force samples and labels")
+def save_without_images(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> None:
+    """Write a copy of a data set that has everything but the images and the ground truth of simulated trials.
 
-    @classmethod
-    def of(cls, capture: Capture) -> "ExportedTrial":
-        """Text of a stored trial, which has labels."""
-        labels, forces = capture.labels, capture.forces
-        assert labels is not None
-        return cls(
-            facts=TrialFacts(**{field.name: getattr(capture, field.name) for field in fields(TrialFacts)}),
-            split=capture.split,
-            simulated=capture.simulated,
-            frames=len(capture),
-            force_samples=len(forces.time_s) if forces else 0,
-            force_source=forces.source if forces else "",
-            optional=tuple(name for name in EXPORTED_OPTIONAL if getattr(labels, name) is not None),
-            labelling=labels.labelling,
+    An export carries it beside the images, so that `restore_trials` gives back labels, reference frame and forces.
+    """
+    rows = []
+    for info in trials:
+        stored = load_recording(trial_path(data.folder, info.trial), pixels=False)
+        path, samples = trial_path(folder, info.trial), forces_path(folder, info.trial)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if info.forces_sha256:
+            samples.parent.mkdir(exist_ok=True)
+            shutil.copyfile(forces_path(data.folder, info.trial), samples)
+        no_images = [[b""] * len(stored)]
+        write_trial(path, no_images, facts=stored, time_s=stored.time_s, labels=stored, reference=stored.reference)
+        rows.append(trial_info(path, split=info.split))
+    write_dataset_table(folder, rows, simulated=data.simulated)
+
+
+def restore_trials(
+    folder: Path, images: Sequence[tuple[str, int, tuple[int, int], Callable[[], Iterator[Frame]]]]
+) -> list[Capture]:
+    """Join the trials of `save_without_images` with their images.
+
+    Parameters
+    ----------
+    folder
+        Copy without images.
+    images
+        For each trial: source for people, number of frames, their height and width, and how to read them.
+
+    Raises
+    ------
+    RecordingError
+        If the copy is damaged, or the images are not those of its trials.
+    """
+    try:
+        data = load_dataset(folder)
+        for info in data.trials:
+            hashes = {trial_path(folder, info.trial): info.sha256}
+            if info.forces_sha256:
+                hashes[forces_path(folder, info.trial)] = info.forces_sha256
+            for path, sha256 in hashes.items():
+                require_file(path, missing="export the data set again")
+                if hash_file(path) != sha256:
+                    raise RecordingError(f"{path} was changed since it was exported; export the data set again")
+        stored = [read_stored_trial(data, info) for info in data.trials]
+    except InputError as error:
+        raise RecordingError(str(error)) from None
+    if len(stored) != len(images):
+        raise RecordingError(
+            f"{folder} describes {len(stored)} trials beside the images of {len(images)}; export the data set again, "
+            "or remove that folder to import without labels"
         )
-
-    def dump(self, **more: object) -> str:
-        """JSON; `more` is for people and not read back."""
-        return msgspec.json.encode({**to_builtins(self), **more}).decode()
-
-    @classmethod
-    def parse(cls, text: str, *, where: str) -> "ExportedTrial":
-        """Read what `dump` wrote, believing nothing."""
-        if len(text) > _LONGEST:
-            raise RecordingError(f"{where} has {len(text)} characters, no description does; export the trial again")
-        try:
-            values = parse_json(text, where=where, cure="export the trial again")
-        except InputError as error:
-            raise RecordingError(str(error)) from None
-        if not isinstance(values, dict) or values.get("format") != FORMAT:
-            raise RecordingError(f"{where} does not describe a {FORMAT}; export the trial again")
-        if values.get("version") != VERSION:
+    captures = []
+    for capture, (source, frames, size, read_frames) in zip(stored, images, strict=True):
+        if (len(capture), capture.frame_size) != (frames, size):
             raise RecordingError(
-                f"{where} is of version {str(values.get('version'))[:20]}, this sliplens reads {VERSION}; update it"
+                f"{source} has {frames} frames of {size[0]} x {size[1]} pixels, but trial {capture.trial} in {folder} "
+                f"has {len(capture)} of {capture.frame_size[0]} x {capture.frame_size[1]}; export the data set again, "
+                "or remove that folder to import without labels"
             )
-        try:
-            return from_builtins(values, cls, where=where, command="sliplens export")
-        except InputError as error:
-            raise RecordingError(str(error)) from None
-
-    def capture(
-        self,
-        numbers: dict[str, Float[np.ndarray, " frames"]],
-        *,
-        states: tuple[str, ...],
-        valid: np.ndarray,
-        reasons: tuple[str, ...],
-        source: str,
-        **recorded: Any,
-    ) -> Capture:
-        """Trial as it was exported, its times and labels from the columns of another format, checked."""
-        time_s = numbers.pop("time_s")
-        if not np.isfinite(time_s).all():
-            raise RecordingError(f"{source} has a time that is not a number; export the trial again")
-        unknown = set(states) - set(STATES)
-        if unknown:
-            raise RecordingError(
-                f"{source} has the contact state {min(unknown)[:40]!r}, none of {', '.join(STATES)}; "
-                "export the trial again"
-            )
-        optional = {"safety_margin_sigma": numbers.pop("safety_margin_sigma"), "valid": valid, "reason": reasons}
-        labels = Labels(
-            **numbers,
-            contact_state=tuple(STATES[state] for state in states),
-            **{name: values for name, values in optional.items() if name in self.optional},
-            labelling=self.labelling,
-        )
-        told = {**vars(self.facts), "split": self.split, "simulated": self.simulated, "source": source}
-        return Capture(**told, frame_time_s=time_s, labels=labels, **recorded)
+        captures.append(replace(capture, source=f"{capture.trial}, {source}", read_frames=read_frames))
+    return captures
