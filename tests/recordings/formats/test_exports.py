@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,7 +48,7 @@ def sources(folder: Path) -> list[Path]:
     return sorted(folder.glob("*.mcap")) or [folder]
 
 
-def read_all(folder: Path, **options: str) -> dict[str, Capture]:
+def read_all(folder: Path, **options: Any) -> dict[str, Capture]:
     opened = [open_source(path, options=ReadOptions(**options), whole=True) for path in sources(folder)]
     return {capture.trial: capture for captures in opened for capture in captures}
 
