@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from labelled import LABELLING
@@ -20,6 +21,7 @@ def make_trial(name: str, rng: np.random.Generator, *, start_s: float = 0.0, cou
     margin = rng.uniform(size=count)
     margin[0], margin[1:3] = np.nan, (1, 0)[: count - 1]
     states = list(ContactState)
+    signals: dict[str, Any] = {name: rng.normal(size=count) for name in LABEL_SIGNALS[:3]}
     return Recording(
         trial=name,
         sensor="dome",
@@ -28,7 +30,7 @@ def make_trial(name: str, rng: np.random.Generator, *, start_s: float = 0.0, cou
         reference=rng.integers(0, 256, (*SIZE, 3), dtype=np.uint8),
         frames=rng.integers(0, 256, (count, *SIZE, 3), dtype=np.uint8),
         time_s=start_s + np.cumsum(1 / 30 + rng.uniform(-2e-4, 2e-4, count)),
-        **{name: rng.normal(size=count) for name in LABEL_SIGNALS[:3]},
+        **signals,
         safety_margin=margin,
         stick_ratio=margin**2,
         contact_state=tuple(states[index % len(states)] for index in range(count)),
