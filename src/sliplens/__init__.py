@@ -21,9 +21,11 @@ if TYPE_CHECKING:
     from sliplens.parts import read_status
     from sliplens.plots.figure import plot
     from sliplens.recordings.check import check_dataset
-    from sliplens.recordings.dataset import load_dataset
+    from sliplens.recordings.corrections import draft_corrections
+    from sliplens.recordings.dataset import load_dataset, recover_dataset
     from sliplens.recordings.exporting import export_lerobot, export_mcap
-    from sliplens.recordings.importing import import_recordings, label_dataset
+    from sliplens.recordings.importing import import_recordings
+    from sliplens.recordings.relabelling import label_dataset
     from sliplens.recordings.splits import split_dataset
     from sliplens.report.page import write_report
     from sliplens.simulation.sharing import compare_datasets
@@ -41,6 +43,7 @@ _MODULES = {
     "check_dataset": "sliplens.recordings.check",
     "compare_datasets": "sliplens.simulation.sharing",
     "diagnose": "sliplens.study.diagnose",
+    "draft_corrections": "sliplens.recordings.corrections",
     "evaluate": "sliplens.training.evaluation",
     "examine_installation": "sliplens.doctor",
     "explain": "sliplens.explainers.table",
@@ -49,13 +52,14 @@ _MODULES = {
     "export_onnx": "sliplens.models.onnx",
     "hold_grip": "sliplens.grip.hold",
     "import_recordings": "sliplens.recordings.importing",
-    "label_dataset": "sliplens.recordings.importing",
+    "label_dataset": "sliplens.recordings.relabelling",
     "load": "sliplens.models.checkpoint",
     "load_dataset": "sliplens.recordings.dataset",
     "plot": "sliplens.plots.figure",
     "predict": "sliplens.models.predictions",
     "read_live": "sliplens.live.loop",
     "read_status": "sliplens.parts",
+    "recover_dataset": "sliplens.recordings.dataset",
     "run_episodes": "sliplens.grip.episodes",
     "run_study": "sliplens.study.run",
     "score": "sliplens.faithfulness.scoring",
@@ -74,6 +78,7 @@ __all__ = [
     "check_dataset",
     "compare_datasets",
     "diagnose",
+    "draft_corrections",
     "evaluate",
     "examine_installation",
     "explain",
@@ -89,6 +94,7 @@ __all__ = [
     "predict",
     "read_live",
     "read_status",
+    "recover_dataset",
     "run_episodes",
     "run_study",
     "score",

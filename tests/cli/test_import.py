@@ -16,7 +16,7 @@ from sliplens.errors import InputError
 from sliplens.images import write_png
 from sliplens.parts import read_status
 from sliplens.recordings import Recording, load_dataset
-from sliplens.recordings.importing import import_recordings, label_dataset
+from sliplens.recordings.importing import import_recordings
 from sliplens.recordings.store import read_header, write_trial
 
 
@@ -271,6 +271,5 @@ def test_a_recording_in_a_store_is_refused_by_its_name(words: tuple[str, ...], t
 
 
 def test_a_store_is_no_place_for_a_data_set_and_that_is_told_first(tmp_path: Path):
-    for make in (import_recordings, label_dataset):
-        with pytest.raises(InputError, match=r"^s3://lab/data is in a store, where this writes nothing"):
-            make(tmp_path / "nothing", out="s3://lab/data")
+    with pytest.raises(InputError, match=r"^s3://lab/data is in a store, where this writes nothing"):
+        import_recordings(tmp_path / "nothing", out="s3://lab/data")

@@ -1,6 +1,6 @@
 """`sliplens label`, and the import of recordings that bring labels of their own."""
 
-import shlex
+import csv
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +13,16 @@ from there import there
 
 from sliplens.images import write_png
 from sliplens.parts import read_status
-from sliplens.recordings import ContactState, LabelSettings, Recording, load_dataset
+from sliplens.recordings import (
+    ContactState,
+    Corrections,
+    LabelSettings,
+    Recording,
+    label_dataset,
+    load_dataset,
+    read_corrections,
+)
 from sliplens.recordings.dataset import trial_path
-from sliplens.recordings.edits import EDITS_FILE, edits_in_force, keep_edit, make_edit, read_edits
-from sliplens.recordings.importing import relabel_trial
 from sliplens.recordings.store import (
     forces_path,
     load_forces,
@@ -236,44 +242,87 @@ def margins(folder: Path, trial: Recording) -> np.ndarray:
     return load_recording(trial_path(folder, trial.trial), pixels=False).safety_margin
 
 
-def test_edits_give_the_labels_of_their_settings_and_undone_those_of_before(
+def test_corrections_give_the_labels_of_their_settings_and_removed_those_of_before(
     tmp_path: Path, trial: Recording, relabelled: Path, capsys: pytest.CaptureFixture[str]
 ):
-    folder = tmp_path / "data"
+    folder, name, table = tmp_path / "data", trial.trial, tmp_path / "corrections.csv"
     shutil.copytree(relabelled, folder)
-    data, name = load_dataset(folder), trial.trial
     before = load_recording(trial_path(folder, name))
-    assert before.labelling is not None
-    slip_s = there(there(before.labelling.basis).friction.onset_s)
-    said = {"slip_s": slip_s - 0.5, "contact_s": 0.7, "reference_frame": 5, "tare": (0.01, 0.0, -0.02)}
-    bad = (60, 79)
-    settings = LabelSettings(**said, bad_frames=(bad,))
-    edits = [make_edit(name, kind, value) for kind, value in (*said.items(), ("bad", bad))]
-    expected = relabel_trial(data, name, labelling=settings)
-    for edit in edits:
-        keep_edit(data, edit)
-    assert run("label", folder, "--no-audit") == 0
-    assert "5 edits by hand applied to 1 trial" in capsys.readouterr().err
-    edited = load_recording(trial_path(folder, name))
-    np.testing.assert_array_equal(edited.safety_margin, expected.safety_margin)
-    np.testing.assert_array_equal(edited.reference, trial.frames[5])
-    assert edited.reason is not None
-    assert {edited.reason[place] for place in range(bad[0], bad[1] + 1)} == {"marked by hand"}
-    assert edited.labelling is not None
-    assert there(edited.labelling.basis).friction.onset_s == pytest.approx(said["slip_s"])
-    assert edited.labelling.edits == tuple(edits)
-    assert {edited.reason[place] for place in np.flatnonzero(trial.time_s < 0.7)} == {"no contact"}
+    slip_s = there(there(there(before.labelling).basis).friction.onset_s) - 0.5
+    values = {"slip_s": slip_s, "contact_s": 0.7, "reference_frame": 5, "tare": (0.01, 0.0, -0.02)}
+    settings = LabelSettings(**values, bad_frames=((60, 79), (90, 90)))
+    expected = label_dataset(relabelled, out=tmp_path / "expected", labelling=settings)
+    table.write_text(
+        f"trial,slip_s,contact_s,reference_frame,tare,bad_frames\n{name},{slip_s!r},0.7,5,0.01 0 -0.02,60..79 90\n"
+    )
+    assert run("label", folder, "--no-audit", "--corrections", table) == 0
+    assert "corrections of 1 trial applied" in capsys.readouterr().err
+    corrected = load_recording(trial_path(folder, name))
+    np.testing.assert_array_equal(corrected.safety_margin, expected.load(expected.trials[0]).safety_margin)
+    np.testing.assert_array_equal(corrected.reference, trial.frames[5])
+    reasons = np.array(there(corrected.reason))
+    assert {*reasons[60:80], reasons[90]} == {"marked by hand"}
+    assert {*reasons[trial.time_s < 0.7]} == {"no contact"}
+    labelling = there(corrected.labelling)
+    assert there(labelling.basis).friction.onset_s == pytest.approx(slip_s)
+    assert labelling.corrections == Corrections(**values, bad_frames=((60, 79), (90, 90)))
     assert run("check", folder) == 0
-    # after a restart, and though the reference had been written anew
-    for _ in edits:
-        keep_edit(load_dataset(folder), make_edit(name, "undo"))
+    # a later call follows them
     assert run("label", folder, "--no-audit") == 0
+    again = load_recording(trial_path(folder, name))
+    assert again.labelling == labelling
+    np.testing.assert_array_equal(again.safety_margin, corrected.safety_margin)
+    # an empty table takes them back, though the reference had been replaced
+    table.write_text(f"trial,slip_s\n{name},\n")
+    assert run("label", folder, "--no-audit", "--corrections", table) == 0
+    assert f"corrections of 1 trial removed, such as {name}" in capsys.readouterr().err
     after = load_recording(trial_path(folder, name))
-    for field, values in signals(before).items():
-        np.testing.assert_array_equal(getattr(after, field), values, err_msg=field)
+    for field, numbers in signals(before).items():
+        np.testing.assert_array_equal(getattr(after, field), numbers, err_msg=field)
     np.testing.assert_array_equal(after.reference, before.reference)
     assert after.labelling == before.labelling
-    assert len(read_edits(folder)) == 2 * len(edits)
+
+
+def test_an_excluded_trial_has_no_label_until_it_is_included_again(tmp_path: Path, trial: Recording, relabelled: Path):
+    folder, table = shutil.copytree(relabelled, tmp_path / "data"), tmp_path / "corrections.csv"
+    before = load_recording(trial_path(folder, trial.trial))
+    table.write_text(f"trial,exclude\n{trial.trial},yes\n")
+    assert run("label", folder, "--corrections", table) == 0
+    excluded = load_recording(trial_path(folder, trial.trial))
+    assert not excluded.labelled.any()
+    assert excluded.count() == {"excluded by hand": len(excluded)}
+    assert run("check", folder) == 0
+    table.write_text(f"trial,exclude\n{trial.trial},no\n")
+    assert run("label", folder, "--no-audit", "--corrections", table) == 0
+    after = load_recording(trial_path(folder, trial.trial))
+    np.testing.assert_array_equal(after.safety_margin, before.safety_margin)
+    assert after.labelling == before.labelling
+
+
+def test_a_draft_is_a_table_that_changes_nothing_until_it_is_edited(
+    tmp_path: Path, trial: Recording, relabelled: Path, capsys: pytest.CaptureFixture[str]
+):
+    folder, table = shutil.copytree(relabelled, tmp_path / "data"), tmp_path / "corrections.csv"
+    assert run("label", folder, "--draft", table) == 0
+    assert read_corrections(table) == {}
+    (row,) = csv.DictReader(table.read_text().splitlines())
+    basis = there(there(load_recording(trial_path(folder, trial.trial)).labelling).basis)
+    assert float(row["current_slip_s"]) == pytest.approx(there(basis.slip_s), abs=1e-4)
+    assert float(row["current_mu"]) == pytest.approx(basis.friction.mu, rel=1e-4)
+    assert 0 < float(row["current_contact_s"]) < float(row["current_slip_s"])
+    row |= {"mu": "1.6", "bad_frames": "3..4"}
+    table.unlink()
+    with table.open("w") as stream:
+        writer = csv.DictWriter(stream, list(row))
+        writer.writeheader()
+        writer.writerow(row)
+    expected = Corrections(mu=1.6, bad_frames=((3, 4),))
+    assert read_corrections(table) == {trial.trial: expected}
+    assert run("label", folder, "--no-audit", "--corrections", table) == 0
+    assert run("label", folder, "--draft", tmp_path / "second.csv") == 0
+    assert read_corrections(tmp_path / "second.csv") == {trial.trial: expected}
+    capsys.readouterr()
+    assert "name a file that does not" in refused(capsys, "label", folder, "--draft", table)
 
 
 def test_what_cannot_be_labelled_is_listed_and_the_data_set_is_as_it_was(
@@ -296,28 +345,25 @@ def test_what_cannot_be_labelled_is_listed_and_the_data_set_is_as_it_was(
     assert [(one.name, len(one.why)) for one in status.failed] == [("jar", 1)]  # it cannot go better
 
 
-def test_edits_that_do_not_fit_their_data_set_are_told(
-    tmp_path: Path, relabelled: Path, trial: Recording, capsys: pytest.CaptureFixture[str]
+def test_corrections_outside_their_data_set_are_refused_with_their_cure(
+    tmp_path: Path, trial: Recording, relabelled: Path, capsys: pytest.CaptureFixture[str]
 ):
-    shutil.copytree(relabelled, tmp_path / "data")
-    line = '{"trial": "%s", "kind": "bad", "value": [100, 900], "by": "ana", "at": "2026-11-23T00:00:00+00:00"}\n'
-    path = tmp_path / "data" / EDITS_FILE
-    path.write_text(line % trial.trial)
-    told = refused(capsys, "label", tmp_path / "data", "--no-audit")
-    assert "frames 100 to 900 cannot be marked as bad: the trial has frames 0 to 239" in told
-    undo = shlex.split(told.split("`")[1])  # one command ends it
-    assert undo[0] == "sliplens"
-    assert run(*undo[1:], "--by", "bo") == 0
-    assert "took back what ana set on 2026-11-23: bad 100, 900" in capsys.readouterr().out
-    assert edits_in_force(read_edits(tmp_path / "data"), trial.trial) == ()
-    assert "no edit that could be undone" in refused(capsys, *undo[1:])
-    path.write_text(line % "gone")
-    assert run("label", tmp_path / "data", "--no-audit") == 0
-    assert "edits gone, which is no trial of the data set" in capsys.readouterr().err
-    assert path.read_text() == line % "gone"
+    folder, table = shutil.copytree(relabelled, tmp_path / "data"), tmp_path / "corrections.csv"
+    before = contents(folder)
+    cases = {
+        f"{trial.trial},100..900,": "frames 100 to 900 cannot be marked as bad: the trial has frames 0 to 239",
+        f"{trial.trial},,99": "the slip is set to 99.00 s",
+        "nobody,1..2,": f"has no trial nobody; it has {trial.trial}",
+    }
+    for row, error in cases.items():
+        table.write_text(f"trial,bad_frames,slip_s\n{row}\n")
+        assert error in refused(capsys, "label", folder, "--no-audit", "--corrections", table)
+    assert contents(folder) == before
 
 
-def test_the_page_is_refused_what_it_cannot_heed(relabelled: Path, capsys: pytest.CaptureFixture[str]):
-    assert "leave --output" in refused(capsys, "label", relabelled, "--page", "-o", "elsewhere")
-    assert "leave --page or --undo out" in refused(capsys, "label", relabelled, "--page", "--undo", "cup")
-    assert "add --page" in refused(capsys, "label", relabelled, "--by", "ana")
+@pytest.mark.parametrize(
+    "words",
+    [("--draft", "a.csv", "-o", "b"), ("--draft", "a.csv", "--audit-only"), ("--audit-only", "--corrections", "a")],
+)
+def test_options_that_exclude_each_other_are_refused(words: tuple[str, ...], relabelled: Path, capsys):
+    assert "leave" in refused(capsys, "label", relabelled, *words)

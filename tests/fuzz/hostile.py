@@ -29,14 +29,13 @@ from sliplens.errors import SliplensError
 from sliplens.files import hash_file, scratch_folder
 from sliplens.images import write_png
 from sliplens.models import predict
-from sliplens.recordings import import_recordings, load_dataset
+from sliplens.recordings import import_recordings, label_dataset, load_dataset
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.check import check_dataset
+from sliplens.recordings.corrections import read_corrections
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.edits import keep_edit, make_edit
 from sliplens.recordings.exporting import export_lerobot, export_mcap
 from sliplens.recordings.formats.stored import read_stored
-from sliplens.recordings.importing import relabel_trial
 from sliplens.recordings.labelling import Reason
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import load_profile
@@ -319,7 +318,8 @@ def _require_no_fault(labels: Labels) -> None:
 
 
 def _labels(folder: Path) -> object:
-    labels = relabel_trial(load_dataset(folder), "trial-0", labelling=LabelSettings(mu=0.6))
+    data = label_dataset(folder, out=folder / "out", labelling=LabelSettings(mu=0.6), overwrite=True)
+    labels = data.read_labels(data.find("trial-0"))
     _require_no_fault(labels)
     return labels.safety_margin
 
@@ -599,17 +599,11 @@ def _read_toml(folder: Path) -> object:
     return profile, profile.output_size((480, 640)), assign_splits(read_splits(folder / "rules.toml"), trials).splits
 
 
-def _edits(folder: Path) -> None:
-    _data_set(folder)
-    for edit in (make_edit("trial-0", "bad", (2, 3), by="ana"), make_edit("trial-0", "mu", 0.7, by="ana")):
-        keep_edit(load_dataset(folder), edit)
-
-
-def _line_of_json(path: Path, rng: Rng) -> None:
-    lines = path.read_bytes().splitlines()
-    at = int(rng.integers(len(lines)))
-    lines[at] = spoil_json(lines[at], rng, str(rng.choice(["replaced", "dropped", "larger"])))
-    path.write_bytes(b"\n".join(lines) + b"\n")
+def _corrections(folder: Path) -> None:
+    (folder / "corrections.csv").write_text(
+        "trial,exclude,reference_frame,slip_s,tare,normal_sign,mu,bad_frames\n"
+        "trial-0,,5,1.25,0.1 0 -0.2,-1,0.7,2..3 9\ntrial-1,yes,,,,,,\n"
+    )
 
 
 def _frames_of(name: str, **options: Any) -> Callable[[Path], object]:
@@ -622,7 +616,9 @@ FORMATS = {
     "data set": Format(_data_set, ("dataset.json",), {**ANY, **JSON}, _read_data_set),
     "trial": Format(_data_set, ("trials/trial-0.parquet",), TRIAL, _read_data_set, _hashes),
     "samples": Format(_data_set, ("forces/trial-0.parquet",), {**ANY, **COLUMNS}, _labels, _hashes),
-    "edits": Format(_edits, ("edits.jsonl",), {**ANY, "line changed": _line_of_json}, _labels),
+    "corrections": Format(
+        _corrections, ("corrections.csv",), MANY, lambda folder: read_corrections(folder / "corrections.csv")
+    ),
     "stages": Format(_workspace, ("work/*/*.json",), {**ANY, **JSON}, _read_workspace),
     "tables": Format(_workspace, ("work/*/*.parquet",), TABLES, _read_workspace),
     "arrays": Format(_workspace, ("work/*/arrays.npz",), ARRAYS, _read_workspace),

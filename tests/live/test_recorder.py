@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from data_sets import contents
 
 import sliplens as sl
-from sliplens.errors import InputError, RecordingError, SliplensError
+from sliplens.errors import RecordingError, SliplensError
 from sliplens.live import ForceStream, LiveFrame, Recorder, SimulatedSource, SourceOptions, open_live
 from sliplens.recordings import Dataset, Recording, TrialFacts, load_dataset
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.dataset import begin_recording, finish_recording, keep_profile
+from sliplens.recordings.dataset import begin_recording, finish_recording, recover_dataset, save_profile
 from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, Journal, JournalHeader
 from sliplens.recordings.sensor import SENSORS_FOLDER, load_profile
 from sliplens.recordings.store import forces_path, load_forces
@@ -121,10 +122,15 @@ def test_what_is_cut_off_is_whole_up_to_the_cut(recording: Recording, tmp_path: 
     os.truncate(journal.path, cut)
     whole = sum(end <= cut for end in ends)
     if whole == 0:
-        with pytest.raises(InputError):
-            load_dataset(tmp_path / "data")
+        with pytest.raises(RecordingError, match="held no whole frame and was removed"):
+            recover_dataset(tmp_path / "data")
+        assert not (tmp_path / "data").exists()
         return
-    data = load_dataset(tmp_path / "data")
+    before = contents(tmp_path / "data")
+    with pytest.raises(RecordingError, match="was cut off; stop it, or finish it with `sliplens recover"):
+        load_dataset(tmp_path / "data")
+    assert contents(tmp_path / "data") == before
+    data = recover_dataset(tmp_path / "data")
     assert sl.check_dataset(data) == ()
     np.testing.assert_array_equal(data.load(data.trials[0]).frames, recording.frames[:whole])
 
@@ -153,10 +159,10 @@ def test_a_process_that_is_killed_loses_no_frame_that_was_written(tmp_path: Path
         while (last := int(child.stdout.readline())) < 30:
             pass
         with pytest.raises(RecordingError, match="is being recorded; stop the recording first"):
-            load_dataset(folder)
+            recover_dataset(folder)
         child.send_signal(signal.SIGKILL)
         last = max([last, *map(int, child.stdout.read().split()[:-1])])  # the last line may be cut off
-    data = load_dataset(folder)
+    data = recover_dataset(folder)
     assert data.trials[0].frames >= last + 1
     assert sl.check_dataset(data) == ()
     frames = data.load(data.trials[0]).frames
@@ -198,7 +204,7 @@ def test_a_damaged_journal_is_whole_frames_or_a_sentence(
         shutil.copytree(tmp_path / "data", data := tmp_path / str(number))
         (data / JOURNAL_FOLDER / journal.path.name).write_bytes(damaged)
         try:
-            load_dataset(data)
+            recover_dataset(data)
             outcomes.add("read")
         except SliplensError:
             outcomes.add("told")
@@ -206,7 +212,7 @@ def test_a_damaged_journal_is_whole_frames_or_a_sentence(
     with pa.ipc.new_stream(str(journal.path), schema := pa.schema({"time_s": pa.float64()})) as stream:
         stream.write_batch(pa.record_batch([[0.0]], schema=schema))
     with pytest.raises(RecordingError, match=r"is damaged \(it has other columns than a recording\); move it away"):
-        load_dataset(tmp_path / "data")
+        recover_dataset(tmp_path / "data")
 
 
 @contextmanager
@@ -252,7 +258,7 @@ def test_a_disk_that_is_full_at_the_end_keeps_the_journal(recording: Recording, 
         time.sleep(0.01)
     with room_for(5_000), pytest.raises(OSError, match="large"):
         recorder.close()
-    data = load_dataset(tmp_path / "data")
+    data = recover_dataset(tmp_path / "data")
     np.testing.assert_array_equal(data.load(data.trials[0]).frames, recording.frames)
 
 
@@ -298,7 +304,7 @@ def test_nothing_recorded_by_a_profile_leaves_its_folder_free_whenever_it_was_ki
         remove(folder, **options)
 
     recorder, remove = Recorder(tmp_path / "data"), shutil.rmtree
-    keep_profile(tmp_path / "data", load_profile("digit"))
+    save_profile(tmp_path / "data", load_profile("digit"))
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "rmtree", killed)
         with pytest.raises(KeyboardInterrupt):

@@ -88,7 +88,7 @@ def test_a_table_of_forces_is_no_manifest(tmp_path: Path):
     ("text", "words"),
     [
         ("trial,video,colour\na,a.mp4,red\n", "colour"),
-        ("trial,video\na,\n", "line 2: no video"),
+        ("trial,video\na,\n", "line 2: the column video is empty"),
         ("trial,video,day\na,a.mp4,first\n", "line 2: day is 'first'"),
         ("trial,video\na,a.mp4\na,b.mp4\n", "trials named a"),
         ("trial,video\na,b,c\n", "line 2: 3 cells"),

@@ -1,6 +1,5 @@
-"""Pages in a browser: of a running sensor, and one on which labels are repaired by hand."""
+"""Page in a browser: the live readings of a running sensor."""
 
-from sliplens.app.labels import LabelPage
 from sliplens.app.server import LivePage
 
-__all__ = ["LabelPage", "LivePage"]
+__all__ = ["LivePage"]

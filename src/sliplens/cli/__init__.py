@@ -27,6 +27,7 @@ from sliplens.cli.import_ import Import
 from sliplens.cli.label import Label
 from sliplens.cli.live import Live
 from sliplens.cli.predict import Predict
+from sliplens.cli.recover import Recover
 from sliplens.cli.report import Report
 from sliplens.cli.sensor import Sensor
 from sliplens.cli.simulate import Simulate
@@ -40,7 +41,7 @@ from sliplens.errors import InputError, ShardError, SliplensError
 from sliplens.files import StoredPath, as_path
 from sliplens.recordings.options import LabelSettings, ReadOptions
 
-_Recordings = Sensor | Simulate | Import | Label | Split | Check | View | Track
+_Recordings = Sensor | Simulate | Import | Label | Recover | Split | Check | View | Track
 _Networks = Train | Evaluate | Predict | Export
 _Holds = Grip | Hold
 _Why = Explain | Score | Diagnose | Study

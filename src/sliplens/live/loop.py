@@ -34,7 +34,7 @@ from sliplens.models.checkpoint import Network, open_run
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
-from sliplens.recordings.dataset import Dataset, keep_profile
+from sliplens.recordings.dataset import Dataset, save_profile
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.trial import TrialFacts
 
@@ -439,7 +439,7 @@ class LiveReader:
         recorder = Recorder(folder, facts=facts, source=self.source.name, simulated=self.source.simulated)
         if self._profile is not None:
             try:
-                keep_profile(Path(folder), self._profile)
+                save_profile(Path(folder), self._profile)
             except BaseException:
                 recorder.close()
                 raise

@@ -53,7 +53,7 @@ class Recorder:
     """Records frames into a data set, a new one or one that is there, as trials `NAME-1`, `NAME-2` and so on.
 
     A trial ends, and the next begins, where the reference is taken anew, the size changes or the clock jumps back. A
-    process that is killed loses the frame that it was writing; the next command that opens the data set finishes it.
+    process that is killed loses the frame that it was writing; `recover_dataset` makes trials of the rest.
 
     Parameters
     ----------
@@ -123,8 +123,7 @@ class Recorder:
         Raises
         ------
         RecordingError
-            If the disk does not answer: what was recorded stays, and the next command that opens the data set finishes
-            it.
+            If the disk does not answer: what was recorded stays, and `recover_dataset` makes trials of it.
         OSError
             If there is no room; the same holds.
         """
@@ -134,7 +133,7 @@ class Recorder:
                 outlet.discard()
                 raise RecordingError(
                     f"{self.folder} takes no more frames, {outlet.sent} were written; end this program and look after "
-                    "the disk: the next command that opens it makes trials of what is there"
+                    "the disk, then run `sliplens recover {self.folder}`"
                 )
             written = outlet.sent
         closed, self._closed = self._closed, True

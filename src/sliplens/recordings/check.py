@@ -1,4 +1,4 @@
-"""Does a data set hold what it says: hashes, laws of the labels, splits."""
+"""Checks of a data set: its files against their hashes, its labels against their laws."""
 
 import os
 from collections import Counter
@@ -13,8 +13,9 @@ from jaxtyping import Bool
 
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file
-from sliplens.progress import OnProgress, counted
-from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, tell_flags, trial_path
+from sliplens.progress import OnProgress, reporting, track
+from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, report_flags, trial_path
+from sliplens.recordings.journal import JOURNAL_FOLDER
 from sliplens.recordings.store import forces_path, load_recording, read_header, stream_frames
 from sliplens.recordings.trial import SIGNALS, ContactState, Recording
 
@@ -24,23 +25,23 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Something that is wrong in a data set."""
+    """Error in a data set."""
 
     where: str
     """The trial, or the file of the data set."""
     what: str
-    """What is wrong, and at which frame."""
+    """Error, and the frame it is at."""
 
 
 def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None = None) -> tuple[Finding, ...]:
-    """Read every trial of a data set and list what is wrong with it.
+    """Read every trial of a data set and list its errors.
 
-    What puts labels in doubt, such as faults of the force sensor, is told by `on_progress` if it shows notes, and is no
-    finding: frames at a fault are not valid. Checked are, for each trial: that its file is there, has the hash of the
-    table and is what the table says; that every image can be read; that times rise, forces are finite, labels lie in
-    [0, 1] and are missing only without contact, margin and forces agree, contact states follow the margin, and
-    F_t / F_n stays within the friction by 3 sigma, before a slip and after it. For the set: that no trial is listed
-    twice, which would put its frames into two splits, and that no file is left over.
+    For each trial: its file exists, has the hash and the facts of the table, and every image can be decoded; times
+    rise, forces are finite, labels lie in [0, 1] and are missing only without contact, margin and forces agree, contact
+    states follow the margin, and F_t / F_n stays within the friction by 3 sigma, before a slip and after it. For the
+    data set: no trial is listed twice, which would put its frames into two splits, no file is unlisted, and no
+    recording was cut off. Flags on labels, such as faults of the force sensor, are notes and not findings: frames at a
+    fault are not valid.
 
     Raises
     ------
@@ -60,13 +61,18 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
         for path in sorted([*(folder / "trials").glob("*"), *(folder / "forces").glob("*")])
         if path not in listed
     ]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # hashes and decoding let go of the interpreter's lock
+    if (folder / JOURNAL_FOLDER).is_dir():
+        findings.append(
+            Finding(where=JOURNAL_FOLDER, what="still runs or was cut off; finish it with sliplens recover")
+        )
+    # hashes and decoding release the interpreter's lock
+    with ThreadPoolExecutor(os.cpu_count()) as pool, reporting(on_progress):
         checked = pool.map(lambda info: tuple(_check_trial(folder, info)), data.trials)
-        for info, wrong in zip(counted(data.trials, on_progress), checked, strict=True):
-            findings += [Finding(where=info.trial, what=what) for what in wrong]
-            with suppress(SliplensError):  # what cannot be read is found
+        for info, errors in zip(track(data.trials), checked, strict=True):
+            findings += [Finding(where=info.trial, what=error) for error in errors]
+            with suppress(SliplensError):  # an unreadable file is among the findings
                 labellings.append((info.trial, read_header(trial_path(folder, info.trial)).labelling))
-    tell_flags(labellings, on_progress)
+        report_flags(labellings)
     return tuple(findings)
 
 

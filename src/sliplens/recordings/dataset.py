@@ -1,5 +1,6 @@
 """A data set on disk: one Parquet file a trial, frames without loss beside their labels."""
 
+import shlex
 import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -8,8 +9,8 @@ from pathlib import Path
 
 from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
-from sliplens.files import StoredPath, as_path, hash_file, hash_json, read_json, require_folder, whole_file
-from sliplens.progress import OnProgress, fold_equal, note
+from sliplens.files import hash_file, hash_json, read_json, require_folder, whole_file
+from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
 from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, JournalLock, finish_journal, journals_of
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
@@ -17,6 +18,8 @@ from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recordin
 from sliplens.recordings.trial import Recording, TrialFacts
 
 DATASET_FILE = "dataset.json"
+SPLITS_FILE = "splits.json"
+"""Rules that the splits of a data set come from, beside its table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,14 +46,14 @@ class LeftOut:
     trial: str
     """Name that its trial would have."""
     source: str
-    """File or folder, for people."""
+    """File or folder."""
     why: str
-    """What was wrong with it, and the cure."""
+    """Error and its cure."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Table:
-    """What `dataset.json` holds."""
+    """Contents of `dataset.json`."""
 
     schema_version: int = SCHEMA_VERSION
     simulated: bool = False
@@ -69,16 +72,16 @@ class Dataset:
     trials: tuple[TrialInfo, ...]
     simulated: bool = False
     left_out: tuple[LeftOut, ...] = ()
-    """Recordings that were given and could not be imported."""
+    """Recordings that could not be imported."""
 
     @property
     def source(self) -> str:
-        """Where the frames come from, as results tell it: "simulated" or "real"."""
+        """Origin of the frames: "simulated" or "real"."""
         return "simulated" if self.simulated else "real"
 
     @property
     def hash(self) -> str:
-        """Hash of the table, which holds the hash of every trial: the same data, the same hash."""
+        """Hash of the table, which holds the hash of every trial: equal data have equal hashes."""
         return hash_json([asdict(trial) for trial in self.trials])
 
     @property
@@ -87,16 +90,16 @@ class Dataset:
         return sum(trial.frames for trial in self.trials)
 
     def find(self, trial: str) -> TrialInfo:
-        """Trial of a name; a `RecordingError` lists what there is if there is none."""
+        """Return the trial of a name; a `RecordingError` lists the trials if there is none."""
         for info in self.trials:
             if info.trial == trial:
                 return info
         names = [info.trial for info in self.trials]
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        raise RecordingError(f"{self.folder} has no trial {trial}; it has {', '.join(names[:_NAMED])}{more}")
+        more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+        raise RecordingError(f"{self.folder} has no trial {trial}; it has {', '.join(names[:_MOST_NAMES])}{more}")
 
     def select(self, *, split: str | None = None, condition: str | None = None) -> tuple[TrialInfo, ...]:
-        """Trials of a split and a condition; a `RecordingError` lists what there is if there is none."""
+        """Return the trials of a split and a condition; a `RecordingError` lists both if there is none."""
         chosen = tuple(
             trial
             for trial in self.trials
@@ -111,41 +114,68 @@ class Dataset:
         return chosen
 
     def load(self, info: TrialInfo, *, truth: bool = True) -> Recording:
-        """Read one trial, frames included; without the ground truth of a simulated one where that is not needed."""
+        """Read one trial with its frames, and with the ground truth of a simulated one unless `truth` is False."""
         return load_recording(trial_path(self.folder, info.trial), truth=truth)
 
     def profile(self, sensor: str) -> SensorProfile | None:
-        """Profile that the frames of a sensor went through on import; None where there was none."""
-        kept = (self.folder / SENSORS_FOLDER).glob("*.toml")
-        return next((load_profile(path) for path in kept if path.stem == sensor), None)
+        """Load the profile that the frames of a sensor went through on import; None where there was none."""
+        paths = (self.folder / SENSORS_FOLDER).glob("*.toml")
+        return next((load_profile(path) for path in paths if path.stem == sensor), None)
 
     def read_labels(self, info: TrialInfo) -> Recording:
-        """Labels of one trial, with its reference and without its frames."""
+        """Read the labels of one trial, with its reference and without its frames."""
         return load_recording(trial_path(self.folder, info.trial), pixels=False)
 
 
 _RECORDED_SPLIT = "test"  # nothing was trained on it
-_NAMED = 10  # trials named in a message before the rest is counted
+_MOST_NAMES = 10  # trials named in a message before the rest is counted
 
 
 def load_dataset(folder: Path | str) -> Dataset:
-    """Open a data set that `import_recordings` or `simulate` made; its trials are read when they are asked for.
+    """Open a data set that `import_recordings` or `simulate` made; trials are read on request.
+
+    A recording that was cut off is noted, and no trial of the data set until `recover_dataset` finishes it.
 
     Raises
     ------
     InputError
         If the folder or its table is missing, damaged or of another schema, or lists no trial.
     """
-    folder = as_path(folder)
+    folder = Path(folder)
     require_folder(folder, what="the data set")
+    table, unfinished = _read_table(folder), ""
     if (folder / JOURNAL_FOLDER).is_dir():
-        if isinstance(folder, StoredPath):
-            raise RecordingError(f"{folder} holds a recording that was cut off; open it on a disk, and copy it again")
-        finish_recording(folder)
-    table = _read_table(folder)
+        unfinished = (
+            f"{folder} holds a recording that still runs or was cut off; stop it, or finish it with "
+            f"`{shlex.join(['sliplens', 'recover', str(folder)])}`"
+        )
     if not table.trials:
-        raise RecordingError(f"{folder} lists no trials; make or import a data set first")
+        raise RecordingError(unfinished or f"{folder} lists no trials; make or import a data set first")
+    if unfinished:
+        add_note(unfinished)
     return Dataset(folder=folder, trials=table.trials, simulated=table.simulated, left_out=table.left_out)
+
+
+def recover_dataset(folder: Path | str, *, on_progress: OnProgress | None = None) -> Dataset:
+    """Make trials of recordings that were cut off, up to the last whole frame, and open the data set.
+
+    A data set without such a recording stays as it is.
+
+    Raises
+    ------
+    RecordingError
+        If it is still being recorded, a journal is damaged, or no recording holds a whole frame.
+    """
+    folder = Path(folder)
+    require_folder(folder, what="the data set")
+    with reporting(on_progress):
+        if not (folder / JOURNAL_FOLDER).is_dir():
+            add_note(f"{folder} holds no recording that was cut off; nothing was changed")
+        else:
+            finish_recording(folder)
+            if not (folder / DATASET_FILE).is_file():
+                raise RecordingError(f"{folder} held no whole frame and was removed; record again")
+        return load_dataset(folder)
 
 
 def _read_table(folder: Path) -> _Table:
@@ -161,74 +191,84 @@ def _read_table(folder: Path) -> _Table:
 
 
 def begin_recording(folder: Path, *, simulated: bool) -> tuple[JournalLock, tuple[str, ...]]:
-    """Make a data set ready for trials to be recorded into it, a new one or one that is there.
+    """Prepare a new or an existing data set for trials to be recorded into it, after recovering what was cut off.
 
-    Gives what holds it until it is closed, and the names of its trials. What was cut off before is finished first.
+    Returns the lock on the data set, to be passed to `finish_recording`, and the names of its trials.
 
     Raises
     ------
     RecordingError
         If the folder is something else, is being recorded, or holds trials of the other kind, real or simulated.
     """
-    known = (folder / DATASET_FILE).is_file()
-    if folder.exists() and not known and not (folder.is_dir() and _is_hardly_begun(folder)):
+    exists = (folder / DATASET_FILE).is_file()
+    # a recording that was killed before it wrote its table leaves these alone
+    leftovers = {folder / JOURNAL_FOLDER, folder / JOURNAL_FOLDER / LOCK_FILE, folder / f".{DATASET_FILE}.part"}
+    if folder.exists() and not exists and not (folder.is_dir() and set(folder.rglob("*")) <= leftovers):
         raise RecordingError(f"{folder} exists and is no data set of sliplens; choose another folder")
-    if known and (folder / JOURNAL_FOLDER).is_dir():
+    if exists and (folder / JOURNAL_FOLDER).is_dir():
         finish_recording(folder)
-        known = (folder / DATASET_FILE).is_file()  # gone where nothing had been recorded
-    table = _read_table(folder) if known else _Table(trials=(), simulated=simulated)
+        exists = (folder / DATASET_FILE).is_file()  # removed where nothing had been recorded
+    table = _read_table(folder) if exists else _Table(trials=(), simulated=simulated)
     if table.simulated != simulated:
         kinds = ("simulated", "real") if table.simulated else ("real", "simulated")
         raise RecordingError(f"{folder} holds {kinds[0]} trials, these are {kinds[1]}; choose another folder")
     lock = JournalLock(folder)
-    # also where it lists no trial yet: whoever opens the folder sees a data set, and finishes it if it was cut off
+    # also without a trial: whoever opens the folder sees a data set, and recovers it if it was cut off
     write_dataset_table(folder, table.trials, simulated=simulated, left_out=table.left_out)
     return lock, tuple(info.trial for info in table.trials)
 
 
-def _is_hardly_begun(folder: Path) -> bool:
-    """Whether nothing is in a folder but what a recording leaves that was killed before it wrote its table."""
-    left = {folder / JOURNAL_FOLDER, folder / JOURNAL_FOLDER / LOCK_FILE, folder / f".{DATASET_FILE}.part"}
-    return set(folder.rglob("*")) <= left
-
-
 def finish_recording(folder: Path, lock: JournalLock | None = None) -> None:
-    """Make trials of what was recorded into a data set, whether it was ended or cut off.
+    """Make trials of the journals of a data set; a data set without a trial is removed.
 
-    `lock`: what `begin_recording` gave; taken here if None, so that nobody finishes what is still being recorded. A
-    data set without a trial is removed.
+    `lock` is the one of `begin_recording`; if None, it is acquired, so that a running recording is never finished.
     """
-    held = lock or JournalLock(folder)
+    lock = lock or JournalLock(folder)
     try:
         table = _read_table(folder)
-        found = {info.trial: info for info in table.trials}
+        trials = {info.trial: info for info in table.trials}
         for journal in journals_of(folder):
             path = trial_path(folder, journal.stem)
             if finish_journal(journal, path) is not None:
-                found[journal.stem] = trial_info(path, split=_RECORDED_SPLIT)
-        write_dataset_table(folder, tuple(found.values()), simulated=table.simulated, left_out=table.left_out)
-        held.discard()
+                trials[journal.stem] = trial_info(path, split=_RECORDED_SPLIT)
+        write_dataset_table(folder, tuple(trials.values()), simulated=table.simulated, left_out=table.left_out)
+        lock.discard()
     finally:
-        held.release()
-    if not found:
+        lock.release()
+    if not trials:
         shutil.rmtree(folder / SENSORS_FOLDER, ignore_errors=True)
         (folder / DATASET_FILE).unlink()  # without it the rest would be nobody's
         with suppress(OSError):  # where something else is in it
             folder.rmdir()
 
 
-def tell_flags(trials: Iterable[tuple[str, Labelling | None]], on_progress: OnProgress | None) -> None:
-    """Note all that puts the labels of trials in doubt, what is said of several once."""
-    bases = [(trial, labelling.basis) for trial, labelling in trials if labelling and labelling.basis]
+def report_flags(labellings: Iterable[tuple[str, Labelling | None]]) -> None:
+    """Note the flags on the labels of trials, equal ones of several trials once."""
+    bases = [(trial, labelling.basis) for trial, labelling in labellings if labelling and labelling.basis]
     for message in fold_equal(f"{trial}: {flag}" for trial, basis in bases for flag in basis.flags):
-        note(on_progress, message)
+        add_note(message)
 
 
-def keep_profile(folder: Path, profile: SensorProfile) -> None:
-    """Keep, in the folder of a data set, the profile that frames went through."""
+def report_dataset(data: Dataset, *, kept: bool) -> None:
+    """Report a data set that was written, or was there already, and the flags on its labels."""
+    report_flags((info.trial, read_header(trial_path(data.folder, info.trial)).labelling) for info in data.trials)
+    count = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
+    report_file(data.folder, count, kept=kept)
+
+
+def save_profile(folder: Path, profile: SensorProfile) -> None:
+    """Write the profile that frames went through into the folder of their data set."""
     path = folder / SENSORS_FOLDER / f"{profile.name}.toml"
     with whole_file(path) as part:
         part.write_text(profile_text(profile), encoding="utf-8")
+
+
+def copy_settings(source: Path, folder: Path) -> None:
+    """Copy the sensor profiles and the split rules of a data set into another folder."""
+    if (source / SENSORS_FOLDER).is_dir():
+        shutil.copytree(source / SENSORS_FOLDER, folder / SENSORS_FOLDER, dirs_exist_ok=True)
+    if (source / SPLITS_FILE).is_file():
+        shutil.copyfile(source / SPLITS_FILE, folder / SPLITS_FILE)
 
 
 def trial_path(folder: Path, trial: str) -> Path:
@@ -240,9 +280,9 @@ def trial_info(path: Path, *, split: str) -> TrialInfo:
     """Row of the data set's table for a trial saved at `path`."""
     header = read_header(path)
     samples = forces_path(path.parent.parent, path.stem)
-    shared = {one.name: getattr(header, one.name) for one in fields(TrialInfo) if hasattr(header, one.name)}
+    values = {field.name: getattr(header, field.name) for field in fields(TrialInfo) if hasattr(header, field.name)}
     return TrialInfo(
-        **shared, split=split, sha256=hash_file(path), forces_sha256=hash_file(samples) if samples.is_file() else ""
+        **values, split=split, sha256=hash_file(path), forces_sha256=hash_file(samples) if samples.is_file() else ""
     )
 
 

@@ -1,4 +1,4 @@
-"""From recordings to a labelled data set on disk, one frame at a time; and its labels made anew."""
+"""From recordings to a labelled data set on disk, one frame at a time."""
 
 import os
 import shutil
@@ -9,53 +9,35 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import numpy as np
-from jaxtyping import Float
-
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import output_folder, require_local, whole_file
-from sliplens.progress import OnProgress, note, number_of, stage, wrote
+from sliplens.progress import OnProgress, note, number_of, reporting, stage
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import (
     Dataset,
     LeftOut,
     TrialInfo,
-    keep_profile,
+    copy_settings,
     load_dataset,
-    tell_flags,
-    trial_path,
+    report_dataset,
+    save_profile,
     write_dataset_table,
 )
-from sliplens.recordings.edits import EDITS_FILE, apply_edits, edits_in_force, read_edits, undo_command
-from sliplens.recordings.formats.stored import read_stored_trial
-from sliplens.recordings.labelling import Edit
-from sliplens.recordings.labels import measure_motion, require_inside, soften
 from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
-from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, is_profile, load_profile
+from sliplens.recordings.sensor import SensorProfile, is_profile, load_profile
 from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import (
-    SPLITS_FILE,
     SplitPlan,
     SplitResult,
     assign_splits,
     read_splits,
     write_split_record,
 )
-from sliplens.recordings.store import (
-    read_first_reference,
-    read_header,
-    stream_frames,
-)
-from sliplens.recordings.trial import Labels
 from sliplens.recordings.trial_writer import (
-    Footage,
     TrialJob,
     TrialWork,
-    label_footage,
-    leave_cores,
     require_forces,
-    trial_rng,
     write_trials,
 )
 from sliplens.shards import EXECUTORS
@@ -148,7 +130,7 @@ def import_recordings(
         raise InputError("one table of forces goes with one recording; name what belongs together in a manifest (CSV)")
     if splits is not None and (validation_trials is not None or test_trials is not None):
         raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
-    before, kept_edits = load_dataset(out) if add else None, read_edits(Path(out))
+    before = load_dataset(out) if add else None
     with stage(on_progress, "Opening the recordings") as count:
         work = _Importing(asked=asked, sources=[(path, asked.find_rows(path)) for path in paths])
         left_out = work.open_all(count)
@@ -159,7 +141,9 @@ def import_recordings(
     jobs = {item: job for item, job in work.opened.items() if job.capture.trial not in known}
     captures = [job.capture for job in jobs.values()]
     if before is not None and not jobs:
-        return _tell(replace(before, left_out=tuple(left_out)), on_progress, kept=True)
+        with reporting(on_progress):
+            report_dataset(before, kept=True)
+        return replace(before, left_out=tuple(left_out))
     _require_names(captures, left_out)
     plan = splits if splits is None or isinstance(splits, SplitPlan) else read_splits(Path(splits))
     config = {
@@ -176,13 +160,11 @@ def import_recordings(
         if not output.complete:
             if before is not None:
                 _link_trials(before.folder, output.folder)
-            elif kept_edits:
-                _keep_words(Path(out), output.folder, (EDITS_FILE,))
             given = [(item, job.capture.trial, len(job.capture)) for item, job in jobs.items()]
-            how = {"on": on, "retry_failed": retry_failed, "on_progress": on_progress}
-            with write_trials(work, given, output.folder, title="Importing frames", **how) as (rows, failed):
+            how = {"title": "Importing frames", "on": on, "retry_failed": retry_failed}
+            with reporting(on_progress), write_trials(work, given, output.folder, **how) as (rows, failed):
                 for one in {job.profile.name: job.profile for job in jobs.values() if job.profile}.values():
-                    keep_profile(output.folder, one)
+                    save_profile(output.folder, one)
                 names = {info.trial for info in rows}
                 written = [capture for capture in captures if capture.trial in names]
                 dealt_to, dealt = deal(written)
@@ -196,9 +178,9 @@ def import_recordings(
                 write_dataset_table(output.folder, table, simulated=simulated, left_out=left_out)
     for message in dealt.notes if dealt else ():
         note(on_progress, message)
-    if kept_edits and not output.complete and before is None:
-        note(on_progress, f"the edits by hand in {out} are kept; `sliplens label {out}` makes the labels follow them")
-    return _tell(load_dataset(out), on_progress, kept=output.complete)
+    with reporting(on_progress):
+        report_dataset(data := load_dataset(out), kept=output.complete)
+    return data
 
 
 _Source: TypeAlias = tuple[Path, Sequence[ManifestRow] | None]
@@ -344,164 +326,7 @@ def _link_trials(source: Path, folder: Path) -> None:
     for name in ("trials", "forces", "audit"):
         if (source / name).is_dir():
             shutil.copytree(source / name, folder / name, copy_function=link, dirs_exist_ok=True)
-    _keep_words(source, folder)
-
-
-def _keep_words(source: Path, folder: Path, names: Sequence[str] = (SENSORS_FOLDER, SPLITS_FILE, EDITS_FILE)) -> None:
-    """Copy what a data set keeps of its sensors, splits and edits."""
-    for name in names:
-        if (source / name).is_dir():
-            shutil.copytree(source / name, folder / name, dirs_exist_ok=True)
-        elif (source / name).is_file():
-            shutil.copyfile(source / name, folder / name)
-
-
-def label_dataset(
-    data: Dataset | Path | str,
-    *,
-    out: Path | str,
-    labelling: LabelSettings | None = None,
-    on: str = "serial",
-    retry_failed: bool = False,
-    overwrite: bool = False,
-    on_progress: OnProgress | None = None,
-) -> Dataset:
-    """Label the trials of a data set anew, from the frames and the force samples that it keeps; splits stay.
-
-    Edits that are kept beside the data set (`sliplens.recordings.edits`) are followed, and count for their trials
-    before what `labelling` says of all.
-
-    Parameters
-    ----------
-    data
-        Data set that keeps its force samples, or its folder.
-    out
-        Folder to make. The data set's own gets the new labels once all of them are there.
-    labelling
-        What is known of forces and friction.
-    on, retry_failed
-        As `import_recordings` takes them.
-
-    Raises
-    ------
-    InputError
-        If a trial has no forces, or its labels did not come from them and would be overwritten.
-    RecordingError
-        If nothing touches, or a trial never slips and no friction is given.
-    ShardError
-        If that is so of some of several trials, when all others are labelled; the data set is as it was.
-    """
-    require_local(out)
-    data = data if isinstance(data, Dataset) else load_dataset(data)
-    labelling, out = labelling or LabelSettings(), Path(out)
-    work = _Labelling(data=data, labelling=labelling, edits=read_edits(data.folder))
-    in_place = out.resolve() == data.folder.resolve()
-    if set(read_edits(out)) - set(work.edits):
-        raise InputError(
-            f"{out} has edits by hand that {data.folder} has not; label {out} itself, or name a new folder"
-        )
-    edits = []
-    for number, info in enumerate(data.trials):  # a mistake is told before anything slow
-        edits.append(work.open(number).edits)
-        kept = read_header(trial_path(data.folder, info.trial)).labelling
-        if in_place and (kept is None or kept.basis is None):
-            raise InputError(
-                f"the labels of {info.trial} did not come from its forces and would be lost; "
-                "name a new folder with --output"
-            )
-    config = {"labelling": labelling, "data_hash": data.hash, "edits": edits}
-    with output_folder(out, stage="label", config=config, overwrite=overwrite or in_place) as output:
-        if not output.complete:
-            given = [(number, info.trial, info.frames) for number, info in enumerate(data.trials)]
-            how = {"on": on, "retry_failed": retry_failed, "on_progress": on_progress}
-            with write_trials(work, given, output.folder, title="Labelling frames", **how) as (rows, _):
-                named = [replace(row, split=info.split) for row, info in zip(rows, data.trials, strict=True)]
-                write_dataset_table(output.folder, named, simulated=data.simulated, left_out=data.left_out)
-                _keep_words(data.folder, output.folder)
-    if count := sum(map(len, edits)):
-        note(on_progress, f"{number_of(count, 'edit')} by hand applied to {number_of(sum(map(bool, edits)), 'trial')}")
-    if gone := sorted({edit.trial for edit in work.edits} - {info.trial for info in data.trials}):
-        note(on_progress, f"{data.folder / EDITS_FILE} edits {gone[0]}, which is no trial of the data set; it is kept")
-    return _tell(load_dataset(out), on_progress, kept=output.complete)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Labelling(TrialWork):
-    """Work on the stored trials of a data set, by their numbers there."""
-
-    data: Dataset
-    labelling: LabelSettings
-    edits: tuple[Edit, ...]
-    """Those by hand, of all trials."""
-
-    def open(self, item: int) -> TrialJob:
-        capture = read_stored_trial(self.data, self.data.trials[item])
-        return _relabelling(self.data, capture, self.labelling, self.edits)
-
-
-def relabel_trial(
-    data: Dataset,
-    trial: str,
-    *,
-    labelling: LabelSettings | None = None,
-    edits: Sequence[Edit] | None = None,
-    image_motion: Float[np.ndarray, " frames"] | None = None,
-) -> Labels:
-    """Labels of one trial as `label_dataset` makes them, in memory.
-
-    Parameters
-    ----------
-    labelling
-        What is known of forces and friction.
-    edits
-        Edits to follow in place of those that are kept beside the data set.
-    image_motion
-        `measure_motion` of its frames, where it is known already; it is most of the work.
-
-    Raises
-    ------
-    InputError
-        If there is no such trial, it has no forces, or edits do not fit it.
-    RecordingError
-        If nothing touches, or the trial never slips and no friction is given.
-    """
-    info = data.find(trial)
-    edits = read_edits(data.folder) if edits is None else edits
-    job = _relabelling(data, read_stored_trial(data, info), labelling or LabelSettings(), edits)
-    path = trial_path(data.folder, trial)
-    motion = measure_motion(map(soften, stream_frames(path))) if image_motion is None else image_motion
-    footage = Footage(motion=motion, read=lambda places: stream_frames(path, set(places)))
-    with leave_cores():  # as it is where trials are written
-        rng = trial_rng(job.settings, trial)
-        return label_footage(job.capture, footage, settings=job.settings, edits=job.edits, rng=rng)[1]
-
-
-def _relabelling(data: Dataset, capture: Capture, labelling: LabelSettings, edits: Sequence[Edit]) -> TrialJob:
-    """Stored trial, as it was recorded and with the image of the untouched sensor from before any edit."""
-    if capture.forces is None:
-        raise InputError(
-            f"{capture.trial} of {data.folder} has no forces, and without them there is no label; "
-            "import it again with its table of forces"
-        )
-    profile, mine = data.profile(capture.sensor), edits_in_force(edits, capture.trial)
-    settings = apply_edits(labelling if profile is None else profile.settings(labelling), mine)
-    undo = f"`{undo_command(data.folder, capture.trial)}` takes back the last edit by hand" if mine else ""
-    try:
-        require_inside(settings, frames=len(capture), time_s=capture.forces.time_s)
-    except RecordingError as error:
-        raise RecordingError(f"{capture.trial}: {error}{undo and f'; {undo}'}") from None
-    capture = _without_labels(capture)
-    if (first := read_first_reference(trial_path(data.folder, capture.trial))) is not None:
-        capture = replace(capture, reference=first)
-    return TrialJob(capture=capture, settings=settings, edits=mine, undo=undo)
-
-
-def _tell(data: Dataset, on_progress: OnProgress | None, *, kept: bool) -> Dataset:
-    headers = [(info.trial, read_header(trial_path(data.folder, info.trial))) for info in data.trials]
-    tell_flags([(trial, header.labelling) for trial, header in headers], on_progress)
-    count = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
-    wrote(on_progress, data.folder, count, kept=kept)
-    return data
+    copy_settings(source, folder)
 
 
 def _require_names(captures: Sequence[Capture], left_out: Sequence[LeftOut] = ()) -> None:
@@ -556,12 +381,3 @@ def _fingerprint(path: Path) -> list[object]:
         sum(stat.st_size for stat in stats),
         max((stat.st_mtime_ns for stat in stats), default=0),
     ]
-
-
-def _without_labels(capture: Capture) -> Capture:
-    """A stored trial as if it came from where it was recorded, with what was noted then."""
-    kept = capture.labels.labelling if capture.labels else None
-    if kept is None:
-        return replace(capture, labels=None)
-    choice = kept.first_reference or kept.reference
-    return replace(capture, labels=None, source=kept.source, notes=kept.notes, reference_choice=choice)

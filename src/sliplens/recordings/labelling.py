@@ -1,7 +1,7 @@
 """How the labels of a trial were made: kept with it, shown by the audit and the viewer."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from typing import TypeAlias
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from sliplens.errors import RecordingError
 from sliplens.friction import MOST_FRICTION
+from sliplens.recordings.options import LabelSettings
 
 AXES = ("x", "y", "z")
 
@@ -176,6 +177,7 @@ class Reason(StrEnum):
     SPIKE = "spike of the force"
     STEP = "step of the force"
     MARKED = "marked by hand"
+    EXCLUDED = "excluded by hand"
     MISSING_SAMPLES = "missing samples"
     OUT_OF_RANGE = "outside the force sensor's range"
     NO_CONTACT = "no contact"
@@ -244,57 +246,52 @@ def tell_faults(faults: Sequence[ForceFault]) -> tuple[str, ...]:
     return tuple(told)
 
 
-class EditKind(StrEnum):
-    """What an edit says: a field of `LabelSettings`, a mark of frames, or that the edit before does not hold."""
-
-    REFERENCE = "reference_frame"
-    CONTACT = "contact_s"
-    SLIP = "slip_s"
-    TARE = "tare"
-    SIGN = "normal_sign"
-    FRICTION = "mu"
-    BAD = "bad"
-    GOOD = "good"
-    UNDO = "undo"
-
-
-_VALUES = {EditKind.TARE: 3, EditKind.BAD: 2, EditKind.GOOD: 2, EditKind.UNDO: 0}
-_WHOLE = {EditKind.REFERENCE, EditKind.SIGN, EditKind.BAD, EditKind.GOOD}
-
-
 @dataclass(frozen=True, kw_only=True)
-class Edit:
-    """One repair of a trial's labels by hand.
+class Corrections:
+    """Settings of one trial that a person set in place of the automatic ones; None where those stay.
 
-    A value that does not fit its kind is a `RecordingError`.
+    A value that no trial can have is a `RecordingError`.
     """
 
-    trial: str
-    kind: EditKind
-    value: float | tuple[float, ...] | None = None
-    """Number of the frame; seconds on the clock of the forces; x, y, z of the untouched sensor, in newtons; 1 or -1;
-    the coefficient; first and last frame of a span. None: to be found, as if nothing had been said."""
-    by: str
-    """Who made it."""
-    at: str
-    """Date and time in UTC, as ISO 8601."""
+    exclude: bool = False
+    """If True, no frame of the trial has a label."""
+    reference_frame: int | None = None
+    """Number of the untouched frame."""
+    contact_s: float | None = None
+    """Begin of the contact, in seconds on the clock of the forces."""
+    slip_s: float | None = None
+    """First gross slip, in seconds on the clock of the forces."""
+    tare: Vector | None = None
+    """Reading of the untouched force sensor, in newtons."""
+    normal_sign: int | None = None
+    """1 where pressing is positive as recorded, -1 where it is negative."""
+    mu: float | None = None
+    """Static coefficient of friction."""
+    bad_frames: tuple[tuple[int, int], ...] = ()
+    """First and last frame of each span whose frames are not valid."""
 
     def __post_init__(self) -> None:
-        values = self.numbers
-        wanted = _VALUES.get(self.kind, 1)
-        missing = self.value is None and self.kind not in {EditKind.BAD, EditKind.GOOD}
-        if not missing and (len(values) != wanted or isinstance(self.value, tuple) != (wanted > 1)):
-            raise RecordingError(f"an edit of {self.kind} takes {wanted or 'no'} numbers, not {self.value}; mend it")
-        whole = self.kind not in _WHOLE or all(float(one).is_integer() for one in values)
-        friction = self.kind is not EditKind.FRICTION or all(0 < one <= MOST_FRICTION for one in values)
-        sign = self.kind is not EditKind.SIGN or {*values} <= {1, -1}
-        if not (np.isfinite(values).all() and whole and friction and sign):
-            raise RecordingError(f"an edit of {self.kind} cannot be {self.value}; mend it, or undo it")
+        for name in ("contact_s", "slip_s", "tare"):
+            if (value := getattr(self, name)) is not None and not np.isfinite(value).all():
+                raise RecordingError(f"{name} is {value}; give a finite number, or leave it empty")
+        if self.normal_sign not in (None, 1, -1):
+            raise RecordingError(f"normal_sign is {self.normal_sign}; give 1 or -1, or leave it empty")
+        if self.mu is not None and not 0 < self.mu <= MOST_FRICTION:
+            raise RecordingError(f"mu is {self.mu:g}; give more than 0 and at most {MOST_FRICTION:g}")
 
-    @property
-    def numbers(self) -> tuple[float, ...]:
-        """Its value as numbers, however many it has."""
-        return () if self.value is None else self.value if isinstance(self.value, tuple) else (self.value,)
+    def apply(self, settings: LabelSettings) -> LabelSettings:
+        """Replace the settings that are corrected; spans of bad frames add to those of the settings.
+
+        Examples
+        --------
+        >>> from sliplens.recordings.labelling import Corrections, LabelSettings
+        >>> settings = Corrections(slip_s=1.25).apply(LabelSettings(mu=0.5))
+        >>> settings.mu, settings.slip_s
+        (0.5, 1.25)
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "exclude"}
+        values["bad_frames"] = (*settings.bad_frames, *self.bad_frames)
+        return replace(settings, **{name: value for name, value in values.items() if value is not None})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -311,7 +308,7 @@ class Labelling:
     clip: Clip | None = None
     basis: LabelBasis | None = None
     """None where the labels came with the frames."""
-    edits: tuple[Edit, ...] = ()
-    """Repairs by hand that the labels follow."""
+    corrections: Corrections | None = None
+    """Settings that were corrected by hand; None where none were."""
     first_reference: ReferenceChoice | None = None
-    """How the reference was chosen before one was named by an edit; None where none was."""
+    """Choice of the reference before a correction named another frame; None where none did."""

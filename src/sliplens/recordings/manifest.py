@@ -1,10 +1,10 @@
-"""Many recordings at once: what belongs to which trial, from a folder's names or from a table (CSV)."""
+"""Many recordings at once: pair videos with force tables by file name, or list them in a manifest (CSV)."""
 
 import csv
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -15,14 +15,14 @@ from sliplens.recordings.formats.tables import trial_name
 
 _VIDEOS = frozenset({".mp4", ".m4v", ".mkv", ".mov", ".avi", ".webm", ".mpg", ".mpeg"})
 _TABLES = frozenset({".csv", ".tsv", ".txt"})
-_FORCE_WORDS = re.compile(r"[-_. ](forces?|wrench|ft)$", re.IGNORECASE)
+_FORCE_SUFFIX = re.compile(r"[-_. ](forces?|wrench|ft)$", re.IGNORECASE)
 _LONGEST_NAME = 255  # characters, of a file or a folder
-_LONGEST = 100_000  # characters of a field; those of a manifest are paths and words
+_LONGEST_HEADER = 100_000  # characters
 
 
 @dataclass(frozen=True, kw_only=True)
 class ManifestRow:
-    """Recording of one trial, its table of forces, and what is known of it; None where nobody says."""
+    """Recording of one trial, its force table and its facts; None where the manifest names none."""
 
     trial: str
     """Name of the trial."""
@@ -35,7 +35,7 @@ class ManifestRow:
     day: int | None = None
     """Counted from 1."""
     object: str | None = None
-    """What was held."""
+    """Name of the object in the grasp."""
     condition: str | None = None
     """State of the surface, such as dry or wet."""
     mu: float | None = None
@@ -48,19 +48,19 @@ _COLUMNS = tuple(field.name for field in fields(ManifestRow))
 
 
 def find_rows(source: Path) -> tuple[ManifestRow, ...] | None:
-    """Rows of a manifest or of a folder of recordings; None where the path is one recording."""
+    """List the rows of a manifest or of a folder of recordings; None where the path is one recording."""
     if source.is_dir():
         return None if recognise(source) else pair_recordings(source)
-    if source.suffix.lower() == ".csv" and source.is_file() and "video" in _header(source)[0]:
+    if source.suffix.lower() == ".csv" and source.is_file() and "video" in _read_header(source)[0]:
         return read_manifest(source)
     return None
 
 
 def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
-    """Pair the videos, folders of images and bags of a folder with the tables of forces of the same name.
+    """Pair the videos, folders of images and bags of a folder with the force tables of the same name.
 
-    The table of `cup.mp4` is `cup.csv`, or `cup_forces.csv`. What is neither is passed over; so are data sets
-    of sliplens, which may well have been made of this very folder.
+    The table of `cup.mp4` is `cup.csv`, or `cup_forces.csv`. Other files are ignored, and so are data sets of
+    sliplens, which may have been made of this very folder.
 
     Raises
     ------
@@ -69,79 +69,85 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
     """
     tables: dict[str, list[Path]] = {}
     recordings: dict[str, list[Path]] = {}
-    seen = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
-    texts = [path for path in seen if path.is_file() and path.suffix.lower() in _TABLES]
-    for path in seen:
+    paths = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
+    for path in paths:
         bag = path.is_dir() or path.suffix in {".mcap", ".db3"}
         if path.suffix.lower() in _VIDEOS or (bag and recognise(path) not in {None, "sliplens"}):
-            recordings.setdefault(_same(path.stem if path.is_file() else path.name), []).append(path)
-    for path in texts:
-        stem = _same(path.stem)
-        # a recording may itself be named lift_ft
-        tables.setdefault(stem if stem in recordings else _FORCE_WORDS.sub("", stem), []).append(path)
+            recordings.setdefault(_normalise(path.stem if path.is_file() else path.name), []).append(path)
+    for path in paths:
+        if path.is_file() and path.suffix.lower() in _TABLES:
+            stem = _normalise(path.stem)
+            # a recording may itself be named lift_ft
+            tables.setdefault(stem if stem in recordings else _FORCE_SUFFIX.sub("", stem), []).append(path)
     if not recordings:
         raise RecordingError(
             f"{folder} holds no recording (looked for videos such as .mp4, bags, and folders of images); check the path"
         )
-    for what, found in (("recordings", recordings), ("tables of forces", tables)):
-        for stem, paths in found.items():
-            if len(paths) > 1 and stem in recordings:
+    for kind, by_stem in (("recordings", recordings), ("tables of forces", tables)):
+        for stem, same_name in by_stem.items():
+            if len(same_name) > 1 and stem in recordings:
                 raise RecordingError(
-                    f"{folder} has several {what} named {stem} ({', '.join(path.name for path in paths)}); rename all "
-                    "but one, or say what belongs together in a manifest (CSV)"
+                    f"{folder} has several {kind} named {stem} ({', '.join(path.name for path in same_name)}); rename "
+                    "all but one, or list what belongs together in a manifest (CSV)"
                 )
     rows = tuple(
         ManifestRow(trial=trial_name(stem), video=path, forces=tables.get(stem, [None])[0])
         for stem, (path,) in recordings.items()
     )
-    _require_different(rows, str(folder))
+    _require_unique(rows, folder)
     return rows
 
 
-def _same(name: str) -> str:
-    """Name as one spelling: some systems write an umlaut as two characters."""
+def _normalise(name: str) -> str:
+    """Compose characters: some systems write an umlaut as two."""
     return unicodedata.normalize("NFC", name)
 
 
 def read_manifest(path: Path) -> tuple[ManifestRow, ...]:
-    """Read a manifest: a CSV with a row a trial and the columns of `ManifestRow`, of which `video` alone must be there.
+    """Read a manifest: a CSV with a row a trial and the columns of `ManifestRow`, of which `video` alone is required.
 
     Paths are relative to the manifest; `reference` is an image or the number of a frame.
 
     Raises
     ------
     RecordingError
-        If a column is not known, or a row names no recording or gives a number that is none.
+        If a column is unknown, a row names no recording, or a value is not a number where one is needed.
     """
-    header, delimiter = _header(path)
-    if strange := [name for name in header if name not in _COLUMNS]:
-        raise RecordingError(f"{path} has a column {strange[0]!r}; a manifest has {', '.join(_COLUMNS)}")
-    rows = tuple(_read_rows(path, delimiter))
+    rows = tuple(_parse_row(cells, path.parent, where) for where, cells in read_csv(path, _COLUMNS, what="a manifest"))
     if not rows:
         raise RecordingError(f"{path} lists no trial; write a row for each below the header")
-    _require_different(rows, str(path))
+    _require_unique(rows, path)
     return rows
 
 
-def _require_different(rows: tuple[ManifestRow, ...], where: str) -> None:
-    twice = [name for name, count in Counter(row.trial for row in rows).items() if count > 1]
-    if twice:
-        raise RecordingError(f"{where} has several trials named {', '.join(twice)}; give each a name of its own")
+def _require_unique(rows: Sequence[ManifestRow], where: Path) -> None:
+    repeated = [name for name, count in Counter(row.trial for row in rows).items() if count > 1]
+    if repeated:
+        raise RecordingError(f"{where} has several trials named {', '.join(repeated)}; give each a name of its own")
 
 
-def _header(path: Path) -> tuple[list[str], str]:
-    """Names of the columns in small letters, and what stands between them."""
+def _read_header(path: Path) -> tuple[list[str], str]:
+    """Read the column names, in small letters, and find the delimiter."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
-            line = stream.readline(_LONGEST)
+            line = stream.readline(_LONGEST_HEADER)
     except (OSError, UnicodeDecodeError):
         return [], ","
     delimiter = max(",;\t", key=line.count)
     return [name.strip().strip('"').lower() for name in line.strip("\r\n").split(delimiter)], delimiter
 
 
-def _read_rows(path: Path, delimiter: str) -> Iterator[ManifestRow]:
-    names = _header(path)[0]
+def read_csv(path: Path, columns: Collection[str], *, what: str) -> Iterator[tuple[str, dict[str, str]]]:
+    """Read a table that a person wrote; yields the place of each row and its cells that are not empty, by column.
+
+    Raises
+    ------
+    RecordingError
+        If a column is not one of `columns`, a row has too many cells, or the file is not CSV in UTF-8.
+    """
+    names, delimiter = _read_header(path)
+    if unknown := [name for name in names if name not in columns]:
+        raise RecordingError(f"{path} has a column {unknown[0]!r}; {what} has {', '.join(columns)}")
     try:
         with path.open(encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream, delimiter=delimiter)
@@ -152,41 +158,40 @@ def _read_rows(path: Path, delimiter: str) -> Iterator[ManifestRow]:
                 if len(cells) > len(names):
                     raise RecordingError(
                         f"{path}, line {reader.line_num}: {number_of(len(cells), 'cell')} but "
-                        f"{number_of(len(names), 'column')}; mend the row"
+                        f"{number_of(len(names), 'column')}; correct the row"
                     )
-                said = {name: cell.strip() for name, cell in zip(names, cells, strict=False) if cell.strip()}
-                yield _row(said, path, f"{path}, line {reader.line_num}")
-    except (UnicodeDecodeError, csv.Error) as error:
+                filled = {name: cell.strip() for name, cell in zip(names, cells, strict=False) if cell.strip()}
+                yield f"{path}, line {reader.line_num}", filled
+    except (UnicodeDecodeError, csv.Error, StopIteration) as error:
         raise RecordingError(f"{path} cannot be read as CSV ({error}); export it again as UTF-8") from None
 
 
-def _row(said: Mapping[str, str], path: Path, where: str) -> ManifestRow:
-    if "video" not in said:
-        raise RecordingError(f"{where}: no video is named; name the recording of the trial")
-    folder, reference = path.parent, said.get("reference")
-    for name, text in said.items():
+def _parse_row(cells: dict[str, str], folder: Path, where: str) -> ManifestRow:
+    if "video" not in cells:
+        raise RecordingError(f"{where}: the column video is empty; name the recording of the trial")
+    for name, text in cells.items():
         if max(map(len, re.split(r"[/\\]", text))) > _LONGEST_NAME:
-            raise RecordingError(f"{where}: {name} has {len(text):,} characters, which no name has; mend it")
+            raise RecordingError(f"{where}: {name} has {len(text):,} characters, which no name has; correct it")
     numbers: dict[str, float | int] = {}
     for name, kind in (("day", int), ("mu", float)):
-        if name in said:
+        if name in cells:
             try:
-                numbers[name] = kind(said[name])
+                numbers[name] = kind(cells[name])
             except ValueError:
-                raise RecordingError(f"{where}: {name} is {said[name]!r}, which is no number; mend it") from None
-    sensor = said.get("sensor")
+                raise RecordingError(f"{where}: {name} is {cells[name]!r}, which is no number; correct it") from None
+    sensor, reference = cells.get("sensor"), cells.get("reference")
     if sensor is not None and sensor.endswith(".toml"):
         sensor = str(folder / sensor)
     return ManifestRow(
-        trial=trial_name(said.get("trial") or Path(said["video"]).stem),
-        video=folder / said["video"],
-        forces=folder / said["forces"] if "forces" in said else None,
+        trial=trial_name(cells.get("trial") or Path(cells["video"]).stem),
+        video=folder / cells["video"],
+        forces=folder / cells["forces"] if "forces" in cells else None,
         sensor=sensor,
-        object=said.get("object"),
-        condition=said.get("condition"),
+        object=cells.get("object"),
+        condition=cells.get("condition"),
         reference=None if reference is None else int(reference) if reference.isdecimal() else folder / reference,
         **numbers,  # pyright: ignore[reportArgumentType]
     )
 
 
-__all__ = ["ManifestRow", "find_rows", "pair_recordings", "read_manifest"]
+__all__ = ["ManifestRow", "find_rows", "pair_recordings", "read_csv", "read_manifest"]

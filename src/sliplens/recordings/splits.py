@@ -18,7 +18,7 @@ from sliplens._version import __version__
 from sliplens.errors import InputError
 from sliplens.files import read_toml, write_json
 from sliplens.images import natural_key
-from sliplens.recordings.dataset import Dataset, load_dataset, write_dataset_table
+from sliplens.recordings.dataset import SPLITS_FILE, Dataset, load_dataset, write_dataset_table
 from sliplens.recordings.trial import TrialFacts
 
 FACTS = ("trial", "day", "object", "condition", "sensor")
@@ -208,8 +208,6 @@ PRESETS: dict[str, Callable[[Sequence[TrialFacts]], SplitPlan]] = {
 validation and test, by whole objects or by single trials."""
 
 
-SPLITS_FILE = "splits.json"
-"""Keeps, in the folder of a data set, the rules that its splits come from."""
 _NAMED = 5  # so many names are told before the rest is counted
 
 

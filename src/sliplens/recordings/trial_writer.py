@@ -1,4 +1,4 @@
-"""Labelled trials written from recordings, each whole or not at all, wherever that is done."""
+"""Recordings written as labelled trials of a data set, each complete or not at all."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from threadpoolctl import threadpool_limits
 
 from sliplens.codec import RESULT_FILE, load_record, save_record
@@ -16,10 +16,10 @@ from sliplens.errors import RecordingError, ShardError, SliplensError
 from sliplens.files import remove
 from sliplens.images import require_rgb
 from sliplens.parts import Shard, shard
-from sliplens.progress import OnProgress, number_of, stage
+from sliplens.progress import OnProgress, current_listener, number_of, open_stage, report_progress, reporting
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import LeftOut, TrialInfo, trial_info, trial_path
-from sliplens.recordings.labelling import Edit, EditKind, Labelling, ReferenceChoice
+from sliplens.recordings.labelling import Corrections, Labelling, ReferenceChoice
 from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion, soften
 from sliplens.recordings.labels.lag import Soft
 from sliplens.recordings.options import LabelSettings
@@ -35,38 +35,38 @@ from sliplens.recordings.store import (
     save_forces,
     write_trial,
 )
-from sliplens.recordings.trial import Labels
+from sliplens.recordings.trial import Labels, labels_of_margins
 from sliplens.shards import MakePart, Work, make_parts
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialJob:
-    """A trial to be imported."""
+    """Trial to be labelled and written."""
 
     capture: Capture
     settings: LabelSettings
-    edits: tuple[Edit, ...] = ()
-    """Repairs by hand that its labels follow."""
-    undo: str = ""
-    """How the last of them is taken back; empty where there is none."""
+    corrections: Corrections | None = None
+    """Corrections by hand, which `settings` follow already."""
+    cure: str = ""
+    """End of an error message, where corrections may be the cause."""
     profile: SensorProfile | None = None
-    """What its frames went through."""
+    """Profile that its frames go through."""
     one_of_many: bool = False
-    """Whether it is left out where it cannot be imported, rather than stopping the others."""
+    """If True, a failure leaves the trial out instead of stopping the others."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenTrial:
-    """What came of a trial: its row of the data set's table, or why it was left out."""
+    """Row of the data set's table for a trial, or the reason why the trial was left out."""
 
     info: TrialInfo | None = None
     left_out: LeftOut | None = None
 
 
 class TrialWork(Work):
-    """Work on whole trials, each of which becomes a data set of its own, to be taken into that of all."""
+    """Work on whole trials: each becomes a data set of its own, which is moved into the common one."""
 
-    in_threads = True  # decoding, arrays and compression let go of the interpreter's lock
+    in_threads = True  # decoding, arrays and compression release the interpreter's lock
 
     @abstractmethod
     def open(self, item: Any) -> TrialJob:
@@ -81,16 +81,23 @@ class TrialWork(Work):
             capture = job.capture
             trial, samples = trial_path(path, capture.trial), forces_path(path, capture.trial)
             try:
-                own = {"settings": job.settings, "edits": job.edits, "rng": trial_rng(job.settings, capture.trial)}
-                import_trial(capture, trial, **own, forces_file=samples, on_progress=on_progress)
+                rng = trial_rng(job.settings, capture.trial)
+                with reporting(on_progress):
+                    import_trial(
+                        capture,
+                        trial,
+                        settings=job.settings,
+                        corrections=job.corrections,
+                        rng=rng,
+                        forces_file=samples,
+                    )
             except SliplensError as error:
-                if job.undo:
-                    raise RecordingError(f"{error}; {job.undo}") from None
+                if job.cure:
+                    raise RecordingError(f"{error}{job.cure}") from None
                 if not job.one_of_many:
                     raise
                 samples.unlink(missing_ok=True)
-                left_out = LeftOut(trial=capture.trial, source=capture.source, why=str(error))
-                written = WrittenTrial(left_out=left_out)
+                written = WrittenTrial(left_out=LeftOut(trial=capture.trial, source=capture.source, why=str(error)))
             else:
                 written = WrittenTrial(info=trial_info(trial, split=""))
             save_record(written, path / RESULT_FILE)
@@ -99,12 +106,12 @@ class TrialWork(Work):
 
 
 def trial_rng(settings: LabelSettings, trial: str) -> np.random.Generator:
-    """Random numbers for the labels of a trial, whichever others there are."""
+    """Make the random numbers for the labels of a trial, independent of the other trials."""
     return np.random.default_rng((settings.seed, *trial.encode()))
 
 
 def leave_cores() -> AbstractContextManager:
-    """Keep the threads of NumPy's matrices, which are small here, from taking cores while they spin."""
+    """Run NumPy's matrix products, which are small here, in one thread: idle ones would spin on all cores."""
     return threadpool_limits(1, user_api="blas")
 
 
@@ -117,13 +124,12 @@ def write_trials(
     title: str,
     on: str,
     retry_failed: bool,
-    on_progress: OnProgress | None,
 ) -> Iterator[tuple[list[TrialInfo], list[LeftOut]]]:
-    """Write trials into the folder of a data set; gives their rows, and what was left out of many.
+    """Write trials into the folder of a data set; yields their rows, and the trials that were left out of many.
 
-    Of each trial the item of its shard, its name and its number of frames are given. What was done is kept for another
-    try until all within this ends well. A trial of many that was set aside, as one that ends its process again and
-    again, is left out like one that is damaged.
+    `trials` gives the item of the shard, the name and the number of frames of each. Finished trials are reused by the
+    next attempt until the enclosed block ends without an error. A trial of many that fails again and again is left out
+    like a damaged one.
     """
     parts = folder / "parts"
 
@@ -133,30 +139,32 @@ def write_trials(
 
     rows: list[TrialInfo] = []
     left_out: list[LeftOut] = []
-    set_aside: dict[str, TrialJob] = {}
-    with leave_cores(), stage(on_progress, title) as count:
+    with leave_cores(), open_stage(title):
         try:
-            make_parts(work, shards, parts, title=title, on=on, retry_failed=retry_failed, on_progress=count)
+            make_parts(
+                work, shards, parts, title=title, on=on, retry_failed=retry_failed, on_progress=current_listener()
+            )
         except ShardError as error:
-            set_aside = {name: work.open(item) for item, name, _ in trials if name in error.why}
-            if len(set_aside) == len(trials) or not all(job.one_of_many for job in set_aside.values()):
+            failed = {name: work.open(item) for item, name, _ in trials if name in error.why}
+            if len(failed) == len(trials) or not all(job.one_of_many for job in failed.values()):
                 raise
-            cure = "the same command with --add tries it again"
             left_out = [
-                LeftOut(trial=name, source=job.capture.source, why=f"{error.why[name]}; {cure}")
-                for name, job in set_aside.items()
+                LeftOut(
+                    trial=name,
+                    source=job.capture.source,
+                    why=f"{error.why[name]}; the same command with --add tries it again",
+                )
+                for name, job in failed.items()
             ]
-    for one in shards():
-        if one.name in set_aside:
-            continue
-        part = parts / one.part
+    set_aside = {trial.trial for trial in left_out}
+    for part in (parts / each.part for each in shards() if each.name not in set_aside):
         written = load_record(part / RESULT_FILE, WrittenTrial, command="the interrupted command")
         if written.left_out is not None:
             left_out.append(written.left_out)
         if written.info is not None:
             rows.append(written.info)
             for path in (trial_path(part, written.info.trial), forces_path(part, written.info.trial)):
-                if path.exists():  # else there are none, or they were taken before an interruption
+                if path.exists():  # else there are none, or they were moved before an interruption
                     target = folder / path.relative_to(part)
                     target.parent.mkdir(exist_ok=True)
                     path.replace(target)
@@ -172,28 +180,28 @@ def import_trial(
     path: Path,
     *,
     settings: LabelSettings | None = None,
-    edits: Sequence[Edit] = (),
+    corrections: Corrections | None = None,
     rng: np.random.Generator,
     forces_file: Path | None = None,
-    on_progress: OnProgress | None = None,
 ) -> None:
-    """Write a recording as a trial of a data set, with the labels that came with it, or found; whole or not at all.
+    """Write a recording as a trial of a data set, with its own labels or with automatic ones; complete or not at all.
 
-    The frames are decoded once, never all at once. The samples of the force sensor, from which labels can be made anew,
-    are kept in `forces_file`. `edits` are those by hand that the settings follow, to be kept with the trial.
+    The frames are decoded once, never all at once. The samples of the force sensor, from which labels can be made
+    again, are written to `forces_file`. `corrections` are stored with the labels; `settings` follow them already.
     """
     require_forces(capture)
     with Spool(path.parent) as images:
-        footage = _read_footage(capture, images, on_progress)
+        footage = _read_footage(capture, images)
         try:
-            reference, labels = label_footage(
-                capture, footage, settings=settings or LabelSettings(), edits=edits, rng=rng
+            reference, labels = _label_footage(
+                capture, footage, settings=settings or LabelSettings(), corrections=corrections, rng=rng
             )
         except RecordingError as error:
             raise RecordingError(f"{capture.source}: {error}") from None
-        # before the trial, whose file tells that all of it is there
+        # before the trial, whose file means that all of it is there
         if forces_file is not None and capture.forces is not None:
             save_forces(capture.forces, forces_file)
+        replaced = labels.labelling is not None and labels.labelling.first_reference is not None
         write_trial(
             path,
             images.chunks(ROW_GROUP),
@@ -201,40 +209,39 @@ def import_trial(
             time_s=capture.frame_time_s,
             labels=labels,
             reference=reference,
-            first_reference=capture.reference if labels.labelling and labels.labelling.first_reference else None,
+            first_reference=capture.reference if replaced else None,
         )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Footage:
-    """Frames of a recording for whoever labels it, decoded once before."""
+class _Footage:
+    """Frames of a recording, decoded once before they are labelled."""
 
     motion: Float[np.ndarray, " frames"]
     """See `measure_motion`."""
     read: Callable[[Sequence[int]], Iterator[Frame]]
-    """Gives frames of rising numbers."""
+    """Reads frames of rising numbers."""
 
 
-def _read_footage(capture: Capture, images: Spool, on_progress: OnProgress | None) -> Footage:
-    """Decode the frames of a recording and put them by, encoded as they are stored."""
+def _read_footage(capture: Capture, images: Spool) -> _Footage:
+    """Decode the frames of a recording and spool them, encoded as they are stored."""
 
-    def keep() -> Iterator[Soft]:
-        for image, soft in in_turn(lambda frame: (encode_pixels(frame), soften(frame)), _frames(capture)):
+    def spool() -> Iterator[Soft]:
+        for image, soft in in_turn(lambda frame: (encode_pixels(frame), soften(frame)), _check_frames(capture)):
             images.append(image)
             yield soft
-            if on_progress is not None:
-                on_progress(len(images), len(capture))
+            report_progress(len(images), len(capture))
 
     def read(places: Sequence[int]) -> Iterator[Frame]:
         for place in places:
             where = f"frame {place} of {capture.source}"
             yield decode_pixels(images[place], size=(*capture.frame_size, 3), where=where)
 
-    return Footage(motion=measure_motion(keep()), read=read)
+    return _Footage(motion=measure_motion(spool()), read=read)
 
 
 def require_forces(capture: Capture) -> None:
-    """Refuse a recording that has neither labels nor forces to find them from."""
+    """Refuse a recording that has neither labels nor forces to make them from."""
     if capture.labels is None and capture.forces is None:
         raise RecordingError(
             f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor "
@@ -242,24 +249,53 @@ def require_forces(capture: Capture) -> None:
         )
 
 
-def label_footage(
-    capture: Capture, footage: Footage, *, settings: LabelSettings, edits: Sequence[Edit], rng: np.random.Generator
+def _label_footage(
+    capture: Capture,
+    footage: _Footage,
+    *,
+    settings: LabelSettings,
+    corrections: Corrections | None,
+    rng: np.random.Generator,
 ) -> tuple[Frame, Labels]:
-    """Image of the untouched sensor, and the labels that came with the recording, or are found."""
-    index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
-    labels, found, image = capture.labels, None, capture.reference
-    if labels is None:
+    """Return the image of the untouched sensor and the labels: those of the recording, or automatic ones."""
+    labels, basis, untouched = capture.labels, None, None
+    if labels is None and corrections is not None and corrections.exclude:
+        labels = labels_of_margins(np.full(len(capture), np.nan))
+        labels = replace(labels, reason=(Reason.EXCLUDED,) * len(capture))
+    elif labels is None:
         assert capture.forces is not None
-        labels = found = label_trial(capture.frame_time_s, footage.motion, capture.forces, settings=settings, rng=rng)
-        doubt = describe_repeats(footage.motion, capture.frame_time_s)
-        if doubt is not None:
-            basis = replace(found.basis, doubts=(*found.basis.doubts, doubt))
-            labels = found = replace(found, basis=basis)
-    if image is not None and index is None:
-        method = "recorded apart from the frames" if found else "came with the recording"
-        choice = capture.reference_choice or ReferenceChoice(method=method)
-    elif found is not None:
-        untouched = np.array([reason is Reason.NO_CONTACT for reason in found.reason])
+        automatic = label_trial(capture.frame_time_s, footage.motion, capture.forces, settings=settings, rng=rng)
+        labels, basis = automatic, automatic.basis
+        untouched = np.array([reason is Reason.NO_CONTACT for reason in automatic.reason])
+        if (doubt := describe_repeats(footage.motion, capture.frame_time_s)) is not None:
+            basis = replace(basis, doubts=(*basis.doubts, doubt))
+    image, choice = _choose_reference(capture, footage, settings=settings, untouched=untouched)
+    first = None
+    if capture.reference is not None and corrections is not None and corrections.reference_frame is not None:
+        # for who takes the correction back
+        first = capture.reference_choice or ReferenceChoice(method="came with the recording")
+    labelling = labels.labelling or Labelling(
+        source=capture.source,
+        forces=capture.forces.source if capture.forces else None,
+        notes=capture.notes,
+        reference=choice,
+        clip=capture.clip,
+        basis=basis,
+        corrections=corrections,
+        first_reference=first,
+    )
+    return image, replace(labels, labelling=labelling)
+
+
+def _choose_reference(
+    capture: Capture, footage: _Footage, *, settings: LabelSettings, untouched: Bool[np.ndarray, " frames"] | None
+) -> tuple[Frame, ReferenceChoice]:
+    """Return the image of the untouched sensor: the one named, the recorded one, or one of the untouched frames."""
+    index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
+    if capture.reference is not None and index is None:
+        method = "came with the recording" if untouched is None else "recorded apart from the frames"
+        return capture.reference, capture.reference_choice or ReferenceChoice(method=method)
+    if untouched is not None:
         choice = choose_reference(footage.read, untouched, index=index, method=settings.reference_method)
     elif index is None:
         raise RecordingError("no frame is known to be untouched; name one with --reference-frame")
@@ -267,42 +303,24 @@ def label_footage(
         raise RecordingError(f"the reference is frame {index} of {len(capture)}; name one from 0 on that is there")
     else:
         choice = ReferenceChoice(index=index, method="named")
-    if image is None or index is not None:
-        assert choice.index is not None  # without an image it is one of the frames
-        (image,) = footage.read([choice.index])
-    labelling = labels.labelling or Labelling(
-        source=capture.source,
-        forces=capture.forces.source if capture.forces else None,
-        notes=capture.notes,
-        reference=choice,
-        clip=capture.clip,
-        basis=found.basis if found else None,
-        edits=tuple(edits),
-        first_reference=_first_reference(capture, edits),
-    )
-    return image, replace(labels, labelling=labelling)
+    assert choice.index is not None
+    (image,) = footage.read([choice.index])
+    return image, choice
 
 
-def _first_reference(capture: Capture, edits: Sequence[Edit]) -> ReferenceChoice | None:
-    """What the first image of the untouched sensor was, where an edit named another: it is kept for who undoes that."""
-    if capture.reference is None or all(one.kind is not EditKind.REFERENCE for one in edits):
-        return None
-    return capture.reference_choice or ReferenceChoice(method="came with the recording")
-
-
-def _frames(capture: Capture) -> Iterator[Frame]:
-    """Frames of a capture, which must be as many as it promised and of one size."""
-    read = 0
+def _check_frames(capture: Capture) -> Iterator[Frame]:
+    """Read the frames of a capture; they must be of one size and as many as promised."""
+    count = 0
     for frame in capture.read_frames():
-        require_rgb(frame, what=f"levels of frame {read} of {capture.source}")
+        require_rgb(frame, what=f"levels of frame {count} of {capture.source}")
         if frame.shape[:2] != capture.frame_size:
             raise RecordingError(
-                f"frame {read} of {capture.source} is {frame.shape[0]} x {frame.shape[1]} pixels, not "
+                f"frame {count} of {capture.source} is {frame.shape[0]} x {frame.shape[1]} pixels, not "
                 f"{capture.frame_size[0]} x {capture.frame_size[1]} as its first; cut the recording there"
             )
-        read += 1
+        count += 1
         yield frame
-    if read != len(capture):
+    if count != len(capture):
         raise RecordingError(
-            f"{capture.source} promised {number_of(len(capture), 'frame')} but gave {read}; copy or export it again"
+            f"{capture.source} promised {number_of(len(capture), 'frame')} but gave {count}; copy or export it again"
         )
