@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.live import Check, HealthLimits, HealthMonitor, LiveFrame
+from sliplens.live import Check, HealthMonitor, LiveFrame
 from sliplens.live.health import check_novelty, margin_risk, severity
 from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Estimate
@@ -201,9 +201,10 @@ def test_a_network_without_novelty_has_no_such_check():
     assert check_novelty(Estimate(margin=np.array([0.5]), calibration=None)) is None
 
 
-def test_limits_that_cannot_be_are_told():
-    with pytest.raises(InputError, match="the health limit focus must be positive, got -1"):
-        HealthLimits(focus=-1.0)
+@pytest.mark.parametrize(("name", "limit"), [("focus", -1.0), ("haze", 1.0)])
+def test_a_limit_that_cannot_be_is_refused_with_those_that_can(untouched: np.ndarray, name: str, limit: float):
+    with pytest.raises(InputError, match=f"the health limit {name} is {limit:g}; give a positive limit of one of"):
+        HealthMonitor(untouched.astype(np.uint8), {name: limit})
 
 
 def check_of(name: str, value: float, *, limit: float = 1.0) -> Check:

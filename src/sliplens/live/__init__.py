@@ -2,7 +2,7 @@
 
 from sliplens.live.camera import Camera, CameraMode, CameraSource, list_cameras
 from sliplens.live.contract import LiveSource, SourceKind, SourceOptions
-from sliplens.live.health import HealthLimits, HealthMonitor
+from sliplens.live.health import HealthMonitor
 from sliplens.live.loop import LiveReader, read_live
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.live.recorder import ForceStream, Recorder, RecordingState
@@ -10,7 +10,7 @@ from sliplens.live.slip import SlipDetector, SlipLimits
 from sliplens.live.sources import SOURCES, FolderSource, ReplaySource, SimulatedSource, StreamSource, open_live
 
 __all__ = [
-    "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthLimits",
+    "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "ForceStream",
     "HealthMonitor", "Latency", "LiveFrame", "LiveReader", "LiveSource", "MarkerReading", "Reading", "Recorder",
     "RecordingState", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipLimits", "SlipState", "SourceKind",
     "SourceOptions", "StreamSource", "list_cameras", "open_live", "read_live",
