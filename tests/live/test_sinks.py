@@ -22,7 +22,6 @@ from sliplens.live.sinks import (
     READING_TOPIC,
     ROS_TOPICS,
     SINKS,
-    FoxgloveTopics,
     Sender,
     open_sink,
     reading_schema,
@@ -82,9 +81,11 @@ def test_an_mcap_file_is_read_by_mcap(tmp_path: Path):
 def test_a_foxglove_viewer_is_told_the_reading():
     pytest.importorskip("foxglove", reason="Foxglove's SDK is not installed")
     client = pytest.importorskip("websockets.sync.client", reason="websockets is not installed")
-    sink = FoxgloveTopics(port=0)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    sink = open_sink(f"foxglove::{port}")
     try:
-        with client.connect(f"ws://127.0.0.1:{sink.port}", subprotocols=["foxglove.sdk.v1"]) as viewer:
+        with client.connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"]) as viewer:
             channels = {}
             while READING_TOPIC not in channels:
                 told = viewer.recv(timeout=10)

@@ -1,4 +1,4 @@
-"""Where readings go: one row a kind of sink."""
+"""Sinks of readings: JSON lines, datagrams, MCAP and Foxglove, Rerun, ROS 2 over Zenoh."""
 
 import errno
 import itertools
@@ -9,7 +9,7 @@ import secrets
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -32,7 +32,7 @@ class Sink(Protocol):
     """Takes readings, one after another."""
 
     def send(self, reading: Reading, image: Frame | None, /) -> None:
-        """Send a reading, and the frame that it was made from where there is one."""
+        """Send a reading, and its frame where there is one."""
         ...
 
     def close(self) -> None:
@@ -40,67 +40,55 @@ class Sink(Protocol):
         ...
 
 
+@dataclass(frozen=True, kw_only=True)
+class OpenSink:
+    """Sink of two functions."""
+
+    send: Callable[[Reading, Frame | None], None]
+    close: Callable[[], None]
+
+
 def encode_reading(reading: Reading) -> bytes:
-    """One line of JSON: the reading, and its `words`; what is not known is null."""
+    """Encode a reading and its `words` as one line of JSON; unknown values are null."""
     return msgspec.json.encode({**to_builtins(reading), "words": to_builtins(describe_reading(reading))})
 
 
-class JsonLines:
-    """One line of JSON a reading on standard output."""
+def reading_schema() -> dict[str, Any]:
+    """Return the JSON schema of an encoded reading, an object at its root as Foxglove wants it."""
+    (_, words), parts = msgspec.json.schema_components([Reading, ReadingWords], ref_template="#/$defs/{name}")
+    schema = parts.pop("Reading")
+    return {**schema, "properties": {**schema["properties"], "words": words}, "$defs": parts}
 
-    def send(self, reading: Reading, _: Frame | None, /) -> None:
-        """Print a line, at once."""
-        sys.stdout.buffer.write(encode_reading(reading) + b"\n")
-        sys.stdout.buffer.flush()
 
-    def close(self) -> None:
-        """Nothing waits."""
+_EPOCH_S = time.time() - time.monotonic()
+"""Time of the machine's start, computed once so that stamps stay in order: captures count from there."""
+
+
+def _stamp_ns(reading: Reading) -> int:
+    """Compute the time of a capture, in nanoseconds since 1970."""
+    captured_s = reading.captured_s if np.isfinite(reading.captured_s) else time.monotonic()
+    return round(1e9 * (captured_s + _EPOCH_S))
 
 
 def _open_json(address: str) -> Sink:
     if address:
         raise InputError(f"--sink json prints on standard output and takes no address, got {address}; leave it out")
-    return JsonLines()
+
+    def send(reading: Reading, _: Frame | None) -> None:
+        sys.stdout.buffer.write(encode_reading(reading) + b"\n")
+        sys.stdout.buffer.flush()
+
+    return OpenSink(send=send, close=lambda: None)
 
 
-class Datagrams:
-    """A JSON object a reading, as one UDP datagram; what nobody listens for is gone.
-
-    Parameters
-    ----------
-    host, port
-        Where they are sent.
-    """
-
-    def __init__(self, host: str, port: int) -> None:
-        try:
-            [(family, kind, protocol, _, self._address), *_] = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-        except socket.gaierror as error:
-            raise InputError(f"--sink udp: {host} is not known ({error.strerror}); give an address") from None
-        self._socket = socket.socket(family, kind, protocol)
-        self._socket.setblocking(False)
-
-    def send(self, reading: Reading, _: Frame | None, /) -> None:
-        """Send a datagram, without waiting."""
-        try:
-            self._socket.sendto(encode_reading(reading), self._address)
-        except OSError as error:
-            # nobody listens, the buffer is full, the network is away for a while: the next reading is newer anyway
-            if error.errno not in _PASSING:
-                raise
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
-_PASSING = (
+_TRANSIENT = (
     errno.EAGAIN, errno.ECONNREFUSED, errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENOBUFS,
 )  # fmt: skip
+"""Errors at which a datagram is lost and the next, newer one is sent: no listener, a full buffer, no network."""
 
 
-def _host_and_port(address: str, *, kind: str, port: int | None = None) -> tuple[str, int]:
-    """Parts of HOST:PORT, of :PORT, or of nothing where there is a usual port; this machine where no host is named."""
+def _parse_address(address: str, *, kind: str, port: int | None = None) -> tuple[str, int]:
+    """Split HOST:PORT, :PORT, or nothing where there is a default port; this machine where no host is named."""
     host, _, number = address.rpartition(":")
     if not address and port is not None:
         return "127.0.0.1", port
@@ -110,106 +98,81 @@ def _host_and_port(address: str, *, kind: str, port: int | None = None) -> tuple
 
 
 def _open_udp(address: str) -> Sink:
-    host, port = _host_and_port(address, kind="udp")
+    host, port = _parse_address(address, kind="udp")
     if port == 0:
         raise InputError("--sink udp cannot send to port 0; give udp:HOST:PORT, as udp:127.0.0.1:9870")
-    return Datagrams(host, port)
+    try:
+        [(family, kind, protocol, _, target), *_] = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+    except socket.gaierror as error:
+        raise InputError(f"--sink udp: {host} is not known ({error.strerror}); give an address") from None
+    outgoing = socket.socket(family, kind, protocol)
+    outgoing.setblocking(False)
+
+    def send(reading: Reading, _: Frame | None) -> None:
+        try:
+            outgoing.sendto(encode_reading(reading), target)
+        except OSError as error:
+            if error.errno not in _TRANSIENT:
+                raise
+
+    return OpenSink(send=send, close=outgoing.close)
 
 
 READING_TOPIC, IMAGE_TOPIC = "/sliplens/reading", "/sliplens/image"
 """Topics of Foxglove and MCAP: readings as JSON, frames as `foxglove.CompressedImage`."""
 _BACKLOG = 8  # messages that wait for a slow viewer: old readings help nobody
-_FOXGLOVE_PORT = 8765
-
-
-def reading_schema() -> dict[str, Any]:
-    """JSON schema of a reading, an object at its root as Foxglove wants it."""
-    (_, words), parts = msgspec.json.schema_components([Reading, ReadingWords], ref_template="#/$defs/{name}")
-    schema = parts.pop("Reading")
-    return {**schema, "properties": {**schema["properties"], "words": words}, "$defs": parts}
-
-
-class FoxgloveTopics:
-    """Readings and frames on two topics of Foxglove: of a server that viewers visit, or in an MCAP file.
-
-    Parameters
-    ----------
-    path
-        MCAP file to write; None for a server.
-    host, port
-        Where the server listens.
-    """
-
-    def __init__(self, *, path: Path | None = None, host: str = "127.0.0.1", port: int = _FOXGLOVE_PORT) -> None:
-        require_packages("foxglove", extra="sinks", purpose=f"--sink {'mcap' if path else 'foxglove'}")
-        import foxglove  # noqa: PLC0415 (an extra)
-        from foxglove.channels import CompressedImageChannel  # noqa: PLC0415
-        from foxglove.messages import CompressedImage, Timestamp  # noqa: PLC0415
-
-        # without a reference to it, its channels are closed
-        self._context = context = foxglove.Context()
-        self._image, self._timestamp, self._stamps = CompressedImage, Timestamp, _Stamps()
-        self._readings = foxglove.Channel(READING_TOPIC, schema=reading_schema(), context=context)
-        self._frames = CompressedImageChannel(IMAGE_TOPIC, context=context)
-        try:
-            if path is not None:
-                self._close = foxglove.open_mcap(str(path), context=context).close
-                return
-            server = foxglove.start_server(
-                name="sliplens", host=host, port=port, context=context, message_backlog_size=_BACKLOG
-            )
-        except (OSError, RuntimeError) as error:
-            where = str(path) if path else f"{host}:{port}"
-            raise InputError(f"{where} cannot be opened ({error}); name another with --sink") from None
-        self.port = server.port
-        """Port on which the server listens."""
-        self._close = server.stop
-
-    def send(self, reading: Reading, image: Frame | None, /) -> None:
-        """Send the reading and its frame, at the time of its capture."""
-        at_ns = self._stamps.of(reading)
-        self._readings.log(encode_reading(reading), log_time=at_ns)
-        if image is not None:
-            stamp = self._timestamp(sec=at_ns // 10**9, nsec=at_ns % 10**9)
-            frame = self._image(timestamp=stamp, frame_id=_FRAME_ID, data=encode_jpeg(image, _QUALITY), format="jpeg")
-            self._frames.log(frame, log_time=at_ns)
-
-    def close(self) -> None:
-        """End the file, or the server."""
-        self._close()
-
-
 _QUALITY = 90
 _FRAME_ID = "fingertip"
 
 
-class _Stamps:
-    """Times of captures as other programs count them: readings count from whenever the machine was started."""
-
-    def __init__(self) -> None:
-        self._epoch_s = time.time() - time.monotonic()  # once, so that what follows stays in order
-
-    def of(self, reading: Reading) -> int:
-        """Nanoseconds since 1970."""
-        captured_s = reading.captured_s if np.isfinite(reading.captured_s) else time.monotonic()
-        return round(1e9 * (captured_s + self._epoch_s))
-
-
 def _open_foxglove(address: str) -> Sink:
-    host, port = _host_and_port(address, kind="foxglove", port=_FOXGLOVE_PORT)
-    return FoxgloveTopics(host=host, port=port)
+    host, port = _parse_address(address, kind="foxglove", port=8765)
+
+    def serve(foxglove: Any, context: object) -> Callable[[], None]:
+        options = {"name": "sliplens", "context": context, "message_backlog_size": _BACKLOG}
+        return foxglove.start_server(host=host, port=port, **options).stop
+
+    return _foxglove_topics(serve, kind="foxglove", where=f"{host}:{port}")
 
 
 def _open_mcap(address: str) -> Sink:
     path = _new_file(address, kind="mcap")
-    return FoxgloveTopics(path=path)
+    return _foxglove_topics(
+        lambda foxglove, context: foxglove.open_mcap(str(path), context=context).close, kind="mcap", where=str(path)
+    )
+
+
+def _foxglove_topics(open_in: Callable[[Any, object], Callable[[], None]], *, kind: str, where: str) -> Sink:
+    """Send readings and frames on two topics of Foxglove, of a server or in an MCAP file."""
+    require_packages("foxglove", extra="sinks", purpose=f"--sink {kind}")
+    import foxglove  # noqa: PLC0415 (an extra)
+    from foxglove.channels import CompressedImageChannel  # noqa: PLC0415
+    from foxglove.messages import CompressedImage, Timestamp  # noqa: PLC0415
+
+    context = foxglove.Context()
+    readings = foxglove.Channel(READING_TOPIC, schema=reading_schema(), context=context)
+    frames = CompressedImageChannel(IMAGE_TOPIC, context=context)
+    try:
+        close = open_in(foxglove, context)
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"{where} cannot be opened ({error}); name another with --sink") from None
+
+    def send(reading: Reading, image: Frame | None) -> None:
+        at_ns = _stamp_ns(reading)
+        readings.log(encode_reading(reading), log_time=at_ns)
+        if image is not None:
+            stamp = Timestamp(sec=at_ns // 10**9, nsec=at_ns % 10**9)
+            data = encode_jpeg(image, _QUALITY)
+            frames.log(CompressedImage(timestamp=stamp, frame_id=_FRAME_ID, data=data, format="jpeg"), log_time=at_ns)
+
+    # a context that is collected closes its channels
+    return OpenSink(send=send, close=lambda _=context: close())
 
 
 def _new_file(address: str, *, kind: str) -> Path:
-    path = Path(address)
-    ending = {"rerun": "rrd"}.get(kind, kind)
-    if path.suffix != f".{ending}":
-        raise InputError(f"--sink {kind} writes a file that ends in .{ending}; give {kind}:grip.{ending}")
+    path, suffix = Path(address), {"rerun": ".rrd"}.get(kind, f".{kind}")
+    if path.suffix != suffix:
+        raise InputError(f"--sink {kind} writes a file that ends in {suffix}; give {kind}:grip{suffix}")
     if path.exists():
         raise InputError(f"{path} is there already; name another file, or move it away")
     if not path.parent.is_dir():
@@ -285,14 +248,21 @@ def _open_rerun(address: str) -> Sink:
 
 @dataclass(frozen=True, kw_only=True)
 class RosTopic:
-    """What is sent to ROS on one topic."""
+    """Topic of ROS 2, and how its messages are made."""
 
     name: str
     """Below the key of the sink."""
     kind: str
     """Type of its messages."""
-    fields: Callable[[Reading, Frame | None, Any], dict[str, Any] | None]
-    """Fields of the message of a reading, with a header at hand; None where there is none to send."""
+    fields: Callable[[Reading, Frame | None, Any], Mapping[str, Any] | None]
+    """Fields of the message of a reading, its frame and a header; None to send nothing."""
+
+
+def _image_fields(_: Reading, image: Frame | None, header: Any) -> Mapping[str, Any] | None:
+    if image is None:
+        return None
+    data = np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8)
+    return {"header": header, "format": "jpeg", "data": data}
 
 
 ROS_TOPICS = (
@@ -306,19 +276,7 @@ ROS_TOPICS = (
         kind="std_msgs/msg/String",
         fields=lambda reading, *_: {"data": encode_reading(reading).decode()},
     ),
-    RosTopic(
-        name="image/compressed",
-        kind="sensor_msgs/msg/CompressedImage",
-        fields=lambda _, image, header: (
-            None
-            if image is None
-            else {
-                "header": header,
-                "format": "jpeg",
-                "data": np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8),
-            }
-        ),
-    ),
+    RosTopic(name="image/compressed", kind="sensor_msgs/msg/CompressedImage", fields=_image_fields),
 )
 """Topics of ROS 2 that the sink `zenoh` sends; a margin that is withheld is not sent at all."""
 ZENOH_ADDRESS = "tcp/127.0.0.1:7447"
@@ -337,7 +295,7 @@ class ZenohRos:
     address
         Router or bridge to connect to.
     purpose
-        What wants it, as a person wrote it, for messages.
+        Option or part of the program that needs it, for messages.
 
     Raises
     ------
@@ -361,7 +319,7 @@ class ZenohRos:
             ("mode", "client"),
             ("connect/endpoints", [address]),
             ("connect/timeout_ms", _ZENOH_PATIENCE_MS),
-            ("scouting/multicast/enabled", False),  # it is told where to go, and calls out to nobody else
+            ("scouting/multicast/enabled", False),  # it connects to the given address and calls out to nobody else
         ):
             config.insert_json5(name, json.dumps(value))
         try:
@@ -380,21 +338,21 @@ class ZenohRos:
             self._types.register(get_types_from_msg(definition, kind))
 
     def header(self, at_ns: int) -> Any:
-        """Header of a message, at nanoseconds since 1970."""
+        """Make the header of a message, at nanoseconds since 1970."""
         stamp = self._types.types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
         return self._types.types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME_ID)
 
-    def publisher(self, topic: str, kind: str) -> Callable[[dict[str, Any], int], None]:
-        """Declare a topic; gives what sends a message of these fields on it, at nanoseconds since 1970.
+    def publisher(self, topic: str, kind: str) -> Callable[[Mapping[str, Any], int], None]:
+        """Declare a topic; returns a function that sends a message of some fields, at nanoseconds since 1970.
 
-        Sending raises `OSError` where the way is closed.
+        It raises `OSError` where the connection is closed.
         """
         publishers = [self._session.declare_publisher(name) for name in self._names(topic, kind)]
-        ext, own_id, count = self._ext, secrets.token_bytes(16), itertools.count(1)
+        ext, sender_id, count = self._ext, secrets.token_bytes(16), itertools.count(1)
 
-        def send(fields: dict[str, Any], at_ns: int) -> None:
+        def send(fields: Mapping[str, Any], at_ns: int) -> None:
             message = bytes(self._types.serialize_cdr(self._types.types[kind](**fields), kind))
-            attachment = ext.z_serialize((ext.Int64(next(count)), ext.Int64(at_ns), own_id))
+            attachment = ext.z_serialize((ext.Int64(next(count)), ext.Int64(at_ns), sender_id))
             by_name, by_type = publishers
             try:
                 by_name.put(message)
@@ -404,13 +362,13 @@ class ZenohRos:
 
         return send
 
-    def subscribe(self, topic: str, kind: str, heard: Callable[[bytes], None]) -> None:
-        """Hand over each message of a topic, undecoded, in a thread of Zenoh's."""
+    def subscribe(self, topic: str, kind: str, callback: Callable[[bytes], None]) -> None:
+        """Call back with each message of a topic, undecoded, in a thread of Zenoh's."""
         for name in self._names(topic, kind):
-            self._session.declare_subscriber(name, lambda sample: heard(bytes(sample.payload)))
+            self._session.declare_subscriber(name, lambda sample: callback(bytes(sample.payload)))
 
     def decode(self, message: bytes, kind: str) -> Any:
-        """Message of a type; raises whatever its decoder does at one of another."""
+        """Decode a message of a type; raises whatever the decoder does at one of another."""
         return self._types.deserialize_cdr(message, kind)
 
     def close(self) -> None:
@@ -423,36 +381,8 @@ class ZenohRos:
         return topic, f"{domain}/{topic}/{package}::msg::dds_::{message}_/{self._types.hash_rihs01(kind)}"
 
 
-class ZenohTopics:
-    """Readings and frames as messages of ROS 2 over Zenoh (`ZenohRos`).
-
-    Parameters
-    ----------
-    key
-        Key of all topics, such as `tip`, which ROS names `/tip/margin`, `/tip/reading` and `/tip/image/compressed`.
-    address
-        Router or bridge to connect to.
-    """
-
-    def __init__(self, key: str, address: str = ZENOH_ADDRESS) -> None:
-        self._ros, self._stamps = ZenohRos(address, purpose="--sink zenoh"), _Stamps()
-        self._publishers = {topic: self._ros.publisher(f"{key}/{topic.name}", topic.kind) for topic in ROS_TOPICS}
-
-    def send(self, reading: Reading, image: Frame | None, /) -> None:
-        """Send what there is of the reading on each topic, at the time of its capture."""
-        at_ns = self._stamps.of(reading)
-        for topic, send in self._publishers.items():
-            fields = topic.fields(reading, image, self._ros.header(at_ns))
-            if fields is not None:
-                send(fields, at_ns)
-
-    def close(self) -> None:
-        """Leave the router."""
-        self._ros.close()
-
-
 def parse_zenoh(address: str, *, purpose: str) -> tuple[str, str]:
-    """Key of the topics and address of the router in KEY or KEY@tcp/HOST:PORT."""
+    """Split KEY or KEY@tcp/HOST:PORT into the key of the topics and the address of the router."""
     key, at, where = address.partition("@")
     if not re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", key) or bool(at) != bool(where):
         raise InputError(
@@ -463,7 +393,19 @@ def parse_zenoh(address: str, *, purpose: str) -> tuple[str, str]:
 
 
 def _open_zenoh(address: str) -> Sink:
-    return ZenohTopics(*parse_zenoh(address, purpose="--sink zenoh"))
+    """Send readings and frames to ROS; the key `tip` names `/tip/margin`, `/tip/reading`, `/tip/image/compressed`."""
+    key, router = parse_zenoh(address, purpose="--sink zenoh")
+    ros = ZenohRos(router, purpose="--sink zenoh")
+    publishers = {topic: ros.publisher(f"{key}/{topic.name}", topic.kind) for topic in ROS_TOPICS}
+
+    def send(reading: Reading, image: Frame | None) -> None:
+        at_ns = _stamp_ns(reading)
+        for topic, publish in publishers.items():
+            fields = topic.fields(reading, image, ros.header(at_ns))
+            if fields is not None:
+                publish(fields, at_ns)
+
+    return OpenSink(send=send, close=ros.close)
 
 
 SINKS = Table[Callable[[str], Sink]](
@@ -500,15 +442,15 @@ _FLUSH_S = 5.0
 
 @dataclass(frozen=True, kw_only=True)
 class SinkState:
-    """How far a sink is."""
+    """Progress of a sink."""
 
     name: str
     sent: int
     """Readings that it took."""
     lost: int
-    """Readings that it was too slow for, or that came after it broke off."""
+    """Readings that it was too slow for, or that came after it failed."""
     trouble: str | None
-    """Why it broke off, with the cure; None while it goes on."""
+    """Why it failed, with the cure; None while it works."""
 
     def __str__(self) -> str:
         lost = f", {self.lost:,} lost" if self.lost else ""
@@ -517,7 +459,7 @@ class SinkState:
 
 
 class Sender:
-    """Sends readings to a sink in a thread of its own: a slow one loses readings, and delays none.
+    """Sends readings to a sink in a thread of its own: a slow sink loses readings, and delays none.
 
     Parameters
     ----------
@@ -533,18 +475,16 @@ class Sender:
 
     @property
     def state(self) -> SinkState:
-        """How far it is now."""
+        """Current progress."""
         outlet, trouble = self._outlet, None
         if outlet.error is not None:
-            trouble = (
-                f"--sink {self._name} broke off after {number_of(outlet.sent, 'reading')} "
-                f"({outlet.reason}); begin it anew"
-            )
+            sent = number_of(outlet.sent, "reading")
+            trouble = f"--sink {self._name} broke off after {sent} ({outlet.reason}); begin it anew"
         return SinkState(name=self._name, sent=outlet.sent, lost=outlet.lost, trouble=trouble)
 
     @property
     def error(self) -> Exception | None:
-        """What broke it off."""
+        """Error of the sink, after which nothing more is sent."""
         return self._outlet.error
 
     def put(self, reading: Reading, frame: LiveFrame | None) -> None:
@@ -560,7 +500,6 @@ class Sender:
 
 
 __all__ = [
-    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "Datagrams", "FoxgloveTopics", "JsonLines", "RerunSink",
-    "RosTopic", "Sender", "Sink", "SinkState", "ZenohRos", "ZenohTopics", "encode_reading", "open_sink", "parse_zenoh",
-    "reading_schema",
+    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "OpenSink", "RerunSink", "RosTopic", "Sender", "Sink", "SinkState",
+    "ZenohRos", "encode_reading", "open_sink", "parse_zenoh", "reading_schema",
 ]  # fmt: skip
