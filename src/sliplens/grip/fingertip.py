@@ -7,6 +7,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
+from scipy.sparse import csr_array
 
 from sliplens.simulation.filming import Film, batches, prepare_film, see_markers
 from sliplens.simulation.loading import load_at_margins, load_at_states
@@ -124,8 +125,11 @@ class MarkerField:
     """
 
     def __init__(self, seeds: Sequence[int]) -> None:
-        parts = [_marker_grid(seed) for seed in seeds]
-        self.rest_px, self._press, self._shear = (np.stack(values) for values in zip(*parts, strict=True))
+        rest, press, shear = (np.stack(values) for values in zip(*map(_marker_grid, seeds), strict=True))
+        self.rest_px = rest
+        self._size = shear[..., 0, 0].size
+        # a row a state: motion by the press at each force, below it motion by the pull
+        self._moved_px = np.concatenate([press.reshape(-1, _SEEN * 2), shear.reshape(-1, _SEEN * 2)])
 
     def at(
         self,
@@ -137,21 +141,24 @@ class MarkerField:
         pulled_back: Bool[np.ndarray, "episodes 2"],
     ) -> Float[np.ndarray, "episodes 2 markers 2"]:
         """Places in pixels (x, y); at rest where nothing presses."""
-        which = grippers[:, None], np.arange(2)
-        (force, part), (margin, share) = (
-            place_in_grid(np.asarray(grid), values)
-            for grid, values in ((_FORCES_N, normal_force_n), (_MARGINS, margins))
-        )
-        force, part = force[:, None], part[:, None, None, None]
-        share, pull = share[..., None, None], (np.where(pulled_back, -1, 1) * friction)[..., None, None]
-        press = sum(weight * self._press[*which, force + upper] for upper, weight in ((0, 1 - part), (1, part)))
-        shear = sum(
-            one * other * self._shear[*which, force + upper, margin + right]
-            for upper, one in ((0, 1 - part), (1, part))
-            for right, other in ((0, 1 - share), (1, share))
-        )
-        touches = (normal_force_n > _TOUCH_N)[:, None, None, None]
-        return self.rest_px[grippers] + np.where(touches, press + pull * shear, 0)
+        tips = 2 * grippers[:, None] + np.arange(2)
+        touches = (normal_force_n > _TOUCH_N)[:, None]
+        force, part = (values[:, None] for values in place_in_grid(np.asarray(_FORCES_N), normal_force_n))
+        margin, share = place_in_grid(np.asarray(_MARGINS), margins)
+        pull = np.where(pulled_back, -1, 1) * friction
+        rows, weights = list[np.ndarray](), list[np.ndarray]()
+        for upper, by_force in ((0, 1 - part), (1, part)):
+            press = tips * len(_FORCES_N) + force + upper
+            rows.append(press)
+            weights.append(np.broadcast_to(touches * by_force, tips.shape))
+            for right, by_margin in ((0, 1 - share), (1, share)):
+                rows.append(len(self._moved_px) - self._size + press * len(_MARGINS) + margin + right)
+                weights.append(touches * by_force * by_margin * pull)
+        # a sparse product, which sums the weighted states without a temporary array each
+        columns, values = (np.stack(parts, axis=-1) for parts in (rows, weights))
+        starts = np.arange(0, columns.size + 1, len(rows))
+        mix = csr_array((values.ravel(), columns.ravel(), starts), shape=(tips.size, len(self._moved_px)))
+        return self.rest_px[grippers] + (mix @ self._moved_px).reshape(*tips.shape, _SEEN, 2)
 
 
 _FORCES_N = (_TOUCH_N, 0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
@@ -175,7 +182,8 @@ def _marker_grid(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         moved = (places - rest)[:, nearest].reshape(*force.shape, len(nearest), 2)
         parts.append((rest[nearest], moved[:, -1], moved - moved[:, -1:]))
     rest, press, shear = (np.stack(values) for values in zip(*parts, strict=True))
-    return rest, press.astype(np.float32), shear.astype(np.float32)
+    # rounded as they were stored, in the type of all else: mixed types are slow
+    return rest, press.astype(np.float32).astype(np.float64), shear.astype(np.float32).astype(np.float64)
 
 
 def place_in_grid(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

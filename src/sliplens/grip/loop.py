@@ -94,7 +94,9 @@ class TableEyes:
 
     def _follow(self, places_px: Float[np.ndarray, "episodes 2 markers 2"]) -> tuple[Markers, Markers]:
         """Places as markers are followed to them, of each finger."""
-        followed = places_px + NOISE_PX * self._rng.standard_normal(places_px.shape)
+        followed = self._rng.standard_normal(places_px.shape)
+        followed *= NOISE_PX
+        followed += places_px
         return followed[:, 0], followed[:, 1]
 
     def look(self, state: PlantState, slipping_s: Episodes) -> Sight:

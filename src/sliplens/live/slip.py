@@ -10,9 +10,11 @@ from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import InputError
 from sliplens.live.reading import MarkerReading, SlipState
-from sliplens.markers.estimators import FieldTrial, stick_area
+from sliplens.markers.estimators import INNER_SHARE, FieldTrial, rank_from_centre, stick_area
 
 Field = Float[np.ndarray, "markers 2"]
+Fields: TypeAlias = np.ndarray
+"""Fields by row, coordinate and marker: not checked in tests, for these helpers run some 20 times a frame."""
 
 _FEWEST = 6
 """Markers of the contact without which no motion of it can be told."""
@@ -88,7 +90,7 @@ class _Recoil:
 
     time_s: float
     spread: float
-    hold: Field
+    hold: Float[np.ndarray, "2 markers"]
     inner: Bool[np.ndarray, " markers"]
     shear_px: Float[np.ndarray, "2"]
 
@@ -99,7 +101,7 @@ class _Frame:
 
     time_s: float
     spread: Float[np.ndarray, " contacts"]
-    moved: Float[np.ndarray, "contacts markers 2"]
+    moved: Float[np.ndarray, "contacts 2 markers"]
     seen: Bool[np.ndarray, "contacts markers"]
 
 
@@ -124,11 +126,15 @@ class SlipBatch:
         if markers < _FEWEST:
             raise InputError(f"{markers} markers are too few to tell slip, at least {_FEWEST} are needed")
         self.limits = limits or SlipLimits()
-        self._rest = rest_px
-        self._reach_px = np.linalg.norm(_from_middle(rest_px), axis=2).mean(axis=1)
-        self._still: list[list[tuple[float, Field]]] = [[] for _ in range(contacts)]
+        # fields have the coordinate before the marker: sums over markers are several times faster
+        self._rest = np.ascontiguousarray(rest_px.swapaxes(1, 2), dtype=np.float64)
+        self._reach_px = np.linalg.norm(_from_middle(self._rest), axis=1).mean(axis=1)
+        self._still: list[tuple[float, Fields]] = []
+        """Times and motions (NaN where a marker is not seen) of the frames in which noise is measured."""
+        self._still_s, self._still_frames = np.full(contacts, np.inf), np.zeros(contacts, dtype=int)
+        """Time of the first of these frames that counts for each contact, and their number."""
         self._seen = np.ones((contacts, markers), dtype=bool)
-        self._divergence = _divergence_weights(rest_px, self._seen)
+        self._fit = _affine_weights(self._rest, self._seen)
         self._noise_px = np.full(contacts, np.nan)
         """Standard deviation of a coordinate of a marker of the still sensor."""
         self._together_px = np.full(contacts, np.nan)
@@ -136,9 +142,9 @@ class SlipBatch:
         self._frames: deque[_Frame] = deque()
         self._window = np.zeros(contacts, dtype=int)
         """How many of the last frames are looked at."""
-        self._hold = np.full(rest_px.shape, np.nan)
+        self._hold = np.full(self._rest.shape, np.nan)
         """Motion of the markers up to the end of the press; NaN without a contact."""
-        self._pattern = np.full(rest_px.shape, np.nan)
+        self._pattern = np.full(self._rest.shape, np.nan)
         """Mean motion since then, of the frames that left the window."""
         self._inner = np.zeros((contacts, markers), dtype=bool)
         self._pressed, self._hold_s, self._seen_s = np.zeros((3, contacts))
@@ -150,28 +156,30 @@ class SlipBatch:
 
     def update(self, positions_px: Float[np.ndarray, "contacts markers 2"], time_s: float, /) -> ContactStates:
         """Take the markers of a frame, in the order of `rest_px`, NaN where one is not seen; times must rise."""
-        moved = positions_px - self._rest
-        seen = np.isfinite(moved[..., 0])
-        moved, count = np.where(seen[..., None], moved, 0), seen.sum(axis=1)
+        moved = np.ascontiguousarray(positions_px.swapaxes(1, 2)) - self._rest
+        seen = np.isfinite(moved[:, 0])
+        moved, count = np.where(seen[:, None], moved, 0), np.count_nonzero(seen, axis=1)
         learns = np.isnan(self._noise_px)
-        for row in np.flatnonzero(learns & (count >= _FEWEST)).tolist():
-            self._learn_noise(row, np.where(seen[row, :, None], moved[row], np.nan), time_s)
+        if learns.any():
+            still = learns & (count >= _FEWEST)
+            self._learn_noise(still, np.where((still[:, None] & seen)[:, None], moved, np.nan), time_s)
         ready = ~learns & (count >= _FEWEST)
         if not np.array_equal(seen, self._seen):
-            self._seen, self._divergence = seen, _divergence_weights(self._rest, seen)
-        spread = (self._divergence * moved).sum(axis=(1, 2))
-        stand_out = (moved**2).sum(axis=2) > ((2 * _RAYLEIGH_95 * self._noise_px) ** 2)[:, None]
+            self._seen, self._fit = seen, _affine_weights(self._rest, seen)
+        spread = np.einsum("ckm,ckm->c", self._fit[:, 1:], moved)
+        stand_out = moved[:, 0] ** 2 + moved[:, 1] ** 2 > ((2 * _RAYLEIGH_95 * self._noise_px) ** 2)[:, None]
         # out of the noise, and a contact that was there has not been let go
-        contact = ready & (stand_out.sum(axis=1) > 0.1 * count) & (spread > _LET_GO * self._pressed)
+        contact = ready & (np.count_nonzero(stand_out, axis=1) > 0.1 * count) & (spread > _LET_GO * self._pressed)
         self._end(np.flatnonzero(~contact & (self._pressed > 0)))
         shear_px = np.linalg.norm(self._shear(moved, seen), axis=1)
         # what is stuck, and the shear, count from a press that grew by much, and more than it was pulled: a pull, too,
         # spreads the markers a little
         grown_px = (spread - self._pressed) / 2 * self._reach_px
         pressed = (spread > _REPRESSED * self._pressed) & (grown_px > np.nan_to_num(shear_px))
-        for row in np.flatnonzero(contact & pressed).tolist():
-            self._begin(row, np.where(seen[row, :, None], moved[row], np.nan), float(spread[row]), time_s)
-            shear_px[row] = 0.0
+        begins = np.flatnonzero(contact & pressed)
+        if len(begins):
+            self._begin(begins, moved[begins], spread[begins], time_s)
+            shear_px[begins] = 0.0
         self._window = np.where(contact, self._window + 1, 0)
         self._frames.append(_Frame(time_s=time_s, spread=spread, moved=moved, seen=seen))
         self._shorten_windows(time_s)
@@ -221,7 +229,7 @@ class SlipBatch:
                     spread=float(first.spread[row]),
                     hold=self._hold[row].copy(),
                     inner=middle,
-                    shear_px=(first.moved[row] - self._hold[row])[middle].mean(axis=0),
+                    shear_px=(first.moved[row] - self._hold[row])[:, middle].mean(axis=1),
                 )
         for row, recoil in list(self._recoils_at.items()):
             if not self._pressed[row] or time_s - recoil.time_s > 2 * _CONFIRMED_S:
@@ -230,33 +238,49 @@ class SlipBatch:
                 del self._recoils_at[row]
                 self._judged_s[row] = recoil.time_s
                 middle = recoil.inner & newest.seen[row]
-                shear_px = (newest.moved[row] - recoil.hold)[middle].mean(axis=0) if middle.any() else np.zeros(2)
+                shear_px = (newest.moved[row] - recoil.hold)[:, middle].mean(axis=1) if middle.any() else np.zeros(2)
                 carried = float(shear_px @ recoil.shear_px) / max(float(recoil.shear_px @ recoil.shear_px), 1e-9)
                 tightened = newest.spread[row] > _TIGHTENED * recoil.spread
                 if carried >= (_CARRIED_TIGHTENED if tightened else _CARRIED):
                     confirmed_s[row] = time_s - recoil.time_s
         return confirmed_s
 
-    def _learn_noise(self, row: int, moved: Field, time_s: float) -> None:
-        still, limits = self._still[row], self.limits
-        still.append((time_s, moved))
-        if time_s - still[0][0] < limits.still_s or len(still) < limits.still_frames:
-            return
-        steps = np.diff(np.stack([field for _, field in still]), axis=0)
-        # of differences, and their median: creep and a touch that begins count little
-        single, together = (
-            max(float(np.nanmedian(np.abs(part))) / 0.6745 / np.sqrt(2), _LEAST_NOISE_PX)
-            for part in (steps, np.nanmean(steps, axis=1) * np.sqrt(np.isfinite(moved[:, 0]).sum()))
-        )
-        self._noise_px[row], self._together_px[row] = single, max(single, together)
-        still.clear()
+    def _learn_noise(self, rows: Bool[np.ndarray, " contacts"], moved: Fields, time_s: float) -> None:
+        """Take a still frame for some contacts; measure the noise of those that have enough of them."""
+        limits = self.limits
+        self._still.append((time_s, moved))
+        self._still_s[rows] = np.minimum(self._still_s[rows], time_s)
+        self._still_frames[rows] += 1
+        enough = rows & (time_s - self._still_s >= limits.still_s) & (self._still_frames >= limits.still_frames)
+        for first_s in np.unique(self._still_s[enough]).tolist():
+            at = np.flatnonzero(enough & (self._still_s == first_s))
+            fields = np.stack([field[at] for then_s, field in self._still if then_s >= first_s], axis=1)
+            steps = np.diff(fields, axis=1)
+            known = np.isfinite(steps)
+            median, count = np.median if known.all() else np.nanmedian, known.sum(axis=3)
+            mean = np.where(count, np.where(known, steps, 0).sum(axis=3) / np.maximum(count, 1), np.nan)
+            mean *= np.sqrt(np.isfinite(moved[at, 0]).sum(axis=1))[:, None, None]
+            # of differences, and their median: creep and a touch that begins count little
+            single, together = (
+                np.maximum(median(np.abs(part).reshape(len(at), -1), axis=1) / 0.6745 / np.sqrt(2), _LEAST_NOISE_PX)
+                for part in (steps, mean)
+            )
+            self._noise_px[at], self._together_px[at] = single, np.maximum(single, together)
+        if not np.isnan(self._noise_px).any():
+            self._still.clear()
 
-    def _begin(self, row: int, moved: Field, spread: float, time_s: float) -> None:
-        """Begin a contact, or begin it anew."""
-        self._hold[row], self._pressed[row], self._hold_s[row] = moved, spread, time_s
-        self._pattern[row], self._window[row] = np.nan, 0
-        inner = self.trial(row, 0 * moved).inner & np.isfinite(moved[:, 0])
-        self._inner[row] = inner if inner.sum() >= 2 else np.isfinite(moved[:, 0])
+    def _begin(
+        self, rows: Int[np.ndarray, " begins"], moved: Fields, spread: Float[np.ndarray, " begins"], time_s: float
+    ) -> None:
+        """Begin some contacts, or begin them anew."""
+        seen = self._seen[rows]
+        self._hold[rows] = np.where(seen[:, None], moved, np.nan)
+        self._pressed[rows], self._hold_s[rows] = spread, time_s
+        self._pattern[rows], self._window[rows] = np.nan, 0
+        mean_px = (self._fit[rows, :1] * moved).sum(axis=2)
+        rank = rank_from_centre(self._rest[rows].swapaxes(1, 2), mean_px=mean_px, divergence=spread)
+        inner = (rank < INNER_SHARE) & seen
+        self._inner[rows] = np.where((inner.sum(axis=1) >= 2)[:, None], inner, seen)
 
     def _end(self, rows: Int[np.ndarray, " ended"]) -> None:
         self._hold[rows] = self._pattern[rows] = self._slip_s[rows] = np.nan
@@ -265,8 +289,8 @@ class SlipBatch:
 
     def trial(self, row: int, since: Field) -> FieldTrial:
         """Two frames of a contact for the estimators: as it was pressed, and some motion since."""
-        hold = self._hold[row]
-        return FieldTrial(rest_px=self._rest[row], displacement_px=np.stack([hold, hold + since]), hold=0)
+        hold = self._hold[row].T
+        return FieldTrial(rest_px=self._rest[row].T, displacement_px=np.stack([hold, hold + since]), hold=0)
 
     def step_px(self, row: int) -> float:
         """Length that 95 % of the differences between two places of a still marker do not reach."""
@@ -275,19 +299,19 @@ class SlipBatch:
     def since_press(self, row: int) -> Field:
         """Motion of a contact's markers since it was pressed, in the newest frame."""
         frame = self._frames[-1]
-        return np.where(frame.seen[row, :, None], frame.moved[row] - self._hold[row], np.nan)
+        return np.where(frame.seen[row], frame.moved[row] - self._hold[row], np.nan).T
 
     def _middle_noise_px(self) -> Float[np.ndarray, " contacts"]:
         """Noise of a difference of two means over the contact's middle."""
         return self._noise_px * np.sqrt(2 / np.maximum(self._inner.sum(axis=1), 1))
 
     def _shear(
-        self, moved: Float[np.ndarray, "contacts markers 2"], seen: Bool[np.ndarray, "contacts markers"]
+        self, moved: Float[np.ndarray, "contacts 2 markers"], seen: Bool[np.ndarray, "contacts markers"]
     ) -> Float[np.ndarray, "contacts 2"]:
         """Mean motion of the contact's middle since it was pressed; NaN without a contact."""
-        middle = self._inner & seen & np.isfinite(self._hold[..., 0])
-        count = middle.sum(axis=1)[:, None]
-        total = np.where(middle[..., None], moved - self._hold, 0).sum(axis=1)
+        middle = self._inner & seen & np.isfinite(self._hold[:, 0])
+        count = np.count_nonzero(middle, axis=1)[:, None]
+        total = np.where(middle[:, None], moved - self._hold, 0).sum(axis=2)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
     def _shorten_windows(self, time_s: float) -> None:
@@ -300,11 +324,11 @@ class SlipBatch:
             for at in np.unique(first[late]).tolist():
                 rows = np.flatnonzero(late & (first == at))
                 share = -np.expm1(-(times[at + 1] - times[at]) / limits.pattern_s)
-                field = np.where(frames[at].seen[rows, :, None], frames[at].moved[rows] - self._hold[rows], np.nan)
+                field = np.where(frames[at].seen[rows][:, None], frames[at].moved[rows] - self._hold[rows], np.nan)
                 pattern = self._pattern[rows]
+                blended = pattern + share * (field - pattern)
                 # a marker that was not seen keeps what it had
-                step = np.nan_to_num(share * (field - pattern))
-                self._pattern[rows] = np.where(np.isfinite(pattern), pattern + step, field)
+                self._pattern[rows] = np.where(np.isnan(blended), np.where(np.isnan(pattern), field, pattern), blended)
             self._window -= late
             if not late.any():
                 break
@@ -314,7 +338,7 @@ class SlipBatch:
     def _recoils(self) -> Float[np.ndarray, " contacts"]:
         """Time at which the skin began to spring back; NaN where it did not, or where that tells no slip."""
         began_s = np.full(len(self._rest), np.nan)
-        searched = (self._window > 1) & np.isfinite(self._pattern[..., 0]).any(axis=1)
+        searched = (self._window > 1) & np.isfinite(self._pattern[:, 0]).any(axis=1)
         for count in np.unique(self._window[searched]).tolist():
             rows = np.flatnonzero(searched & (self._window == count))
             frames = [self._frames[at] for at in range(-count, 0)]
@@ -324,30 +348,33 @@ class SlipBatch:
     def _recoils_of(self, rows: Int[np.ndarray, " rows"], frames: Sequence[_Frame]) -> Float[np.ndarray, " rows"]:
         """The same of contacts whose windows are these frames."""
         began_s, limits = np.full(len(rows), np.nan), self.limits
-        known = np.isfinite(self._pattern[rows, :, 0]) & np.isfinite(self._hold[rows, :, 0])
+        picks = slice(None) if len(rows) == len(self._rest) else rows
+        rest, pattern, hold = (values[picks] for values in (self._rest, self._pattern, self._hold))
+        known = np.isfinite(pattern[:, 0]) & np.isfinite(hold[:, 0])
         for frame in frames:
-            known &= frame.seen[rows]
-        rest, pattern, hold = (
-            np.where(known[..., None], values[rows], 0) for values in (self._rest, self._pattern, self._hold)
-        )
+            known &= frame.seen[picks]
+        if not known.all():
+            rest, pattern, hold = (np.where(known[:, None], values, 0) for values in (rest, pattern, hold))
         count = np.maximum(known.sum(axis=1), 1)[:, None, None]
-        arm = np.where(known[..., None], rest - rest.sum(axis=1, keepdims=True) / count, 0)
+        arm = (rest - rest.sum(axis=2, keepdims=True) / count) * known[:, None]
         # a grip that is tightened or loosened moves the markers as its press did, or from the middle
         press = _unit(hold)
         pattern = _without(pattern, press, _unit(_without(arm, press)))
-        length = np.sqrt((pattern**2).sum(axis=(1, 2)))
+        length = np.sqrt(np.einsum("rkm,rkm->r", pattern, pattern))
         # of little shear the pattern is noise
         enough = (length >= 2 * limits.recoil * self._together_px[rows]) & (known.sum(axis=1) >= _FEWEST)
         if not enough.any():
             return began_s
-        rows, known, pattern, arm, length = (values[enough] for values in (rows, known, pattern, arm, length))
-        pattern = _unit(pattern)
+        if not enough.all():
+            rows, known, pattern, arm, length = (values[enough] for values in (rows, known, pattern, arm, length))
+        pattern /= length[:, None, None]
         old = np.arange(1, len(frames))
         spread = np.sqrt(1 / old + 1 / (len(frames) - old))
 
         def drops(ways: Fields, of: slice | np.ndarray) -> Float[np.ndarray, "rows cuts"]:
             """Fall of the mean motion along a way from the frames before each cut to those after it."""
-            heights = np.stack([np.einsum("rmk,rmk->r", frame.moved[rows[of]], ways) for frame in frames], axis=-1)
+            picks = slice(None) if len(ways) == len(self._rest) else rows[of]  # a view of all costs no copy
+            heights = np.stack([np.einsum("rkm,rkm->r", frame.moved[picks], ways) for frame in frames], axis=-1)
             total = np.cumsum(heights, axis=-1)
             return total[:, :-1] / old - (total[:, -1:] - total[:, :-1]) / (len(frames) - old)
 
@@ -359,35 +386,40 @@ class SlipBatch:
         springs = (drop >= limits.fall * length) & (whole >= limits.recoil)
         if not springs.any():
             return began_s
-        shifts = [_unit(known[springs, :, None] * np.array(way)) for way in ([1.0, 0.0], [0.0, 1.0])]
-        turn = _unit(arm[springs][..., ::-1] * np.array([-1.0, 1.0]))
+        shifts = [_unit(known[springs, None] * np.array(way)) for way in ([[1.0], [0.0]], [[0.0], [1.0]])]
+        turn = _unit(arm[springs][:, ::-1] * np.array([[-1.0], [1.0]]))
         bent = _without(pattern[springs], *shifts, turn)
-        left = np.sqrt((bent**2).sum(axis=(1, 2)))
+        left = np.sqrt(np.einsum("rkm,rkm->r", bent, bent))
         bending = np.take_along_axis(drops(_unit(bent), springs), cut[springs, None], axis=-1)[:, 0]
         bending = bending / wide[springs] / self._noise_px[rows[springs]]
         # a large motion must show more than noise that happens to bend
         bends = springs.copy()
         bends[springs] = bending >= np.maximum(limits.evidence, _BENT_SHARE * left * whole[springs])
-        began = np.full(len(rows), np.nan)
-        for at in np.flatnonzero(bends).tolist():
-            drop_px = float(drop[at]) / np.sqrt(known[at].sum())
-            if not self._is_handled(int(rows[at]), frames, int(cut[at]) + 1, known[at], drop_px):
-                began[at] = frames[cut[at]].time_s
-        began_s[enough] = began
+        bends[bends] = ~self._handled(rows[bends], frames, cut[bends] + 1, known[bends], drop[bends])
+        began_s[enough] = np.where(bends, np.array([frame.time_s for frame in frames])[cut], np.nan)
         return began_s
 
-    def _is_handled(
-        self, row: int, frames: Sequence[_Frame], cut: int, known: Bool[np.ndarray, " markers"], drop_px: float
-    ) -> bool:
-        """Whether the contact was let go, pressed or pulled further from a frame of the window on."""
-        spreads = np.array([frame.spread[row] for frame in frames])
-        pressed = abs(float(spreads[:cut].mean() - spreads[cut:].mean()))
-        inner = known & self._inner[row]
-        markers = inner if inner.any() else known
-        middle = np.stack([(frame.moved[row] - self._hold[row])[markers].mean(axis=0) for frame in frames])
-        before, after = (float(np.linalg.norm(part.mean(axis=0))) for part in (middle[:cut], middle[cut:]))
-        pulled = after > before + self.limits.recoil * self._middle_noise_px()[row]
-        return bool(pulled or pressed / 2 * self._reach_px[row] > drop_px)
+    def _handled(
+        self,
+        rows: Int[np.ndarray, " rows"],
+        frames: Sequence[_Frame],
+        cut: Int[np.ndarray, " rows"],
+        known: Bool[np.ndarray, "rows markers"],
+        drop: Float[np.ndarray, " rows"],
+    ) -> Bool[np.ndarray, " rows"]:
+        """True where a contact was let go, pressed or pulled further from a frame of the window on."""
+        old = np.arange(len(frames))[:, None] < cut
+        shares = [old / cut, ~old / (len(frames) - cut)]  # weights of the means before the cut and from it on
+        spread = np.stack([frame.spread[rows] for frame in frames])
+        pressed = np.abs((spread * (shares[0] - shares[1])).sum(axis=0))
+        inner = known & self._inner[rows]
+        markers = np.expand_dims(np.where(inner.any(axis=1, keepdims=True), inner, known), 1)
+        count = np.count_nonzero(markers, axis=2)
+        hold = np.where(markers, self._hold[rows], 0)
+        middle = np.stack([(np.where(markers, frame.moved[rows], 0) - hold).sum(axis=2) / count for frame in frames])
+        before, after = (np.linalg.norm((middle * share[..., None]).sum(axis=0), axis=1) for share in shares)
+        pulled = after > before + self.limits.recoil * self._middle_noise_px()[rows]
+        return pulled | (pressed / 2 * self._reach_px[rows] > drop / np.sqrt(known.sum(axis=1)))
 
 
 class SlipDetector:
@@ -457,30 +489,26 @@ class SlipDetector:
         )
 
 
-Fields: TypeAlias = np.ndarray
-"""Fields by row and marker, (x, y) last: not checked in tests, for these helpers run some 20 times a frame."""
-
-
 def _from_middle(places_px: Fields) -> Fields:
-    return places_px - places_px.mean(axis=1, keepdims=True)
+    return places_px - places_px.mean(axis=2, keepdims=True)
 
 
-def _divergence_weights(rest_px: Fields, seen: Bool[np.ndarray, "rows markers"]) -> Fields:
-    """Weights of each marker's motion in the divergence of its field, the least-squares fit of `affine_parts`."""
-    terms = np.concatenate([np.ones((*seen.shape, 1)), _from_middle(rest_px)], axis=2) * seen[..., None]
-    fit = np.linalg.solve(terms.swapaxes(1, 2) @ terms + 1e-9 * np.eye(3), terms.swapaxes(1, 2))
-    return fit[:, 1:].swapaxes(1, 2)
+def _affine_weights(rest_px: Fields, seen: Bool[np.ndarray, "rows markers"]) -> Fields:
+    """Weights of each marker's motion in the mean and in the divergence (x and y) of its field, as `affine_parts`."""
+    terms = np.concatenate([np.ones((len(seen), 1, seen.shape[1])), _from_middle(rest_px)], axis=1) * seen[:, None]
+    return np.linalg.solve(terms @ terms.swapaxes(1, 2) + 1e-9 * np.eye(3), terms)
 
 
 def _unit(fields: Fields) -> Fields:
     """Fields of length 1 that are 0 where they were 0."""
-    return fields / np.maximum(np.sqrt((fields**2).sum(axis=(1, 2), keepdims=True)), 1e-9)
+    length = np.sqrt(np.einsum("rkm,rkm->r", fields, fields))
+    return fields / np.maximum(length, 1e-9)[:, None, None]
 
 
 def _without(fields: Fields, *ways: Fields) -> Fields:
     """Fields less their parts along some ways, which are orthogonal to each other and of length 1."""
     for way in ways:
-        fields = fields - (fields * way).sum(axis=(1, 2), keepdims=True) * way
+        fields = fields - np.einsum("rkm,rkm->r", fields, way)[:, None, None] * way
     return fields
 
 

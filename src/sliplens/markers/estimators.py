@@ -15,7 +15,7 @@ from sliplens.markers.tracks import Tracks
 _FEWEST = 6
 _PRESSED_SHARE = 0.9  # of the trial's own largest spread: from here on the press is done, creep aside
 _PULL_PX = 0.2  # of the inner markers' mean motion: several times its noise
-_INNER_SHARE = 1 / 3  # of the markers: what surely touches
+INNER_SHARE = 1 / 3  # of the markers: what surely touches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,12 +57,12 @@ class FieldTrial:
     @property
     def inner(self) -> Bool[np.ndarray, " markers"]:
         """The third of the markers nearest to where pressing moved nothing: what touches for sure."""
-        return _ring(self.rest_px, self.displacement_px[self.hold], 0.0, _INNER_SHARE)
+        return _ring(self.rest_px, self.displacement_px[self.hold], 0.0, INNER_SHARE)
 
     @property
     def outer(self) -> Bool[np.ndarray, " markers"]:
         """The next third: the edge of the contact."""
-        return _ring(self.rest_px, self.displacement_px[self.hold], _INNER_SHARE, 2 * _INNER_SHARE)
+        return _ring(self.rest_px, self.displacement_px[self.hold], INNER_SHARE, 2 * INNER_SHARE)
 
 
 def _ring(
@@ -72,14 +72,29 @@ def _ring(
 
     That is told by the affine fit; the middle of the markers stands for it where the fit says nothing.
     """
-    centre = rest_px.mean(axis=0)
-    mean_x, mean_y, divergence, *_ = affine_parts(rest_px, pressed_px[None])[0]
-    if np.isfinite(divergence) and abs(divergence) >= 1e-3:
-        reach = np.abs(rest_px - centre).max() / 2
-        centre = centre - np.clip(2 * np.array([mean_x, mean_y]) / divergence, -reach, reach)
-    distance = np.linalg.norm(rest_px - centre, axis=1)
-    rank = np.argsort(np.argsort(distance, kind="stable"), kind="stable") / len(distance)
+    parts = affine_parts(rest_px, pressed_px[None])
+    [rank] = rank_from_centre(rest_px[None], mean_px=parts[:, :2], divergence=parts[:, 2])
     return (rank >= low) & (rank < high)
+
+
+def rank_from_centre(
+    rest_px: Float[np.ndarray, "fields markers 2"],
+    *,
+    mean_px: Float[np.ndarray, "fields 2"],
+    divergence: Float[np.ndarray, " fields"],
+) -> Float[np.ndarray, "fields markers"]:
+    """Rank markers, 0 to 1, by their distance from where pressing moved nothing: the centre of the contact.
+
+    Mean and divergence are those of the affine fit (`affine_parts`); without a divergence the middle of the markers is
+    the centre.
+    """
+    middle = rest_px.mean(axis=1)
+    reach = np.abs(rest_px - middle[:, None]).max(axis=(1, 2))[:, None] / 2
+    spreads = np.abs(np.nan_to_num(divergence)) >= 1e-3
+    shift = 2 * mean_px / np.where(spreads, divergence, 1)[:, None]
+    centre = middle - np.where(spreads[:, None], np.clip(shift, -reach, reach), 0)
+    distance = np.linalg.norm(rest_px - centre[:, None], axis=2)
+    return np.argsort(np.argsort(distance, axis=1, kind="stable"), axis=1, kind="stable") / distance.shape[1]
 
 
 def affine_parts(
@@ -135,7 +150,7 @@ def find_holds(
     settled = np.array([int(np.argmax(spread >= _PRESSED_SHARE * one)) for one in largest])
     holds = np.zeros(len(spread), dtype=np.int64)
     for first in np.unique(settled[largest > 0]):
-        inner = _ring(rest_px, displacement_px[first], 0.0, _INNER_SHARE)
+        inner = _ring(rest_px, displacement_px[first], 0.0, INNER_SHARE)
         moved = affine_parts(rest_px[inner], displacement_px[first:, inner] - displacement_px[first, inner])[:, :2]
         later = np.flatnonzero(np.nan_to_num(np.linalg.norm(moved, axis=1), nan=0.0) > _PULL_PX)
         pull = first + int(later[0]) if len(later) else len(spread)
