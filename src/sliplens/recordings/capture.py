@@ -1,4 +1,4 @@
-"""Recordings as a reader finds them in files: frames and forces, nothing interpreted."""
+"""Recordings as they are in files: frames and forces, nothing interpreted."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ class Forces:
 
     time_s: Float[np.ndarray, " _"]
     force_n: Float[np.ndarray, "_ 3"]
-    """x, y, z of the sensor, sign and tare as recorded; no number where a sample dropped out."""
+    """x, y, z of the sensor, sign and tare as recorded; NaN where a sample dropped out."""
     source: str
-    """Topic, file or column names, for people."""
+    """Topic, file or column names in messages."""
 
     def __post_init__(self) -> None:
         if len(self.time_s) == 0:
@@ -42,40 +42,40 @@ class Forces:
 
 @dataclass(frozen=True, kw_only=True)
 class Capture(TrialFacts):
-    """One trial as recorded; facts that its source does not tell have their defaults.
+    """One trial as recorded; facts that its source does not have are the defaults.
 
     Frames are read one at a time, so that a long recording needs no more memory than a short.
     """
 
     source: str
-    """File, folder or topic, for people."""
+    """File, folder or topic in messages."""
     frame_time_s: Float[np.ndarray, " _"]
-    """On the clock of the camera, from the same zero as the forces; all NaN where nobody tells them."""
+    """Times on the clock of the camera, from the same zero as the forces; all NaN where they are unknown."""
     frame_size: tuple[int, int]
     """Height and width, in pixels."""
     read_frames: Callable[[], Iterator[Frame]]
-    """Begins anew at every call: one RGB image for each time, in their order."""
+    """Iterate from the first frame at every call: one RGB image for each time, in their order."""
     forces: Forces | None = None
     """None where only images were recorded."""
     notes: tuple[str, ...] = ()
     """Assumptions and omissions of the reader, a sentence each, to be shown to the user."""
     labels: Labels | None = None
-    """Labels that came with the frames; None where they are to be found."""
+    """Labels that came with the frames; None where they are to be estimated."""
     reference: Frame | None = None
     """Image of the untouched sensor, where it was recorded apart from the frames."""
     reference_index: int | None = None
-    """Frame that a source, or its reader, takes for the untouched one."""
+    """Number of the untouched frame, by the source or its reader."""
     reference_choice: ReferenceChoice | None = None
-    """How the image of the untouched sensor was chosen; None where that is not told."""
+    """How the image of the untouched sensor was chosen; None where unknown."""
     clip: Clip | None = None
-    """Knowledge of the whole recording."""
+    """Facts about the whole recording."""
     split: str = ""
-    """Split that the source tells; empty where it tells none."""
+    """Split in the source; empty where it has none."""
     simulated: bool = False
     files: tuple[str, ...] | None = None
     """Names of the images of a folder."""
     opened: str = "frames in memory"
-    """Path that was opened, for people and metadata."""
+    """Path that was opened, for messages and metadata."""
 
     def __post_init__(self) -> None:
         if len(self.frame_time_s) == 0:
@@ -111,18 +111,18 @@ class Capture(TrialFacts):
 
     @property
     def time_s(self) -> Float[np.ndarray, " frames"] | None:
-        """Times of the frames; None where they are not known."""
+        """Times of the frames; None where they are unknown."""
         return None if np.isnan(self.frame_time_s).all() else self.frame_time_s
 
     @property
     def safety_margin(self) -> Float[np.ndarray, " frames"] | None:
-        """Labels, NaN where a frame has none that can be trusted; None where the source has none at all."""
+        """Labels, NaN where a frame has no valid one; None where the source has no labels."""
         labels = self.labels
         return None if labels is None else np.where(labels.labelled, labels.safety_margin, np.nan)
 
     @property
     def read_reference(self) -> Callable[[], Frame] | None:
-        """The sensor untouched, T_0; None where neither the source nor the user names it."""
+        """Function that reads the reference frame T_0; None where it is unknown."""
         image, index = self.reference, self.reference_index
         if image is not None:
             return lambda: image
@@ -130,7 +130,7 @@ class Capture(TrialFacts):
 
     @property
     def frame_rate_hz(self) -> float:
-        """Frames a second at which it can be watched, 1 to 120; 25 where times are not known."""
+        """Frames a second for playback, 1 to 120; 25 where times are unknown."""
         if self.time_s is None or len(self) < 2:
             return 25.0
         return float(np.clip(1 / np.median(np.diff(self.time_s)), 1, 120))

@@ -11,18 +11,18 @@ REFERENCE_METHODS: tuple[str, ...] = get_args(ReferenceMethod)
 
 Budget: TypeAlias = Literal["frames", "pixels", "samples", "span"]
 LIMITS: dict[Budget, int] = {"frames": 1_000_000, "pixels": 2**25, "samples": 20_000_000, "span": 86_400}
-"""Most frames, pixels of a frame, samples of forces and seconds of a recording, unless they are told to be many: those
+"""Most frames, pixels of a frame, samples of forces and seconds of a recording, unless `allow_large` names them: those
 of nine hours of video, of an 8K camera, of five hours at 1 kHz, and of a day."""
 
 
-def spoken(names: Iterable[str]) -> str:
-    """Fields of options as the command line writes them."""
+def option_flags(names: Iterable[str]) -> str:
+    """Write fields of options as flags of the command line."""
     return ", ".join(f"--{name.replace('_', '-')}" for name in names)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """What is known of a source; each format takes some of it, and says so where it does not."""
+    """Facts about a source; each format takes some of them and refuses the others."""
 
     forces: Path | None = None
     """Table of forces beside a video or folder of images (CSV)."""
@@ -42,7 +42,7 @@ class ReadOptions:
     name_unit: str | None = None
     """Unit (s, ms, us, ns) of the last number in the names of images, which is then their time."""
     skip_frames: int | None = None
-    """How many frames to leave out at the start of a video."""
+    """Number of frames to leave out at the start of a video."""
     skip_stale: bool = False
     """Leave out the dark or frozen frames that a camera hands out when it was just started."""
     start_s: float | None = None
@@ -58,13 +58,12 @@ class ReadOptions:
     image_root: Path | None = None
     """Folder that now holds the images whose old paths a list of the thesis names."""
     margin_unit: Literal["fraction", "percent"] | None = None
-    """Unit of the safety margins in a list of the thesis; told by their size if not given."""
-
+    """Unit of the safety margins in a list of the thesis; guessed from their size if not given."""
     allow_large: tuple[Budget, ...] = ()
     """Limits that do not hold, where a recording really is so large: frames, pixels, samples or span."""
 
     def given(self) -> tuple[str, ...]:
-        """Names of the options that were said, of those that a reader must understand."""
+        """Return the names of the options that are set, of those that a reader must support."""
         return tuple(
             field.name
             for field in fields(self)
@@ -74,7 +73,7 @@ class ReadOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class LabelSettings:
-    """How labels are found from forces; what is not given is found out."""
+    """Settings for labels from forces; what is not given is estimated from the trial."""
 
     mu: float | None = None
     """Static coefficient of friction, if you know it; estimated where the contact begins to slip otherwise."""
@@ -82,31 +81,31 @@ class LabelSettings:
     """Relative standard deviation by which friction may change from touch to slip; on wet objects some 0.1 to 0.2. It
     widens the uncertainty."""
     tare: tuple[float, float, float] | None = None
-    """What the untouched force sensor reads (x y z), in newtons; found if not given."""
+    """Output of the untouched force sensor (x y z), in newtons; estimated if not given."""
     drift_rate: float | None = None
-    """Standard deviation of the rate at which the force sensor's zero may drift, in N/s; 0 for one that does not. What
-    the untouched sensor leaves open if not given."""
+    """Standard deviation of the rate at which the force sensor's zero may drift, in N/s; 0 for none. Estimated from the
+    untouched sensor if not given."""
     lag_ms: float | None = None
     """Milliseconds by which the camera's clock is late, if you know them; the forces are then shifted by them."""
     apply_lag: bool = False
-    """Shift the forces by the lag that was found between camera and force sensor; it is always shown."""
+    """Shift the forces by the estimated lag between camera and force sensor; it is always shown."""
     normal_axis: Literal["x", "y", "z"] | None = None
-    """Axis of the force sensor that presses; found if not given."""
+    """Axis of the force sensor that presses; estimated if not given."""
     normal_sign: Literal[1, -1] | None = None
-    """1 if pressing is positive as recorded, -1 if negative; found if not given."""
+    """1 if pressing is positive as recorded, -1 if negative; estimated if not given."""
     contact_threshold: float | None = None
     """Least normal force of a contact, in newtons; chosen from the noise if not given."""
     force_range: float | None = None
-    """What each axis of the force sensor can measure, in newtons; frames beyond are not valid."""
+    """Range of each axis of the force sensor, in newtons; frames beyond are not valid."""
     reference_method: ReferenceMethod = "least contact energy"
-    """How to choose the untouched frame among those before the contact, where the source does not tell it."""
+    """How to choose the untouched frame among those before the contact, where the source has none."""
     reference_frame: int | None = None
-    """Number of the untouched frame, by hand."""
+    """Number of the untouched frame."""
     contact_s: float | None = None
-    """Time at which the contact begins, on the clock of the forces; found if not given."""
+    """Time at which the contact begins, on the clock of the forces; estimated if not given."""
     slip_s: float | None = None
-    """Time at which the contact slips as a whole, on the clock of the forces; found if not given."""
+    """Time at which the contact slips as a whole, on the clock of the forces; estimated if not given."""
     bad_frames: tuple[tuple[int, int], ...] = ()
-    """First and last frame of each span that is wrong: its frames are not valid, its forces tell nothing."""
+    """First and last frame of each span that is wrong: its frames are not valid, and its forces are left out."""
     seed: int = 0
     """Seed of the random draws behind the uncertainties."""

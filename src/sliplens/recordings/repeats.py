@@ -56,7 +56,7 @@ def describe_repeats(motion: Float[np.ndarray, " frames"], time_s: Float[np.ndar
 
 
 def inspect_repeats(capture: Capture) -> tuple[str, ...]:
-    """Return what `describe_repeats` says of the first frames of a recording, as a note; none without times."""
+    """Describe repeats among the first frames of a recording, as a note; none without times."""
     if capture.time_s is None:
         return ()
     motion = measure_motion(soften(frame) for frame in islice(capture.read_frames(), _INSPECTED))

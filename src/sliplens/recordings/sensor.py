@@ -1,4 +1,4 @@
-"""Sensor profiles: what a camera's frames go through before anybody reads them, as one small TOML file."""
+"""Sensor profiles: how the frames of a camera are prepared, as one small TOML file."""
 
 import json
 import re
@@ -24,7 +24,7 @@ from sliplens.recordings.options import LabelSettings, ReferenceMethod
 _MOST_STRETCH = 0.02  # of width against height: markers stay round, and distances mean the same along both
 _SHIPPED = Path(str(files("sliplens"))) / "sensors"
 SENSORS_FOLDER = "sensors"
-"""Keeps, in the folder of a data set, the profiles that its frames went through."""
+"""Folder in a data set with the profiles that its frames went through."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,77 +51,78 @@ class Lens:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorProfile:
-    """What is known of a sensor and its camera: how its frames are made alike, and what its labels rest on.
+    """Facts about a sensor and its camera: how to prepare its frames, and how to label them.
 
     A frame is first brought to red, green and blue, then undistorted, cropped, rotated, flipped and resized, in this
-    order. What is not said stays as the camera gave it.
+    order. Steps that are not set are left out.
     """
 
     name: str
-    """Name of the sensor, as trials and networks tell it."""
+    """Name of the sensor in trials and networks."""
     camera_size_px: tuple[int, int] | None = None
-    """Width and height of the frames that crop and lens are told for. Frames of another size and the same shape are
-    read alike, with both scaled."""
+    """Width and height of the frames to which crop and lens refer. For frames of another size and the same shape both
+    are scaled."""
     colours: Literal["rgb", "rbg", "grb", "gbr", "brg", "bgr"] = "rgb"
     """Order in which the channels arrive."""
     undistort: Lens | None = None
-    """Lens whose distortion is taken out."""
+    """Lens whose distortion is removed."""
     crop_px: tuple[int, int, int, int] | None = None
-    """Left, top, width and height of what is kept: the gel."""
+    """Left, top, width and height of the gel."""
     rotate_deg: Literal[0, 90, 180, 270] = 0
     """Clockwise."""
     flip: Literal["none", "horizontal", "vertical", "both"] = "none"
     """Horizontal swaps left and right."""
     resize_px: tuple[int, int] | None = None
-    """Width and height that frames are brought to, of the same shape; those a network was trained on."""
+    """Width and height of prepared frames, of the same shape; those a network was trained on."""
     markers: str | None = None
-    """What markers look like, a row of `markers.KINDS`; None where there are none, or nobody says."""
+    """Kind of markers, a row of `markers.KINDS`; None where there are none, or unknown."""
     reference: ReferenceMethod = "least contact energy"
-    """How to choose the untouched frame among those before the contact, where forces tell the contact."""
+    """How to choose the untouched frame among those before the contact, where forces were recorded."""
     reference_frame: int | None = None
-    """Number of the untouched frame where the source names none, as of a video without forces."""
+    """Number of the untouched frame where the source has none, as in a video without forces."""
     frame_rate_hz: float | None = None
-    """Where a video's stamps are missing or wrong, and for images."""
+    """Frame rate of images, and of videos whose stamps are missing or wrong."""
     normal_axis: Literal["x", "y", "z"] | None = None
-    """Axis of the force sensor that presses; found if None."""
+    """Axis of the force sensor that presses; estimated if None."""
     normal_sign: Literal[1, -1] | None = None
-    """1 if pressing is positive as recorded, -1 if negative; found if None."""
+    """1 if pressing is positive as recorded, -1 if negative; estimated if None."""
     pull_direction_deg: float | None = None
-    """Direction in which what is held pulls, mostly that of gravity, in frames as the profile makes them: 0 is right,
-    90 down the image. Checked against the directions that a network was trained on."""
+    """Direction in which the object pulls, mostly that of gravity, in prepared frames: 0 is right, 90 down the image.
+    Checked against the directions that a network was trained on."""
     network: str | None = None
-    """Network that reads these frames: a folder, or the name of one that comes with sliplens."""
+    """Network for these frames: a folder, or the name of one that comes with sliplens."""
 
     def __post_init__(self) -> None:
-        # a data set keeps the profile in a file of this name
+        # a data set stores the profile in a file of this name
         if not re.fullmatch(r"[A-Za-z0-9._-]+", self.name):
             raise ValueError(f"a sensor's name has letters, digits, dots, dashes and underscores, not {self.name!r}")
         for what, size in (("camera_size_px", self.camera_size_px), ("resize_px", self.resize_px)):
             if size is not None and min(size) <= 0:
                 raise ValueError(f"{what} is {size}; widths and heights are positive")
         if self.crop_px is not None:
-            left, top, width, height = self.crop_px
+            x, y, width, height = self.crop_px
             if self.camera_size_px is None:
-                raise ValueError("a crop is told in pixels of a frame; tell its camera_size_px, width and height, too")
-            inside = left + width <= self.camera_size_px[0] and top + height <= self.camera_size_px[1]
-            if min(left, top) < 0 or min(width, height) <= 0 or not inside:
+                raise ValueError("crop_px is in pixels of a frame; set its camera_size_px, width and height, too")
+            inside = x + width <= self.camera_size_px[0] and y + height <= self.camera_size_px[1]
+            if min(x, y) < 0 or min(width, height) <= 0 or not inside:
                 raise ValueError(f"crop_px is {list(self.crop_px)}, not inside a frame of {list(self.camera_size_px)}")
         if self.pull_direction_deg is not None and not 0 <= self.pull_direction_deg < 360:
             raise ValueError(
                 f"pull_direction_deg is {self.pull_direction_deg:g}; give 0 for right, 90 for down, up to below 360"
             )
         if self.undistort is not None and self.camera_size_px is None:
-            raise ValueError("a lens is told in pixels of a frame; tell its camera_size_px, width and height, too")
+            raise ValueError("undistort is in pixels of a frame; set its camera_size_px, width and height, too")
 
     def output_size(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Height and width of what becomes of a camera's frame, from its height and width.
+        """Return height and width of a prepared frame, from those of the camera's frame.
 
-        An `ImageError` says where a frame has another shape than the camera's, or would be stretched.
+        Raises
+        ------
+        ImageError
+            If the frame has another shape than the camera's, or would be stretched.
         """
-        height, width = size
-        left, top, right, bottom = self._box(size)
-        if self.crop_px is not None:
-            height, width = bottom - top, right - left
+        x0, y0, x1, y1 = self._box(size)
+        height, width = y1 - y0, x1 - x0
         if self.rotate_deg in {90, 270}:
             height, width = width, height
         if self.resize_px is None:
@@ -135,7 +136,7 @@ class SensorProfile:
         return wanted_height, wanted_width
 
     def apply(self, frame: Frame) -> UInt8[np.ndarray, "rows columns 3"]:
-        """Frame as networks and markers' trackers read it.
+        """Prepare a frame for networks and trackers of markers.
 
         Examples
         --------
@@ -153,8 +154,8 @@ class SensorProfile:
             cv2 = import_cv2()
             frame = cv2.remap(np.ascontiguousarray(frame), *_undistorting(self.undistort, self._scale(size), size), 1)
         if self.crop_px is not None:
-            left, top, right, bottom = self._box(size)
-            frame = frame[top:bottom, left:right]
+            x0, y0, x1, y1 = self._box(size)
+            frame = frame[y0:y1, x0:x1]
         frame = np.rot90(frame, k=-self.rotate_deg // 90)
         if self.flip in {"horizontal", "both"}:
             frame = frame[:, ::-1]
@@ -167,14 +168,14 @@ class SensorProfile:
         return np.asarray(Image.fromarray(frame).resize((width, height), Image.Resampling.BILINEAR))
 
     def prepare(self, capture: Capture) -> Capture:
-        """Recording as its frames become; its untouched image goes the same way, and it gets the sensor's name."""
+        """Return a recording with prepared frames and reference, and the name of the sensor."""
         size = self.output_size(capture.frame_size)
 
         def read_frames() -> Iterator[Frame]:
             return map(self.apply, capture.read_frames())
 
-        named = capture.reference is not None or capture.reference_index is not None
-        index = capture.reference_index if named else self.reference_frame
+        has_reference = capture.reference is not None or capture.reference_index is not None
+        index = capture.reference_index if has_reference else self.reference_frame
         if index is not None and not 0 <= index < len(capture):
             raise InputError(
                 f"{capture.source} has {number_of(len(capture), 'frame')} but the profile {self.name} takes frame "
@@ -190,19 +191,18 @@ class SensorProfile:
             reference_index=index,
         )
 
-    def settings(self, given: LabelSettings) -> LabelSettings:
-        """Add what the profile knows of forces to what a user says; what is said counts."""
-        more = {
-            name: getattr(self, name)
-            for name in ("normal_axis", "normal_sign")
-            if getattr(given, name) is None and getattr(self, name) is not None
-        }
-        if given.reference_method == LabelSettings.reference_method:
-            more["reference_method"] = self.reference
-        return replace(given, **more)
+    def settings(self, settings: LabelSettings) -> LabelSettings:
+        """Return settings with the axis, sign and reference of the profile where the user set none."""
+        axis, sign, method = settings.normal_axis, settings.normal_sign, settings.reference_method
+        return replace(
+            settings,
+            normal_axis=self.normal_axis if axis is None else axis,
+            normal_sign=self.normal_sign if sign is None else sign,
+            reference_method=self.reference if method == LabelSettings.reference_method else method,
+        )
 
     def _scale(self, size: tuple[int, int]) -> tuple[float, float]:
-        """How many times wider and higher a frame is than the profile was told for."""
+        """Return how many times wider and higher a frame is than `camera_size_px`."""
         if self.camera_size_px is None:
             return 1.0, 1.0
         across, down = size[1] / self.camera_size_px[0], size[0] / self.camera_size_px[1]
@@ -215,17 +215,18 @@ class SensorProfile:
         return across, down
 
     def _box(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
+        """Return the corners of the crop: x, y of the first pixel, and of the first one beyond."""
         across, down = self._scale(size)
         if self.crop_px is None:
             return 0, 0, size[1], size[0]
-        left, top, width, height = self.crop_px
-        box = (round(left * across), round(top * down), round((left + width) * across), round((top + height) * down))
+        x, y, width, height = self.crop_px
+        box = (round(x * across), round(y * down), round((x + width) * across), round((y + height) * down))
         return box[0], box[1], min(box[2], size[1]), min(box[3], size[0])
 
 
 @lru_cache(maxsize=4)
 def _undistorting(lens: Lens, scale: tuple[float, float], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Where each pixel of the straight image lies in the camera's, as OpenCV remaps."""
+    """Compute the maps that OpenCV's `remap` takes, from pixels of the straight image to the camera's."""
     cv2 = import_cv2()
     (across, down), (focal_x, focal_y), (centre_x, centre_y) = scale, lens.focal_px, lens.centre_px
     camera = np.array(
@@ -238,7 +239,7 @@ def _undistorting(lens: Lens, scale: tuple[float, float], size: tuple[int, int])
 
 
 def shipped_profiles() -> tuple[str, ...]:
-    """Names of the profiles that come with sliplens."""
+    """List the names of the profiles that come with sliplens."""
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
 
@@ -248,7 +249,7 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
     Raises
     ------
     InputError
-        If there is none, or its file says what no profile has, or a value that cannot be.
+        If there is none, or its file has an unknown key or an impossible value.
 
     Examples
     --------
@@ -267,9 +268,9 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
             f"{', '.join(shipped_profiles())}"
         )
     values = read_toml(path, what="a sensor profile")
-    known = [field.name for field in fields(SensorProfile)]
-    if strange := sorted(set(values) - set(known)):
-        raise InputError(f"{path} has {strange[0]!r}, which no sensor profile has; choose from {', '.join(known)}")
+    names = [field.name for field in fields(SensorProfile)]
+    if strange := sorted(set(values) - set(names)):
+        raise InputError(f"{path} has {strange[0]!r}, which no sensor profile has; choose from {', '.join(names)}")
     try:
         return msgspec.convert(values, SensorProfile)
     except (msgspec.ValidationError, ValueError) as error:
@@ -279,27 +280,23 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
 
 
 def is_profile(sensor: Path | str | SensorProfile) -> bool:
-    """Whether what names a sensor names a profile: a TOML file, or one that comes with sliplens."""
+    """Return True for a profile, a TOML file, or the name of a profile that comes with sliplens."""
     return isinstance(sensor, SensorProfile) or str(sensor).endswith(".toml") or str(sensor) in shipped_profiles()
 
 
 def profile_text(profile: SensorProfile, *, notes: tuple[str, ...] = ()) -> str:
-    """Profile as TOML, for `load_profile` and for people; notes stand before it as comments."""
+    """Write a profile as TOML, with notes as comments before it."""
     rows, tables = [f"# {note}" for note in notes], []
     for field in fields(SensorProfile):
         value = getattr(profile, field.name)
         if value is None:
             continue
         if isinstance(value, Lens):
-            tables += ["", f"[{field.name}]", *(f"{name} = {_toml(part)}" for name, part in vars(value).items())]
+            tables += ["", f"[{field.name}]", *(f"{name} = {json.dumps(part)}" for name, part in vars(value).items())]
         else:
-            rows.append(f"{field.name} = {_toml(value)}")
+            # texts, numbers and lists of numbers are equal in JSON and TOML
+            rows.append(f"{field.name} = {json.dumps(value, ensure_ascii=False)}")
     return "\n".join([*rows, *tables]) + "\n"
-
-
-def _toml(value: object) -> str:
-    # texts, numbers and lists of numbers are written alike in JSON and TOML
-    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
 
 
 __all__ = ["Lens", "SensorProfile", "load_profile", "profile_text", "shipped_profiles"]

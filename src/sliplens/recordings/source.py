@@ -1,17 +1,17 @@
-"""One way to open frames: of a data set, a folder of images, a video, a bag, whatever a reader opens, or arrays."""
+"""Sources of frames: data sets, folders of images, videos, bags and whatever else a reader opens, or arrays."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias, TypedDict, TypeVar, Unpack
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from sliplens.errors import ImageError, InputError, RecordingError
-from sliplens.files import as_path, hash_file, hash_json, hash_tree
+from sliplens.files import hash_file, hash_json, hash_tree
 from sliplens.images import list_images, read_image, require_rgb
 from sliplens.parts import Shard, shard
 from sliplens.progress import number_of
@@ -21,15 +21,28 @@ from sliplens.recordings.formats import open_captures, recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
-from sliplens.recordings.options import LIMITS, Budget, ReadOptions, spoken
+from sliplens.recordings.options import LIMITS, Budget, ReadOptions, option_flags
 from sliplens.recordings.repeats import inspect_repeats
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.shards import LONGEST
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 """RGB images of the camera, one after another."""
+Other = TypeVar("Other")
 _INSPECTED = 8
-"""Recordings whose first frames are looked at for repeats."""
+"""Recordings whose first frames are checked for repeats."""
+
+
+class SourceOptions(TypedDict, total=False):
+    """Parameters of `open_source` that a command passes on."""
+
+    reference: Path | str | Frame | None
+    reference_frame: int | None
+    split: str | None
+    trial: str | None
+    format: str | None
+    options: ReadOptions | None
+    sensor: SensorProfile | Path | str | None
 
 
 def open_source(
@@ -44,31 +57,31 @@ def open_source(
     sensor: SensorProfile | Path | str | None = None,
     whole: bool = False,
 ) -> tuple[Capture, ...]:
-    """Open frames wherever they are; no frame is read yet.
+    """Open frames of a source; no frame is read yet.
 
     Parameters
     ----------
     source
         Data set, folder of images, recording, or uint8 RGB frames (frames, height, width, 3).
     reference, reference_frame
-        The sensor untouched, as an image or the number of the frame that shows it; what the source names if None.
+        Untouched sensor: an image, or the number of the frame that shows it. If neither, that of the source.
     split, trial
         Trials of a data set, or the name of one; all if None.
     format
         Row of `FORMATS`; recognised if None.
     options
-        What is known of a source that is no data set.
+        Facts about a source that is no data set.
     sensor
-        Profile of the sensor, its file (TOML), or the name of one that comes with sliplens: what frames and reference
-        go through before they are read. Those of a data set went through it on import.
+        Profile of the sensor, its file (TOML), or the name of one that comes with sliplens; frames and reference are
+        prepared by it. Those of a data set were prepared on import.
     whole
-        With the samples of forces that a data set keeps; images must then have times.
+        If True, read the samples of forces that a data set stores; images must then have times.
 
     Raises
     ------
     InputError
-        If something named is missing, damaged or does not fit the source; of an image an `ImageError`, of a recording a
-        `RecordingError`.
+        If the source is missing, damaged, or does not take an option; `ImageError` for an image, `RecordingError` for a
+        recording.
 
     Examples
     --------
@@ -82,104 +95,111 @@ def open_source(
         raise InputError("the untouched sensor is named twice; give --reference or --reference-frame, not both")
     options = ReadOptions() if options is None else options
     profile = None if sensor is None else load_profile(sensor)
-    source = as_path(source) if isinstance(source, Path | str) else source
-    if isinstance(source, Path) and format in {None, "sliplens"} and (source / DATASET_FILE).is_file():
-        source = load_dataset(source)
-    if isinstance(source, Dataset):
+    opened = _open_dataset(source, format)
+    if isinstance(opened, Dataset):
         if reference is not None or reference_frame is not None:
-            raise InputError(f"the trials of {source.folder} bring their reference frames; leave out --reference")
-        if given := options.given():
-            raise InputError(f"{source.folder} is a data set of sliplens, which does not take {spoken(given)}")
+            raise InputError(f"the trials of {opened.folder} bring their reference frames; leave out --reference")
+        if names := options.given():
+            raise InputError(f"{opened.folder} is a data set of sliplens, which does not take {option_flags(names)}")
         if profile is not None:
             raise InputError(
-                f"{source.folder} is a data set of sliplens, whose frames went through their profile on import; "
+                f"{opened.folder} is a data set of sliplens, whose frames went through their profile on import; "
                 "leave out --sensor"
             )
-        infos = source.select(split=split)
-        names = [info.trial for info in infos]
-        opened = [
-            read_stored_trial(source, info, samples=whole) for info in _chosen(infos, names, trial, source.folder)
-        ]
-        return tuple(replace(one, opened=str(source.folder)) for one in opened)
+        infos = opened.select(split=split)
+        places = _choose_trial([info.trial for info in infos], trial, str(opened.folder))
+        stored = (read_stored_trial(opened, infos[place], samples=whole) for place in places)
+        return tuple(replace(capture, opened=str(opened.folder)) for capture in stored)
+    name = str(opened) if isinstance(opened, Path) else Capture.opened
     if split is not None:
-        raise InputError(f"{_words(source)} is no data set of sliplens and has no splits; leave out --split")
+        raise InputError(f"{name} is no data set of sliplens and has no splits; leave out --split")
     if profile is not None and profile.frame_rate_hz is not None and options.frame_rate is None:
         options = replace(options, frame_rate=profile.frame_rate_hz)
-    opened = [
-        replace(_with_reference(one, reference, reference_frame), opened=_words(source))
-        for one in _open(source, format, options, whole=whole)
+    captures = [
+        replace(_with_reference(capture, reference, reference_frame), opened=name)
+        for capture in _read_captures(opened, format, options, whole=whole)
     ]
-    for one in opened if isinstance(source, Path) else ():
-        _require_usual(one, options.allow_large)
-    if profile is not None:
-        opened = [profile.prepare(one) for one in opened]
-    return tuple(_chosen(opened, [one.name for one in opened], trial, source))
+    for capture in captures if isinstance(opened, Path) else ():
+        _require_usual(capture, options.allow_large)
+    captures = captures if profile is None else [profile.prepare(capture) for capture in captures]
+    return tuple(captures[place] for place in _choose_trial([capture.name for capture in captures], trial, name))
+
+
+def _open_dataset(source: Path | str | Other, format: str | None) -> Path | Dataset | Other:
+    """Open the data set that a path names; any other source stays as it is."""
+    if not isinstance(source, str | Path):
+        return source
+    path = Path(source)
+    return load_dataset(path) if format in {None, "sliplens"} and (path / DATASET_FILE).is_file() else path
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trials:
-    """Trials of a source that every process can open again, by paths and names."""
+    """Trials of a source that every process can open again, by their paths and names."""
 
     source: Path | Dataset | tuple[Capture, ...]
-    """What is opened; captures stay in this process."""
-    named: Mapping[str, Any]
-    """Parameters of `open_source`."""
+    """Source to open; captures stay in this process."""
+    options: SourceOptions
     kinds: tuple[Capture, ...]
-    """A capture of each sensor and size of frames, to see whether it can be read: to open all takes as long as there
-    are trials."""
+    """A capture of each sensor and size of frames, by which to check a source quickly."""
     rows: tuple[tuple[str, int, str], ...]
-    """Name, number of frames, and hash of what it shows, of each trial; empty where nobody asks."""
+    """Name, number of frames, and hash of each trial; the hash is empty where parts are not stored."""
 
     @property
     def frames(self) -> int:
         """Number of frames of all trials."""
         return sum(frames for _, frames, _ in self.rows)
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "kinds": ()}  # whoever gets it opens its own
+    def __getstate__(self) -> dict:
+        return {**vars(self), "kinds": ()}  # every process opens its own
 
     @property
     def travels(self) -> bool:
-        """Whether other processes can open it."""
+        """True where other processes can open the source."""
         return isinstance(self.source, Path | Dataset)
 
     def shards(self, recipe: object, *, longest: int | None = LONGEST) -> Iterator[Shard]:
         """Shards of (trial, first frame, number of frames), whose parts are Parquet files; whole trials with None."""
         recipe = hash_json(recipe)
-        for trial, total, shown in self.rows:
+        for trial, total, sha256 in self.rows:
             for first in range(0, total, longest or total):
-                frames, known = min(longest or total, total - first), {"recipe": recipe, "shown": shown}
-                yield shard((trial, first, frames), trial=trial, first=first, frames=frames, suffix=".parquet", **known)
+                frames, hashes = min(longest or total, total - first), {"recipe": recipe, "shown": sha256}
+                yield shard(
+                    (trial, first, frames), trial=trial, first=first, frames=frames, suffix=".parquet", **hashes
+                )
 
     @property
     def recipe(self) -> object:
-        """What was named of the source, as JSON holds it: an image by its hash."""
-        image = self.named.get("reference")
+        """Options of the source as JSON holds them; an image by its hash."""
+        image = self.options.get("reference")
         if image is not None:
             pixels = isinstance(image, np.ndarray)
             image = hashlib.sha256(image.tobytes()).hexdigest() if pixels else hash_file(Path(image))
-        return {**self.named, "reference": image}
+        return {**self.options, "reference": image}
 
     def reader(self) -> Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]:
-        """Open shards, in whatever process: gives the trial, and the frames with their numbers.
+        """Return a function that opens a shard: its trial, and its frames with their numbers.
 
-        Shards of a long trial that come one after another go on where the one before ended.
+        A shard of a long trial that follows the one before goes on where that ended.
         """
-        given = self.source
-        opened = open_source(given, **self.named) if isinstance(given, Path) else given
-        known = {} if isinstance(opened, Dataset) else {one.name: one for one in opened}
+        source, options = self.source, self.options
+        opened = open_source(source, **options) if isinstance(source, Path) else source
+        by_name = {} if isinstance(opened, Dataset) else {capture.name: capture for capture in opened}
         following: tuple[tuple[str, int], Iterator[tuple[int, Frame]]] | None = None
 
         def read(trial: str, first: int, count: int) -> tuple[Capture, Iterator[tuple[int, Frame]]]:
             nonlocal following
-            (capture,) = open_source(given, trial=trial, **self.named) if isinstance(given, Dataset) else [known[trial]]
+            if isinstance(source, Dataset):
+                (capture,) = open_source(source, **{**options, "trial": trial})
+            else:
+                capture = by_name[trial]
             if following is not None and following[0] == (trial, first):
                 frames = following[1]
             else:
                 frames = islice(enumerate(capture.read_frames()), first, None)
-            following = None  # until this shard was read to its end: one that failed leaves the frames anywhere
+            following = None  # until this shard is read to its end: a failure leaves the iterator anywhere
 
-            def own() -> Iterator[tuple[int, Frame]]:
+            def read_shard() -> Iterator[tuple[int, Frame]]:
                 nonlocal following
                 number = first - 1
                 for number, frame in islice(frames, count):
@@ -190,7 +210,7 @@ class Trials:
                     raise RecordingError(f"{capture.source} {ends}; make or copy it again")
                 following = (trial, first + count), frames
 
-            return capture, own()
+            return capture, read_shard()
 
         return read
 
@@ -200,105 +220,101 @@ def open_trials(
     *,
     on: str = "serial",
     resumable: bool = True,
-    **named: Any,
+    **options: Unpack[SourceOptions],
 ) -> Trials:
-    """Open a source for work that may be done elsewhere; the other parameters are those of `open_source`.
+    """Open a source for work that other processes may do; the options are those of `open_source`.
 
-    Where parts are kept for another run (`resumable`), files other than a data set are read whole for their hash.
+    Where parts are stored for another run (`resumable`), files other than a data set are read whole for their hash.
 
     Raises
     ------
     InputError
-        As `open_source`, and if frames in memory are to be worked on elsewhere than in this process.
+        See `open_source`; and if frames in memory are to be worked on in other processes.
     """
-    if isinstance(source, Path | str):
-        source = as_path(source)
-        if named.get("format") in {None, "sliplens"} and (source / DATASET_FILE).is_file():
-            source = load_dataset(source)
+    source = _open_dataset(source, options.get("format"))
     if isinstance(source, Dataset):
-        infos = [info for info in source.select(split=named.get("split")) if named.get("trial") in {None, info.trial}]
+        trial = options.pop("trial", None)
+        infos = [info for info in source.select(split=options.get("split")) if trial in {None, info.trial}]
         first = {(info.sensor, info.height, info.width): info.trial for info in reversed(infos)}
-        told = {"trial": named.pop("trial", None)}
-        kinds = [open_source(source, **named, trial=trial)[0] for trial in reversed(first.values() or told.values())]
-        rows = [(info.trial, info.frames, info.sha256) for info in infos]
-        return Trials(source=source, named=named, kinds=tuple(kinds), rows=tuple(rows))
+        names = list(reversed(first.values())) or [trial]
+        kinds = tuple(open_source(source, **{**options, "trial": name})[0] for name in names)
+        rows = tuple((info.trial, info.frames, info.sha256) for info in infos)
+        return Trials(source=source, options=options, kinds=kinds, rows=rows)
     if on != "serial" and not isinstance(source, Path):
         raise InputError("frames in memory are worked on in this process; name their file or folder, or leave out --on")
-    opened = tuple(open_source(source, **named) if isinstance(source, Path | np.ndarray) else source)
-    if len({one.name for one in opened}) < len(opened):
-        raise InputError("two of the trials have one name; give each its own")
-    shown = hash_tree(source) if resumable and isinstance(source, Path) else ""
-    rows = [(one.name, one.frames, shown) for one in opened]
-    # of many recordings a few: to open all takes long enough
-    kinds = tuple(
-        replace(one, notes=(*one.notes, *inspect_repeats(one))) if at < _INSPECTED else one
-        for at, one in enumerate(opened)
+    captures = tuple(open_source(source, **options) if isinstance(source, Path | np.ndarray) else source)
+    if len({capture.name for capture in captures}) < len(captures):
+        raise InputError("two of the trials have the same name; give each its own")
+    sha256 = hash_tree(source) if resumable and isinstance(source, Path) else ""
+    # of many recordings a few: to inspect all takes long
+    kinds = tuple(replace(each, notes=(*each.notes, *inspect_repeats(each))) for each in captures[:_INSPECTED])
+    return Trials(
+        source=source if isinstance(source, Path) else captures,
+        options=options,
+        kinds=(*kinds, *captures[_INSPECTED:]),
+        rows=tuple((capture.name, capture.frames, sha256) for capture in captures),
     )
-    return Trials(source=source if isinstance(source, Path) else opened, named=named, kinds=kinds, rows=tuple(rows))
 
 
-def _open(source: Path | Frames, format: str | None, options: ReadOptions, *, whole: bool) -> Sequence[Capture]:
-    if not isinstance(source, Path):
-        return [_array(source, options)]
-    if not whole and set(options.given()) <= {"frame_rate"} and (format or recognise(source)) == "images":
-        return [_images(source, options.frame_rate)]
-    return open_captures(source, format=format, options=options)
+def _read_captures(
+    source: Path | Frames, format: str | None, options: ReadOptions, *, whole: bool
+) -> Sequence[Capture]:
+    if isinstance(source, Path):
+        if not whole and set(options.given()) <= {"frame_rate"} and (format or recognise(source)) == "images":
+            return [_read_images(source, options.frame_rate)]
+        return open_captures(source, format=format, options=options)
+    if not len(source):
+        raise InputError("there is no frame; give one or more")
+    require_rgb(source)
+    if strange := [name for name in options.given() if name != "frame_rate"]:
+        raise InputError(f"{Capture.opened} do not take {option_flags(strange)}; leave it out")
+    return [
+        Capture(
+            trial="frames",
+            source=Capture.opened,
+            frame_time_s=_frame_times(len(source), options.frame_rate),
+            frame_size=source.shape[1:3],
+            read_frames=lambda: iter(source),
+        )
+    ]
 
 
 def _require_usual(capture: Capture, allowed: Sequence[Budget]) -> None:
-    """Refuse a recording that is larger than any usual one, before anything of its size is made."""
+    """Refuse a recording that is larger than any usual one, before memory of its size is allocated."""
     height, width = capture.frame_size
     clocks = [time for time in (capture.time_s, capture.forces and capture.forces.time_s) if time is not None]
     sizes: dict[Budget, tuple[float, str]] = {
         "frames": (len(capture), number_of(len(capture), "frame")),
         "pixels": (height * width, f"frames of {height} x {width} pixels"),
         "samples": (samples := len(capture.forces.time_s) if capture.forces else 0, f"{samples:,} samples of forces"),
-        "span": max(((float(time[-1] - time[0]), _span(time)) for time in clocks), default=(0.0, "")),
+        "span": max(((float(time[-1] - time[0]), _describe_span(time)) for time in clocks), default=(0.0, "")),
     }
-    for name, (size, told) in sizes.items():
+    for name, (size, text) in sizes.items():
         if size > LIMITS[name] and name not in allowed:
             raise RecordingError(
-                f"{capture.source} has {told}, more than the {LIMITS[name]:,} that are usual; cut or mend it, or say "
+                f"{capture.source} has {text}, more than the {LIMITS[name]:,} that are usual; cut or mend it, or say "
                 f"--allow-large {name} if it is right"
             )
 
 
-def _span(time_s: np.ndarray) -> str:
-    """Length of a series of times, and its longest gap, in words."""
+def _describe_span(time_s: np.ndarray) -> str:
+    """Describe the length of a series of times, and its longest gap."""
     at = int(np.argmax(np.diff(time_s))) if len(time_s) > 1 else 0
     gap = f", {time_s[at + 1] - time_s[at]:.6g} s of them after stamp {at}" if len(time_s) > 1 else ""
     return f"times over {time_s[-1] - time_s[0]:.6g} s{gap}"
 
 
-def _chosen(trials: Sequence[Any], names: list[str], trial: str | None, source: Path | Frames) -> Sequence[Any]:
+def _choose_trial(names: Sequence[str], trial: str | None, source: str) -> Sequence[int]:
+    """Return the place of a trial, or of all if None."""
     if trial is None:
-        return trials
+        return range(len(names))
     if trial not in names:
-        raise InputError(f"{_words(source)} has no trial {trial}; choose one such as {names[0]}")
-    return [trials[names.index(trial)]]
+        raise InputError(f"{source} has no trial {trial}; choose one such as {names[0]}")
+    return [names.index(trial)]
 
 
-def _words(source: Path | Frames) -> str:
-    return str(source) if isinstance(source, Path) else Capture.opened
-
-
-def _array(frames: Frames, options: ReadOptions) -> Capture:
-    if not len(frames):
-        raise InputError("there is no frame; give one or more")
-    require_rgb(frames)
-    if strange := [option for option in options.given() if option != "frame_rate"]:
-        raise InputError(f"{Capture.opened} do not take {spoken(strange)}; leave it out")
-    return Capture(
-        trial="frames",
-        source=Capture.opened,
-        frame_time_s=_frame_times(len(frames), options.frame_rate),
-        frame_size=frames.shape[1:3],
-        read_frames=lambda: iter(frames),
-    )
-
-
-def _images(folder: Path, frame_rate: float | None) -> Capture:
-    """Images as one trial; unlike on import, their times may stay unknown."""
+def _read_images(folder: Path, frame_rate: float | None) -> Capture:
+    """Open images as one trial; unlike on import, their times may stay unknown."""
     paths = list_images(folder)
     size, count = frame_size(paths[0]), len(paths)
     return Capture(
@@ -312,12 +328,12 @@ def _images(folder: Path, frame_rate: float | None) -> Capture:
 
 
 def _frame_times(count: int, frame_rate: float | None) -> Float[np.ndarray, " frames"]:
-    """Times of frames, NaN where their rate is not told."""
+    """Return times of frames; NaN where their rate is unknown."""
     return np.full(count, np.nan) if frame_rate is None else evenly_spaced(count, frame_rate=frame_rate)
 
 
 def _with_reference(trial: Capture, image: Path | str | Frame | None, number: int | None) -> Capture:
-    """Name the untouched sensor; what the trial names itself stays where nothing is named."""
+    """Set the image of the untouched sensor; that of the trial stays if neither image nor number is given."""
     if image is None and number is None and trial.reference is None:
         number = trial.reference_index
     if number is not None:

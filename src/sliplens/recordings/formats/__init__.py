@@ -1,7 +1,7 @@
 """Readers of recordings: one row a format. An installed package adds one through `sliplens.formats`.
 
-Files come from outside and are believed only as far as they can be true: whatever is missing, damaged or of another
-kind is told as a `RecordingError` (an image as an `ImageError`), one sentence with the place and the cure.
+Files come from outside and may be damaged or hostile: a reader raises a `RecordingError` (of an image an `ImageError`)
+of one sentence with the place and the cure.
 """
 
 from collections.abc import Callable
@@ -20,19 +20,19 @@ from sliplens.recordings.formats.rosbag import read_rosbag
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.formats.thesis import is_thesis_list, read_thesis
 from sliplens.recordings.formats.video import read_video
-from sliplens.recordings.options import ReadOptions, spoken
+from sliplens.recordings.options import ReadOptions, option_flags
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reader:
-    """How a format is recognised and read."""
+    """Reader of one format."""
 
     words: str
-    """What it reads, for people."""
+    """Description of the format in messages."""
     recognises: Callable[[Path], bool]
-    """Told by names, or by the header of a table; no frame is read."""
+    """Return True for a file or folder of this format, by names or the header of a table; no frame is read."""
     takes: tuple[str, ...]
-    """Fields of `ReadOptions` that it understands."""
+    """Fields of `ReadOptions` that the reader supports."""
     read: Callable[[Path, ReadOptions], Capture | list[Capture]]
 
 
@@ -87,7 +87,7 @@ FORMATS = Table("format", "sliplens.formats", _ROWS)
 
 
 def recognise(path: Path) -> str | None:
-    """Format of a source, told by names: those of installed packages are tried first, then ours in their order."""
+    """Recognise the format of a source; formats of installed packages are tried first."""
     added = [name for name in FORMATS if name not in _ROWS]
     return next((name for name in (*added, *_ROWS) if FORMATS[name].recognises(path)), None)
 
@@ -98,18 +98,17 @@ def open_captures(path: Path, *, format: str | None = None, options: ReadOptions
     Raises `InputError` where the source is missing, of no known format, or does not take an option that was given.
     """
     if format is not None:
-        FORMATS.pick(format)  # a wrong name is told before a wrong path
+        FORMATS.pick(format)  # a wrong name is reported before a wrong path
     if not path.exists():
         raise InputError(f"{path} does not exist; check the path")
     name = format or recognise(path)
     if name is None:
-        known = "; ".join(f"{name}: {FORMATS[name].words}" for name in FORMATS)
-        raise InputError(f"{path} is none of the formats that are known ({known}); name one with --format")
+        formats = "; ".join(f"{name}: {FORMATS[name].words}" for name in FORMATS)
+        raise InputError(f"{path} has none of the supported formats ({formats}); name one with --format")
     reader = FORMATS[name]
     if strange := [option for option in options.given() if option not in reader.takes]:
-        raise InputError(
-            f"{path} is read as {name}, which does not take {spoken(strange)}; leave it out or name another format"
-        )
+        flags = option_flags(strange)
+        raise InputError(f"{path} is read as {name}, which does not take {flags}; leave it out or name another format")
     captures = reader.read(path, options)
     return (captures,) if isinstance(captures, Capture) else tuple(captures)
 
