@@ -87,7 +87,7 @@ CASES = {
     "label -o": Case(("label", "@/imported", "-o", "out", "--mu", "0.5", "--no-audit")),
     "split": Case(("split", "data", "--preset", "trials"), copies=("data",)),
     "train": Case(("train", "@/data", "-o", "out", *_SMALL)),
-    "predict": Case(("predict", "@/run", "@/data", "-o", "out.csv", "--plot", "out.png", "--engine", "eager")),
+    "predict": Case(("predict", "@/run", "@/data", "-o", "out.csv", "--plot", "out.png", "--engine", "torch")),
     "evaluate": Case(("evaluate", "@/run", "@/data", "-o", "out")),
     "explain": Case(("explain", "@/run", "@/data", "-o", "out", "--method", "grad-cam", "integrated-gradients")),
     "score": Case(("score", "@/run", "@/explained", "-o", "out", "--steps", "8")),

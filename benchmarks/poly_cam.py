@@ -101,7 +101,7 @@ def measure(run: Path, images: Tensor, references: Tensor, *, options: argparse.
     trained, rows = load(run), []
     model = trained.model
     # torch alone and in batches: the loop's own map where its passes are too many to make them all
-    plain = PolyCam(engine="eager")
+    plain = PolyCam(engine="torch")
     exact = PolyCam(levels=True)
     fast = PolyCam(budget=options.budget)
     with_engine = exact(model, images[:1], reference=references[:1])  # prepares the engine, as the first frame does

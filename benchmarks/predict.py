@@ -2,12 +2,12 @@
 
 In every round each engine predicts once, in an order that turns, so that whatever else the machine does hits all alike.
 Decoding is left out; encoding (compare, resize, normalise) is reported apart. The answers of each engine are compared
-with those of `eager`.
+with those of `torch`.
 
 `fps_ratios` compares whole calls of `predict` by each engine, in turn too: frames a second of `chromatouch-pair` over
 those of `chromatouch-difference`, as they come (112 and 224 px) and both at 224 px, of frames in order over frames
 one by one, and of `chromatouch-pair` over the same network without its `novelty`, which tells no `known`.
-`python benchmarks/predict.py --engines eager folded onnxruntime openvino --rounds 100 --json` takes two minutes. With
+`python benchmarks/predict.py --rounds 100 --json` takes two minutes. With
 `--json` the last line is one JSON object.
 """
 
@@ -114,9 +114,9 @@ def encoders(trained: Network) -> dict[str, Callable[[], object]]:
     return work
 
 
-def parity(trained: Network, engine: Engine, eager: Engine, inputs: Tensor) -> float:
-    """Largest difference between the margins of an engine and those of `eager`."""
-    return difference(engine.estimate(trained, inputs).margin, eager.estimate(trained, inputs).margin)
+def parity(trained: Network, engine: Engine, plain: Engine, inputs: Tensor) -> float:
+    """Largest difference between the margins of an engine and those of `torch`."""
+    return difference(engine.estimate(trained, inputs).margin, plain.estimate(trained, inputs).margin)
 
 
 RATIOS = {
@@ -171,15 +171,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     load.append(os.getloadavg()[0])
     encode_times = time_rounds(encoders(trained), rounds=options.rounds)
     fps = time_calls(list(engines), frames=120, rounds=max(1, options.rounds // 20))
-    eager = engines.get("eager") or make_engine("eager", trained, batch_size=1, streams=1)
+    plain = make_engine("torch", trained, batch_size=1, streams=1)
     result = {
         "p50_ms": {name: float(np.percentile(values, 50)) for name, values in times.items()},
         "p99_ms": {name: float(np.percentile(values, 99)) for name, values in times.items()},
-        "parity": {name: parity(trained, engine, eager, inputs) for name, engine in engines.items()},
+        "parity": {name: parity(trained, engine, plain, inputs) for name, engine in engines.items()},
         "fastest": min(times, key=lambda name: float(np.median(times[name]))),
         "ready_s": ready_s,
         "missing": missing,
-        "margin_sd": float(eager.estimate(trained, inputs).margin.std()),
+        "margin_sd": float(plain.estimate(trained, inputs).margin.std()),
         "encode_p50_ms": {name: float(np.percentile(values, 50)) for name, values in encode_times.items()},
         "encode_p99_ms": {name: float(np.percentile(values, 99)) for name, values in encode_times.items()},
         "fps": {
@@ -197,8 +197,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "machine": vars(machine()),
         "versions": versions(),
     }
-    print(f"{'engine':12s} {'p50 ms':>8s} {'p99 ms':>8s} {'of eager':>9s} {'off eager':>10s} {'ready s':>8s}")
-    slow = float(np.median(times["eager"])) if "eager" in times else float("nan")
+    print(f"{'engine':12s} {'p50 ms':>8s} {'p99 ms':>8s} {'of torch':>9s} {'off torch':>10s} {'ready s':>8s}")
+    slow = float(np.median(times["torch"])) if "torch" in times else float("nan")
     for name in times:
         p50 = result["p50_ms"][name]
         print(

@@ -41,7 +41,6 @@ from sliplens import load_dataset, predict, simulate
 from sliplens.extras import missing_packages
 from sliplens.files import hash_file, hash_json, machine, partial_folder, versions, write_json
 from sliplens.markers.tracking import track
-from sliplens.models.engines import one_thread
 from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
@@ -124,12 +123,13 @@ def size_of(folder: Path) -> int:
 @contextmanager
 def one_core() -> Iterator[None]:
     """Leave this thread, and those that it begins, the last core alone."""
-    every = os.sched_getaffinity(0)
+    every, threads = os.sched_getaffinity(0), torch.get_num_threads()
     os.sched_setaffinity(0, {max(every)})
     try:
-        with one_thread():
-            yield
+        torch.set_num_threads(1)
+        yield
     finally:
+        torch.set_num_threads(threads)
         os.sched_setaffinity(0, every)
 
 
@@ -168,7 +168,7 @@ class Empty(Work):
 def time_predict(data: Dataset, out: Path, on: str) -> Rate:
     """Margins of all frames."""
     ticks = Ticks()
-    predict(NETWORK, data, engine="folded", on=on, out=out, on_progress=ticks)
+    predict(NETWORK, data, engine="torch", on=on, out=out, on_progress=ticks)
     return ticks.rate(out, content(out))
 
 
@@ -294,7 +294,7 @@ def survive(data: Path, on: str, *, wanted: str, within_s: float, rng: random.Ra
 
 def kill_words(data: Path, out: Path, on: str) -> list[str]:
     """Command that is killed."""
-    own = [sys.executable, "-m", "sliplens", "predict", NETWORK, str(data), "--engine", "folded"]
+    own = [sys.executable, "-m", "sliplens", "predict", NETWORK, str(data), "--engine", "torch"]
     return [*own, "-o", str(out), "--on", on]
 
 

@@ -246,7 +246,7 @@ def read_on(log: Log, part: str, *, seconds: float, rate_hz: float, fast: bool) 
 
     with (
         scratch_folder() as scratch,
-        sl.LiveReader(source, "chromatouch-difference", engine="eager") as reader,
+        sl.LiveReader(source, "chromatouch-difference", engine="torch") as reader,
         LivePage(reader, port=0) as page,
     ):
         reader.subscribe(keep)

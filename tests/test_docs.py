@@ -25,7 +25,7 @@ PAGE = pytest.mark.parametrize(
 NO_MODULES = (
     {
         f"sliplens.{name}"
-        for name in ("fills", "formats", "encodings", "backbones", "engines", "executors", "controllers", "conditions")
+        for name in ("fills", "formats", "encodings", "backbones", "executors", "controllers", "conditions")
     }
     | {
         f"sliplens.{name}"

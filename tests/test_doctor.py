@@ -46,7 +46,7 @@ def test_what_fails_is_told_and_stops_nothing(few: None, tmp_path: Path, monkeyp
     assert "cameras does not work" in said.err
 
 
-@pytest.mark.parametrize("name", ["eager", "folded"])
+@pytest.mark.parametrize("name", ["torch", "openvino"])
 def test_an_engine_agrees_with_the_network(name: str):
     assert doctor._engine(name).startswith("agrees with the network")
 

@@ -17,7 +17,6 @@ from sliplens.markers import KINDS
 from sliplens.markers.estimators import ESTIMATORS
 from sliplens.models.backbones import BACKBONES
 from sliplens.models.encodings import ENCODINGS
-from sliplens.models.engines import ENGINES
 from sliplens.recordings.formats import FORMATS
 from sliplens.simulation import PRESETS, SENSORS
 from sliplens.simulation.plan import PULLS
@@ -27,7 +26,6 @@ from sliplens.training.data import AUGMENTATIONS
 TABLES = {
     "sliplens.backbones": BACKBONES,
     "sliplens.encodings": ENCODINGS,
-    "sliplens.engines": ENGINES,
     "sliplens.conditions": CONDITIONS,
     "sliplens.controllers": CONTROLLERS,
     "sliplens.explainers": EXPLAINERS,

@@ -17,7 +17,7 @@ from sliplens.files import machine, scratch_folder, shipped_names, versions
 from sliplens.images import list_images, read_image
 from sliplens.live.camera import list_cameras
 from sliplens.models.checkpoint import Network, load
-from sliplens.models.engines import ENGINES, prepare
+from sliplens.models.engines import ENGINES, find_obstacle, prepare
 from sliplens.models.onnx import TOLERANCE
 from sliplens.progress import OnProgress, number_of
 from sliplens.recordings.store import load_recording, save_recording
@@ -25,8 +25,6 @@ from sliplens.simulation import make_recipe, plan_trials, simulate_trial
 
 _BUILDERS = frozenset({"dev", "docs"})
 """Extras of those who work on sliplens itself."""
-_SLOW = "compiled"
-"""Engine that takes minutes to be made ready."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,13 +131,11 @@ def _network(name: str) -> str:
 
 
 def _engine(name: str) -> str:
-    if name == _SLOW:
-        return _absent("takes minutes to be made ready, and is not tried here")
     trained = load(shipped_names()[0])
     inputs = _inputs(trained)
     expected = trained.predict(inputs)
-    if said := ENGINES[name].obstacle(inputs.device):
-        return _absent(said)
+    if name == "openvino" and (obstacle := find_obstacle(trained.model, inputs)):
+        return _absent(obstacle)
     engine = prepare(trained.model, inputs, expected, passes=1, engine=name)
     off = max(float((part - whole).abs().max()) for part, whole in zip(engine.run([inputs]), [expected], strict=True))
     if off > TOLERANCE:

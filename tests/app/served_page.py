@@ -32,7 +32,7 @@ def main() -> None:
         source.load(normal_force_n=0.0, tangential_force_n=0.0)  # nobody presses yet
     with (
         # a busy machine drops frames, and health and markers would withhold margins for that
-        sl.LiveReader(source, network, engine="eager", health=None, slip=None) as reader,
+        sl.LiveReader(source, network, engine="torch", health=None, slip=None) as reader,
         LivePage(reader, port=0, record_into=sys.argv[1]) as page,
     ):
         port = int(page.address.rstrip("/").rpartition(":")[2])

@@ -166,7 +166,7 @@ def test_its_threads_have_ended_when_it_is_closed():
     async def run() -> list[str]:
         source = SimulatedSource(rate_hz=200.0)
         source.load(normal_force_n=4.0, tangential_force_n=1.0)
-        with sl.LiveReader(source, "chromatouch-difference", engine="eager", health=None, slip=None) as reader:
+        with sl.LiveReader(source, "chromatouch-difference", engine="torch", health=None, slip=None) as reader:
             feed = Feed(reader)
             feed.viewers.add(cast("Any", Looks()))
             before = set(threading.enumerate())

@@ -34,7 +34,7 @@ def test_the_network_is_that_of_the_profile(tmp_path: Path, capsys):
 def test_frames_of_another_sensor_are_told_once(small_dataset: Dataset, difference_run: Path, tmp_path: Path, capsys):
     profile = tmp_path / "tip.toml"
     profile.write_text('name = "another"\n', encoding="utf-8")
-    words = ("hold", small_dataset.folder, "--network", difference_run, "--engine", "eager", "--sensor", profile)
+    words = ("hold", small_dataset.folder, "--network", difference_run, "--engine", "torch", "--sensor", profile)
     assert run(*words, "--dry-run", "--controller", "fixed") == 0
     assert " ".join(capsys.readouterr().err.split()).count("reads frames of another") == 1
 

@@ -13,7 +13,7 @@ from sliplens.recordings import Dataset
 
 
 def test_a_line_of_json_a_reading(small_dataset: Dataset, difference_run: Path, capfdbinary: pytest.CaptureFixture):
-    words = ["live", str(small_dataset.folder), "--network", str(difference_run), "--engine", "eager"]
+    words = ["live", str(small_dataset.folder), "--network", str(difference_run), "--engine", "torch"]
     assert main([*words, "--speed", "2.0", "--sink", "json", "--no-page"]) == 0
     lines = [json.loads(line) for line in capfdbinary.readouterr().out.splitlines()]
     assert lines

@@ -66,10 +66,3 @@ def test_the_library_says_which_rows_there_are_to_simulate(
 ) -> None:
     line = refused(capsys, "simulate", tmp_path / "data", option, "other")
     assert f"there is no {noun} named 'other'; choose one of " in line
-
-
-def test_the_library_says_which_engines_there_are(
-    small_dataset: Dataset, difference_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ("predict", difference_run, small_dataset.folder, "-o", tmp_path / "margins.parquet", "--engine", "other")
-    assert "there is no engine named 'other'; choose one of " in refused(capsys, *words)

@@ -45,7 +45,7 @@ def test_a_data_set_is_predicted(
     told = {key.decode(): value.decode() for key, value in table.schema.metadata.items() if key.startswith(b"sliplens")}
     assert told == {
         "sliplens.version": __version__,
-        "sliplens.engine": "eager",  # for so few frames
+        "sliplens.engine": "torch",  # for so few frames
         "sliplens.source": str(small_dataset.folder),
         "sliplens.manifest_hash": hash_json(read_json(difference_run / "manifest.json")),
         "sliplens.weights_sha256": hash_file(difference_run / "model.safetensors"),
@@ -60,11 +60,11 @@ def test_a_video_alone_is_read_by_a_network_and_beside_a_frame_that_are_named(
     trial = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=20))
     write_video(trial, tmp_path / "cup.mkv")
     (tmp_path / "tip.toml").write_text('name = "tip"\nnetwork = "thesis-raw"\n')
-    run(tmp_path / "cup.mkv", "--engine", "eager")
+    run(tmp_path / "cup.mkv", "--engine", "torch")
     alone = " ".join(capsys.readouterr().err.split())
     assert "no network was named, so chromatouch-pair reads it, which comes with sliplens" in alone
     assert "its first frame was taken for the untouched sensor" in alone
-    run(tmp_path / "cup.mkv", "--engine", "eager", "--sensor", tmp_path / "tip.toml")
+    run(tmp_path / "cup.mkv", "--engine", "torch", "--sensor", tmp_path / "tip.toml")
     known = " ".join(capsys.readouterr().err.split())
     assert "so thesis-raw reads it, which the profile tip names" in known
     assert "reads frames of tip" in known
@@ -73,13 +73,13 @@ def test_a_video_alone_is_read_by_a_network_and_beside_a_frame_that_are_named(
 
 def test_engines_agree_on_a_folder_of_images(difference_run: Path, difference_folder: Path, tmp_path: Path, capsys):
     answers = {}
-    for engine in ("eager", "folded"):
+    for engine in ("torch", "openvino"):
         run(difference_run, difference_folder, "-o", tmp_path / f"{engine}.parquet", "--engine", engine)
         answers[engine] = pq.read_table(tmp_path / f"{engine}.parquet").to_pydict()
     assert "taken for difference images" in capsys.readouterr().err.replace("\n", " ")
     # float32 sums in another order, through some 60 layers
-    assert answers["eager"]["prediction"] == pytest.approx(answers["folded"]["prediction"], abs=1e-4)
-    assert [name.split("_")[0] for name in answers["eager"]["file"]] == ["frame1", "frame6", "frame11"]
+    assert answers["torch"]["prediction"] == pytest.approx(answers["openvino"]["prediction"], abs=1e-4)
+    assert [name.split("_")[0] for name in answers["torch"]["file"]] == ["frame1", "frame6", "frame11"]
 
 
 def test_a_file_that_exists_is_kept_unless_told_otherwise(difference_run: Path, difference_folder: Path, tmp_path):
@@ -102,8 +102,6 @@ def test_mistakes_are_told_before_anything_is_written(
     refused("the run .*nothing does not exist", tmp_path / "nothing", difference_folder, *here)
     refused("nothing does not exist", difference_run, tmp_path / "nothing", *here)
     refused("no trial with split exam", difference_run, small_dataset.folder, *here, "--split", "exam")
-    onnx = ("--onnx", tmp_path / "a.onnx")
-    refused("not for eager; leave it out", difference_run, difference_folder, *here, *onnx, "--engine", "eager")
     assert not output.exists()
 
 

@@ -272,7 +272,7 @@ def test_warns_where_masked_images_have_no_prediction(images):
 def test_the_error_of_small_effects_stays_within_what_is_said_of_it(network, images):
     exact_network = network("small shufflenet")
     single = copy.deepcopy(exact_network).float()
-    images, explain = images.float(), PolyCam(levels=True, engine="eager")
+    images, explain = images.float(), PolyCam(levels=True, engine="torch")
     seen = []
     for step in (1.0, 1e-2, 1e-4):
         near = images[:1] + step * (images[1:2] - images[:1])
@@ -307,3 +307,12 @@ def test_the_error_of_small_effects_stays_within_what_is_said_of_it(network, ima
 def test_rejects_options(options, message):
     with pytest.raises(InputError, match=message):
         replace(PolyCam(), **options)
+
+
+def test_the_engine_does_not_change_the_map(network, images):
+    pytest.importorskip("openvino")
+    model, image = network("small shufflenet").float().requires_grad_(requires_grad=False), images[:1].float()
+    plain = PolyCam(engine="torch", batch_size=1)(model, image)
+    fast = PolyCam(engine="openvino")(model, image)
+    assert (plain.engine, fast.engine) == ("torch", "openvino")
+    torch.testing.assert_close(fast.saliency, plain.saliency, atol=1e-4, rtol=0)

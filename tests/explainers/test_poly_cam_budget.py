@@ -172,8 +172,8 @@ def test_all_rounds_use_one_engine(network, images, monkeypatch):
         return prepared[-1]
 
     monkeypatch.setattr("sliplens.explainers.contract.prepare", prepare)
-    explain = PolyCam(budget=0.25, likeness=Likeness(pearson_r=1.0), engine="folded")
-    assert explain(network("small shufflenet"), images[:2]).engine == "folded"
+    explain = PolyCam(budget=0.25, likeness=Likeness(pearson_r=1.0), engine="torch")
+    assert explain(network("small shufflenet"), images[:2]).engine == "torch"
     assert len(prepared) == 1
 
 

@@ -169,7 +169,7 @@ def test_the_loop_detects_slip_as_a_real_hold_does_and_only_where_an_object_slid
 def test_the_loop_closes_through_pixels(network):
     """A little of an episode: what is read follows what the plant does."""
     scripts = draw_scripts("cup", "dry", episodes=1, seed=0, script={"mass_kg": 0.08, "friction": 0.6})
-    eyes = RenderedEyes(network, seed=11, engine="folded")
+    eyes = RenderedEyes(network, seed=11, engine="torch")
     loop = GripLoop(Plant(pick_object("cup")), eyes, make_controller("fixed", {"force_n": 1.2}))
     ticks = [loop.tick(scripts.world(loop.plant.state.time_s)) for _ in range(3)]
     frames = ticks[-1].sight.frames
@@ -317,7 +317,7 @@ def test_a_slip_narrows_what_was_told_of_friction(table):
 
 def test_friction_told_shapes_what_is_read_through_pixels(ratio_run: Path):
     network, known = sl.load(ratio_run), Friction(0.4)
-    eyes = RenderedEyes(network, seed=11, engine="eager", learner=SlipLearner(known))
+    eyes = RenderedEyes(network, seed=11, engine="torch", learner=SlipLearner(known))
     plant = Plant(pick_object("cup"))
     plant.state = replace(plant.state, force_n=np.ones(1), shear_n=np.full((1, 2), 0.2))
     sight = eyes.look(plant.state, np.full(1, np.nan))
@@ -363,7 +363,7 @@ def test_what_slips_taught_counts_in_the_grasps_that_follow_only_of_the_same_obj
 
 
 def test_frames_of_a_grip_are_read_in_order_through_pixels(network: Network):
-    eyes = [RenderedEyes(network, seed=11, engine="eager", sequence=way) for way in (False, True)]
+    eyes = [RenderedEyes(network, seed=11, engine="torch", sequence=way) for way in (False, True)]
     followers, differ = [network.follow() for _ in range(2)], list[float]()
     plant = Plant(pick_object("cup"))
     for step in range(3):

@@ -266,7 +266,7 @@ def test_a_gripper_that_misbehaves_holds_a_cup_by_what_is_read_of_its_frames(gri
     ):
         assert old in code
         code = code.replace(old, new)
-    names = {"source": source, "address": gripper.address, "given": {"engine": "eager", "health": None, "slip": None}}
+    names = {"source": source, "address": gripper.address, "given": {"engine": "torch", "health": None, "slip": None}}
     exec(code, names)
     hold, held = names["hold"], source.held(max(source._told))
     assert held is not None

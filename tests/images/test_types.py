@@ -36,7 +36,7 @@ def predict_capture(frames, reference):
 
 
 def read_live(frames, reference):
-    with sl.LiveReader(frames, run, reference=reference, engine="eager") as reader:
+    with sl.LiveReader(frames, run, reference=reference, engine="torch") as reader:
         return list(reader.readings())
 
 

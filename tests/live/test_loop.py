@@ -77,7 +77,7 @@ def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, diffe
     told = table.column("prediction").to_numpy()
     source = Patient(recording.frames, list(range(12)))
     readings = source.all_readings(
-        plain_reader(source, difference_run, reference=recording.reference, engine="eager", stall_s=10.0)
+        plain_reader(source, difference_run, reference=recording.reference, engine="torch", stall_s=10.0)
     )
     assert len(readings) == 12
     for reading in readings:
@@ -92,7 +92,7 @@ def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, 
     table = sl.predict(run, [replace(capture, frame_time_s=0.05 * np.arange(12))], sequence=True).frame()
     source = Patient(recording.frames[1:], list(range(1, 12)))  # nothing touches the first, and it is forgotten
     readings = source.all_readings(
-        plain_reader(source, run, reference=recording.reference, sequence=True, engine="eager", stall_s=10.0)
+        plain_reader(source, run, reference=recording.reference, sequence=True, engine="torch", stall_s=10.0)
     )
     assert [reading.number for reading in readings] == list(range(1, 12))
     assert all(reading.sequence for reading in readings)
@@ -106,7 +106,7 @@ def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, 
 def test_frames_after_a_gap_are_read_by_themselves_and_say_so(recording: Recording, sequence_run: Path):
     numbers = [1, 2, 3, 20, 21, 22]  # 0.85 s were withheld, or lost
     source = Patient(recording.frames[[1, 2, 3, 4, 5, 6]], numbers)
-    reader = plain_reader(source, sequence_run, reference=recording.reference, sequence=True, engine="eager")
+    reader = plain_reader(source, sequence_run, reference=recording.reference, sequence=True, engine="torch")
     assert [reading.sequence for reading in source.all_readings(reader)] == [True] * 3 + [False] * 3
 
 
@@ -178,7 +178,7 @@ def test_a_grey_camera_puts_a_network_that_learned_from_colours_in_doubt(recordi
     trained = replace(trained, manifest=replace(trained.manifest, colour=True))
     grey = np.repeat(recording.reference[..., :1], 3, axis=-1)
     for untouched, doubts in ((grey, 1), (recording.reference, 0)):
-        reader = plain_reader(recording.frames[:1], trained, reference=untouched, engine="eager")
+        reader = plain_reader(recording.frames[:1], trained, reference=untouched, engine="torch")
         assert not reader.doubts
         with reader:
             assert len(reader.doubts) == doubts
@@ -220,7 +220,7 @@ class Strict:
 def test_a_margin_is_withheld_where_a_check_fails(recording: Recording, difference_run: Path):
     source = Patient(recording.frames, list(range(12)))
     readings = source.all_readings(
-        plain_reader(source, difference_run, reference=recording.reference, engine="eager", health=Strict, stall_s=10.0)
+        plain_reader(source, difference_run, reference=recording.reference, engine="torch", health=Strict, stall_s=10.0)
     )
     assert {(reading.number % 2 == 1, reading.margin is None, bool(reading.withheld)) for reading in readings} == {
         (False, False, False),
@@ -251,7 +251,7 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
     source = Patient(frames, list(range(len(frames))))
     readings = source.all_readings(
         sl.LiveReader(
-            source, network, reference=trial.reference, engine="eager", health=Lenient, slip=None, stall_s=10.0
+            source, network, reference=trial.reference, engine="torch", health=Lenient, slip=None, stall_s=10.0
         )
     )
     for reading, share in zip(readings, known, strict=True):
@@ -300,7 +300,7 @@ def test_without_a_contact_there_is_no_margin(trials: dict[str, Recording], name
     source = Patient(trial.frames[:2], [0, 1])
     network = "chromatouch-difference" if named else None
     first, second = source.all_readings(
-        plain_reader(source, network, reference=trial.reference, engine="eager", slip=Watch, stall_s=10.0)
+        plain_reader(source, network, reference=trial.reference, engine="torch", slip=Watch, stall_s=10.0)
     )
     assert first.contact_state is ContactState.NO_CONTACT
     assert first.margin is None
@@ -325,7 +325,7 @@ def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
 
     told, source = sl.Friction.between(0.3, 0.9), Patient(trial.frames[10:14], [0, 1, 2, 3])
     reader = sl.LiveReader(
-        source, network, reference=trial.reference, friction=told, engine="eager", slip=Watch, health=None, stall_s=10.0
+        source, network, reference=trial.reference, friction=told, engine="torch", slip=Watch, health=None, stall_s=10.0
     )
     readings = source.all_readings(reader)
     estimates = [network.estimate(network.encode(frame[None], trial.reference)) for frame in trial.frames[10:14]]
@@ -361,7 +361,7 @@ def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another
     trial = trials["chromatouch"]
     images = np.tile(trial.frames[10:15], (3, 1, 1, 1))
     source, friction, kept = Patient(images, list(range(15))), list[str | None](), list[bool]()
-    options = {"same_object": same_object, "sequence": sequence, "slip": Grasps, "health": None, "engine": "eager"}
+    options = {"same_object": same_object, "sequence": sequence, "slip": Grasps, "health": None, "engine": "torch"}
     reader = sl.LiveReader(source, "chromatouch-difference", reference=trial.reference, stall_s=10.0, **options)
 
     def hear(reading: Reading, _: object) -> None:

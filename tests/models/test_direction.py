@@ -45,7 +45,7 @@ def read_live(network: Network, reference: np.ndarray, frames: np.ndarray) -> li
         open_live(frames), network, friction=None, same_object=False, sequence=False, smoothing_s=0.0,
         health=HealthMonitor, slip=None,
     )  # fmt: skip
-    reader.begin(sl.models.make_engine("eager", network, batch_size=1), reference)
+    reader.begin(sl.models.make_engine("torch", network, batch_size=1), reference)
     return [
         reader.read(LiveFrame(image=image, number=at, time_s=at / 30, captured_s=0.0))
         for at, image in enumerate(frames)
@@ -58,7 +58,7 @@ def withheld_by(network: Network, reference: np.ndarray, frames: np.ndarray, *, 
             any(check.name == "direction" and not check.ok for check in reading.health) and reading.margin is None
             for reading in read_live(network, reference, frames)
         ]
-    table = sl.predict(network, frames, reference=reference, engine="eager").frame()
+    table = sl.predict(network, frames, reference=reference, engine="torch").frame()
     hidden = [reason is not None for reason in table["withheld"].to_pylist()]
     assert [margin is None for margin in table["prediction"].to_pylist()] == hidden
     return hidden
@@ -93,10 +93,10 @@ def test_difference_images_hide_the_direction_and_a_note_says_so():
     reference, frames = turned_frames(270.0, "as it is", margins=(0.02,))
     compared = absolute_difference(frames, reference)
     limited = replace(network, manifest=replace(network.manifest, pull_direction_deg=(75.0, 105.0)))
-    told = [note for note in sl.predict(limited, compared, engine="eager").notes if "75 to 105 degrees" in note]
+    told = [note for note in sl.predict(limited, compared, engine="torch").notes if "75 to 105 degrees" in note]
     assert len(told) == 1
     everywhere = replace(network, manifest=replace(network.manifest, pull_direction_deg=FULL_CIRCLE))
-    assert not any("degrees" in note for note in sl.predict(everywhere, compared, engine="eager").notes)
+    assert not any("degrees" in note for note in sl.predict(everywhere, compared, engine="torch").notes)
 
 
 @pytest.mark.parametrize(("seat_deg", "fits"), [(90.0, True), (70.0, True), (0.0, False), (270.0, False), (None, True)])
@@ -105,7 +105,7 @@ def test_a_profile_that_sits_otherwise_is_told_once_where_it_is_opened(
 ):
     profile = SensorProfile(name="chromatouch-9", pull_direction_deg=seat_deg)
     reference, frames = turned_frames(90.0, "as it is", margins=(0.5,))
-    notes = sl.predict(pulled_down, frames, reference=reference, sensor=profile, engine="eager").notes
+    notes = sl.predict(pulled_down, frames, reference=reference, sensor=profile, engine="torch").notes
     doubts = sl.LiveReader(frames, pulled_down, reference=reference, sensor=profile).doubts
     for told in (notes, doubts):
         assert sum("chromatouch-9" in sentence and "75 to 105" in sentence for sentence in told) == (not fits)

@@ -1,241 +1,160 @@
-"""Engines: all answer alike, and say why where they cannot."""
+"""Engines: each predicts the same as the network itself, or is not used."""
 
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from threading import Thread
 
 import numpy as np
 import pytest
 import torch
-from there import there
 from torch import Tensor, nn
-from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
-from sliplens.models import Manifest, Network, load
-from sliplens.models.backbones import Answers, HistogramRegressor, answer_names
-from sliplens.models.engines import ENGINES, fold_batch_norm, make_engine
+from sliplens.models import Network, load
+from sliplens.models.backbones import answer_names
+from sliplens.models.engines import ENGINES, Engine, expecting, make_engine, prepare
 from sliplens.models.novelty import read_features
-from sliplens.models.onnx import export_onnx
 
 ATOL = 1e-4  # float32 sums in another order, through some 60 layers
 
 
-def skip_without(name: str) -> None:
-    obstacle = ENGINES[name].obstacle(torch.device("cpu"))
-    if obstacle:
-        pytest.skip(obstacle)
+@pytest.fixture(params=ENGINES)
+def name(request: pytest.FixtureRequest) -> str:
+    if request.param == "openvino":
+        pytest.importorskip("openvino")
+    return request.param
 
 
-def small_network(*, head: str) -> Network:
-    """Seconds to compile: a convolution, batch normalisation and a linear layer."""
+@pytest.fixture
+def tiny() -> nn.Module:
+    """A convolution, batch normalisation and a linear layer: milliseconds to convert."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        outputs = 60 if head == "histogram" else 1
-        model = nn.Sequential(
-            nn.Conv2d(3, 4, 3),
-            nn.BatchNorm2d(4, momentum=None),
-            nn.ReLU(),
-            nn.AdaptiveAvgPool2d(1),
-            nn.Flatten(),
-            nn.Linear(4, outputs),
-        )
-        model.train()(functional.interpolate(torch.rand(16, 3, 4, 4) ** 2, size=(32, 32), mode="bilinear"))
-        torch.nn.init.normal_(model[-1].get_parameter("weight"), std=10)
-    whole = HistogramRegressor(model) if head == "histogram" else model
-    manifest = Manifest(backbone="small", input="raw", image_size=32, frame_size=(32, 32), sensor="", data_hash="")
-    return Network(model=whole.eval(), manifest=manifest)
+        layers = (nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten())
+        return nn.Sequential(*layers, nn.Linear(4, 1)).eval().requires_grad_(requires_grad=False)
 
 
-def assert_alike(name: str, trained: Network, images: Tensor, *, onnx_file: Path | None = None) -> None:
-    engine, eager = make_engine(name, trained, onnx_file=onnx_file), make_engine("eager", trained)
-    assert eager.estimate(trained, images).margin.std() > 100 * ATOL  # else nothing would be shown
-    for batch in (images, images[:1], torch.cat([images] * 4)):
-        found, expected = engine.estimate(trained, batch), eager.estimate(trained, batch)
-        np.testing.assert_allclose(found.margin, expected.margin, atol=ATOL, rtol=ATOL)
-        assert found.calibration == expected.calibration
-        if expected.probabilities is None:
-            assert found.probabilities is None
-            continue
-        np.testing.assert_allclose(there(found.probabilities), expected.probabilities, atol=ATOL)
-        np.testing.assert_array_equal(found.edges, expected.edges)
-
-
-@pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
-def test_eager_answers_as_the_network(head: str, networks: dict[str, Network], images: Tensor):
-    found = make_engine("eager", networks[head]).estimate(networks[head], images)
-    expected = networks[head].estimate(images)
-    # the same operations on the same numbers
-    np.testing.assert_allclose(found.margin, expected.margin, atol=1e-6)
-    if head == "histogram":
-        np.testing.assert_allclose(there(found.sigma), there(expected.sigma), atol=1e-6)
-
-
-@pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
-def test_folded_answers_as_eager(head: str, networks: dict[str, Network], images: Tensor):
-    assert_alike("folded", networks[head], images)
-
-
-@pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
-@pytest.mark.parametrize("name", ["onnxruntime", "openvino"])
-def test_engines_of_onnx_files_answer_as_eager(
-    name: str, head: str, networks: dict[str, Network], onnx_files: dict[str, Path], images: Tensor
-):
-    skip_without(name)
-    assert_alike(name, networks[head], images, onnx_file=onnx_files[head])
-
-
-@pytest.mark.parametrize("name", ["onnxruntime", "openvino"])
-def test_without_a_file_the_network_is_exported_on_the_fly(name: str, images: Tensor):
-    skip_without(name)
-    assert_alike(name, small_network(head="histogram"), images)
-
-
-def test_compiled_answers_as_eager(images: Tensor):
-    skip_without("compiled")
-    assert_alike("compiled", small_network(head="histogram"), images)
-
-
-def test_answers_of_a_call_outlive_the_next(networks: dict[str, Network], onnx_files: dict[str, Path], images):
-    for name in ("onnxruntime", "openvino"):
-        skip_without(name)
-        engine = make_engine(name, networks["histogram"], onnx_file=onnx_files["histogram"])
-        first = engine.estimate(networks["histogram"], images)
-        before = first.margin.copy()
-        engine.estimate(networks["histogram"], torch.zeros_like(images))
-        np.testing.assert_array_equal(first.margin, before)
-
-
-def test_folding_leaves_no_batch_normalisation_and_the_network_as_it_was(networks: dict[str, Network]):
-    for trained in networks.values():
-        before = {name: value.clone() for name, value in trained.model.state_dict().items()}
-        folded = fold_batch_norm(trained.model)
-        assert not [one for one in folded.modules() if isinstance(one, nn.BatchNorm2d)]
-        assert [one for one in trained.model.modules() if isinstance(one, nn.BatchNorm2d)]
-        for name, value in trained.model.state_dict().items():
-            assert torch.equal(value, before[name])
-
-
-def test_features_come_with_the_answers_by_every_engine():
-    trained = load("chromatouch-pair")
-    novelty = there(trained.novelty)
-    images = torch.rand(5, 6, 112, 112, generator=torch.Generator().manual_seed(0))
-    features = read_features(trained.model, novelty.layer, images)
-    folded = fold_batch_norm(Answers(trained.model, novelty.layer))
-    assert not [one for one in folded.get_submodule("watched").modules() if isinstance(one, nn.BatchNorm2d)]
-    for name in ("eager", "folded", "onnxruntime", "openvino"):
-        if ENGINES[name].obstacle(torch.device("cpu")) is None:
-            [answers] = make_engine(name, trained, batch_size=8).answers([images])
-            assert len(answers) == len(answer_names(trained.model, novelty.layer)) == 4
-            np.testing.assert_allclose(answers[-1], features, atol=ATOL)
-
-
-def test_a_network_that_cannot_be_traced_is_run_as_it_is(images: Tensor):
-    class Branches(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.inner = small_network(head="point").model
-
-        def forward(self, images: Tensor) -> Tensor:
-            return self.inner(images) if images.sum() > 0 else self.inner(-images)
-
-    model = Branches().eval()
+def make(model: nn.Module, images: Tensor, *, engine: str = "auto", passes: int = 10_000) -> Engine:
     with torch.no_grad():
-        assert torch.equal(fold_batch_norm(model)(images), model(images))
+        return prepare(model, images, model(images).flatten(), passes=passes, engine=engine, batch_size=2)
 
 
-def test_a_network_that_another_thread_runs_while_one_is_folded_answers_as_before(images: Tensor):
-    other, answers = small_network(head="point").model, []
-
-    class Meanwhile(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.inner = small_network(head="point").model
-
-        def forward(self, images: Tensor) -> Tensor:
-            elsewhere = Thread(target=lambda: answers.append(other(some)))  # no proxy: numbers of its own
-            elsewhere.start()
-            elsewhere.join()
-            return self.inner(images)
-
-    some = images
-    folded = fold_batch_norm(Meanwhile().eval())
-    torch.testing.assert_close(answers[0], other(images))
-    assert not [one for one in folded.modules() if isinstance(one, nn.BatchNorm2d)]
+@pytest.mark.parametrize("head", ["point", "histogram", "margin-and-ratio"])
+def test_an_engine_predicts_the_same_as_the_network(name: str, head: str, networks: dict[str, Network], images: Tensor):
+    network = networks[head]
+    engine = make_engine(name, network)
+    for batch in (images, images[:1], torch.cat([images] * 4)):
+        estimate, expected = engine.estimate(network, batch), network.estimate(batch)
+        np.testing.assert_allclose(estimate.margin, expected.margin, atol=ATOL, rtol=ATOL)
+        assert estimate.calibration == expected.calibration
+        assert (estimate.probabilities is None) == (expected.probabilities is None)
+        if estimate.probabilities is not None and expected.probabilities is not None:
+            np.testing.assert_allclose(estimate.probabilities, expected.probabilities, atol=ATOL)
+    assert network.estimate(images).margin.std() > 100 * ATOL  # else the comparison would show nothing
 
 
-def test_an_unknown_engine_is_refused(networks: dict[str, Network]):
-    with pytest.raises(InputError, match="no engine named 'tensorrt'; choose one of eager, folded, compiled,"):
+def test_predictions_come_in_the_order_of_the_batches(name: str, tiny: nn.Module, images: Tensor):
+    batches = [images[:2], images[1:3], images[:1], images[3:], images[2:3]]  # short ones among them
+    answers = list(make(tiny, images[:2], engine=name).run(iter(batches)))
+    assert [len(answer) for answer in answers] == [2, 2, 1, 2, 1]
+    with torch.no_grad():
+        expected = torch.cat([tiny(batch).flatten() for batch in batches])
+    torch.testing.assert_close(torch.cat(answers), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_predictions_outlive_the_next_call(name: str, networks: dict[str, Network], images: Tensor):
+    engine = make_engine(name, networks["histogram"])
+    first = engine.estimate(networks["histogram"], images)
+    before = first.margin.copy()
+    engine.estimate(networks["histogram"], torch.zeros_like(images))
+    np.testing.assert_array_equal(first.margin, before)
+
+
+def test_features_come_with_the_predictions(name: str):
+    network = load("chromatouch-pair")
+    assert network.novelty is not None
+    images = torch.rand(5, 6, 112, 112, generator=torch.Generator().manual_seed(0))
+    features = read_features(network.model, network.novelty.layer, images)
+    [answers] = make_engine(name, network, batch_size=8).answers([images])
+    assert len(answers) == len(answer_names(network.model, network.feature_layer)) == 4
+    np.testing.assert_allclose(answers[-1], features, atol=ATOL)
+
+
+def test_auto_takes_openvino_where_its_conversion_pays(tiny: nn.Module, images: Tensor, monkeypatch):
+    pytest.importorskip("openvino")
+    assert make(tiny, images, passes=100).name == "torch"
+    assert make(tiny, images, passes=100_000).name == "openvino"
+    # a choice depends on the call alone, not on earlier ones
+    assert make(tiny, images, passes=100).name == "torch"
+    with expecting(100_000):
+        assert make(tiny, images, passes=100).name == "openvino"
+    monkeypatch.setattr("sliplens.extras.find_spec", lambda _: None)
+    assert make(tiny, images, passes=100_000).name == "torch"
+
+
+def test_new_weights_are_converted_anew(tiny: nn.Module, images: Tensor):
+    pytest.importorskip("openvino")
+    make(tiny, images, engine="openvino")
+    tiny[-1].get_parameter("weight").mul_(-1)
+    answers = torch.cat(list(make(tiny, images, engine="openvino").run(images.split(2))))
+    torch.testing.assert_close(answers, tiny(images).flatten(), atol=1e-5, rtol=1e-5)
+
+
+class Branches(nn.Module):
+    """A network whose graph depends on its input: a trace keeps the branch of the example, all zeros."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maps = nn.Conv2d(3, 4, 3, stride=2)
+
+    def forward(self, images: Tensor) -> Tensor:
+        features = self.maps(images).mean(dim=(1, 2, 3))
+        return 2 * features if float(images.sum()) > 0 else features
+
+
+def test_an_engine_with_other_predictions_is_not_used(images: Tensor):
+    pytest.importorskip("openvino")
+    assert make(Branches(), images).name == "torch"
+    with pytest.raises(ModelError, match=r"openvino cannot run Branches \(its predictions differ by .*; choose torch"):
+        make(Branches(), images, engine="openvino")
+
+
+def with_hook(model: nn.Module) -> nn.Module:
+    model.register_forward_hook(lambda _module, _arguments, output: 2 * output)
+    return model
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_hook, "the model has hooks.*; remove them, or choose torch"),
+        (nn.Module.double, r"it runs float32, not torch\.float64; choose torch"),
+    ],
+)
+def test_openvino_says_why_it_cannot_run_a_network(
+    change: Callable[[nn.Module], nn.Module], message: str, tiny: nn.Module, images: Tensor
+):
+    model = change(tiny)
+    some = images.to(next(model.parameters()).dtype)
+    with pytest.raises(InputError, match=f"the engine openvino cannot be used: {message}"):
+        make(model, some, engine="openvino")
+    assert make(model, some).name == "torch"
+
+
+def test_an_engine_that_is_not_there_is_refused_with_the_cure(networks: dict[str, Network], monkeypatch):
+    with pytest.raises(InputError, match="no engine named 'tensorrt'; choose one of auto, torch, openvino"):
         make_engine("tensorrt", networks["point"])
-
-
-def test_a_missing_package_is_told(networks: dict[str, Network], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("sliplens.extras.find_spec", lambda name: None if name == "openvino" else name)
     with pytest.raises(InputError, match=r"needs openvino, which is not .* `pip install \"sliplens\[openvino\]\"`"):
         make_engine("openvino", networks["point"])
 
 
-def test_a_missing_compiler_is_told(networks: dict[str, Network], monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv("PATH", "")
-    monkeypatch.delenv("CXX", raising=False)
-    with pytest.raises(InputError, match="needs a C\\+\\+ compiler and there is none"):
-        make_engine("compiled", networks["point"])
-
-
-def test_a_file_of_another_network_is_refused(networks: dict[str, Network], onnx_files: dict[str, Path]):
-    with pytest.raises(InputError, match="holds another network"):
-        make_engine("onnxruntime", networks["point"], onnx_file=onnx_files["histogram"])
-
-
-def test_a_file_that_tells_less_than_the_network_is_refused(tmp_path: Path):
-    onnx = pytest.importorskip("onnx")
-    trained = load("chromatouch-pair")
-    model = onnx.load(export_onnx(trained, tmp_path / "a.onnx"))
-    assert [one.name for one in model.graph.output] == ["margin", "probabilities", "ratio_probabilities", "features"]
-    del model.graph.output[-1]
-    onnx.save(model, tmp_path / "b.onnx")
-    with pytest.raises(InputError, match=r"b\.onnx does not tell features, as an older export; export the run again$"):
-        make_engine("onnxruntime", trained, onnx_file=tmp_path / "b.onnx")
-
-
-def test_a_damaged_file_is_told(networks: dict[str, Network], onnx_files: dict[str, Path], tmp_path: Path):
-    onnx = pytest.importorskip("onnx")
-    model = onnx.load(onnx_files["point"])
-    del model.graph.node[3]
-    onnx.save(model, tmp_path / "a.onnx")
-    for name in ("onnxruntime", "openvino"):
-        skip_without(name)
-        with pytest.raises(ModelError, match=r"cannot run ShuffleNetV2 .*; export .*a\.onnx again$"):
-            make_engine(name, networks["point"], onnx_file=tmp_path / "a.onnx")
-
-
-def test_the_fastest_engine_is_that_which_pays(monkeypatch: pytest.MonkeyPatch):
-    hidden: set[str] = set()
-    monkeypatch.setattr("sliplens.extras.find_spec", lambda name: None if name in hidden else name)
-
-    def chosen(frames: int) -> str:
-        return make_engine("auto", small_network(head="point"), frames=frames).name
-
-    assert chosen(10) == "eager"
-    # a conversion takes longer than to predict a few frames
-    assert chosen(1000) == "folded"
-    assert chosen(100_000) == "openvino"
-    hidden.add("openvino")
-    assert chosen(100_000) == "onnxruntime"
-    hidden.add("onnxscript")
-    assert chosen(100_000) == "folded"
-
-
-def test_a_file_that_was_made_before_pays_at_once(networks: dict[str, Network], onnx_files: dict[str, Path]):
-    skip_without("openvino")
-    assert make_engine("auto", networks["point"], frames=1, onnx_file=onnx_files["point"]).name == "openvino"
-
-
 def test_nothing_is_reported_to_anybody(tmp_path: Path):
     """Both libraries keep an identifier below the home folder when they report."""
-    skip_without("openvino")
+    pytest.importorskip("openvino")
+    pytest.importorskip("onnxruntime")
     code = (
         "import sys, os, socket\n"
         "def refuse(*_): raise SystemExit('somebody was called')\n"
@@ -252,23 +171,3 @@ def test_nothing_is_reported_to_anybody(tmp_path: Path):
     done = subprocess.run([sys.executable, "-c", code], check=False, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert not list(tmp_path.rglob("*"))
-
-
-def test_frames_that_were_read_before_choose_no_engine():
-    trained = small_network(head="histogram")
-    assert [make_engine("auto", trained, frames=40).name for _ in range(4)] == ["eager"] * 4
-
-
-def test_folded_gives_the_same_bits_on_any_number_of_threads():
-    trained = load("chromatouch-difference")  # small ones have no layer whose sums threads would share
-    images = torch.rand(19, 3, 224, 224, generator=torch.Generator().manual_seed(0))
-    before, found = torch.get_num_threads(), []
-    try:
-        for threads in (1, 2, 3):
-            torch.set_num_threads(threads)
-            engine = make_engine("folded", trained, batch_size=8)
-            found.append(engine.estimate(trained, images).margin.tobytes())
-            assert torch.get_num_threads() == threads
-    finally:
-        torch.set_num_threads(before)
-    assert found[1:] == found[:1] * 2

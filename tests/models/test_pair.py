@@ -93,7 +93,7 @@ def test_from_training_to_an_explanation(small_dataset: Dataset, raw_run: Path, 
         # the untouched sensor, twice
         empty = again.predict(again.encode(reference[None], reference))
         torch.testing.assert_close(explanation.reference_prediction, empty.expand(2), atol=1e-5, rtol=0)
-    with sl.LiveReader(frames, again, reference=reference, engine="folded", health=None, slip=None) as reader:
+    with sl.LiveReader(frames, again, reference=reference, engine="torch", health=None, slip=None) as reader:
         *_, last = reader.readings()
     assert last.margin == pytest.approx(np.clip(own[-1], 0, 1), abs=1e-4)
 

@@ -53,7 +53,7 @@ def wet(small_dataset: Dataset) -> Recording:
 
 
 def predict(source: Path, trained: Network, path: Path, *, batch_size: int = 5, **options: object) -> dict[str, list]:
-    predict_source(trained, source, out=path, batch_size=batch_size, engine="eager", **options)  # pyright: ignore
+    predict_source(trained, source, out=path, batch_size=batch_size, engine="torch", **options)  # pyright: ignore
     return pq.read_table(path).to_pydict()
 
 
@@ -126,7 +126,7 @@ def test_how_far_the_network_knows_each_frame_is_told(trials: dict[str, Recordin
     trial, network = trials["chromatouch"], sl.load("chromatouch-difference")
     bright = np.clip(trial.frames[20:22] * 1.5, 0, 255).astype(np.uint8)
     frames = np.concatenate([trial.frames[18:23], bright])
-    predictions = sl.predict(network, frames, reference=trial.reference, engine="folded", batch_size=3)
+    predictions = sl.predict(network, frames, reference=trial.reference, engine="torch", batch_size=3)
     estimate = network.estimate(network.encode(frames, trial.reference))
     assert estimate.known is not None
     np.testing.assert_allclose(predictions.frame()["known"].to_numpy(), estimate.known, atol=1e-3)
@@ -324,7 +324,7 @@ def test_a_source_that_fails_leaves_what_was_there(trained: Network, wet: Record
     path = tmp_path / "a.parquet"
     path.write_text("the last good one")
     with pytest.raises(RecordingError, match="the disk is gone"):
-        predict_source(trained, [trial], out=path, overwrite=True, engine="eager", batch_size=4)
+        predict_source(trained, [trial], out=path, overwrite=True, engine="torch", batch_size=4)
     assert path.read_text() == "the last good one"
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -351,7 +351,7 @@ def test_only_one_batch_of_frames_is_held(trained: Network, wet: Recording, tmp_
         trained,
         [trial],
         out=tmp_path / "a.parquet",
-        engine="eager",
+        engine="torch",
         batch_size=4,
         on_progress=lambda done, total: seen.append((done, total)),
     )
@@ -400,7 +400,7 @@ def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_the
     def write(path: Path, **options: object) -> Predictions:
         return predict_source(trained, small_dataset.folder, out=path, **own, **options)  # pyright: ignore
 
-    own: dict[str, Any] = {"split": "test", "engine": "eager"}
+    own: dict[str, Any] = {"split": "test", "engine": "torch"}
     serial, others = write(tmp_path / "a.parquet"), write(tmp_path / "b.parquet", on=elsewhere)
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
     folder = write(tmp_path / "set")
@@ -410,7 +410,7 @@ def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_the
         "trial=test-dry-6",
         f"trial={TRIAL}",
     ]
-    refused(small_dataset.folder, trained, InputError, "other settings", out=tmp_path / "set", engine="folded")
+    refused(small_dataset.folder, trained, InputError, "other settings", out=tmp_path / "set", engine="torch")
     same = [replace(info, sha256="0" * 64) for info in small_dataset.trials]  # frames that changed
     with pytest.raises(InputError, match="other settings"):
         predict_source(trained, replace(small_dataset, trials=tuple(same)), out=tmp_path / "set", **own)
@@ -424,7 +424,7 @@ def test_a_damaged_trial_does_not_lose_the_others(trained: Network, small_datase
     shutil.copytree(small_dataset.folder, data)
     good = trial_path(data, TRIAL).read_bytes()
     trial_path(data, TRIAL).write_bytes(good[:-100])
-    own: dict[str, Any] = {"split": "test", "engine": "eager", "out": tmp_path / "set"}
+    own: dict[str, Any] = {"split": "test", "engine": "torch", "out": tmp_path / "set"}
     with pytest.raises(ShardError, match=f"1 of 2 could not be done.*--retry-failed:\n  {TRIAL}: .*{TRIAL}"):
         predict_source(trained, data, **own)
     assert not (tmp_path / "set").exists()

@@ -240,7 +240,7 @@ def test_frames_that_come_too_seldom_are_refused(run: Network, small_dataset: Da
     with pytest.raises(InputError, match=r"the trial test-\S+ has a frame each 1 s"):
         evaluate_frames(run, replace(frames, time_s=30 * frames.time_s), sequence=True)
     slow, reference = SourceOptions(rate_hz=1.0), small_dataset.load(trials[0]).reference
-    reader = sl.LiveReader(seldom, run, options=slow, reference=reference, sequence=True, engine="eager")
+    reader = sl.LiveReader(seldom, run, options=slow, reference=reference, sequence=True, engine="torch")
     with pytest.raises(InputError, match="has a frame each 1 s"), reader:
         pass
 

@@ -64,7 +64,7 @@ class Hold(Command):
     """Folder to keep what was told, measured and read in; its steps.parquet has a row a command."""
     json: bool = False
     """Print a line of JSON a command, with all that was read; else a line a second is printed."""
-    engine: Literal["auto", "eager", "folded", "compiled", "onnxruntime", "openvino"] = "auto"
+    engine: Literal["auto", "torch", "openvino"] = "auto"
     """What runs the network; auto is the fastest at hand."""
     device: Device = "cpu"
 

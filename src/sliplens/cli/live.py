@@ -74,7 +74,7 @@ class Live:
     """dry or wet, for the recording."""
     day: int = 1
     """Day of the recording."""
-    engine: Literal["auto", "eager", "folded", "compiled", "onnxruntime", "openvino"] = "auto"
+    engine: Literal["auto", "torch", "openvino"] = "auto"
     """What runs the network; auto is the fastest at hand."""
     device: Device = "cpu"
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -46,10 +46,8 @@ class Predict(SourceCommand):
     memory at once; the rows of the table are, when they are shown at the end."""
     plot: Annotated[Path | None, tyro.conf.arg(metavar="FILE.png")] = None
     """Picture to draw: margin with its interval over time, and label and forces where they are known."""
-    engine: str = "auto"
-    """What runs the network: eager, folded, compiled, onnxruntime or openvino; auto takes the fastest at hand."""
-    onnx: Annotated[Path | None, tyro.conf.arg(metavar="FILE.onnx")] = None
-    """The network as `sliplens export` wrote it; without it onnxruntime and openvino convert the network first."""
+    engine: Literal["auto", "torch", "openvino"] = "auto"
+    """Library that runs the network; auto takes OpenVINO where it is installed and the frames are many."""
     friction: Friction = None
     sequence: InOrder = False
     batch_size: int = 8
@@ -87,7 +85,7 @@ class Predict(SourceCommand):
 
         assert self.source is not None  # see above
         run, source = (self.source, None) if self.model is None else (self.model, self.source)
-        named = {"run": run, "source": source, "options": self.options, "onnx_file": self.onnx, "out": self.output}
+        named = {"run": run, "source": source, "options": self.options, "out": self.output}
         predictions = self.call(predict, **named)
         predictions = replace(predictions, rows=predictions.frame())  # a file is read back once
         _show(predictions)

@@ -209,8 +209,8 @@ class Attribution:
     """The map layer by layer, fine to coarse, where the method has levels and was asked to keep them."""
     approximations: tuple[Approximation, ...] = ()
     """For each image what its map has in common with the exact one; empty where the map is exact."""
-    engine: str = "eager"
-    """What ran the network: as it is (`eager`), or a faster engine of `models.engines` that answers as it does."""
+    engine: str = "torch"
+    """Engine that ran the network, one of `models.engines.ENGINES`."""
     raises_only: bool = False
     """Whether the method tells only what raises the prediction, as a published map with a ReLU does of f itself."""
 

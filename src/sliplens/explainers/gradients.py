@@ -12,9 +12,9 @@ from torch import Tensor, fx, nn
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import Attribution, check_slopes, frame_of, with_reference_of
 from sliplens.explainers.contract import Comparison, Method, black_frames, freeze, require_at_least_one
+from sliplens.explainers.folding import fold_batch_norm
 from sliplens.extras import require_packages
 from sliplens.models.backbones import HistogramRegressor
-from sliplens.models.engines import fold_batch_norm
 from sliplens.progress import OnProgress
 
 _NODES = 4  # of a piece; the slope along the path has kinks, on which more nodes to a piece are wasted

@@ -205,7 +205,7 @@ class Faithfulness:
 def _made_ready(predict: Predict, batch_size: int) -> Engine:
     if isinstance(predict, Engine):
         return predict
-    return Engine(name="eager", batch_size=batch_size, answers=lambda batches: ((predict(batch),) for batch in batches))
+    return Engine(name="torch", batch_size=batch_size, answers=lambda batches: ((predict(batch),) for batch in batches))
 
 
 def _answer(

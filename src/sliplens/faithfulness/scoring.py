@@ -29,7 +29,7 @@ from sliplens.faithfulness.removal import (
 )
 from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
-from sliplens.models.engines import Engine, counting_passes, prepare
+from sliplens.models.engines import Engine, prepare
 from sliplens.progress import OnProgress
 from sliplens.results.explanation import require_saliency
 
@@ -404,8 +404,7 @@ def score_by_deletion(
 def prepare_passes(trained: Network, inputs: Float[Tensor, "images colours size size"], passes: int) -> Engine:
     """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
     some = inputs[:_CHECKED_IMAGES].to(trained.device)
-    with counting_passes():
-        return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
+    return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
 
 
 def _influence(

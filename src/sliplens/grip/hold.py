@@ -137,7 +137,7 @@ def hold_grip(
     Examples
     --------
     >>> import sliplens as sl
-    >>> with sl.LiveReader("simulated", "chromatouch-pair", engine="eager") as reader:
+    >>> with sl.LiveReader("simulated", "chromatouch-pair", engine="torch") as reader:
     ...     hold = sl.hold_grip(reader, "dry-run", ceiling_n=3.0, seconds=0.2)
     >>> bool((hold.steps.command_n >= 2).all())  # lifted with 2 N, whatever is read
     True

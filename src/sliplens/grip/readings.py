@@ -117,7 +117,7 @@ def measure_readings(
     fingertips
         How many, an even number; each has a seed of its own, counted from `seed`.
     engine
-        Row of `ENGINES`.
+        `auto`, `torch` or `openvino`.
 
     Raises
     ------

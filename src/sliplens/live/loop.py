@@ -129,7 +129,7 @@ class LiveReader:
         Whether what the frames of a contact so far tell counts too, as `predict` takes it. Health and markers tell when
         a contact ends: without both, all frames count as one.
     engine
-        Row of `ENGINES`; `auto` for the fastest at hand that pays for `seconds`, or for hours where that is None, and
+        `torch`, `openvino`, or `auto` for OpenVINO where it pays for `seconds`, or for hours where that is None, and
         that may take seconds to be made.
     device
         Device of a network that is loaded here: cpu or cuda.
@@ -160,7 +160,7 @@ class LiveReader:
     >>> import numpy as np
     >>> import sliplens as sl
     >>> frames = np.full((20, 224, 224, 3), 128, dtype=np.uint8)
-    >>> with sl.LiveReader(frames, "chromatouch-pair", reference=frames[0], engine="eager") as reader:
+    >>> with sl.LiveReader(frames, "chromatouch-pair", reference=frames[0], engine="torch") as reader:
     ...     readings = list(reader.readings())
     >>> readings[-1].number
     19

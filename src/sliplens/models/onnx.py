@@ -1,4 +1,4 @@
-"""ONNX files: the network alone, all that is needed to feed it in the metadata, checked before it appears."""
+"""Export of a network as an ONNX file, with its encoding in the metadata, checked before it appears."""
 
 import json
 import warnings
@@ -6,15 +6,15 @@ from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from sliplens._version import __version__
-from sliplens.errors import InputError, ModelError
+from sliplens.errors import ModelError
 from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
 from sliplens.files import require_new_file, to_builtins, whole_file
 from sliplens.models.backbones import Answers, answer_names, bin_edges, ratio_edges
@@ -28,13 +28,12 @@ INPUT = "image"
 OPSET = 18
 """Version of the file's operators: the oldest that torch writes without converting, read by ONNX Runtime from 1.14."""
 TOLERANCE = 1e-4
-"""Largest difference of an engine's answer from the network's own, times its size where that is above 1.
+"""Largest difference of an engine's prediction from the network's own, times its size where that is above 1.
 
 Float32 sums in another order move the answers of trained networks by 1e-7 to 1e-6, and those of networks with large
 weights by 4e-5, which is as far as the network itself is from exact sums. What is wrong moves them by 1e-3 or more: a
 kernel, bfloat16, a batch normalisation left out.
 """
-MANIFEST, INPUT_NOTES, OUTPUT_NOTES = "sliplens.manifest", "sliplens.input", "sliplens.output"
 _COMPARED = {
     "difference": "|T_n - T_0|",
     "amplitude": "|T_n - T_0|",
@@ -45,13 +44,13 @@ _COMPARED = {
 
 
 def export_onnx(run: Network | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
-    """Write a network as an ONNX file, which appears once ONNX Runtime gives the same answers as the network.
+    """Write a network as an ONNX file, which appears once ONNX Runtime predicts the same as the network.
 
     Input `image` is float32 (batch, 3, size, size), of a `pair` network (batch, 6, size, size), encoded and normalised;
     outputs are `margin` (batch,), for a histogram `probabilities` (batch, bins), `ratio_probabilities` of a network
-    that tells F_t / F_n, and `features` (batch, channels) of one that tells how far it knows a frame (`Novelty`). The
-    batch may be of any size. Properties of the model, as JSON: `sliplens.manifest`,
-    `sliplens.input` (how frames become an input) and `sliplens.output` (edges of the bins).
+    that predicts F_t / F_n, and `features` (batch, channels) of a network with a `Novelty`. The batch may be of any
+    size. Properties of the model, as JSON: `sliplens.manifest`, `sliplens.input` (how frames become an input) and
+    `sliplens.output` (edges of the bins).
 
     Parameters
     ----------
@@ -59,55 +58,51 @@ def export_onnx(run: Network | Path | str, out: Path | str, *, overwrite: bool =
         The network, its folder, or the name of one that comes with sliplens.
     out
         File to write; its name ends in `.onnx`.
+    overwrite
+        If True, replace a file of that name.
 
     Raises
     ------
     InputError
         If a package or the run is missing, or the file exists or has another suffix.
     ModelError
-        If torch cannot export the network, or an answer differs by more than `TOLERANCE`.
+        If torch cannot export the network, or a prediction differs by more than `TOLERANCE`.
     """
     path = Path(out)
     require_new_file(path, suffix=".onnx", overwrite=overwrite)
     require_packages(*ONNX_PACKAGES, extra="onnx", purpose="an ONNX file")
-    trained = open_run(run)
-    size = trained.manifest.image_size
-    images = torch.zeros(1, trained.encoding.colours, size, size)
-    proto = convert_network(trained.model, images, layer=trained.feature_layer)
-    _describe(proto, trained)
+    network = open_run(run)
+    proto = _convert(network)
+    _describe(proto, network)
     with whole_file(path) as part:
         part.write_bytes(proto.SerializeToString())
-        check_parity(part, trained)
+        _check_parity(part, network)
     return path
 
 
-def convert_network(
-    model: nn.Module, images: Float[Tensor, "batch colours height width"], *, layer: str | None = None
-) -> "ModelProto":
-    """A network as ONNX holds it: input `image`, outputs named by `answer_names`, a batch of any size.
-
-    `model`: in evaluation mode, one number an image; it stays as it is. `layer`: as `Answers` takes it.
-    """
-    copied = deepcopy(model).to("cpu", memory_format=torch.contiguous_format)  # pyright: ignore[reportCallIssue]
+def _convert(network: Network) -> "ModelProto":
+    """Convert a network to ONNX: input `image`, outputs named by `answer_names`, a batch of any size."""
+    copied = deepcopy(network.model).to("cpu", memory_format=torch.contiguous_format)  # pyright: ignore[reportCallIssue]
+    size = network.manifest.image_size
     # two images: torch takes a batch of one for a constant
-    example = torch.zeros(2, *images.shape[1:])
+    example = torch.zeros(2, network.encoding.colours, size, size)
     with warnings.catch_warnings():
         # of torch about its own parts; what counts is checked afterwards
         warnings.simplefilter("ignore")
         try:
             program = torch.onnx.export(
-                Answers(copied, layer).eval(),
+                Answers(copied, network.feature_layer).eval(),
                 (example,),
                 dynamo=True,
                 input_names=[INPUT],
-                output_names=list(answer_names(model, layer)),
+                output_names=list(answer_names(network.model, network.feature_layer)),
                 dynamic_shapes={INPUT: {0: torch.export.Dim("batch", min=1)}},
                 opset_version=OPSET,
                 external_data=False,
                 verbose=False,
             )
         except (torch.onnx.OnnxExporterError, RuntimeError, ValueError, TypeError) as error:
-            reason = next(iter(str(error).strip().splitlines()), "no reason told")
+            reason = next(iter(str(error).strip().splitlines()), "no reason given")
             raise ModelError(
                 f"torch {torch.__version__} cannot export the network ({reason}); train another backbone"
             ) from None
@@ -116,18 +111,18 @@ def convert_network(
     return program.model_proto
 
 
-def _describe(proto: "ModelProto", trained: Network) -> None:
+def _describe(proto: "ModelProto", network: Network) -> None:
     # torch notes where in whose source files each node was made
     values = (*proto.graph.input, *proto.graph.output, *proto.graph.value_info, *proto.graph.initializer)
     for part in (proto, proto.graph, *proto.graph.node, *values):
         del part.metadata_props[:]
         part.doc_string = ""
     proto.producer_name, proto.producer_version = "sliplens", __version__
-    manifest, encoding = trained.manifest, trained.encoding
-    edges, of_ratio = bin_edges(trained.model), ratio_edges(trained.model)
-    properties: dict[str, Any] = {
-        MANIFEST: asdict(manifest),
-        INPUT_NOTES: {
+    manifest, encoding = network.manifest, network.encoding
+    edges, of_ratio = bin_edges(network.model), ratio_edges(network.model)
+    properties = {
+        "sliplens.manifest": asdict(manifest),
+        "sliplens.input": {
             "encoding": encoding.name,
             "frame_size": manifest.frame_size,
             "channels": "RGB" * (encoding.colours // 3),
@@ -137,7 +132,7 @@ def _describe(proto: "ModelProto", trained: Network) -> None:
             "scale": "the image's own maximum, at least 1" if encoding.own_maximum else "255",
             "neutral": encoding.neutral,
         },
-        OUTPUT_NOTES: {
+        "sliplens.output": {
             "margin": "safety margin; 1 full stick, 0 onset of full slip; not clipped",
             "bin_edges": None if edges is None else edges.tolist(),
             "ratio_bin_edges": None if of_ratio is None else of_ratio.tolist(),
@@ -148,16 +143,16 @@ def _describe(proto: "ModelProto", trained: Network) -> None:
 
 
 @torch.no_grad()
-def check_parity(path: Path, trained: Network) -> None:
-    """Check that ONNX Runtime answers as the network does, on black, white and noise, alone and in a batch."""
-    runtime, network = import_onnxruntime(), Answers(trained.model, trained.feature_layer)
-    names, differences = list(answer_names(trained.model, trained.feature_layer)), []
+def _check_parity(path: Path, network: Network) -> None:
+    """Check that ONNX Runtime predicts the same as the network, on black, white and noise, alone and in a batch."""
+    runtime, answers = import_onnxruntime(), Answers(network.model, network.feature_layer)
+    names, differences = list(answer_names(network.model, network.feature_layer)), []
     try:
         session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-        for inputs in trial_inputs(trained):
-            expected = network(inputs.to(trained.device))
-            for found, answer in zip(session.run(names, {INPUT: inputs.numpy()}), expected, strict=True):
-                differences.append(difference(found, answer.cpu().numpy()))
+        for inputs in trial_inputs(network):
+            expected = answers(inputs.to(network.device))
+            for output, answer in zip(session.run(names, {INPUT: inputs.numpy()}), expected, strict=True):
+                differences.append(difference(output, answer.cpu().numpy()))
     except Exception as error:  # its errors have no other base
         reason = str(error).splitlines()[0]
         raise ModelError(
@@ -167,42 +162,20 @@ def check_parity(path: Path, trained: Network) -> None:
     worst = max(differences, key=lambda value: float("inf") if np.isnan(value) else value)
     if not worst <= TOLERANCE:  # a NaN is not
         raise ModelError(
-            f"the exported network answers {worst:.2g} off the trained one, {TOLERANCE:g} is allowed; "
+            f"the exported network's predictions differ by {worst:.2g}, {TOLERANCE:g} is allowed; "
             "nothing was written, export it with other versions of torch and onnxscript"
         )
 
 
-def difference(found: np.ndarray, expected: np.ndarray) -> float:
-    """Largest difference between answers, divided by the answer's size where that is above 1; NaN if shapes differ."""
-    if found.shape != expected.shape:
+def difference(values: np.ndarray, expected: np.ndarray) -> float:
+    """Return the largest difference, divided by the expected size where that is above 1; NaN if shapes differ."""
+    if values.shape != expected.shape:
         return float("nan")
-    return float(np.max(np.abs(found - expected) / np.maximum(np.abs(expected), 1)))
+    return float(np.max(np.abs(values - expected) / np.maximum(np.abs(expected), 1)))
 
 
-def trial_inputs(trained: Network) -> Iterator[Float[Tensor, "batch colours size size"]]:
-    """Inputs that a network and its copies are compared on: black, white and noise, alone and in a batch."""
-    generator, size = torch.Generator().manual_seed(0), trained.manifest.image_size
-    for shape in ((count, trained.encoding.colours, size, size) for count in (1, 7)):
+def trial_inputs(network: Network) -> Iterator[Float[Tensor, "batch colours size size"]]:
+    """Make the inputs that a network and its copies are compared on: black, white, noise; alone and in a batch."""
+    generator, size = torch.Generator().manual_seed(0), network.manifest.image_size
+    for shape in ((count, network.encoding.colours, size, size) for count in (1, 7)):
         yield from (torch.zeros(shape), torch.ones(shape), torch.rand(shape, generator=generator))
-
-
-def require_file_of(path: Path, trained: Network) -> None:
-    """Check that an ONNX file holds a network, and not another one."""
-    require_packages("onnx", extra="onnx", purpose="an ONNX file")
-    import onnx  # noqa: PLC0415 (an extra)
-    from google.protobuf.message import DecodeError  # noqa: PLC0415 (comes with it)
-
-    try:
-        # the weights stand in the file itself
-        proto = onnx.load(path, load_external_data=False)
-        properties = {item.key: item.value for item in proto.metadata_props}
-        weights = json.loads(properties[MANIFEST])["weights_sha256"]
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; make it with `sliplens export RUN -o {path} --onnx`") from None
-    except (DecodeError, KeyError, TypeError, ValueError):
-        raise InputError(f"{path} is not an ONNX file of sliplens; make it with `sliplens export --onnx`") from None
-    if weights != trained.manifest.weights_sha256:
-        raise InputError(f"{path} holds another network than the run; export the run again")
-    wanted = answer_names(trained.model, trained.feature_layer)
-    if missing := [name for name in wanted if name not in {output.name for output in proto.graph.output}]:
-        raise InputError(f"{path} does not tell {' and '.join(missing)}, as an older export; export the run again")

@@ -15,7 +15,7 @@ from torch import Tensor
 from sliplens._version import __version__
 from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
-from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_file, hash_json
+from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
 from sliplens.models.checkpoint import Estimate, Network, open_run, sensor_kind
@@ -90,7 +90,7 @@ class Predictions:
 
     frames: int
     engine: str
-    """Row of `ENGINES` that ran the network."""
+    """Engine that ran the network, one of `ENGINES`."""
     path: Path | None
     """File of the rows; None where they are kept in memory."""
     rows: pa.Table | None
@@ -184,7 +184,6 @@ def predict(
     sequence: bool = False,
     sensor: SensorProfile | Path | str | None = None,
     engine: str = "auto",
-    onnx_file: Path | None = None,
     batch_size: int = 8,
     device: str = "cpu",
     on: str = "serial",
@@ -216,9 +215,7 @@ def predict(
         Read each trial in order: what the frames of a contact so far tell of its friction and of sliding counts too
         (`Follower`). The times of the frames must be known, and friction is not told then.
     engine
-        Row of `ENGINES`; `auto` for the fastest at hand that pays.
-    onnx_file
-        The network as `export_onnx` wrote it, for `onnxruntime` and `openvino`.
+        `torch`, `openvino`, or `auto` for OpenVINO where it is installed and the frames are many.
     batch_size
         Frames predicted together; on a processor more are slower, their layers no longer fit its cache.
     device
@@ -255,8 +252,6 @@ def predict(
         require_new_table(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
     if batch_size < 1:
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
-    if onnx_file is not None and engine not in {"auto", "onnxruntime", "openvino"}:
-        raise InputError(f"--onnx is for onnxruntime and openvino, not for {engine}; leave it out")
     trained = None if source is None else open_run(run, device=device)
     read = run if source is None else source
     if isinstance(read, Network):
@@ -303,9 +298,9 @@ def predict(
     for sentence in notes:
         note(on_progress, sentence)
     schema = _schema(trained, kinds, metadata)
-    run_with = {"frames": trials.frames, "batch_size": batch_size, "onnx_file": onnx_file}
+    run_with = {"frames": trials.frames, "batch_size": batch_size}
     make = partial(make_engine, engine, trained, **run_with)
-    recipe = run_with | {"onnx_file": onnx_file and hash_file(onnx_file), "engine": engine, **metadata}
+    recipe = run_with | {"engine": engine, **metadata}
     recipe |= {"columns": schema.names, "device": str(trained.device), "source": trials.recipe}
     recipe["friction"] = known and known.digest
     written, rows = make_table(

@@ -243,7 +243,7 @@ class Explaining(Stage[Explanation]):
             inputs = run.encoding.normalise(self.chosen.images[frame]).to(run.device)
             maps = len(self.chosen.ids) * len(self.explainers)
             # of few maps the first is waited for: each then takes the engine that its own passes pay for
-            with expecting(run.model, _PASSES_A_MAP * maps if maps > _FEW_MAPS else 0):
+            with expecting(_PASSES_A_MAP * maps if maps > _FEW_MAPS else 0):
                 explanation = self.explainers[method](run.model, inputs, reference=references[frame].to(run.device))
             relevance = explanation.relevance[0].cpu().numpy()
             where = f"the map of {self.chosen.ids[item[1]]} by {method}"

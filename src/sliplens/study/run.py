@@ -17,7 +17,6 @@ from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, sc
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
-from sliplens.models.engines import counting_passes
 from sliplens.progress import OnProgress, note, number_of, stage, wrote
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import Explanation
@@ -473,7 +472,7 @@ class _Stages:
             if out.complete:
                 wrote(self.on_progress, target, what, kept=True)
                 return load_result(target, _KINDS[name], command=_COMMAND)
-            with stage(self.on_progress, title) as count, counting_passes():
+            with stage(self.on_progress, title) as count:
                 result = work(out.folder / "parts", count)
             save_result(result, out.folder)
             remove(out.folder / "parts")  # not before: what fails above goes on from them

@@ -12,7 +12,6 @@ import numpy as np
 from sliplens.codec import load_result, save_result
 from sliplens.files import scratch_folder
 from sliplens.models import Network
-from sliplens.models.engines import counting_passes
 from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress
 from sliplens.results.explanation import Explanation
@@ -53,12 +52,10 @@ class Stage(Work, Generic[Result]):
 
     def begin(self) -> MakePart:
         """Make records, and write each as the folder of its shard."""
-        with counting_passes():
-            find = self.prepare()
+        find = self.prepare()
 
         def make(item: Any, path: Path, on_progress: OnProgress) -> None:
-            with counting_passes():  # whatever was made before here, or elsewhere
-                piece = find(item, on_progress)
+            piece = find(item, on_progress)
             path.mkdir()
             save_result(piece, path)
 
