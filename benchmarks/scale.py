@@ -36,6 +36,8 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does; before torch is imported
 
+import torch
+
 import sliplens
 from sliplens import load_dataset, predict, simulate
 from sliplens.extras import missing_packages

@@ -50,7 +50,7 @@ def test_a_data_set_is_predicted(
         "sliplens.manifest_hash": hash_json(read_json(difference_run / "manifest.json")),
         "sliplens.weights_sha256": hash_file(difference_run / "model.safetensors"),
     }
-    assert "24 frames, by eager" in capsys.readouterr().out
+    assert "24 frames, by torch" in capsys.readouterr().out
     assert [path.name for path in output.parent.iterdir()] == ["a.parquet"]
 
 
