@@ -1,6 +1,7 @@
 """The published GelSight Mini clips of grasps that slip or hold, with their pitfalls handled."""
 
 import csv
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,14 +18,37 @@ from sliplens.recordings.trial import labels_of_margins
 
 LABELS_FILE = "labels.csv"
 FRAME_RATE_HZ = 8.0
-"""Roughly: the files say 25, their author that 10 to 13 s of video are 37 s of motion."""
+"""Rough rate: the files say 25, their author that 10 to 13 s of video are 37 s of motion."""
+
+
+def is_gelsight(path: Path) -> bool:
+    """Return True for a clip of the data set, the folder of a grasp, or the data set, by the header of `labels.csv`."""
+    for folder in (path, *path.absolute().parents[1:3]):
+        with suppress(RecordingError):
+            if (folder / LABELS_FILE).is_file() and {"file", "slip_label"} <= set(
+                open_table(folder / LABELS_FILE).header
+            ):
+                return True
+    return False
+
+
+def read_gelsight(path: Path, options: ReadOptions) -> list[Capture]:
+    """Read clips: all in the data set's folder, those in the folder of a grasp, or a single one."""
+    if (path / LABELS_FILE).is_file():
+        clips = list_gelsight_clips(path)
+    else:
+        clips = [path] if path.is_file() else sorted(path.glob("*.avi"))
+    if not clips:
+        raise RecordingError(f"{path} holds no clip; name a clip, the folder of a grasp, or that of {LABELS_FILE}")
+    rate = FRAME_RATE_HZ if options.frame_rate is None else options.frame_rate
+    return [read_gelsight_clip(clip, frame_rate=rate) for clip in clips]
 
 
 def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: float = FRAME_RATE_HZ) -> Capture:
     """Open a clip of the data set behind *Incipient Slip Detection* (A. Parag), as laid out in its `labels.csv`.
 
-    No frame has a label; what is known of the whole clip is kept beside. Its reference is the frame with the least
-    relief: a candidate, to be looked at before it is used.
+    No frame has a label; `Capture.clip` has the label of the whole clip. Its reference is the frame with the least
+    relief, which may show a contact: check it before use.
     """
     table = path.absolute().parent.parent.parent / LABELS_FILE if labels is None else labels
     rows = _read_labels(table)
@@ -47,8 +71,8 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
         f"{path.name}: times are nominal; the true frame rate is unknown, roughly {FRAME_RATE_HZ:g} frames/s, and not "
         "the 25 of the file.",
         f"{path.name}: one label for the whole clip ({label}); it is not known when slip begins.",
-        f"{path.name}: no reference frame was recorded; frame {reference} of those kept shows the least contact, "
-        "look at it before it is used.",
+        f"{path.name}: no reference frame was recorded; frame {reference} of the rest shows the least contact, "
+        "check it before use.",
     )
     return replace(
         capture,
@@ -62,38 +86,12 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     )
 
 
-def read_gelsight(path: Path, options: ReadOptions) -> list[Capture]:
-    """Read clips: all of the data set's folder that are there, those of the folder of a grasp, or a single one."""
-    if (path / LABELS_FILE).is_file():
-        clips = list_gelsight_clips(path)
-    else:
-        clips = [path] if path.is_file() else sorted(path.glob("*.avi"))
-    if not clips:
-        raise RecordingError(f"{path} holds no clip; name a clip, the folder of a grasp, or that of {LABELS_FILE}")
-    rate = FRAME_RATE_HZ if options.frame_rate is None else options.frame_rate
-    return [read_gelsight_clip(clip, frame_rate=rate) for clip in clips]
-
-
-def is_gelsight(path: Path) -> bool:
-    """Whether a path is a clip of the data set, the folder of a grasp, or the data set; told by its `labels.csv`."""
-    tables = [folder / LABELS_FILE for folder in (path, *path.absolute().parents[1:3])]
-    return any(_lists_clips(table) for table in tables if table.is_file())
-
-
-def _lists_clips(table: Path) -> bool:
-    """Whether a table has the header of the data set's own; its rows are not read."""
-    try:
-        return {"file", "slip_label"} <= set(open_table(table).header)
-    except RecordingError:
-        return False
-
-
 def list_gelsight_clips(folder: Path) -> list[Path]:
-    """Clips that the data set's `labels.csv` lists and that are there."""
-    found = [folder / name for name in _read_labels(folder / LABELS_FILE) if (folder / name).is_file()]
-    if not found:
+    """List the clips in the data set's `labels.csv` that exist."""
+    clips = [folder / name for name in _read_labels(folder / LABELS_FILE) if (folder / name).is_file()]
+    if not clips:
         raise RecordingError(f"{folder} holds none of the clips that its {LABELS_FILE} lists; copy them beside it")
-    return found
+    return clips
 
 
 def _read_labels(path: Path) -> dict[str, dict[str, str]]:

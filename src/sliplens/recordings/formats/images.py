@@ -25,7 +25,6 @@ from sliplens.images import (
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import (
     UNITS,
-    TextTable,
     evenly_spaced,
     guess_time_column,
     guess_time_unit,
@@ -43,7 +42,7 @@ from sliplens.recordings.options import ReadOptions
 
 @contextmanager
 def open_encoded(data: Any, *, where: str) -> Iterator[Image.Image]:
-    """Header of a PNG or JPEG in memory, whatever it is called: the bytes say what they are."""
+    """Open a PNG or JPEG in memory, recognised by its bytes, and read its header."""
     with open_image(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
         if image.mode not in {"RGB", "L"}:
             raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
@@ -52,15 +51,15 @@ def open_encoded(data: Any, *, where: str) -> Iterator[Image.Image]:
 
 
 def rgb_pixels(image: Image.Image) -> Frame:
-    """Pixels of an RGB or grey image, upright; a grey one gets three equal channels."""
+    """Return the pixels of an RGB or grey image, upright; a grey one gets three equal channels."""
     pixels = upright_pixels(image)
     return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
 
 
 def frame_size(path: Path) -> tuple[int, int]:
-    """Height and width of an image, in pixels, read from its header."""
+    """Read height and width of an image, in pixels, from its header."""
     require_image(path)
-    with _telling_of(path), open_image(path) as image:
+    with _image_errors(path), open_image(path) as image:
         pages = getattr(image, "n_frames", 1)
         if pages > 1:
             raise ImageError(f"{path} holds {pages} images; save one image a file")
@@ -70,18 +69,18 @@ def frame_size(path: Path) -> tuple[int, int]:
 def read_frame(path: Path, *, size: tuple[int, int]) -> Frame:
     """Read an image as a frame."""
     require_image(path)
-    with _telling_of(path), open_image(path) as image:
+    with _image_errors(path), open_image(path) as image:
         if image.mode != "L" or upright_size(image) != size:
-            return read_image(path, size=size)  # says what is wrong, too
+            return read_image(path, size=size)  # and refuse what no frame is
         return rgb_pixels(image)
 
 
-def _telling_of(path: Path) -> AbstractContextManager[None]:
+def _image_errors(path: Path) -> AbstractContextManager[None]:
     return telling_damage(f"{path} cannot be read as an image", "copy or export it again")
 
 
 def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
-    """Height and width that all images share."""
+    """Return the height and width that all images share."""
     first = frame_size(paths[0])
     for path in paths[1:]:
         size = frame_size(path)
@@ -99,7 +98,7 @@ _NAME_COLUMNS = ("file", "filename", "file_name", "image", "image_name", "frame"
 def read_frame_times(
     table: Path, images: Sequence[Path]
 ) -> tuple[tuple[Path, ...], Float[np.ndarray, " frames"], list[str]]:
-    """Images in the order they were taken, their times from a table with names of files and times, and notes."""
+    """Sort images by a table with names of files and times; return them, their times, and notes."""
     text = open_table(table)
     name_column = next((name for name in text.header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
     if name_column is None:
@@ -107,18 +106,27 @@ def read_frame_times(
             f"{table} has no column with the names of images among {', '.join(map(repr, text.header))}; call it file"
         )
     time_column = guess_time_column(text)
-    stamps, listed = _stamps(text, name_column, time_column)
-    found = []
+    name_at, time_at = text.header.index(name_column), text.header.index(time_column)
+    stamps: dict[str, tuple[float, int]] = {}
+    for line, fields in text.rows():
+        name = fields[name_at].replace("\\", "/").rsplit("/", maxsplit=1)[-1]
+        if name in stamps:
+            raise RecordingError(f"{table}, line {line} names {name!r} again; give each image one time")
+        stamps[name] = to_number(fields[time_at], where=f"{table}, line {line}, {time_column!r}"), line
+    rows = len(stamps)
+    # "frame_1.5" has no ending: a full name is looked up before one without it
+    for name in list(stamps):
+        stamps.setdefault(Path(name).stem, stamps[name])
+    taken = []
     for image in images:
         row = stamps.get(image.name, stamps.get(image.stem))
         if row is None:
             raise RecordingError(f"{table} has no time for {image.name}; add a row for every image of the folder")
-        found.append((*row, image))
-    stamp, lines, ordered = zip(*sorted(found, key=lambda row: row[0]), strict=True)
+        taken.append((*row, image))
+    stamp, lines, ordered = zip(*sorted(taken, key=lambda row: row[0]), strict=True)
     time = np.array(stamp)
     require_rising(time, lines, path=table, column=time_column)
-    unit = unit_of(time_column, quantity="time", path=str(table))
-    how = "by its name"
+    unit, how = unit_of(time_column, quantity="time", path=str(table)), "by its name"
     if unit is None:
         unit, how = guess_time_unit(time), "guessed from its steps"
     notes = [
@@ -126,39 +134,18 @@ def read_frame_times(
         f"{table.name}: times of images are those of column {time_column!r}, in {unit} ({how}), "
         f"their names those of {name_column!r}.",
     ]
-    if listed > len(images):
-        notes.append(f"{table.name}: {listed - len(images)} of {listed} rows name no image of the folder.")
+    if rows > len(images):
+        notes.append(f"{table.name}: {rows - len(images)} of {rows} rows name no image of the folder.")
     return ordered, time * UNITS["time"][unit][0], notes
-
-
-def _stamps(text: TextTable, name_column: str, time_column: str) -> tuple[dict[str, tuple[float, int]], int]:
-    """Time and line of every name, with and without its ending, and how many rows there are."""
-    name_at, time_at = text.header.index(name_column), text.header.index(time_column)
-    stamps: dict[str, tuple[float, int]] = {}
-    count = 0
-    for line, fields in text.rows():
-        count += 1
-        name = fields[name_at].replace("\\", "/").rsplit("/", maxsplit=1)[-1]
-        value = to_number(fields[time_at], where=f"{text.path}, line {line}, {time_column!r}")
-        if name in stamps:
-            raise RecordingError(f"{text.path}, line {line} names {name!r} again; give each image one time")
-        stamps[name] = value, line
-    # "frame_1.5" has no ending: a full name is looked for before one without it
-    for name in list(stamps):
-        stamps.setdefault(Path(name).stem, stamps[name])
-    return stamps, count
-
-
-_LOSSY = frozenset({".jpg", ".jpeg"})
 
 
 def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
     """Open a folder of images, in natural order (2 before 10), and a table of forces recorded beside it."""
     times, frame_rate, name_unit = options.times, options.frame_rate, options.name_unit
-    given = [option for option in (times, frame_rate, name_unit) if option is not None]
-    if len(given) != 1:
+    count = sum(option is not None for option in (times, frame_rate, name_unit))
+    if count != 1:
         raise RecordingError(
-            f"the images of {folder} have {'no times' if not given else 'more than one source of times'}; "
+            f"the images of {folder} have {'more than one source of times' if count else 'no times'}; "
             "give exactly one of --times, --frame-rate and --name-unit"
         )
     paths = tuple(list_images(folder))
@@ -172,7 +159,7 @@ def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
         unit = require_unit(str(name_unit), quantity="time")
         time = _numbers_in_names(paths) * UNITS["time"][unit][0]
         notes.append(f"{folder.name}: the last number in a file's name was declared to be its time in {unit}.")
-    lossy = sum(path.suffix.lower() in _LOSSY for path in paths)
+    lossy = sum(path.suffix.lower() in {".jpg", ".jpeg"} for path in paths)
     if lossy:
         notes.append(
             f"{folder.name}: {lossy} of {len(paths)} frames are JPEG, which moves markers a little; "
@@ -192,8 +179,8 @@ def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
 
 
 def _numbers_in_names(paths: Sequence[Path]) -> Float[np.ndarray, " frames"]:
-    found = [re.findall(r"\d+(?:\.\d+)?", path.stem) for path in paths]
-    if [] in found:
-        path = paths[found.index([])]
+    numbers = [re.findall(r"\d+(?:\.\d+)?", path.stem) for path in paths]
+    if [] in numbers:
+        path = paths[numbers.index([])]
         raise RecordingError(f"{path} has no number in its name; give its time in a table (--times) instead")
-    return np.array([float(numbers[-1]) for numbers in found])
+    return np.array([float(each[-1]) for each in numbers])

@@ -1,4 +1,4 @@
-"""Forces from a table in a text file (CSV), with what had to be guessed told in sentences."""
+"""Forces from a table in a text file (CSV), with notes on what was guessed."""
 
 import codecs
 import csv
@@ -32,7 +32,7 @@ _CONTROLS = frozenset(range(32)) - frozenset(b"\t\n\r\f\x1a\x1b")
 
 @dataclass(frozen=True, kw_only=True)
 class TextTable:
-    """A table of a text file, its rows read one at a time."""
+    """Table in a text file; its rows are read one at a time."""
 
     path: Path
     encoding: str
@@ -43,20 +43,18 @@ class TextTable:
 
     def require(self, name: str, *, option: str) -> str:
         """Return the name of a column as the file writes it."""
-        same = [there for there in self.header if there == name] or [
-            there for there in self.header if there.strip().lower() == name.strip().lower()
-        ]
+        exact = [column for column in self.header if column == name]
+        same = exact or [column for column in self.header if column.lower() == name.strip().lower()]
         if not same:
             raise RecordingError(
-                f"{self.path} has no column {name!r}, it has {', '.join(map(repr, self.header))}; "
-                f"name one of them with {option}"
+                f"{self.path} has no column {name!r}, it has {_quote(self.header)}; name one of them with {option}"
             )
         if len(same) > 1:
             raise RecordingError(f"{self.path} has {len(same)} columns {name!r}; rename one of them")
         return same[0]
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Read the rows: the number of the line, and a text a column."""
+        """Iterate over the rows: the number of the line, and the text of each column."""
         for line, text in _lines(self.path, self.encoding):
             if line < self.first_line or _is_comment(text):
                 continue
@@ -75,7 +73,7 @@ class TextTable:
 
 
 def open_table(path: Path) -> TextTable:
-    """Find the separator and the header of a table; a byte order mark, comments and empty lines are passed over."""
+    """Find the separator and the header of a table, after a byte order mark, comments and empty lines."""
     encoding = _encoding(path)
     comment = ""
     for line, text in _lines(path, encoding):
@@ -103,9 +101,9 @@ def open_table(path: Path) -> TextTable:
 def read_numbers(
     table: TextTable, names: Sequence[str], *, may_lack: Collection[str] = ()
 ) -> tuple[Float[np.ndarray, "rows columns"], array, bool]:
-    """Read columns as finite numbers, with the line of each row, and whether decimals have commas.
+    """Read columns as finite numbers: the numbers, the line of each row, and True where decimals have commas.
 
-    Columns that may lack numbers have NaN where a field is empty or says so.
+    Columns in `may_lack` are NaN where a field is empty or `nan`.
     """
     places = [table.header.index(name) for name in names]
     values, lines = array("d"), array("q")
@@ -157,7 +155,7 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def guessed_encodings(*paths: Path) -> tuple[str, ...]:
-    """Tell of text files whose encoding was guessed: characters beyond ASCII may be others than were meant."""
+    """Note text files whose encoding was guessed: characters beyond ASCII may be wrong."""
     guessed = [path.name for path in paths if _encoding(path) == _OLD]
     return tuple(f"{name}: the text is not UTF-8 and was read as Windows-1252." for name in guessed)
 
@@ -232,7 +230,7 @@ UNITS = {
         "lbf": (4.4482216152605, "lbf lb lbs"),
     },
 }
-"""Seconds or newtons in a unit, and how it is spelled."""
+"""Factor of each unit to seconds or newtons, and its spellings."""
 _TIME_WORDS = frozenset({"time", "times", "t", "stamp", "timestamp", "timestamps", "ts", "elapsed", "clock"})
 _AXES = {
     **{axis: (f"f{axis}", f"f {axis}", f"force {axis}", f"force{axis}") for axis in "xyz"},
@@ -242,13 +240,14 @@ _AXES = {
         *("shear", "shear force", "force shear"),
     ),
 }
+"""Spellings of a force along an axis."""
 
 
 def unit_of(name: str, *, quantity: str, path: str) -> str | None:
-    """Unit that a column's name gives, in brackets or as its last word; None where it gives none."""
+    """Return the unit in a column's name, in brackets or as its last word; None if there is none."""
     bracket = re.search(r"[\[(]\s*([^\])]*?)\s*[\])]", name)
     if bracket:
-        unit = _spelled(bracket[1].lower(), quantity)
+        unit = _find_unit(bracket[1].lower(), quantity)
         if unit is None:
             raise RecordingError(
                 f"{path}: {name!r} is in {bracket[1]!r}, which is no known unit of {quantity} "
@@ -257,108 +256,110 @@ def unit_of(name: str, *, quantity: str, path: str) -> str | None:
         return unit
     words = _words(name)
     # "f_n" is a normal force, "fx_n" one along x in newtons
-    if quantity == "force" and (len(words) < 2 or _axis(words) is not None):
+    if not words or (quantity == "force" and (len(words) < 2 or _axis(words) is not None)):
         return None
-    return _spelled(words[-1], quantity) if words else None
+    return _find_unit(words[-1], quantity)
 
 
 def require_unit(unit: str, *, quantity: str) -> str:
-    """Return a declared unit as it is written here."""
-    known = _spelled(unit.lower(), quantity)
-    if known is None:
+    """Return the usual spelling of a declared unit."""
+    usual = _find_unit(unit.lower(), quantity)
+    if usual is None:
         raise RecordingError(f"{unit!r} is no unit of {quantity}; use one of {', '.join(UNITS[quantity])}")
-    return known
+    return usual
 
 
 def guess_time_column(table: TextTable) -> str:
-    """Column whose name says that it holds times."""
-    found = []
+    """Find the column that holds times by its name."""
+    times = []
     for name in table.header:
-        words = _words(re.sub(r"[\[(].*", "", name))
-        named = bool(_TIME_WORDS & set(words)) and _axis(words) is None  # "f_t" is a tangential force
-        if named or (len(words) == 1 and _spelled(words[0], "time")):
-            found.append(name)
-    return _only(found, table=table, what="the time", option="--time-column")
+        words = _words(_without_unit(name))
+        by_word = bool(_TIME_WORDS & set(words)) and _axis(words) is None  # "f_t" is a tangential force
+        if by_word or (len(words) == 1 and _find_unit(words[0], "time")):
+            times.append(name)
+    return _require_single(times, table=table, what="the time", option="--time-column")
 
 
 def guess_force_columns(table: TextTable) -> tuple[str, ...]:
-    """Columns that hold the force along x, y and z, or the normal and the tangential force."""
-    found: dict[str, list[str]] = {axis: [] for axis in _AXES}
+    """Find the columns with the force along x, y and z, or the normal and the tangential force, by their names."""
+    columns: dict[str, list[str]] = {axis: [] for axis in _AXES}
     for name in table.header:
-        words = _words(re.sub(r"[\[(].*", "", name))
+        words = _words(_without_unit(name))
         axis = _axis(words) or _axis(words[:-1])
         if axis is not None:
-            found[axis].append(name)
+            columns[axis].append(name)
+    option = "--force-columns"
     for axes in (("x", "y", "z"), ("normal", "tangential")):
-        if all(found[axis] for axis in axes):
+        if all(columns[axis] for axis in axes):
             return tuple(
-                _only(found[axis], table=table, what=f"the force ({axis})", option="--force-columns") for axis in axes
+                _require_single(columns[axis], table=table, what=f"the force ({axis})", option=option) for axis in axes
             )
-    alone = [name for axis in ("z", "normal") for name in found[axis]]
-    if alone and not any(found[axis] for axis in ("x", "y", "tangential")):
+    alone = columns["z"] + columns["normal"]
+    if alone and not columns["x"] + columns["y"] + columns["tangential"]:
         raise RecordingError(
             f"{table.path} has a normal force ({alone[0]!r}) but no tangential force that is known by its name, and a "
-            "safety margin needs both; name its columns with --force-columns, or go without margins: sliplens track "
-            "follows the markers"
+            f"safety margin needs both; name its columns with {option}, or go without margins: sliplens track follows "
+            "the markers"
         )
     raise RecordingError(
-        f"{table.path} has no columns that look like forces (fx, fy, fz or fn, ft) among "
-        f"{', '.join(map(repr, table.header))}; name them with --force-columns"
+        f"{table.path} has no columns that look like forces (fx, fy, fz or fn, ft) among {_quote(table.header)}; name "
+        f"them with {option}"
     )
 
 
 def guess_time_unit(time: Float[np.ndarray, " samples"]) -> str:
-    """Unit of times from their size: by the date where they count from 1970, else by the usual step.
+    """Guess the unit of times from their size: by the date where they count from 1970, else by the usual step.
 
     A force sensor or camera is read 2 to 10 000 times a second: a step of 0.01 is in seconds, 1 or 10 in milliseconds.
     """
-    size = float(np.abs(time[-1]))
+    size, step = float(np.abs(time[-1])), typical_step(time)
     for unit, since_1970 in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
-        if size >= since_1970 and (unit != "s" or typical_step(time) < 0.5):
+        if size >= since_1970 and (unit != "s" or step < 0.5):
             return unit
-    step = typical_step(time)
-    for unit, most in (("s", 0.5), ("ms", 500.0), ("us", 5e5)):
-        if step <= most:
-            return unit
-    return "ns"
+    return next((unit for unit, most in (("s", 0.5), ("ms", 500.0), ("us", 5e5)) if step <= most), "ns")
 
 
 def _words(name: str) -> Sequence[str]:
     return re.findall(r"[0-9a-z\u00b5\u03bc]+", name.lower())
 
 
+def _without_unit(name: str) -> str:
+    return re.sub(r"[\[(].*", "", name)
+
+
 def _axis(words: Sequence[str]) -> str | None:
-    """Axis that the last words of a name give: "wrench.force.x" is the force along x."""
+    """Return the axis in the last words of a name: "wrench.force.x" is the force along x."""
     ends = {" ".join(words[-count:]) for count in (1, 2)}
     return next((axis for axis, spellings in _AXES.items() if ends & set(spellings)), None)
 
 
-def _spelled(text: str, quantity: str) -> str | None:
+def _find_unit(text: str, quantity: str) -> str | None:
     return next((unit for unit, (_, names) in UNITS[quantity].items() if text in names.split()), None)
 
 
-def _only(found: Sequence[str], *, table: TextTable, what: str, option: str) -> str:
-    if not found:
+def _quote(names: Sequence[str]) -> str:
+    return ", ".join(map(repr, names))
+
+
+def _require_single(names: Sequence[str], *, table: TextTable, what: str, option: str) -> str:
+    if not names:
         raise RecordingError(
-            f"{table.path} has no column that looks like {what} among {', '.join(map(repr, table.header))}; "
-            f"name it with {option}"
+            f"{table.path} has no column that looks like {what} among {_quote(table.header)}; name it with {option}"
         )
-    if len(found) > 1:
-        raise RecordingError(
-            f"{table.path}: {what} could be any of {', '.join(map(repr, found))}; name the right one with {option}"
-        )
-    return found[0]
+    if len(names) > 1:
+        raise RecordingError(f"{table.path}: {what} could be any of {_quote(names)}; name the right one with {option}")
+    return names[0]
 
 
 def evenly_spaced(count: int, *, frame_rate: float) -> Float[np.ndarray, " frames"]:
-    """Times of frames taken at a declared rate, in seconds from the first."""
+    """Return times of frames taken at a declared rate, in seconds from the first."""
     if not (isfinite(frame_rate) and frame_rate > 0):
         raise RecordingError(f"a frame rate of {frame_rate} frames/s cannot be; declare a positive one")
     return np.arange(count) / frame_rate
 
 
 def trial_name(text: str) -> str:
-    """Name of a trial: letters of any script, digits, dots, dashes and underscores."""
+    """Make a name of a trial: letters of any script, digits, dots, dashes and underscores."""
     # some systems write an umlaut as two characters
     return re.sub(r"[^\w.-]+", "-", unicodedata.normalize("NFC", text)).strip("-.") or "trial"
 
@@ -379,13 +380,22 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     """
     table, time_column, force_columns = open_table(path), options.time_column, options.force_columns
     time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="--time-column")
-    names = _force_names(table, force_columns)
+    if force_columns is None:
+        names = guess_force_columns(table)
+    elif len(force_columns) not in {2, 3}:
+        raise RecordingError(
+            f"{len(force_columns)} force columns were named; name three (x, y, z) or two (normal, tangential)"
+        )
+    else:
+        names = tuple(table.require(name, option="--force-columns") for name in force_columns)
+        if len(set(names)) < len(names):
+            raise RecordingError(f"the force columns {', '.join(names)} repeat; name each once")
     values, lines, decimal_comma = read_numbers(table, [time_name, *names], may_lack=names)
     time = values[:, 0]
     require_rising(time, lines, path=path, column=time_name)
-    unit, how = _time_unit(table, time_name, options.time_unit, time)
-    scales, units = _force_scales(table, names, options.force_unit)
-    forces = values[:, 1:] * scales
+    time_unit, how = _time_unit(table, time_name, options.time_unit, time)
+    factors, units = _force_factors(table, names, options.force_unit)
+    forces = values[:, 1:] * factors
     large = np.any(np.abs(forces) > MOST_FORCE_N, axis=1)
     if large.any():
         at = int(np.argmax(large))
@@ -393,29 +403,54 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
             f"{path}, line {lines[at]}: {np.nanmax(np.abs(forces[at])):.4g} N is no force of a fingertip; "
             "declare the right one with --force-unit"
         )
-    found = "declared" if time_column is not None else "by its name"
-    told = "declared" if force_columns is not None else "by their names"
+    by_name = "by its name" if time_column is None else "declared"
+    by_names = "by their names" if force_columns is None else "declared"
     axes = "x, y, z" if len(names) == 3 else "normal (laid along z), tangential (laid along x)"
     notes = [
         *guessed_encodings(path),
-        f"{path.name}: times are those of column {time_name!r} ({found}), in {unit} ({how}).",
-        f"{path.name}: forces are those of {', '.join(map(repr, names))} as {axes} ({told}), in {units}.",
+        f"{path.name}: times are those of column {time_name!r} ({by_name}), in {time_unit} ({how}).",
+        f"{path.name}: forces are those of {_quote(names)} as {axes} ({by_names}), in {units}.",
     ]
     if decimal_comma:
         notes.append(f"{path.name}: commas were read as decimal points.")
     if len(names) == 2:
         # normal and tangential: z points into the gel, the tangential force has no direction and is laid along x
         forces = np.stack([forces[:, 1], np.zeros(len(forces)), forces[:, 0]], axis=1)
-    samples = Forces(time_s=time * UNITS["time"][unit][0], force_n=np.ascontiguousarray(forces), source=str(path))
-    return samples, tuple(notes)
+    time_s = time * UNITS["time"][time_unit][0]
+    return Forces(time_s=time_s, force_n=np.ascontiguousarray(forces), source=str(path)), tuple(notes)
+
+
+def _time_unit(
+    table: TextTable, name: str, declared: str | None, time: Float[np.ndarray, " samples"]
+) -> tuple[str, str]:
+    if declared is not None:
+        return require_unit(declared, quantity="time"), "declared"
+    unit = unit_of(name, quantity="time", path=str(table.path))
+    if unit is not None:
+        return unit, "by its name"
+    unit = guess_time_unit(time)
+    span = (time[-1] - time[0]) * UNITS["time"][unit][0]
+    return unit, f"guessed: {len(time)} samples in {span:.4g} s"
+
+
+def _force_factors(
+    table: TextTable, names: Sequence[str], declared: str | None
+) -> tuple[Float[np.ndarray, " columns"], str]:
+    if declared is not None:
+        unit = require_unit(declared, quantity="force")
+        return np.full(len(names), UNITS["force"][unit][0]), f"{unit} (declared)"
+    by_name = [unit_of(name, quantity="force", path=str(table.path)) for name in names]
+    units = [unit or "N" for unit in by_name]
+    how = "assumed, for the names give no unit" if None in by_name else "by their names"
+    return np.array([UNITS["force"][unit][0] for unit in units]), f"{', '.join(dict.fromkeys(units))} ({how})"
 
 
 def place_on_clock(
     time_s: Float[np.ndarray, " frames"], options: ReadOptions, *, source: str
 ) -> tuple[Float[np.ndarray, " frames"], Forces | None, tuple[str, ...]]:
-    """Times of frames on the clock of the forces in the table beside them, these forces, and notes.
+    """Return times of frames on the clock of the forces in the table beside them, these forces, and notes.
 
-    The first frame was taken at `start_s` on the clock of the forces; where that is None, both count from one zero.
+    The first frame was taken at `start_s` on the clock of the forces; if that is None, both count from the same zero.
     """
     start_s = options.start_s
     samples, notes = (None, ()) if options.forces is None else read_force_table(options.forces, options)
@@ -433,41 +468,3 @@ def place_on_clock(
             "declare with --start-s when the first frame was taken, on the clock of the forces"
         )
     return time_s, samples, notes
-
-
-def _force_names(table: TextTable, declared: Sequence[str] | None) -> tuple[str, ...]:
-    if declared is None:
-        return guess_force_columns(table)
-    if len(declared) not in {2, 3}:
-        raise RecordingError(
-            f"{len(declared)} force columns were named; name three (x, y, z) or two (normal, tangential)"
-        )
-    names = tuple(table.require(name, option="--force-columns") for name in declared)
-    if len(set(names)) < len(names):
-        raise RecordingError(f"the force columns {', '.join(names)} repeat; name each once")
-    return names
-
-
-def _time_unit(
-    table: TextTable, name: str, declared: str | None, time: Float[np.ndarray, " samples"]
-) -> tuple[str, str]:
-    if declared is not None:
-        return require_unit(declared, quantity="time"), "declared"
-    unit = unit_of(name, quantity="time", path=str(table.path))
-    if unit is not None:
-        return unit, "by its name"
-    unit = guess_time_unit(time)
-    span = (time[-1] - time[0]) * UNITS["time"][unit][0]
-    return unit, f"guessed: {len(time)} samples in {span:.4g} s"
-
-
-def _force_scales(
-    table: TextTable, names: Sequence[str], declared: str | None
-) -> tuple[Float[np.ndarray, " columns"], str]:
-    if declared is not None:
-        unit = require_unit(declared, quantity="force")
-        return np.full(len(names), UNITS["force"][unit][0]), f"{unit} (declared)"
-    named = [unit_of(name, quantity="force", path=str(table.path)) for name in names]
-    units = [unit or "N" for unit in named]
-    how = "assumed, for the names give no unit" if None in named else "by their names"
-    return np.array([UNITS["force"][unit][0] for unit in units]), f"{', '.join(dict.fromkeys(units))} ({how})"

@@ -2,6 +2,8 @@
 
 import os
 import re
+from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path, PureWindowsPath
 
 import numpy as np
@@ -9,62 +11,20 @@ from jaxtyping import Float
 
 from sliplens.errors import RecordingError
 from sliplens.images import natural_key
-from sliplens.recordings.capture import Capture
+from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.images import common_size, read_frame
 from sliplens.recordings.formats.tables import evenly_spaced, guessed_encodings, text_lines, trial_name
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import labels_of_margins, require_possible
 
-
-def read_lines(path: Path) -> list[tuple[int, str]]:
-    """Lines of a list that are neither empty nor comments, with their numbers in the file from 1."""
-    if not path.exists():
-        raise RecordingError(f"{path} does not exist; the lists of a set must lie in one folder")
-    lines = [(number, line.strip()) for number, line in text_lines(path)]
-    lines = [(number, line) for number, line in lines if not line.startswith("#")]
-    if not lines:
-        raise RecordingError(f"{path} is empty; list one entry a line")
-    return lines
-
-
-def _find(listed: str, *, where: str, folder: Path, root: Path) -> Path:
-    """File of a list: where its path says, else under the root by the last parts of its path, the most first.
-
-    Relative paths start at the folder and may not lead out of the root.
-    """
-    foreign = PureWindowsPath(listed.strip("\"'"))  # reads slashes and backslashes
-    own = Path(listed.strip("\"'"))
-    if own.is_absolute() and _is_file(own):
-        return own
-    parts = foreign.parts
-    if foreign.anchor:
-        parts = parts[1:]
-    else:
-        inside = Path(os.path.normpath(folder.absolute().joinpath(*parts)))
-        if inside.is_relative_to(os.path.normpath(root.absolute())):
-            if _is_file(inside):
-                return inside
-        elif ".." in parts:
-            raise RecordingError(f"{where}: {listed!r} leads out of {root}; give the folder of all with --image-root")
-    parts = tuple(part for part in parts if part != "..")
-    moved = (root.joinpath(*parts[dropped:]) for dropped in range(len(parts)))
-    if found := next(filter(_is_file, moved), None):
-        return found
-    raise RecordingError(
-        f"{where}: {listed[:200]!r} is not there, nor under {root}; give the folder of the images with --image-root"
-    )
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a line that is too long for a name
-        return False
-
-
 FRAMES, REFERENCES, MARGINS = "_images_L.txt", "_images_Lref.txt", "_gamma.csv"
-"""How the names of the three lists end."""
+"""Endings of the names of the three lists."""
 _FRAME_RATE_HZ = 30.0
+
+
+def is_thesis_list(path: Path) -> bool:
+    """Return True for a path named like a list of the thesis, or a folder that holds one."""
+    return path.name.endswith(FRAMES) or (path.is_dir() and next(path.glob(f"*{FRAMES}"), None) is not None)
 
 
 def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
@@ -78,7 +38,7 @@ def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
     rate = _FRAME_RATE_HZ if frame_rate is None else frame_rate
     how = "assumed" if frame_rate is None else "declared"
     times = f"The lists give no times: {rate:g} frames/s were {how}; how fast the margin falls rests on it."
-    frames_list = _frames_list(path)
+    frames_list = _find_frames_list(path)
     stem = frames_list.name.removesuffix(FRAMES)
     lists = [frames_list, *(frames_list.with_name(stem + ending) for ending in (REFERENCES, MARGINS))]
     frames, references = (read_lines(file) for file in lists[:2])
@@ -92,7 +52,7 @@ def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
     listed: dict[Path, str] = {}
 
     def find(text: str, where: str) -> Path:
-        path = _find(text, where=where, folder=frames_list.parent, root=root)
+        path = _find_image(text, where=where, folder=frames_list.parent, root=root)
         before = listed.setdefault(path, text)
         if before != text:
             raise RecordingError(
@@ -101,56 +61,98 @@ def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
             )
         return path
 
-    rows: dict[Path, list[tuple[Path, float]]] = {}
+    trials: dict[Path, list[tuple[Path, float]]] = {}
     for (number, frame), (at, reference), margin in zip(frames, references, margins.tolist(), strict=True):
         untouched = find(reference, f"{lists[1]}, line {at}")
-        found = find(frame, f"{frames_list}, line {number}")
-        rows.setdefault(untouched, []).append((found, margin))
-    base, digits = trial_name(stem or "thesis"), len(str(len(rows)))
-    names = [base] if len(rows) == 1 else [f"{base}-{number:0{digits}d}" for number in range(1, len(rows) + 1)]
+        image = find(frame, f"{frames_list}, line {number}")
+        trials.setdefault(untouched, []).append((image, margin))
+    base, digits = trial_name(stem or "thesis"), len(str(len(trials)))
     notes = (*guessed_encodings(*lists), *notes, times)
-    named = zip(names, rows.items(), strict=True)
-    return [_trial(name, *row, str(frames_list), notes=notes, rate=rate) for name, row in named]
+    captures = []
+    for number, (reference, rows) in enumerate(trials.items(), start=1):
+        name = base if len(trials) == 1 else f"{base}-{number:0{digits}d}"
+        ordered = sorted(rows, key=lambda row: natural_key(str(row[0])))
+        moved = () if ordered == rows else (f"{name}: frames were put into the natural order of their names.",)
+        paths = tuple(path for path, _ in ordered)
+        if len(set(paths)) < len(paths):
+            twice = next(path for path in paths if paths.count(path) > 1)
+            raise RecordingError(f"{frames_list} lists {twice} twice with one reference; list every frame once")
+        size = common_size((reference, *paths))
+        captures.append(
+            Capture(
+                trial=name,
+                source=f"{name} of {frames_list}",
+                frame_time_s=evenly_spaced(len(paths), frame_rate=rate),
+                frame_size=size,
+                read_frames=partial(_read_frames, paths, size),
+                notes=(*notes, *moved),
+                labels=labels_of_margins(np.array([margin for _, margin in ordered])),
+                reference=read_frame(reference, size=size),
+            )
+        )
+    return captures
 
 
-def is_thesis_list(path: Path) -> bool:
-    """Whether a path is named like a list of the thesis, or a folder that holds one."""
-    return path.name.endswith(FRAMES) or (path.is_dir() and next(path.glob(f"*{FRAMES}"), None) is not None)
+def _read_frames(paths: Sequence[Path], size: tuple[int, int]) -> Iterator[Frame]:
+    return (read_frame(path, size=size) for path in paths)
 
 
-def _frames_list(path: Path) -> Path:
+def _find_frames_list(path: Path) -> Path:
     if path.is_dir():
-        found = sorted(path.glob(f"*{FRAMES}"))
-        if len(found) != 1:
-            names = ", ".join(file.name for file in found) or "none"
+        lists = sorted(path.glob(f"*{FRAMES}"))
+        if len(lists) != 1:
+            names = ", ".join(file.name for file in lists) or "none"
             raise RecordingError(f"{path} must hold one list *{FRAMES}, it holds {names}; name the list itself")
-        return found[0]
+        return lists[0]
     if not path.name.endswith(FRAMES):
         raise RecordingError(f"{path} is not a list of the thesis; name the file that ends in {FRAMES}")
     return path
 
 
-def _trial(
-    name: str, reference: Path, rows: list[tuple[Path, float]], source: str, *, notes: tuple[str, ...], rate: float
-) -> Capture:
-    ordered = sorted(rows, key=lambda row: natural_key(str(row[0])))
-    if ordered != rows:
-        notes = (*notes, f"{name}: frames were put into the natural order of their names.")
-    paths = tuple(path for path, _ in ordered)
-    if len(set(paths)) < len(paths):
-        twice = next(path for path in paths if paths.count(path) > 1)
-        raise RecordingError(f"{source} lists {twice} twice with one reference; list every frame once")
-    size = common_size((reference, *paths))
-    return Capture(
-        trial=name,
-        source=f"{name} of {source}",
-        frame_time_s=evenly_spaced(len(paths), frame_rate=rate),
-        frame_size=size,
-        read_frames=lambda: (read_frame(path, size=size) for path in paths),
-        notes=notes,
-        labels=labels_of_margins(np.array([margin for _, margin in ordered])),
-        reference=read_frame(reference, size=size),
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """Read the lines of a list that are neither empty nor comments, with their numbers from 1."""
+    if not path.exists():
+        raise RecordingError(f"{path} does not exist; the lists of a set must lie in one folder")
+    lines = [(number, line.strip()) for number, line in text_lines(path)]
+    lines = [(number, line) for number, line in lines if not line.startswith("#")]
+    if not lines:
+        raise RecordingError(f"{path} is empty; list one entry a line")
+    return lines
+
+
+def _find_image(listed: str, *, where: str, folder: Path, root: Path) -> Path:
+    """Find the file of a list: at its path, else under the root by the last parts of its path, the most first.
+
+    Relative paths start at the folder and may not lead out of the root.
+    """
+    foreign = PureWindowsPath(listed.strip("\"'"))  # reads slashes and backslashes
+    native = Path(listed.strip("\"'"))
+    if native.is_absolute() and _is_file(native):
+        return native
+    parts = foreign.parts
+    if foreign.anchor:
+        parts = parts[1:]
+    else:
+        inside = Path(os.path.normpath(folder.absolute().joinpath(*parts)))
+        if inside.is_relative_to(os.path.normpath(root.absolute())):
+            if _is_file(inside):
+                return inside
+        elif ".." in parts:
+            raise RecordingError(f"{where}: {listed!r} leads out of {root}; give the folder of all with --image-root")
+    parts = tuple(part for part in parts if part != "..")
+    moved = (root.joinpath(*parts[dropped:]) for dropped in range(len(parts)))
+    if image := next(filter(_is_file, moved), None):
+        return image
+    raise RecordingError(
+        f"{where}: {listed[:200]!r} is not there, nor under {root}; give the folder of the images with --image-root"
     )
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a line that is too long for a name
+        return False
 
 
 def _read_margins(path: Path, *, unit: str | None) -> tuple[Float[np.ndarray, " frames"], tuple[str, ...]]:

@@ -40,12 +40,12 @@ def small_copies(frames: Iterable[Frame]) -> Float32[np.ndarray, "frames rows co
 def count_stale(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
     """Count the frames at the start of `small_copies` that belong to another scene.
 
-    A camera that was just started hands out dark frames, then what lay in its buffers: frozen frames of an earlier
-    moment, the last of them unlike every frame that follows. Of an object that slides all frames leap, or none does.
-    (Where the camera ran already, an object that is pressed all at once within the first 13 frames and never let go
-    cannot be told from a frozen start; do not ask there.)
+    A camera that was just started hands out dark frames, then frozen frames of an earlier moment from its buffers, the
+    last of them unlike every frame that follows. Of an object that slides all frames leap, or none does. (Where the
+    camera ran already, an object that is pressed all at once within the first 13 frames and never released looks like
+    a frozen start; do not count there.)
     """
-    head = min(_HEAD, len(copies) // 3)  # what follows must be seen long enough to compare with
+    head = min(_HEAD, len(copies) // 3)  # enough frames must follow to compare with
     if not head:
         return 0
     flat = copies.reshape(len(copies), -1)
@@ -59,10 +59,10 @@ def count_stale(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
 
 
 def least_contact(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
-    """Frame that shows the least relief: the candidate for a reference where none was recorded.
+    """Find the frame with the least relief: the candidate for a reference where none was recorded.
 
-    What presses into a gel lit by coloured lamps shows as colours that change within a few pixels, where the untouched
-    gel changes slowly.
+    Where an object presses into a gel lit by coloured lamps, colours change within a few pixels; those of the untouched
+    gel change slowly.
     """
     colour = copies[..., [0, 2]] - copies[..., [1]]
     padded = np.pad(colour, ((0, 0), (2, 2), (2, 2), (0, 0)), mode="edge")
@@ -95,14 +95,14 @@ _ANY_ZERO = frozenset({"mpegts", "mpeg"})
 
 @dataclass(frozen=True, kw_only=True)
 class VideoFile:
-    """What the container says of its frames, without any being decoded."""
+    """Facts about the frames of a video from its container, without decoding any."""
 
     frames: int
     stamps: Int64[np.ndarray, " frames"] | None
-    """In units of the stream, in the order the frames are shown; None where there are none."""
+    """Stamps in units of the stream, in the order of display; None where there are none."""
     time_s: Float[np.ndarray, " frames"] | None
     counted: bool
-    """The container counts frames and holds no presentation stamps."""
+    """True where the container counts frames and holds no presentation stamps."""
     frame_size: tuple[int, int]
     """Height and width of the upright frames, in pixels."""
     notes: tuple[str, ...]
@@ -114,33 +114,33 @@ def inspect_video(path: Path) -> VideoFile:
         size = require_size(path, video)
         # AVI counts frames; the presentation stamps made up from that are late where frames are reordered
         counted = container.format.name == "avi"
-        found: list[int | None] = []
+        packets: list[int | None] = []
         cut = False
         try:
             for packet in container.demux(video):
                 # packets to be discarded are decoded for those that need them, but never shown
                 if packet.size and not packet.is_discard:
-                    found.append(packet.dts if counted else packet.pts)
+                    packets.append(packet.dts if counted else packet.pts)
                     cut = packet.is_corrupt
         except FFmpegError as error:
-            raise RecordingError(_damaged(path, len(found), error.strerror)) from None
-        if not found:
+            raise RecordingError(_damaged(path, len(packets), error.strerror)) from None
+        if not packets:
             raise RecordingError(f"{path} holds no frame; record it again")
         stamps = time = None
-        if None not in found and video.time_base is not None:
-            stamps = np.sort(np.array(found, dtype=np.int64))
+        if None not in packets and video.time_base is not None:
+            stamps = np.sort(np.array(packets, dtype=np.int64))
             # the clock of a transport stream starts anywhere
             zero = stamps[0] if container.format.name in _ANY_ZERO else 0
             time = (stamps - zero) * float(video.time_base)
-        if cut or _ends_early(container, video, len(found), time):
+        if cut or _ends_early(container, video, len(packets), time):
             raise RecordingError(
-                f"{path} is truncated or damaged: it ends before frame {len(found)}, sooner than its header says; "
+                f"{path} is truncated or damaged: it ends before frame {len(packets)}, sooner than its header says; "
                 "copy it again"
             )
         notes = _notes(container, video, path)
         turn = read_display_turn(path)
     return VideoFile(
-        frames=len(found), stamps=stamps, time_s=time, counted=counted, frame_size=turn.size(*size), notes=notes
+        frames=len(packets), stamps=stamps, time_s=time, counted=counted, frame_size=turn.size(*size), notes=notes
     )
 
 
@@ -198,7 +198,7 @@ def read_display_turn(path: Path, *, missing: str = "name a video file") -> Disp
 
 @contextmanager
 def open_video(path: Path, *, missing: str = "name a video file") -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Container of a video, never a play list, and its first stream of moving pictures; tells what FFmpeg raises."""
+    """Open the container of a video, never a play list, and its first video stream; FFmpeg's errors are reported."""
     if not path.is_file():
         raise RecordingError(f"{path} {'is no file' if path.exists() else 'does not exist'}; {missing}")
     if is_image(path):
@@ -219,7 +219,7 @@ def open_video(path: Path, *, missing: str = "name a video file") -> Iterator[tu
 
 
 def require_size(path: Path, video: VideoStream) -> tuple[int, int]:
-    """Height and width of the frames as the header claims them, where they can be true."""
+    """Return height and width of the frames in the header, where they are possible."""
     size = video.codec_context.height, video.codec_context.width
     if min(size) <= 0 or size[0] * size[1] > MOST_PIXELS:
         raise RecordingError(
