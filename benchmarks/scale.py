@@ -43,10 +43,9 @@ from sliplens import load_dataset, predict, simulate
 from sliplens.extras import missing_packages
 from sliplens.files import hash_file, hash_json, machine, partial_folder, versions, write_json
 from sliplens.markers.tracking import track
-from sliplens.parts import Shard, shard
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
-from sliplens.shards import MakePart, Work, make_parts
+from sliplens.runner import MakePart, Work, make_parts
 from sliplens.study.workspace import explain_source
 
 NETWORK = "chromatouch-difference"

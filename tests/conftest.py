@@ -24,7 +24,7 @@ from sliplens.models import load_checkpoint, save_checkpoint
 from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.sequence import SequenceHead, SequenceManifest
 from sliplens.recordings import Dataset, Recording
-from sliplens.shards import EXECUTORS
+from sliplens.runner import EXECUTORS
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, plan_trials, simulate_trial
 
 # the same examples every time: a change is judged by its own doing, and a failure can be looked at again

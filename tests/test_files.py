@@ -10,12 +10,10 @@ import pytest
 
 from sliplens.errors import InputError
 from sliplens.files import (
-    end_removal,
     hash_json,
     output_folder,
     read_json,
     remove,
-    scratch_folder,
     to_builtins,
     whole_file,
     write_json,
@@ -193,23 +191,12 @@ def test_what_cannot_be_written_is_named(tmp_path: Path):
     assert raised.value.filename == str(tmp_path / "other")
 
 
-def test_a_temporary_folder_of_a_dead_process_is_cleared_and_one_of_a_living_one_is_not(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    with scratch_folder() as living:
-        (dead := tmp_path / f"{living.name}-dead").mkdir()
-        (dead / "piece").write_text("x")
-        (tmp_path / "else").mkdir()
-        with scratch_folder() as other:
-            assert {path.name for path in tmp_path.iterdir()} == {living.name, other.name, "else"}
-    assert [path.name for path in tmp_path.iterdir()] == ["else"]
-
-
 def test_whatever_change_a_process_was_killed_before_the_next_one_makes_the_same_and_leaves_nothing(tmp_path: Path):
     script = Path(__file__).parent / "helpers" / "killed.py"
     told = subprocess.run([sys.executable, script, tmp_path], capture_output=True, text=True, timeout=120, check=False)
     assert told.returncode == 0, told.stderr
     tried = json.loads(told.stdout)
-    assert {name for name, _ in tried} == {"make", "replace", "file", "table", "scratch", "split"}
+    assert {name for name, _ in tried} == {"make", "replace", "file", "table", "split"}
     assert len(tried) > 40
 
 
@@ -227,5 +214,5 @@ def test_a_folder_that_is_removed_is_there_whole_or_not_at_all(tmp_path: Path, m
         with pytest.raises(KeyboardInterrupt):
             remove(folder)
     assert not folder.exists()
-    end_removal(folder)
+    remove(folder)
     assert not list(tmp_path.iterdir())

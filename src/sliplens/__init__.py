@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
     from sliplens.models.predictions import predict
-    from sliplens.parts import read_status
+    from sliplens.runner import read_status
     from sliplens.plots.figure import plot
     from sliplens.recordings.check import check_dataset
     from sliplens.recordings.corrections import draft_corrections
@@ -58,7 +58,7 @@ _MODULES = {
     "plot": "sliplens.plots.figure",
     "predict": "sliplens.models.predictions",
     "read_live": "sliplens.live.loop",
-    "read_status": "sliplens.parts",
+    "read_status": "sliplens.runner",
     "recover_dataset": "sliplens.recordings.dataset",
     "run_episodes": "sliplens.grip.episodes",
     "run_study": "sliplens.study.run",

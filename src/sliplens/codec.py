@@ -25,7 +25,7 @@ from jaxtyping import AbstractArray, jaxtyped
 from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
 
 from sliplens.errors import InputError, SliplensError
-from sliplens.files import StoredPath, read_json, require_file, to_builtins, whole_file, write_json
+from sliplens.files import read_json, require_file, to_builtins, whole_file, write_json
 
 RESULT_FILE = "result.json"
 """Record of a folder."""
@@ -244,7 +244,7 @@ def telling_parquet(path: Path, *, cure: str, error: type[InputError] = InputErr
 
 def open_table(path: Path, **how: Any) -> pq.ParquetFile:
     """Open a Parquet file on disk or in a store; `read_table` would import pandas."""
-    return pq.ParquetFile(path.open() if isinstance(path, StoredPath) else path, memory_map=True, **how)
+    return pq.ParquetFile(path, memory_map=True, **how)
 
 
 def open_parquet(
@@ -418,7 +418,7 @@ def read_written(path: Path, schema: pa.Schema) -> pa.Table:
         # the writer quotes texts, and leaves null blank
         options = pa_csv.ConvertOptions(column_types=schema, strings_can_be_null=True, quoted_strings_can_be_null=False)
         # none of Python's own: Arrow's thread may let go of it when Python has ended, and that aborts the process
-        with path.open() if isinstance(path, StoredPath) else pa.OSFile(str(path)) as stream:
+        with pa.OSFile(str(path)) as stream:
             return pa_csv.read_csv(stream, convert_options=options)
     if path.suffix == ".json":
         return pa.Table.from_pylist(msgspec.json.decode(path.read_bytes()), schema)

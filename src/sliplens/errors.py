@@ -36,16 +36,17 @@ class CheckpointError(InputError):
     """A checkpoint that is incomplete, damaged, or does not fit the data it is asked about."""
 
 
-class ShardError(SliplensError):
-    """Some of many shards failed again and again, while all others were done; the command line exits with code 1."""
+class PartError(SliplensError):
+    """Some parts of a work failed repeatedly while all others were made; the command line exits with code 1."""
 
-    def __init__(self, why: Mapping[str, str], *, shards: int) -> None:
-        self.why = dict(why)
-        """Sentence of each shard by its name."""
-        failed = f"{len(self.why)} of {shards} could not be done, all others are"
-        self.summary = f"{failed}; mend what is wrong and give the same command with --retry-failed:"
-        """What is said above these."""
-        super().__init__("\n  ".join([self.summary, *(f"{name}: {sentence}" for name, sentence in self.why.items())]))
+    def __init__(self, errors: Mapping[str, str], *, parts: int) -> None:
+        self.errors = dict(errors)
+        """Message of each part by its name."""
+        failed = f"{len(self.errors)} of {parts} could not be done, all others are"
+        self.summary = f"{failed}; correct the errors and give the same command with --retry-failed:"
+        """First line of the message: how many parts failed, and how to retry."""
+        lines = [f"{name}: {sentence}" for name, sentence in self.errors.items()]
+        super().__init__("\n  ".join([self.summary, *lines]))
 
 
 class ContactError(SliplensError):
@@ -61,6 +62,6 @@ class SaliencyError(SliplensError):
 
 
 __all__ = [
-    "CheckpointError", "ContactError", "ImageError", "InputError", "ModelError", "RecordingError", "SaliencyError",
-    "ShardError", "SliplensError", "SourceError",
+    "CheckpointError", "ContactError", "ImageError", "InputError", "ModelError", "PartError", "RecordingError",
+    "SaliencyError", "SliplensError", "SourceError",
 ]  # fmt: skip

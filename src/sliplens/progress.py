@@ -211,9 +211,16 @@ def open_stage(title: str) -> Iterator[None]:
     """Show a progress bar of its own for the enclosed work."""
     listener = current_listener()
     if isinstance(listener, Stages):
-        with listener.stage(title) as count, reporting(_StageListener(listener, count)):
+        with listener.stage(title) as count, counting(count):
             yield
     else:
+        yield
+
+
+@contextmanager
+def counting(count: OnProgress) -> Iterator[None]:
+    """Report the progress of the enclosed work to `count`; stages, files and notes as before."""
+    with reporting(_Counter(current_listener(), count)):
         yield
 
 
@@ -235,12 +242,19 @@ def current_listener() -> OnProgress | None:
     return None if span is None else span.listener
 
 
-class _StageListener:
-    """Callback of an open stage: counts in its own bar, all else as the callback around it."""
+def current_reporter() -> OnProgress:
+    """Return the function that reports the progress of the running loop, to be called from anywhere."""
+    span = _SPAN.get()
+    return ignore if span is None else span.show
 
-    def __init__(self, outer: Stages, count: OnProgress) -> None:
+
+class _Counter:
+    """Callback with a bar of its own; everything else goes to the callback around it."""
+
+    def __init__(self, outer: OnProgress | None, count: OnProgress) -> None:
         self._count = count
-        self.stage, self.wrote, self.note = outer.stage, outer.wrote, outer.note
+        if isinstance(outer, Stages):
+            self.stage, self.wrote, self.note = outer.stage, outer.wrote, outer.note
 
     def __call__(self, done: int, total: int, /) -> None:
         self._count(done, total)
@@ -269,7 +283,9 @@ __all__ = [
     "add_note",
     "continued",
     "counted",
+    "counting",
     "current_listener",
+    "current_reporter",
     "fold_equal",
     "note",
     "number_of",

@@ -14,7 +14,7 @@ from there import there
 
 from sliplens.errors import InputError
 from sliplens.images import write_png
-from sliplens.parts import read_status
+from sliplens.runner import read_status
 from sliplens.recordings import Recording, load_dataset
 from sliplens.recordings.importing import import_recordings
 from sliplens.recordings.store import read_header, write_trial

@@ -12,7 +12,7 @@ from own_recording import write_forces, write_video
 from small import make_recording
 from there import there
 
-from sliplens.parts import TRIES
+from sliplens.runner import TRIES
 from sliplens.recordings import Recording, load_dataset, trial_writer
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.trial_writer import import_trial

@@ -12,7 +12,7 @@ from data_sets import contents, save_dataset
 from there import there
 
 from sliplens.images import write_png
-from sliplens.parts import read_status
+from sliplens.runner import read_status
 from sliplens.recordings import (
     ContactState,
     Corrections,
@@ -342,7 +342,7 @@ def test_what_cannot_be_labelled_is_listed_and_the_data_set_is_as_it_was(
     assert contents(data) == before
     (status,) = read_status(data)
     assert status.done == 1
-    assert [(one.name, len(one.why)) for one in status.failed] == [("jar", 1)]  # it cannot go better
+    assert [(one.name, len(one.errors)) for one in status.failed] == [("jar", 1)]  # it cannot go better
 
 
 def test_corrections_outside_their_data_set_are_refused_with_their_cure(

@@ -15,8 +15,8 @@ from pathlib import Path
 from changes import count_changes
 
 from sliplens.errors import InputError
-from sliplens.files import output_folder, scratch_folder, whole_file, write_json
-from sliplens.parts import parts_folder, require_new_table
+from sliplens.files import locked, output_folder, partial_folder, remove, whole_file, write_json
+from sliplens.runner import require_new_table
 from sliplens.recordings.dataset import TrialInfo, write_dataset_table
 from sliplens.recordings.splits import split_dataset
 
@@ -38,20 +38,17 @@ def prepare_split(folder: Path) -> None:
     )
 
 
-def use_scratch(_: Path) -> None:
-    with scratch_folder() as folder:
-        (folder / "piece").write_text("x")
-
-
 def make_file(folder: Path) -> None:
     """Make a file of a part, or be told that it is there."""
     out = folder / "x.csv"
     with suppress(InputError):
         require_new_table(out, suffix=".csv")
-        with parts_folder(out) as parts:
+        with locked(out):
+            parts = partial_folder(out)
             write_json(parts / "x.json", {"x": 1})
             with whole_file(out) as draft:
                 draft.write_text("x")
+            remove(parts)
 
 
 Work = Callable[[Path], object]
@@ -60,7 +57,6 @@ WORKS: dict[str, tuple[Work, Work]] = {
     "replace": (make, lambda folder: make(folder, "y")),
     "file": (lambda _: None, lambda folder: write_json(folder / "x.json", {"x": 1})),
     "table": (lambda _: None, make_file),
-    "scratch": (lambda _: None, use_scratch),
     "split": (prepare_split, lambda folder: split_dataset(folder, "trials")),
 }
 

@@ -18,14 +18,14 @@ from there import there
 
 import sliplens as sl
 from sliplens.codec import TABLE_SUFFIXES
-from sliplens.errors import ImageError, InputError, RecordingError, ShardError
+from sliplens.errors import ImageError, InputError, RecordingError, PartError
 from sliplens.images import absolute_difference, write_png
 from sliplens.markers.camera import CAMERA_REASON
 from sliplens.models import Network, load_checkpoint
 from sliplens.models.checkpoint import STRANGE_REASON
 from sliplens.models.predictions import Predictions
 from sliplens.models.predictions import predict as predict_source
-from sliplens.parts import read_status
+from sliplens.runner import read_status
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import trial_path
@@ -425,7 +425,7 @@ def test_a_damaged_trial_does_not_lose_the_others(trained: Network, small_datase
     good = trial_path(data, TRIAL).read_bytes()
     trial_path(data, TRIAL).write_bytes(good[:-100])
     own: dict[str, Any] = {"split": "test", "engine": "torch", "out": tmp_path / "set"}
-    with pytest.raises(ShardError, match=f"1 of 2 could not be done.*--retry-failed:\n  {TRIAL}: .*{TRIAL}"):
+    with pytest.raises(PartError, match=f"1 of 2 could not be done.*--retry-failed:\n  {TRIAL}: .*{TRIAL}"):
         predict_source(trained, data, **own)
     assert not (tmp_path / "set").exists()
     (status,) = read_status(tmp_path / "set")

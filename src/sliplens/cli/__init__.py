@@ -6,14 +6,13 @@ import re
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
-from pathlib import Path
 from typing import Any, get_args
 
 import tyro
 
 from sliplens._version import __version__
 from sliplens.cli.check import Check
-from sliplens.cli.command import in_options, option_names, paths_of
+from sliplens.cli.command import in_options, option_names
 from sliplens.cli.console import fail
 from sliplens.cli.demo import Demo
 from sliplens.cli.doctor import Doctor
@@ -37,8 +36,7 @@ from sliplens.cli.study import Diagnose, Study
 from sliplens.cli.track import Track
 from sliplens.cli.train import Train
 from sliplens.cli.view import View
-from sliplens.errors import InputError, ShardError, SliplensError
-from sliplens.files import StoredPath, as_path
+from sliplens.errors import InputError, PartError, SliplensError
 from sliplens.recordings.options import LabelSettings, ReadOptions
 
 _Recordings = Sensor | Simulate | Import | Label | Recover | Split | Check | View | Track
@@ -76,16 +74,9 @@ def _parse(words: Sequence[str]) -> Any:
         raise
     if unknown:
         raise InputError(tell_unknown(unknown[0], option_names(command), what="option", help_of=f"sliplens {words[0]}"))
-    for name, value in vars(command).items():
-        for stored in (path for path in map(as_path, paths_of(value)) if isinstance(path, StoredPath)):
-            if not (isinstance(command, _STORED) and isinstance(value, Path)):
-                raise InputError(f"sliplens {words[0]} reads and writes no {stored}; copy it to this machine first")
-            object.__setattr__(command, name, stored)
     return command
 
 
-_STORED = Predict, Track, Explain, Status
-"""Commands that read and write an object store."""
 _NO_MEMORY = "allocate memory|out of memory|bad_alloc|start new thread|failed to map segment|create a primitive"
 """What torch, threads and libraries say where Python says MemoryError."""
 
@@ -114,7 +105,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 on success, 1 where some of many shards failed, 2 for a mistake the user can mend, 130 when interrupted.
+        0 on success, 1 where some of many parts failed, 2 for a mistake the user can mend, 130 when interrupted.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words == ["--version"]:
@@ -131,8 +122,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # whoever read it has seen enough, as `| head` does; what is still to be written on the way out goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
-    except ShardError as error:
-        fail(error.summary, *(f"{name}: {in_options(sentence, command)}" for name, sentence in error.why.items()))
+    except PartError as error:
+        fail(error.summary, *(f"{name}: {in_options(sentence, command)}" for name, sentence in error.errors.items()))
         return 1
     except (SliplensError, OSError, MemoryError, RuntimeError, ImportError) as error:
         fail(_sentence(error, command))

@@ -64,14 +64,6 @@ def option_names(command: object) -> list[str]:
     return own + [name for group in groups for name in option_names(group)]
 
 
-def paths_of(value: object) -> Iterator[Path]:
-    """Paths that an option names, be it several, or a group of options."""
-    if isinstance(value, Path):
-        yield value
-    for one in value if isinstance(value, tuple) else vars(value).values() if is_dataclass(value) else ():
-        yield from paths_of(one)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Command:
     """A command that writes; its options are named as the parameters of the library's calls are."""

@@ -64,7 +64,7 @@ class Predict(SourceCommand):
     def check(self) -> None:
         """Refuse what is wrong at first sight."""
         from sliplens.codec import TABLE_SUFFIXES
-        from sliplens.parts import require_new_table
+        from sliplens.runner import require_new_table
 
         if self.source is None:
             raise InputError("name what to read: sliplens predict [RUN] SOURCE")

@@ -10,15 +10,15 @@ from sliplens.cli.console import say
 from sliplens.files import RUN_FILE
 
 if TYPE_CHECKING:
-    from sliplens.parts import Status as Progress
+    from sliplens.runner import Status as Progress
 
 _SHOWN = 20
-"""Shards of which each has a line."""
+"""Number of failed parts that are listed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Status:
-    """Show how far a command is that works on many trials: what is done, by whom, how fast, when it ends, what failed.
+    """Show how far a command is that works on many trials: what is done, how fast, when it ends, what failed.
 
     Reads the parts that are there, so that it can be asked from another terminal or machine while the command runs.
     """
@@ -28,7 +28,7 @@ class Status:
 
     def run(self) -> None:
         """Read the parts and show them."""
-        from sliplens.parts import read_status
+        from sliplens.runner import read_status
 
         works = read_status(self.output)
         if not works:
@@ -40,13 +40,11 @@ class Status:
 
 def _show(work: "Progress") -> None:
     frames = f"{work.frames_done:,} of {work.frames:,} frames"
-    say(f"{work.title}, --on {work.on}: {work.done:,} of {work.shards:,} shards, {frames}")
+    say(f"{work.title}, --on {work.on}: {work.done:,} of {work.parts:,} parts, {frames}")
     if work.frames_per_s is not None:
         say(f"  {work.frames_per_s:.3g} a second" + (f", done at {work.ends}" if work.ends else ""))
-    for one in (work.doing or ())[:_SHOWN]:
-        say(f"  {one.name}: process {one.process} of {one.host}, since {one.since}")
-    if work.doing == () and work.done + len(work.failed) < work.shards:
-        say("  nobody works on it; give the same command again and it goes on")
-    for one in work.failed[:_SHOWN]:
-        tried = "once" if len(one.why) == 1 else f"{len(one.why)} times"
-        say(f"  failed, {tried}: {one.name}: {one.why[-1]}")
+    if not work.running:
+        say("  not running; give the same command again to continue")
+    for failure in work.failed[:_SHOWN]:
+        times = "once" if len(failure.errors) == 1 else f"{len(failure.errors)} times"
+        say(f"  failed, {times}: {failure.name}: {failure.errors[-1]}")

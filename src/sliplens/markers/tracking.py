@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -14,18 +13,16 @@ from sliplens._version import __version__
 from sliplens.codec import read_written, regrouped, write_tables
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2
-from sliplens.files import as_path
 from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
-from sliplens.parts import require_new_table
 from sliplens.progress import OnProgress, note, number_of
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, Frames, Trials, open_trials
-from sliplens.shards import MakePart, Work, make_table
+from sliplens.runner import MakePart, Work, require_new_table, run_table
 
 OnTracked: TypeAlias = Callable[[Frame, TrackedFrame, Float[np.ndarray, "markers 2"]], None]
 """Takes a frame, its markers and where they were at rest, in pixels."""
@@ -136,10 +133,10 @@ def track(
         If a reference frame shows fewer than 4 whole markers, or frames are of another size.
     RecordingError
         If the source cannot be read.
-    ShardError
+    PartError
         If some of many trials failed again and again, when all others are there.
     """
-    path = None if out is None else as_path(out)
+    path = None if out is None else Path(out)
     if path is not None and path.suffix:
         require_new_table(path, suffix=".parquet", overwrite=overwrite)
     KINDS.pick(markers)
@@ -162,20 +159,20 @@ def track(
     schema = pa.schema(list(_COLUMNS.items()), metadata={"sliplens.version": __version__, **metadata})
     recipe = {**metadata, "source": trials.recipe}
     outcomes: list[TrialTracking] = []
-    _, rows = make_table(
-        _Following(trials=trials, markers=markers, schema=schema, on_tracked=on_tracked),
-        # a marker is followed from the first frame on: a trial is not cut
-        partial(trials.shards, recipe, longest=None),
-        path,
-        title="Following markers",
-        recipe=recipe,
-        resumable=trials.travels and on_tracked is None,
-        on=on,
-        retry_failed=retry_failed,
-        overwrite=overwrite,
-        on_rows=lambda own: outcomes.append(_outcome(own)),
-        on_progress=on_progress,
-    )
+    with reporting(on_progress):
+        _, rows = run_table(
+            _Following(trials=trials, markers=markers, schema=schema, on_tracked=on_tracked),
+            # a marker is followed from the first frame on: a trial is not cut
+            trials.parts(recipe, longest=None),
+            path,
+            title="Following markers",
+            recipe=recipe,
+            resumable=trials.travels and on_tracked is None,
+            on=on,
+            retry_failed=retry_failed,
+            overwrite=overwrite,
+            on_rows=lambda own: outcomes.append(_outcome(own)),
+        )
     return Tracking(trials=tuple(outcomes), path=path, rows=rows)
 
 
@@ -203,15 +200,13 @@ class _Following(Work):
     def begin(self) -> MakePart:
         read = self.trials.reader()
 
-        def make(item: tuple[str, int, int], path: Path, on_progress: OnProgress) -> None:
+        def make(item: tuple[str, int, int], path: Path) -> None:
             capture, frames = read(*item)
-            write_tables(regrouped(self._tables(capture, frames, on_progress), rows=_ROW_GROUP), path, self.schema)
+            write_tables(regrouped(self._tables(capture, frames), rows=_ROW_GROUP), path, self.schema)
 
         return make
 
-    def _tables(
-        self, trial: Capture, frames: Iterator[tuple[int, Frame]], on_progress: OnProgress
-    ) -> Iterator[pa.Table]:
+    def _tables(self, trial: Capture, frames: Iterator[tuple[int, Frame]]) -> Iterator[pa.Table]:
         tracker = Tracker((trial.read_reference or (lambda: next(trial.read_frames())))(), self.markers)
         rest = tracker.rest.centre_px
         for number, frame in frames:
@@ -220,7 +215,7 @@ class _Following(Work):
             yield _frame_table(trial.name, number, tracked, rest_px=rest, time_s=time_s)
             if self.on_tracked is not None:
                 self.on_tracked(frame, tracked, rest)
-            on_progress(number + 1, trial.frames)
+            report_progress(number + 1, trial.frames)
 
 
 def _outcome(rows: pa.Table) -> TrialTracking:

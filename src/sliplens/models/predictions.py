@@ -15,13 +15,12 @@ from torch import Tensor
 from sliplens._version import __version__
 from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
 from sliplens.errors import InputError
-from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, as_path, hash_json
+from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
 from sliplens.models.checkpoint import Estimate, Network, open_run, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
-from sliplens.parts import require_new_table
 from sliplens.progress import OnProgress, note, number_of, stage
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
@@ -31,7 +30,7 @@ from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, Frames, Trials, open_trials
 from sliplens.recordings.trial import ContactState
-from sliplens.shards import LONGEST, MakePart, Work, make_table
+from sliplens.runner import LONGEST, MakePart, Work, require_new_table, run_table
 from sliplens.shear import FULL_CIRCLE, range_words
 
 _CAMERA_EVERY = 4
@@ -235,7 +234,7 @@ def predict(
         If frames are of another size than those of the network's sensor.
     RecordingError
         If the source cannot be read.
-    ShardError
+    PartError
         If some of many trials failed again and again, when all others are there.
 
     Examples
@@ -247,7 +246,7 @@ def predict(
     >>> predictions.frame().column_names[:4]
     ['trial', 'frame', 'time_s', 'prediction']
     """
-    path = None if out is None else as_path(out)
+    path = None if out is None else Path(out)
     if path is not None and path.suffix:
         require_new_table(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
     if batch_size < 1:
@@ -303,18 +302,20 @@ def predict(
     recipe = run_with | {"engine": engine, **metadata}
     recipe |= {"columns": schema.names, "device": str(trained.device), "source": trials.recipe}
     recipe["friction"] = known and known.digest
-    written, rows = make_table(
-        _Reading(trained=trained, trials=trials, schema=schema, friction=known, sequence=sequence, make_engine=make),
-        partial(trials.shards, recipe, longest=None if sequence else LONGEST),
-        path,
-        title=f"Predicting frames ({trained.manifest.input})",
-        recipe=recipe,
-        resumable=trials.travels,
-        on=on,
-        retry_failed=retry_failed,
-        overwrite=overwrite,
-        on_progress=on_progress,
-    )
+    with reporting(on_progress):
+        written, rows = run_table(
+            _Reading(
+                trained=trained, trials=trials, schema=schema, friction=known, sequence=sequence, make_engine=make
+            ),
+            trials.parts(recipe, longest=None if sequence else LONGEST),
+            path,
+            title=f"Predicting frames ({trained.manifest.input})",
+            recipe=recipe,
+            resumable=trials.travels,
+            on=on,
+            retry_failed=retry_failed,
+            overwrite=overwrite,
+        )
     name = (written.metadata or {})[b"sliplens.engine"].decode()
     return Predictions(frames=trials.frames, engine=name, path=path, rows=rows, schema=path and written, notes=notes)
 
@@ -457,8 +458,8 @@ class _Reading(Work):
         ready, read = self.make_engine(), self.trials.reader()
         schema = self.schema.with_metadata({"sliplens.engine": ready.name, **(self.schema.metadata or {})})
 
-        def make(item: tuple[str, int, int], path: Path, on_progress: OnProgress) -> None:
-            rows = self._rows(ready, *read(*item), count=item[-1], on_progress=on_progress)
+        def make(item: tuple[str, int, int], path: Path) -> None:
+            rows = self._rows(ready, *read(*item), count=item[-1])
             write_tables((pa.Table.from_pydict(some, schema) for some in rows), path, schema)
 
         return make
@@ -470,7 +471,6 @@ class _Reading(Work):
         frames: Iterator[tuple[int, Frame]],
         *,
         count: int,
-        on_progress: OnProgress,
     ) -> Iterator[dict[str, list]]:
         """Columns of some thousand frames at a time: what is read in order is cut nowhere else."""
         # plain numbers: small arrays kept between the large ones of each batch would leave holes in the memory
@@ -522,7 +522,7 @@ class _Reading(Work):
             for name, values in columns.items():
                 if name in rows:
                     rows[name].extend(values)
-            on_progress(done := done + len(touches), count)
+            report_progress(done := done + len(touches), count)
             if len(rows["frame"]) >= LONGEST:
                 yield rows
                 rows = {name: [] for name in rows}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from sliplens.errors import InputError, RecordingError, SliplensError
-from sliplens.files import output_folder, require_local, whole_file
+from sliplens.files import output_folder, whole_file
 from sliplens.progress import OnProgress, note, number_of, reporting, stage
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import (
@@ -40,7 +40,7 @@ from sliplens.recordings.trial_writer import (
     require_forces,
     write_trials,
 )
-from sliplens.shards import EXECUTORS
+from sliplens.runner import require_executor
 
 
 def import_recordings(
@@ -102,7 +102,7 @@ def import_recordings(
         Add to the data set that `out` is; trials that are there already stay as they are, and so do their splits
         unless `splits` deals all of them anew.
     on, retry_failed
-        Where trials are made, a row of `shards.EXECUTORS`: `serial` (several side by side in threads), `processes`,
+        Where trials are made, a row of `runner.EXECUTORS`: `serial` (several side by side in threads), `processes`,
         `processes=4`, `ray`; and whether those are tried again that failed before.
 
     Raises
@@ -111,11 +111,10 @@ def import_recordings(
         If a source is missing, damaged or of no known format, or `out` holds something else.
     RecordingError
         If a trial has neither labels nor forces, nothing touches, or it never slips and no friction is given.
-    ShardError
+    PartError
         If some of several failed that may not be left out, or all of them, when all others are done.
     """
-    require_local(out)
-    EXECUTORS.pick(on.partition("=")[0])
+    require_executor(on)
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]
     profile = load_profile(sensor) if sensor is not None and is_profile(sensor) else None
     asked = _Asked(

@@ -3,7 +3,6 @@
 Each frame is handed to the system before the next is taken: a process that is killed loses the one it was writing.
 """
 
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,10 +13,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pyarrow as pa
+from filelock import FileLock, Timeout
 
 from sliplens.codec import from_builtins, one_line, to_builtins
 from sliplens.errors import RecordingError
-from sliplens.files import make_and_hold, parse_json, require_file
+from sliplens.files import parse_json, require_file
 from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
@@ -108,20 +108,17 @@ class JournalLock:
     def __init__(self, data: Path) -> None:
         self.folder = data / JOURNAL_FOLDER
 
-        def make() -> Path:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            (lock := self.folder / LOCK_FILE).touch()
-            return lock
-
-        _, self._held = make_and_hold(make)
-        if self._held is None:
-            raise RecordingError(f"{data} is being recorded; stop the recording first, or choose another folder")
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock = FileLock(self.folder / LOCK_FILE, blocking=False)
+        try:
+            self._lock.acquire()
+        except Timeout:
+            message = f"{data} is being recorded; stop the recording first, or choose another folder"
+            raise RecordingError(message) from None
 
     def release(self) -> None:
         """Let go; what is there stays for whoever opens the data set next."""
-        if self._held is not None:
-            os.close(self._held)
-            self._held = None
+        self._lock.release()
 
     def discard(self) -> None:
         """Remove the folder, everything in it being in trials, and let go."""

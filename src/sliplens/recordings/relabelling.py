@@ -58,7 +58,7 @@ def label_dataset(
         If a trial has no forces, or its labels did not come from them and would be overwritten.
     RecordingError
         If a correction does not fit its trial, nothing touches, or a trial never slips and its friction is unknown.
-    ShardError
+    PartError
         If some of several trials fail, after all others are labelled; the data set is as it was.
     """
     with reporting(on_progress):

@@ -13,7 +13,6 @@ from jaxtyping import Float, UInt8
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.files import hash_file, hash_json, hash_tree
 from sliplens.images import list_images, read_image, require_rgb
-from sliplens.parts import Shard, shard
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
@@ -24,7 +23,7 @@ from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import LIMITS, Budget, ReadOptions, option_flags
 from sliplens.recordings.repeats import inspect_repeats
 from sliplens.recordings.sensor import SensorProfile, load_profile
-from sliplens.shards import LONGEST
+from sliplens.runner import LONGEST, Part, part
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 """RGB images of the camera, one after another."""
@@ -158,15 +157,22 @@ class Trials:
         """True where other processes can open the source."""
         return isinstance(self.source, Path | Dataset)
 
-    def shards(self, recipe: object, *, longest: int | None = LONGEST) -> Iterator[Shard]:
-        """Shards of (trial, first frame, number of frames), whose parts are Parquet files; whole trials with None."""
+    def parts(self, recipe: object, *, longest: int | None = LONGEST) -> list[Part]:
+        """Return parts of (trial, first frame, number of frames), Parquet files; whole trials if `longest` is None."""
         recipe = hash_json(recipe)
-        for trial, total, sha256 in self.rows:
-            for first in range(0, total, longest or total):
-                frames, hashes = min(longest or total, total - first), {"recipe": recipe, "shown": sha256}
-                yield shard(
-                    (trial, first, frames), trial=trial, first=first, frames=frames, suffix=".parquet", **hashes
-                )
+        return [
+            part(
+                (trial, first, frames := min(longest or total, total - first)),
+                trial=trial,
+                first=first,
+                frames=frames,
+                suffix=".parquet",
+                recipe=recipe,
+                content=content,
+            )
+            for trial, total, content in self.rows
+            for first in range(0, total, longest or total)
+        ]
 
     @property
     def recipe(self) -> object:

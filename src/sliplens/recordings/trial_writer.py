@@ -12,11 +12,11 @@ from jaxtyping import Bool, Float
 from threadpoolctl import threadpool_limits
 
 from sliplens.codec import RESULT_FILE, load_record, save_record
-from sliplens.errors import RecordingError, ShardError, SliplensError
+from sliplens.errors import RecordingError, PartError, SliplensError
 from sliplens.files import remove
 from sliplens.images import require_rgb
-from sliplens.parts import Shard, shard
-from sliplens.progress import OnProgress, current_listener, number_of, open_stage, report_progress, reporting
+
+from sliplens.progress import number_of, open_stage, report_progress
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import LeftOut, TrialInfo, trial_info, trial_path
 from sliplens.recordings.labelling import Corrections, Labelling, ReferenceChoice
@@ -36,7 +36,7 @@ from sliplens.recordings.store import (
     write_trial,
 )
 from sliplens.recordings.trial import Labels, labels_of_margins
-from sliplens.shards import MakePart, Work, make_parts
+from sliplens.runner import MakePart, Work, part, run_parts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,21 +76,20 @@ class TrialWork(Work):
         """Make data sets of one trial."""
         leave_cores()
 
-        def make(item: Any, path: Path, on_progress: OnProgress) -> None:
+        def make(item: Any, path: Path) -> None:
             job = self.open(item)
             capture = job.capture
             trial, samples = trial_path(path, capture.trial), forces_path(path, capture.trial)
             try:
                 rng = trial_rng(job.settings, capture.trial)
-                with reporting(on_progress):
-                    import_trial(
-                        capture,
-                        trial,
-                        settings=job.settings,
-                        corrections=job.corrections,
-                        rng=rng,
-                        forces_file=samples,
-                    )
+                import_trial(
+                    capture,
+                    trial,
+                    settings=job.settings,
+                    corrections=job.corrections,
+                    rng=rng,
+                    forces_file=samples,
+                )
             except SliplensError as error:
                 if job.cure:
                     raise RecordingError(f"{error}{job.cure}") from None
@@ -133,39 +132,36 @@ def write_trials(
     """
     parts = folder / "parts"
 
-    def shards() -> Iterator[Shard]:
-        # the folder is of these recordings and settings alone (`files.output_folder`)
-        return (shard(item, trial=name, frames=frames, recipe="trial", shown=name) for item, name, frames in trials)
+    # the folder is of these recordings and settings alone (`files.output_folder`)
+    every = [part(item, trial=name, frames=frames, recipe="trial", content=name) for item, name, frames in trials]
 
     rows: list[TrialInfo] = []
     left_out: list[LeftOut] = []
     with leave_cores(), open_stage(title):
         try:
-            make_parts(
-                work, shards, parts, title=title, on=on, retry_failed=retry_failed, on_progress=current_listener()
-            )
-        except ShardError as error:
-            failed = {name: work.open(item) for item, name, _ in trials if name in error.why}
+            run_parts(work, every, parts, title=title, on=on, retry_failed=retry_failed)
+        except PartError as error:
+            failed = {name: work.open(item) for item, name, _ in trials if name in error.errors}
             if len(failed) == len(trials) or not all(job.one_of_many for job in failed.values()):
                 raise
             left_out = [
                 LeftOut(
                     trial=name,
                     source=job.capture.source,
-                    why=f"{error.why[name]}; the same command with --add tries it again",
+                    why=f"{error.errors[name]}; the same command with --add tries it again",
                 )
                 for name, job in failed.items()
             ]
     set_aside = {trial.trial for trial in left_out}
-    for part in (parts / each.part for each in shards() if each.name not in set_aside):
-        written = load_record(part / RESULT_FILE, WrittenTrial, command="the interrupted command")
+    for made in (parts / each.path for each in every if each.name not in set_aside):
+        written = load_record(made / RESULT_FILE, WrittenTrial, command="the interrupted command")
         if written.left_out is not None:
             left_out.append(written.left_out)
         if written.info is not None:
             rows.append(written.info)
-            for path in (trial_path(part, written.info.trial), forces_path(part, written.info.trial)):
+            for path in (trial_path(made, written.info.trial), forces_path(made, written.info.trial)):
                 if path.exists():  # else there are none, or they were moved before an interruption
-                    target = folder / path.relative_to(part)
+                    target = folder / path.relative_to(made)
                     target.parent.mkdir(exist_ok=True)
                     path.replace(target)
     if left_out and not rows:

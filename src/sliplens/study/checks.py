@@ -30,7 +30,6 @@ from sliplens.faithfulness.controls import (
 )
 from sliplens.intervals import paired_difference
 from sliplens.models import Network
-from sliplens.parts import Shard
 from sliplens.progress import OnProgress, counted
 from sliplens.recordings import Dataset
 from sliplens.results.faithfulness import NEW_WEIGHTS
@@ -45,6 +44,7 @@ from sliplens.results.study import (
     Timing,
     UntrainedMaps,
 )
+from sliplens.runner import Part
 from sliplens.study.choice import Material, MaterialStage, MethodStage, as_the_thesis_ran, trial_seed
 from sliplens.study.explaining import mean_of_known
 from sliplens.study.stages import Find, join_trials, trial_shards
@@ -331,7 +331,7 @@ class Untrained(MaterialStage[UntrainedMaps]):
 
     seed: int = 0
 
-    def shards(self) -> Iterator[Shard]:
+    def shards(self) -> Iterator[Part]:
         """Trials, whose maps are counted."""
         return trial_shards(self.material.explained, maps=len(self.material.explainers))
 

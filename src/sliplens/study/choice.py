@@ -21,12 +21,12 @@ from sliplens.faithfulness.removal import Units, marker_units, tile_units
 from sliplens.images import absolute_difference
 from sliplens.markers import track_markers
 from sliplens.models import Network
-from sliplens.parts import Shard, shard
 from sliplens.plots.style import input_name, listed
 from sliplens.progress import OnProgress, counted, number_of
 from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.results.explanation import Explanation
 from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkerPlaces, MarkerTable, ShownFrame, States
+from sliplens.runner import Part, part
 from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
 from sliplens.study.explaining import frames_at, nearest_frame, network_inputs, require_methods
 from sliplens.study.stages import Result, Stage
@@ -374,10 +374,10 @@ class MaterialStage(Stage[Result]):
 class MethodStage(MaterialStage[Result]):
     """The same, a method a shard."""
 
-    def shards(self) -> Iterator[Shard]:
+    def shards(self) -> Iterator[Part]:
         """All methods."""
         for method in self.material.explainers:
-            yield shard(method, trial=method, frames=1, recipe="method", shown="")
+            yield part(method, trial=method, frames=1, recipe="method", content="")
 
 
 def worth_scoring(chosen: Iterable[ChosenFrame], explained: Explanation) -> tuple[ChosenFrame, ...]:

@@ -19,7 +19,7 @@ from sliplens.explainers.contract import Explainer
 from sliplens.explainers.table import EXPLAINERS, network_images
 from sliplens.models import Network
 from sliplens.models.engines import expecting
-from sliplens.parts import Shard, shard
+from sliplens.runner import Part, part
 from sliplens.plots.saliency import NOMINAL_MARGINS
 from sliplens.progress import OnProgress, number_of
 from sliplens.recordings import Dataset
@@ -256,7 +256,7 @@ class Explaining(Stage[Explanation]):
 
         return find
 
-    def shards(self) -> Iterator[Shard]:
+    def shards(self) -> Iterator[Part]:
         """Every frame with the first method, then with the next."""
         weights = self.trained.manifest.weights_sha256
         for method in self.explainers:
@@ -264,8 +264,8 @@ class Explaining(Stage[Explanation]):
             recipe = {"weights_sha256": weights, "method": method}
             for index, trial in enumerate(self.chosen.trial):
                 shown = self.chosen.images[index].numpy().tobytes() + self.chosen.references[index].numpy().tobytes()
-                known = {"recipe": recipe, "shown": hashlib.sha256(shown).hexdigest(), "first": index, "frames": 1}
-                yield shard((method, index), trial=trial, name=f"{method} of {self.chosen.ids[index]}", **known)
+                known = {"recipe": recipe, "content": hashlib.sha256(shown).hexdigest(), "first": index, "frames": 1}
+                yield part((method, index), trial=trial, name=f"{method} of {self.chosen.ids[index]}", **known)
 
     @property
     def inputs(self) -> Float[Tensor, "frames colours size size"]:
@@ -324,14 +324,14 @@ def explain_frames(
     """Explain frames with several methods.
 
     `parts` is a folder that keeps each map as soon as it is there, so that an interrupted run loses at most one a
-    process. `on` says where maps are made, a row of `shards.EXECUTORS`; `retry_failed` tries those again that failed
+    process. `on` says where maps are made, a row of `runner.EXECUTORS`; `retry_failed` tries those again that failed
     before. `on_map` is called with each: method, number of the frame, its picture, and the map.
 
     Raises
     ------
     InputError
         If a method is unknown.
-    ShardError
+    PartError
         If some of many maps failed again and again, when all others are there.
     """
     require_methods(methods, explainers)

@@ -32,7 +32,7 @@ from sliplens.results.study import (
     UntrainedMaps,
     tell_left_out,
 )
-from sliplens.shards import EXECUTORS, Crew, MakePart, Work, WorkError
+from sliplens.runner import EXECUTORS, MakePart, Work
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.checks import CASCADE, Measuring, Randomising, Untrained, time_explainers
 from sliplens.study.choice import (
@@ -138,7 +138,7 @@ def run_study(
         If a number is out of range, a method is unknown, or two networks read one input.
     RecordingError
         If no trial has a frame near every safety margin that is looked at.
-    ShardError
+    PartError
         If part of a stage failed again and again, when all the rest of it is done.
 
     Examples
@@ -189,9 +189,8 @@ def run_study(
         seed=seed,
         redrawn="truth" in tests and stages.redrawn,
     )
-    with Crew(judging, on=on, most=len(choice.frames)) as crew:
-        for name in runs:
-            stages.judge(name, judging, crew, tests=frozenset(tests), retry_failed=retry_failed)
+    for name in runs:
+        stages.judge(name, judging, on=on, tests=frozenset(tests), retry_failed=retry_failed)
     for name in runs if "timing" in tests else ():  # while nothing else runs
         stages.time(name, judging)
     tables: dict[str, Any] = {
@@ -220,8 +219,8 @@ _NEEDED_BY = {"score": {"score", "remedies"}, "control": {"faithfulness", "truth
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Judging(Work):
-    """Work on all stages that judge explanations, on shards of ((network, stage), shard of that); paths travel."""
+class _Judging:
+    """Settings of all stages that judge explanations; pickled without what is open."""
 
     folder: Path
     data: Dataset
@@ -238,32 +237,28 @@ class _Judging(Work):
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_opened": {}}  # whoever gets it opens its own
 
-    @property
-    def on_gpu(self) -> bool:
-        return any(run.device.type != "cpu" for run in self.networks.values())
-
-    def begin(self) -> MakePart:
-        opened: tuple[tuple[str, str], MakePart] | None = None
-
-        def make(item: tuple[tuple[str, str], Any], path: Path, on_progress: OnProgress) -> None:
-            nonlocal opened
-            (network, stage), own = item
-            if opened is None or opened[0] != item[0]:  # one at a time: each holds images and maps
-                opened = None
-                try:
-                    opened = item[0], self.open(network).stage(stage).begin()
-                except Exception as error:
-                    raise WorkError(error) from None
-            opened[1](own, path, on_progress)
-
-        return make
-
     def open(self, network: str) -> "_Network":
         """What is known of a network; of one at a time."""
         if network not in self._opened:
             self._opened.clear()
             self._opened[network] = _Network(study=self, name=network)
         return self._opened[network]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _StageWork(Work):
+    """Work of one stage of a network, opened in whatever process."""
+
+    judging: _Judging
+    network: str
+    stage: str
+
+    @property
+    def on_gpu(self) -> bool:
+        return self.judging.networks[self.network].device.type != "cpu"
+
+    def begin(self) -> MakePart:
+        return self.judging.open(self.network).stage(self.stage).begin()
 
 
 @dataclass(kw_only=True)
@@ -400,7 +395,7 @@ class _Stages:
                 note(self.on_progress, f"{what}, so that tiles are asked instead")
         return choice, states
 
-    def judge(self, name: str, judging: _Judging, crew: Crew, *, tests: frozenset[str], retry_failed: bool) -> None:
+    def judge(self, name: str, judging: _Judging, *, on: str, tests: frozenset[str], retry_failed: bool) -> None:
         """Explain the frames with one network's methods, and judge the explanations in every way but by the clock."""
         removal = {"random_orders": judging.random_orders, "areas": STUDY_AREAS, "settings": judging.settings}
         depends: dict[str, dict[str, Any]] = {
@@ -419,8 +414,9 @@ class _Stages:
                 continue
 
             def work(parts: Path, count: OnProgress, test: str = test) -> object:
-                stage, own = judging.open(name).stage(test), {"crew": crew, "name": (name, test)}
-                return stage.make(parts, **own, retry_failed=retry_failed, on_progress=count)
+                work = _StageWork(judging=judging, network=name, stage=test)
+                stage = judging.open(name).stage(test)
+                return stage.make(parts, work=work, on=on, retry_failed=retry_failed, on_progress=count)
 
             about = self._about(name) | ({} if test == "explain" else _SCORED)
             config, title = about | depends.get(test, {}), f"{kind.title} ({name})"

@@ -32,7 +32,6 @@ from sliplens.faithfulness.scoring import (
 )
 from sliplens.intervals import mean_interval, paired_difference
 from sliplens.models import Network
-from sliplens.parts import Shard
 from sliplens.progress import OnProgress, continued
 from sliplens.results.explanation import ExplainedFrame, Explanation
 from sliplens.results.faithfulness import (
@@ -50,6 +49,7 @@ from sliplens.results.faithfulness import (
     VariantTable,
     is_control,
 )
+from sliplens.runner import Part
 from sliplens.study.choice import Material, MaterialStage, trial_seed
 from sliplens.study.explaining import network_inputs
 from sliplens.study.stages import Find, Stage, join_trials, trial_shards
@@ -94,7 +94,7 @@ class Deletion(Stage[DeletionScores]):
     """The image's height if None."""
     seed: int = 0
 
-    def shards(self) -> Iterator[Shard]:
+    def shards(self) -> Iterator[Part]:
         """Trials, whose maps are counted with a random one."""
         return trial_shards(self.explained, maps=len(self.explained.saliency) + 1)
 
@@ -192,7 +192,7 @@ class RemedialDeletion(MaterialStage[Remedies]):
     steps: int = STEPS
     seed: int = 0
 
-    def shards(self) -> Iterator[Shard]:
+    def shards(self) -> Iterator[Part]:
         """Trials, whose maps are counted twice, and with a random one."""
         explained = self.material.explained
         return trial_shards(explained, maps=2 * (len(explained.saliency) + 1))
@@ -410,7 +410,7 @@ class Removal(MaterialStage[RemovalScores]):
     def _known(self) -> list[Setting]:
         return [setting for setting in self.settings if setting.unit in self._units]
 
-    def shards(self) -> Iterator[Shard]:
+    def shards(self) -> Iterator[Part]:
         """All trials under the first setting, then under the next."""
         for setting in (*self._known, *self.further):
             yield from trial_shards(self.material.explained, setting.fill, setting.unit)

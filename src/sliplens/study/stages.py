@@ -3,7 +3,6 @@
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
@@ -12,10 +11,9 @@ import numpy as np
 from sliplens.codec import load_result, save_result
 from sliplens.files import scratch_folder
 from sliplens.models import Network
-from sliplens.parts import Shard, shard
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, report_progress, reporting
 from sliplens.results.explanation import Explanation
-from sliplens.shards import Crew, MakePart, Work, make_parts
+from sliplens.runner import MakePart, Part, Work, part, run_parts
 
 Result = TypeVar("Result")
 Find: TypeAlias = Callable[[Any, OnProgress], Any]
@@ -39,7 +37,7 @@ class Stage(Work, Generic[Result]):
         return self.trained.device.type != "cpu"
 
     @abstractmethod
-    def shards(self) -> Iterator[Shard]:
+    def shards(self) -> Iterator[Part]:
         """All shards, in the order in which `join` takes their records."""
 
     @abstractmethod
@@ -54,8 +52,8 @@ class Stage(Work, Generic[Result]):
         """Make records, and write each as the folder of its shard."""
         find = self.prepare()
 
-        def make(item: Any, path: Path, on_progress: OnProgress) -> None:
-            piece = find(item, on_progress)
+        def make(item: Any, path: Path) -> None:
+            piece = find(item, report_progress)
             path.mkdir()
             save_result(piece, path)
 
@@ -65,41 +63,37 @@ class Stage(Work, Generic[Result]):
         self,
         parts: Path | None = None,
         *,
-        crew: Crew | None = None,
-        name: Any = None,
+        work: Work | None = None,
         on_piece: Callable[[Any, Any], None] | None = None,
         on_progress: OnProgress | None = None,
         **how: Any,
     ) -> Result:
         """Make the records that `parts` does not keep yet, and the result.
 
-        A `crew` does other stages too, and gets each item with the `name` of this one. `on_piece` is called with the
-        item of each record and the record, as soon as it is there; `how` are other parameters of `make_parts`.
+        `work` opens this stage in other processes; the stage itself does if None. `on_piece` is called with the item of
+        each record and the record, as soon as it is there; `how` are other parameters of `run_parts`.
         """
-
-        def shards() -> Iterator[Shard]:
-            for one in self.shards():
-                yield one if crew is None else replace(one, item=(name, one.item))
-
+        every = list(self.shards())
         with nullcontext(parts) if parts else scratch_folder() as folder:
 
-            def read(one: Shard) -> Any:
-                return load_result(folder / one.part, self.piece, command="the interrupted command")
+            def read(one: Part) -> Any:
+                return load_result(folder / one.path, self.piece, command="the interrupted command")
 
-            def show(one: Shard) -> None:
+            def show(one: Part) -> None:
                 if on_piece is not None:
-                    on_piece(one.item if crew is None else one.item[1], read(one))
+                    on_piece(one.item, read(one))
 
-            make_parts(crew or self, shards, folder, title=self.title, on_part=show, on_progress=on_progress, **how)
-            return self.join([read(one) for one in shards()])
+            with reporting(on_progress):
+                run_parts(work or self, every, folder, title=self.title, on_part=show, **how)
+            return self.join([read(one) for one in every])
 
 
-def trial_shards(explained: Explanation, *about: str, maps: int = 1) -> Iterator[Shard]:
+def trial_shards(explained: Explanation, *about: str, maps: int = 1) -> Iterator[Part]:
     """A shard of (*about, trial) for each trial of explained frames, of so many maps a frame."""
     for number, (trial, rows) in enumerate(explained.trials.items()):
         # the folder of the parts is one of these explanations and options alone (`files.output_folder`)
-        known = {"recipe": about, "shown": "", "first": number, "frames": maps * len(rows)}
-        yield shard((*about, trial), trial=trial, name=" ".join((*about, trial)), **known)
+        known = {"recipe": about, "content": "", "first": number, "frames": maps * len(rows)}
+        yield part((*about, trial), trial=trial, name=" ".join((*about, trial)), **known)
 
 
 def join_trials(

@@ -33,7 +33,6 @@ from sliplens.faithfulness.removal import (
 from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.models import Network
-from sliplens.parts import Shard, shard
 from sliplens.plots.style import tell_ends
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
@@ -41,6 +40,7 @@ from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import CHANCE, is_control
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
+from sliplens.runner import Part, part
 from sliplens.simulation.intervention import (
     FilmedTrial,
     draw_with_markers_back,
@@ -355,11 +355,11 @@ class JudgingByTruth(Stage[Truth]):
         for fill in self.fills:
             get_fill(fill)
 
-    def shards(self) -> Iterator[Shard]:
+    def shards(self) -> Iterator[Part]:
         """All frames."""
         for index, frame in enumerate(self.explained.frames):
-            known = {"recipe": "truth", "shown": "", "first": index, "frames": 1}
-            yield shard(index, trial=frame.trial, name=frame.id, **known)
+            known = {"recipe": "truth", "content": "", "first": index, "frames": 1}
+            yield part(index, trial=frame.trial, name=frame.id, **known)
 
     @cached_property
     def _staged(self) -> tuple[tuple[StagedFrame, ...], list[Places], int]:

@@ -20,7 +20,7 @@ from sliplens.explainers.gradients import ExpectedGradients
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD, get_explainer
 from sliplens.faithfulness.fills import get_fill
-from sliplens.files import as_path, output_folder, remove
+from sliplens.files import output_folder, remove
 from sliplens.images import write_png
 from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
@@ -90,7 +90,7 @@ def explain_source(
     split, condition, trials, levels
         Which trials of a data set and how many, and the safety margins at which frames are taken.
     on, retry_failed
-        Where maps are made, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`; and whether those are
+        Where maps are made, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`; and whether those are
         tried again that failed three times before.
     out
         Folder to write: maps, overlays of every map, all of them side by side; nowhere if None. A folder that was
@@ -103,11 +103,11 @@ def explain_source(
     ------
     InputError
         If there is no such method, the source has no such frames, or the folder holds something else.
-    ShardError
+    PartError
         If some of many maps failed again and again, when all others are there.
     """
     require_methods(methods or ())
-    out = None if out is None else as_path(out)
+    out = None if out is None else Path(out)
     if trials < 1:
         raise InputError(f"--trials must be at least 1, got {trials}")
     trained = open_run(run, device=device)
@@ -152,14 +152,14 @@ def explain_source(
         if not output.complete:
             with stage(on_progress, title) as count:
                 show = _show_first(output.folder, chosen.ids, on_progress) if colours == "signed" else None
-                explained = explain(parts=output.parts / "parts", on_map=show, on_progress=count)
+                explained = explain(parts=output.folder / "parts", on_map=show, on_progress=count)
                 # while the stage is open: what differs in numbers alone is then shown once
                 for warning in dict.fromkeys(one for notes in explained.methods.values() for one in notes.warnings):
                     warned = [method for method, notes in explained.methods.items() if warning in notes.warnings]
                     note(on_progress, f"{', '.join(warned)}: {warning}")
             draw_explained(explained, output.folder, colours=colours)
             save_result(explained, output.folder)
-            remove(output.parts / "parts")  # not before: what fails above goes on from them
+            remove(output.folder / "parts")  # not before: what fails above goes on from them
             del explained  # it is read once more, and is large
     wrote(on_progress, out, what, kept=output.complete)
     return load_explanation(out)
@@ -183,7 +183,7 @@ def score_explained(
 
     `run` is the network that was explained, `fill` a row of `FILLS`; as in the thesis every pixel is gone after as many
     steps as the image is high if `steps` is None. Curves and scores are written to the folder `out`, if it is named;
-    interrupted, it goes on after the last trial. `on` says where trials are scored, a row of `shards.EXECUTORS`:
+    interrupted, it goes on after the last trial. `on` says where trials are scored, a row of `runner.EXECUTORS`:
     `serial`, `processes`, `processes=4`; `retry_failed` tries those again that failed three times before.
 
     Raises
@@ -192,7 +192,7 @@ def score_explained(
         If there is no such fill or folder, or the folder to write holds something else.
     CheckpointError
         If the explanations are of another network.
-    ShardError
+    PartError
         If some of several trials failed again and again, when all others are there.
     """
     get_fill(fill)

@@ -1,9 +1,8 @@
-"""Work on shards, for processes that import it by this module's name."""
+"""Work on parts that counts its tries, for processes that import it by this module's name."""
 
 import errno
 import os
 import signal
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,36 +10,33 @@ import pyarrow as pa
 
 from sliplens.codec import write_tables
 from sliplens.errors import InputError, RecordingError
-from sliplens.parts import Shard, shard
-from sliplens.progress import OnProgress
-from sliplens.shards import MakePart, Work, WorkError
+from sliplens.progress import report_progress
+from sliplens.runner import MakePart, Part, Work, part
 
 SCHEMA = pa.schema({"trial": pa.string(), "value": pa.int64()})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Count(Work):
-    """Writes numbers, and remembers in a folder how often each shard was begun."""
+    """Writes numbers, and logs each try of a part in a folder."""
 
     log: Path
     refuse: frozenset[str] = frozenset()
     """Trials that fail."""
     kill: frozenset[str] = frozenset()
-    """Trials at whose first try the process is killed, as for want of memory."""
+    """Trials at whose first try the process is killed."""
     no_room: frozenset[str] = frozenset()
-    """Trials for which the disk has no room."""
+    """Trials for which the disk is full."""
     damaged: frozenset[str] = frozenset()
-    """Trials whose recording is at fault."""
-    unready: frozenset[str] = frozenset()
-    """Trials that need what cannot be loaded."""
+    """Trials whose recording is damaged."""
     broken: str = ""
-    """What is wrong with all of it."""
+    """Error of the preparation."""
 
     def begin(self) -> MakePart:
         if self.broken:
             raise InputError(self.broken)
 
-        def make(item: str, path: Path, on_progress: OnProgress) -> None:
+        def make(item: str, path: Path) -> None:
             tried = self.log / f"{item}-{len(list(self.log.glob(f'{item}-*')))}"
             tried.write_text(str(os.getpid()))
             path.write_text("half of a p")
@@ -49,30 +45,29 @@ class Count(Work):
             if item in self.refuse:
                 raise InputError(f"{item} is damaged; record it again")
             if item in self.damaged:
-                raise RecordingError(f"{item} ends in its midst; record it again")
-            if item in self.unready:
-                raise WorkError(InputError(f"the network of {item} is gone"))
+                raise RecordingError(f"{item} ends early; record it again")
             if item in self.no_room:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            on_progress(2, 3)
+            report_progress(2, 3)
             rows = {"trial": [item] * 3, "value": [ord(item[-1]) + number for number in range(3)]}
             write_tables([pa.table(rows, SCHEMA)], path, SCHEMA)
 
         return make
 
     def tries(self) -> dict[str, int]:
-        """How often each trial was begun."""
+        """Return how often each trial was begun."""
         names = [path.name.rpartition("-")[0] for path in self.log.iterdir()]
         return {name: names.count(name) for name in sorted(set(names))}
 
 
 class CountInThreads(Count):
-    """The same, several shards side by side."""
+    """Count several parts at a time."""
 
     in_threads = True
 
 
-def shards(names: str = "abcde", *, recipe: object = 1) -> Iterator[Shard]:
-    """Shards of three frames, one of each letter."""
-    for name in names:
-        yield shard(name, trial=name, frames=3, recipe=recipe, shown=name, suffix=".parquet")
+def parts(names: str = "abcde", *, recipe: object = 1) -> list[Part]:
+    """Return parts of three frames, one for each letter."""
+    return [
+        part(name, trial=name, frames=3, recipe=recipe, content=name, suffix=".parquet") for name in names
+    ]

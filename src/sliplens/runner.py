@@ -1,0 +1,605 @@
+"""Runs a function over the parts of a work: on disk or in memory, resumed, in this process, in several, or on Ray.
+
+A part is a file or a folder that is complete or absent. Its name holds a hash of everything that shapes it, so that an
+interrupted work continues with the parts that are missing, and changed frames or settings make other parts.
+"""
+
+import errno
+import hashlib
+import logging
+import os
+import pickle
+import re
+import secrets
+import signal
+import sys
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from contextvars import copy_context
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, ClassVar, TypeAlias
+from urllib.parse import quote
+
+import pyarrow as pa
+from loky import get_reusable_executor
+from loky.process_executor import BrokenProcessPool
+
+from sliplens._version import __version__
+from sliplens.codec import load_record, open_table, regrouped, save_record, write_tables
+from sliplens.errors import InputError, PartError, RecordingError, SliplensError
+from sliplens.extras import Table, require_packages
+from sliplens.files import (
+    hash_json,
+    is_locked,
+    locked,
+    output_folder,
+    partial_folder,
+    remove,
+    require_new_file,
+    scratch_folder,
+)
+from sliplens.progress import OnProgress, counting, current_reporter, open_stage
+
+LONGEST = 8192
+"""Largest number of frames of a part; a longer trial is divided."""
+TRIES = 3
+"""Number of times a part is tried before it is set aside; once if its recording is damaged."""
+_LONGEST_NAME = 200  # of a folder; file systems take 255 bytes
+_STATE = "_parts"  # readers of Parquet data sets skip names that begin with an underscore
+_COMMAND = "the interrupted command"
+_PART = re.compile(r"\d{8}-(\d+)-([0-9a-f]{16})(\.\w+)?")
+_FATAL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}  # no other part could be written either
+
+MakePart: TypeAlias = Callable[[Any, Path], None]
+"""Takes the item of a part and the path to write; reports its frames by `progress.report_progress`."""
+
+
+class Work(ABC):
+    """Function over parts with its settings; pickled for other processes, so that it holds paths and settings."""
+
+    in_threads: ClassVar[bool] = False
+    """True if one process makes several parts at a time in threads."""
+
+    @property
+    def on_gpu(self) -> bool:
+        """True if each worker needs a graphics card."""
+        return False
+
+    @abstractmethod
+    def begin(self) -> MakePart:
+        """Load what all parts need, once in each process, and return the function that makes one."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Part:
+    """Some frames of a trial that are processed together."""
+
+    item: Any
+    """Argument of the function that makes the part; pickled, so that it holds names and numbers, no frames."""
+    name: str
+    """Name in messages, such as `trial-012 from frame 8192`."""
+    frames: int
+    path: str
+    """Path in the folder of all parts."""
+
+    @property
+    def key(self) -> str:
+        """Hash of everything that shapes the part."""
+        match = _PART.fullmatch(self.path.rpartition("/")[2])
+        assert match is not None
+        return match[2]
+
+
+def part(
+    item: Any,
+    *,
+    trial: str,
+    frames: int,
+    recipe: object,
+    content: str,
+    first: int = 0,
+    suffix: str = "",
+    name: str | None = None,
+) -> Part:
+    """Return a part of a trial, named by everything that shapes it.
+
+    `content` is the hash of the trial's frames, `recipe` what else shapes the part (weights, settings). The part is a
+    folder if `suffix` is empty. `name` is the trial's if None.
+    """
+    key = hash_json({"recipe": recipe, "shown": content, "first": first, "frames": frames, "sliplens": __version__})
+    folder = quote(trial, safe="")
+    if len(folder) > _LONGEST_NAME:
+        folder = re.sub("%[0-9A-F]?$", "", folder[:_LONGEST_NAME]) + f"~{hash_json(trial)}"
+    name = name or (f"{trial} from frame {first}" if first else trial)
+    return Part(item=item, name=name, frames=frames, path=f"trial={folder}/{first:08d}-{frames}-{key}{suffix}")
+
+
+def run_parts(
+    work: Work,
+    parts: Sequence[Part],
+    folder: Path,
+    *,
+    title: str,
+    on: str = "serial",
+    retry_failed: bool = False,
+    on_part: Callable[[Part], None] | None = None,
+) -> None:
+    """Make the parts that are missing in a folder.
+
+    A part that fails `TRIES` times, or once with a `RecordingError`, is set aside, and the others are made.
+
+    Parameters
+    ----------
+    title
+        Description of the work for `read_status`.
+    on
+        Row of `EXECUTORS` with its argument: `serial`, `processes`, `processes=4`, `ray`, `ray=ADDRESS`.
+    retry_failed
+        If True, parts that were set aside before are tried again.
+    on_part
+        Called with each part once it exists.
+
+    Raises
+    ------
+    PartError
+        If parts were set aside, after all others were made; the error of the part itself if there is only one.
+    InputError
+        If the executor is unknown, or the work cannot be prepared.
+    """
+    name, _, argument = on.partition("=")
+    executor = EXECUTORS.pick(name)
+    tally = _Tally(total=sum(each.frames for each in parts), on_part=on_part)
+    missing: deque[Part] = deque()
+    for each in parts:
+        if (folder / each.path).exists():
+            _failure_file(folder, each).unlink(missing_ok=True)  # ended before it could remove it
+            tally.add(each)
+        elif retry_failed or not _load_failure(folder, each).set_aside:
+            if retry_failed:
+                _failure_file(folder, each).unlink(missing_ok=True)
+            missing.append(each)
+    error: Exception | None = None
+    if missing:
+        for draft in folder.glob("trial=*/.*.draft"):  # of processes that were killed
+            remove(draft)
+        (folder / _STATE).mkdir(parents=True, exist_ok=True)
+        plan = _Plan(title=title, parts=len(parts), frames=tally.total, started_s=time.time(), on=on)
+        save_record(plan, folder / _STATE / "plan.json")
+        with executor(work, argument, len(missing)) as pool:
+            error = _run(pool, missing, folder, tally)
+    failures = [failure for each in parts if (failure := _load_failure(folder, each)).errors]
+    if failures and len(parts) == 1 and error is not None:
+        remove(folder / _STATE)
+        raise error
+    if failures:
+        raise PartError({failure.name: failure.errors[-1] for failure in failures}, parts=len(parts))
+    with suppress(OSError):
+        remove(folder / _STATE)
+
+
+def _run(pool: "_Pool", missing: deque[Part], folder: Path, tally: "_Tally") -> Exception | None:
+    """Submit parts until none is missing; return the last error of a part."""
+    running: dict[Future, Part] = {}
+    alone: deque[Part] = deque()  # a process ended while they were made: which of them is at fault shows one by one
+    last: Exception | None = None
+    while missing or alone or running:
+        waiting, most = (alone, 1) if alone else (missing, pool.workers)
+        while waiting and len(running) < most:
+            each = waiting.popleft()
+            try:
+                running[pool.submit(folder, each, partial(tally.within, each))] = each
+            except pool.lost:
+                alone.append(each)
+                break
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            each, queue = running.pop(future), missing
+            try:
+                error = future.result()
+            except pool.lost:
+                queue, error = alone, SliplensError("its process was ended from outside, perhaps for want of memory")
+            if error is None:
+                _failure_file(folder, each).unlink(missing_ok=True)
+                tally.add(each)
+                continue
+            if isinstance(error, _PreparationError):
+                raise error.args[0]
+            if isinstance(error, OSError) and error.errno in _FATAL:
+                raise error
+            last = error
+            tally.partly.pop(each.key, None)
+            sentence = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
+            failure = _load_failure(folder, each)
+            final = isinstance(error, RecordingError)
+            failure = replace(failure, errors=(*failure.errors, sentence), final=final)
+            save_record(failure, _failure_file(folder, each))
+            if not failure.set_aside:
+                queue.append(each)
+    return last
+
+
+class _PreparationError(Exception):
+    """Error of `Work.begin`: every part would fail with it."""
+
+
+def _make(prepare: Callable[[], MakePart], folder: Path, each: Part) -> Exception | None:
+    """Make a part under a draft's name and rename it; return the error, if any."""
+    path = folder / each.path
+    draft = path.with_name(f".{path.name}.{os.getpid()}.draft")
+    try:
+        try:
+            make = prepare()
+        except Exception as error:  # raised again by the driver
+            return _PreparationError(error)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            make(each.item, draft)
+            draft.replace(path)
+    except Exception as error:  # a damaged trial must not end the others
+        return error
+    finally:
+        remove(draft)
+    return None
+
+
+@dataclass(kw_only=True)
+class _Tally:
+    """Frames done so far, reported as they change."""
+
+    total: int
+    on_part: Callable[[Part], None] | None
+    report: OnProgress = field(default_factory=current_reporter)
+    done: int = 0
+    partly: dict[str, int] = field(default_factory=dict)
+    """Frames done of the parts that are being made, by key."""
+    lock: Any = field(default_factory=threading.Lock)
+
+    def add(self, each: Part) -> None:
+        with self.lock:
+            self.partly.pop(each.key, None)
+            self.done += each.frames
+            self._report()
+        if self.on_part is not None:
+            self.on_part(each)
+
+    def within(self, each: Part, done: int, total: int) -> None:
+        with self.lock:
+            self.partly[each.key] = each.frames * done // max(total, 1)
+            self._report()
+
+    def _report(self) -> None:
+        self.report(self.done + sum(self.partly.values()), self.total)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pool:
+    """Workers of an executor."""
+
+    workers: int
+    submit: Callable[[Path, Part, OnProgress], Future]
+    """Takes the folder of the parts, a part, and a callback for its progress."""
+    lost: type[Exception]
+    """Error of a future whose worker ended."""
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def _serial(work: Work, _: str, most: int) -> Iterator[_Pool]:
+    prepare = lru_cache(work.begin)
+    threads = min(cores(), most) if work.in_threads else 1
+    ended = threading.Event()
+
+    def make(folder: Path, each: Part, count: OnProgress) -> Exception | None:
+        def report(done: int, total: int) -> None:
+            if ended.is_set():
+                raise KeyboardInterrupt
+            count(done, total)
+
+        with counting(report):
+            return _make(prepare, folder, each)
+
+    def submit(*arguments: Any) -> Future:
+        if threads > 1:
+            return pool.submit(copy_context().run, make, *arguments)
+        future: Future = Future()
+        future.set_result(make(*arguments))
+        return future
+
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            yield _Pool(workers=threads, submit=submit, lost=_NeverLostError)
+        except BaseException:
+            ended.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+class _NeverLostError(Exception):
+    """Error of a lost worker where none can be lost."""
+
+
+@contextmanager
+def _processes(work: Work, number: str, most: int) -> Iterator[_Pool]:
+    if number and not (number.isdigit() and int(number)):
+        raise InputError(f"--on processes={number} is no number of processes; write processes or processes=2")
+    count = min(int(number or cores()), most)
+    threads, packed = max(1, cores() // count), pickle.dumps(work)
+
+    def executor() -> Any:  # a new one after a worker was lost
+        return get_reusable_executor(count, timeout=60, initializer=_begin_worker, initargs=(os.getpid(), threads))
+
+    def submit(folder: Path, each: Part, _: OnProgress) -> Future:
+        return executor().submit(_make_remotely, packed, Path.cwd(), folder, each)
+
+    try:
+        yield _Pool(workers=count, submit=submit, lost=BrokenProcessPool)
+    except BaseException:
+        executor().shutdown(kill_workers=True)
+        raise
+
+
+def _begin_worker(parent: int, threads: int) -> None:
+    """Prepare a process for parts: it ends with its parent, and leaves interruptions to it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(threads)
+
+    def end_with_parent() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def _make_remotely(packed: bytes, working_directory: Path, folder: Path, each: Part) -> Exception | None:
+    os.chdir(working_directory)  # relative paths start there
+    return _make(partial(_prepared, packed), folder, each)
+
+
+@lru_cache(maxsize=1)
+def _prepared(packed: bytes) -> MakePart:
+    return pickle.loads(packed).begin()  # noqa: S301 (bytes that this program packed for its own process)
+
+
+@contextmanager
+def _ray(work: Work, address: str, most: int) -> Iterator[_Pool]:
+    require_packages("ray", extra="ray", purpose="--on ray")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # else Ray reports its use to its makers
+    import ray  # noqa: PLC0415 (an extra)  # pyright: ignore[reportMissingImports]
+    from ray.exceptions import RayError  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+
+    connected = ray.is_initialized()
+    if not connected:
+        # without an address Ray tries the one of an earlier cluster, which may be gone
+        where: dict[str, Any] = {"address": address} if address else {"address": "local", "include_dashboard": False}
+        try:
+            ray.init(**where, log_to_driver=False, logging_level=logging.ERROR)
+        except Exception as error:  # what it raises if a node takes more than 30 s to start
+            reason, option = " ".join(str(error).split())[:200], f"ray={address}" if address else "ray"
+            raise InputError(f"--on {option} has no cluster of Ray ({reason}); start it, check it, or retry") from None
+    try:
+        unit = "GPU" if work.on_gpu else "CPU"
+        if (count := int(ray.cluster_resources().get(unit, 0))) < 1:
+            raise InputError(f"the cluster of Ray has no {unit}; start a node that has one")
+        packed, directory = ray.put(pickle.dumps(work)), Path.cwd()
+        options: dict[str, Any] = {"num_cpus": 1, "num_gpus": int(work.on_gpu), "max_retries": 0}
+        task: Any = ray.remote(scheduling_strategy="SPREAD", **options)(_make_remotely)
+
+        def submit(folder: Path, each: Part, _: OnProgress) -> Future:
+            return task.remote(packed, directory, folder, each).future()
+
+        yield _Pool(workers=min(count, most), submit=submit, lost=RayError)
+    finally:
+        if not connected:
+            ray.shutdown()
+
+
+EXECUTORS = Table("executor", "sliplens.executors", {"serial": _serial, "processes": _processes, "ray": _ray})
+"""Where parts are made. A row takes the work, what follows `=`, and the number of parts, and opens its workers."""
+
+
+def run_table(
+    work: Work,
+    parts: Sequence[Part],
+    out: Path | None,
+    *,
+    title: str,
+    recipe: object,
+    resumable: bool = True,
+    on: str = "serial",
+    retry_failed: bool = False,
+    overwrite: bool = False,
+    on_rows: Callable[[pa.Table], None] | None = None,
+) -> tuple[pa.Schema, pa.Table | None]:
+    """Make parts that are Parquet files and join them; return the columns, and the rows if `out` is None.
+
+    With a suffix `out` is one file. Without, it is a folder, and the parts remain: a Parquet data set with a folder per
+    trial. `on_rows` is called with the rows of each part in turn. Other parameters as in `run_parts`.
+    """
+
+    def make(folder: Path) -> pa.Schema:
+        with open_stage(title):
+            run_parts(work, parts, folder, title=title, on=on, retry_failed=retry_failed)
+        return open_table(folder / parts[0].path).schema_arrow
+
+    def rows(folder: Path) -> Iterator[pa.Table]:
+        for each in parts:
+            file = open_table(folder / each.path)
+            if on_rows is None:
+                yield from map(file.read_row_group, range(file.num_row_groups))
+            else:
+                on_rows(table := file.read())
+                yield table
+
+    if out is not None and not out.suffix:
+        every = hashlib.sha256("".join(each.path for each in parts).encode())  # changed frames make another result
+        config = {"recipe": recipe, "shards_sha256": every.hexdigest()}
+        if not resumable:  # frames in memory cannot be compared with those of an earlier call
+            config["made"] = secrets.token_hex(8)
+        with output_folder(out, stage=title, config=config, overwrite=overwrite) as output:
+            schema = make(output.folder)
+            if on_rows is not None:
+                deque(rows(output.folder), maxlen=0)
+            return schema, None
+    if out is None:
+        with scratch_folder() as folder:
+            schema = make(folder)
+            return schema, write_tables(regrouped(rows(folder), rows=LONGEST), None, schema)
+    folder = partial_folder(out)
+    with locked(out):
+        require_new_file(out, overwrite=overwrite)
+        if not resumable:
+            remove(folder)
+        try:
+            schema = make(folder)
+            write_tables(regrouped(rows(folder), rows=LONGEST), out, schema)
+        except BaseException:
+            if not any(path.is_file() for path in folder.rglob("*")):
+                remove(folder)
+            raise
+        remove(folder)
+    return schema, None
+
+
+def require_new_table(out: Path, *, suffix: str | Sequence[str], overwrite: bool = False) -> None:
+    """Check that a table can be written under its name.
+
+    Parts that are older than the table are what a process left that was killed after writing it; they are removed.
+    """
+    parts = partial_folder(out)
+    if out.is_file() and parts.is_dir() and out.stat().st_mtime_ns >= parts.stat().st_mtime_ns:
+        with locked(out):
+            remove(parts)
+    require_new_file(out, suffix=suffix, overwrite=overwrite)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """Errors of a part that could not be made."""
+
+    name: str
+    errors: tuple[str, ...] = ()
+    """Message of each try."""
+    final: bool = False
+    """True if the recording is damaged, so that no further try can succeed."""
+
+    @property
+    def set_aside(self) -> bool:
+        """True if the part is not tried again unless the user retries failed parts."""
+        return self.final or len(self.errors) >= TRIES
+
+
+def _failure_file(folder: Path, each: Part) -> Path:
+    return folder / _STATE / f"{each.key}.failed"
+
+
+def _load_failure(folder: Path, each: Part) -> Failure:
+    path = _failure_file(folder, each)
+    return load_record(path, Failure, command=_COMMAND) if path.is_file() else Failure(name=each.name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Plan:
+    title: str
+    parts: int
+    frames: int
+    started_s: float
+    on: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Status:
+    """Progress of a work, counted from its parts."""
+
+    title: str
+    on: str
+    """Executor, as in `--on`."""
+    parts: int
+    done: int
+    """Number of parts that exist."""
+    frames: int
+    """Number of frames of all parts; of maps if each is a part."""
+    frames_done: int
+    failed: tuple[Failure, ...]
+    running: bool
+    """True if a process is making the result."""
+    frames_per_s: float | None
+    """Rate since the last start; None if no part is newer."""
+    ends: str | None
+    """Date and time in UTC at which the work ends at that rate (ISO 8601); None if nothing is running."""
+
+
+def read_status(out: Path | str) -> list[Status]:
+    """Return the progress of every incomplete work on a result; empty if it is complete.
+
+    Works from another process or machine while the result is being made.
+
+    Parameters
+    ----------
+    out
+        File or folder that a command is writing.
+
+    Raises
+    ------
+    InputError
+        If nothing of that name was begun.
+
+    Examples
+    --------
+    >>> from sliplens import read_status
+    >>> for work in read_status("runs/mine/margins"):  # doctest: +SKIP
+    ...     print(work.title, work.done, work.parts, work.ends)
+    Predicting frames (difference) 812 1404 2026-11-23T18:20:11+00:00
+    """
+    out = Path(out)
+    folders = [place for place in (out, partial_folder(out)) if place.exists()]
+    if not folders:
+        raise InputError(f"nothing was begun at {out}; name the file or folder that a command writes")
+    plans = [path for place in folders if place.is_dir() for path in sorted(place.rglob(f"{_STATE}/plan.json"))]
+    running = is_locked(out)
+    return [_read_status(path.parent, running=running) for path in plans]
+
+
+def _read_status(state: Path, *, running: bool) -> Status:
+    plan = load_record(state / "plan.json", _Plan, command=_COMMAND)
+    made = [
+        (int(match[1]), path.stat().st_mtime)
+        for path in state.parent.glob("trial=*/*")
+        if (match := _PART.fullmatch(path.name)) is not None
+    ]
+    new = [(frames, made_s) for frames, made_s in made if made_s >= plan.started_s]
+    last_s = max((made_s for _, made_s in new), default=plan.started_s)
+    rate = sum(frames for frames, _ in new) / (last_s - plan.started_s) if last_s > plan.started_s else None
+    done = sum(frames for frames, _ in made)
+    ends = None
+    if rate is not None and running:
+        end = datetime.fromtimestamp(last_s, UTC) + timedelta(seconds=(plan.frames - done) / rate)
+        ends = end.isoformat(timespec="seconds")
+    return Status(
+        title=plan.title,
+        on=plan.on,
+        parts=plan.parts,
+        done=len(made),
+        frames=plan.frames,
+        frames_done=done,
+        failed=tuple(load_record(path, Failure, command=_COMMAND) for path in sorted(state.glob("*.failed"))),
+        running=running,
+        frames_per_s=rate,
+        ends=ends,
+    )
+
+
+__all__ = ["Failure", "Part", "Status", "Work", "part", "read_status", "run_parts", "run_table"]
