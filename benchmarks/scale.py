@@ -45,7 +45,7 @@ from sliplens.files import hash_file, hash_json, machine, partial_folder, versio
 from sliplens.markers.tracking import track
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
-from sliplens.runner import MakePart, Work, make_parts
+from sliplens.runner import MakePart, Part, Work, part, run_parts
 from sliplens.study.workspace import explain_source
 
 NETWORK = "chromatouch-difference"
@@ -160,7 +160,7 @@ class Empty(Work):
     def begin(self) -> MakePart:
         """Write a byte a part."""
 
-        def make(_item: int, path: Path, _on_progress: OnProgress) -> None:
+        def make(_item: int, path: Path) -> None:
             path.write_bytes(b"-")
 
         return make
@@ -195,16 +195,15 @@ STAGES = {"predict": time_predict, "explain": time_explain, "track": time_track}
 
 
 def weigh_driver(folder: Path) -> dict[str, float]:
-    """What the driver takes: for ten thousand empty shards, more than for a hundred, and for a long list of trials."""
+    """What the driver takes: for ten thousand empty parts, more than for a hundred, and for a long list of trials."""
 
-    def shards(count: int) -> Iterator[Shard]:
-        for number in range(count):
-            yield shard(number, trial=f"t{number}", frames=1, recipe=0, shown=str(number))
+    def parts(count: int) -> list[Part]:
+        return [part(at, trial=f"t{at}", frames=1, recipe=0, content=str(at)) for at in range(count)]
 
     peaks_mb, took_s = [], 0.0
     for count in (100, EMPTY):
         began_s = time.perf_counter()
-        make_parts(Empty(), lambda count=count: shards(count), folder / str(count), title="Nothing")
+        run_parts(Empty(), parts(count), folder / str(count), title="Nothing")
         took_s = time.perf_counter() - began_s
         peaks_mb.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
     tracemalloc.start()
@@ -417,7 +416,7 @@ def main() -> None:
         "speedup_processes_one_core": over(by_processes, ONE_CORE),
         "ray_over_processes": over("ray", by_processes),
         "same_bytes": {stage: len(set(own.values())) == 1 for stage, own in each("sha256").items()},
-        "driver_mb_10k_shards": driver["grew_mb"],
+        "driver_mb_10k_parts": driver["grew_mb"],
         "kills": killed.total(),
         "kills_survived": survived,
         "killed": dict(killed),

@@ -159,7 +159,7 @@ def pair_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def elsewhere(monkeypatch: pytest.MonkeyPatch) -> str:
     """A place to work that gets what another process gets, without the seconds in which that imports torch."""
     serial = EXECUTORS["serial"]
-    monkeypatch.setitem(EXECUTORS._rows, "elsewhere", lambda work, *_: serial(pickle.loads(pickle.dumps(work)), "", 1))  # noqa: S301
+    monkeypatch.setitem(EXECUTORS, "elsewhere", lambda work, *_: serial(pickle.loads(pickle.dumps(work)), "", 1))  # noqa: S301
     return "elsewhere"
 
 

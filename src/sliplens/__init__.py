@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
     from sliplens.models.predictions import predict
-    from sliplens.runner import read_status
     from sliplens.plots.figure import plot
     from sliplens.recordings.check import check_dataset
     from sliplens.recordings.corrections import draft_corrections
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from sliplens.recordings.relabelling import label_dataset
     from sliplens.recordings.splits import split_dataset
     from sliplens.report.page import write_report
+    from sliplens.runner import read_status
     from sliplens.simulation.sharing import compare_datasets
     from sliplens.simulation.trials import simulate
     from sliplens.study.diagnose import diagnose

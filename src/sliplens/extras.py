@@ -52,9 +52,7 @@ class Table(Mapping[str, Row]):
 
     def pick(self, name: str) -> Row:
         """Row of a name that a user gave."""
-        if name not in self:
-            raise InputError(f"there is no {self.noun} named {name!r}; choose one of {', '.join(self)}")
-        return self[name]
+        return pick(self, name, noun=self.noun)
 
     @cached_property
     def _added(self) -> dict[str, Row]:
@@ -71,6 +69,13 @@ class Table(Mapping[str, Row]):
                     f"{adds}, but {point.value} cannot be imported ({error}); update or uninstall {package}"
                 ) from error
         return rows
+
+
+def pick(rows: Mapping[str, Row], name: str, *, noun: str) -> Row:
+    """Return the row of a name that a user gave; `noun` says in the message what a row is."""
+    if name not in rows:
+        raise InputError(f"there is no {noun} named {name!r}; choose one of {', '.join(rows)}")
+    return rows[name]
 
 
 ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")

@@ -286,8 +286,9 @@ def partial_folder(target: Path) -> Path:
     return target.with_name(f".{target.name}.partial")
 
 
-def _lock(target: Path) -> FileLock:
-    return FileLock(target.with_name(f".{target.name}.lock"), blocking=False)
+def lock_file(target: Path) -> Path:
+    """Return the file that is locked while a target is written; one that a killed process left is not locked."""
+    return target.with_name(f".{target.name}.lock")
 
 
 @contextmanager
@@ -299,7 +300,7 @@ def locked(target: Path) -> Iterator[None]:
     InputError
         If another process is writing it, or its parent folder cannot be written.
     """
-    lock = _lock(target)
+    lock = FileLock(lock_file(target), blocking=False)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         lock.acquire()
@@ -314,17 +315,16 @@ def locked(target: Path) -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):  # while it is locked: a process that opened the file meanwhile makes it anew
-            Path(lock.lock_file).unlink()
+            lock_file(target).unlink()
         lock.release()
 
 
 def is_locked(target: Path) -> bool:
     """Return True if a process is writing a target."""
-    lock = _lock(target)
-    if not Path(lock.lock_file).exists():
+    if not lock_file(target).exists():
         return False
     try:
-        with lock:
+        with FileLock(lock_file(target), blocking=False):
             return False
     except (Timeout, OSError):
         return True
@@ -351,7 +351,9 @@ def output_folder(
     recipe = to_builtins(config)
     config_hash = hash_json({"stage": stage, "config": recipe, "sliplens": __version__})
     partial, replaced = partial_folder(target), target.with_name(f".{target.name}.replaced")
-    if not (replaced.exists() or Path(_lock(target).lock_file).exists()) and _is_complete(target, config_hash, run_file=run_file, overwrite=overwrite):
+    if not (replaced.exists() or lock_file(target).exists()) and _is_complete(
+        target, config_hash, run_file=run_file, overwrite=overwrite
+    ):
         yield Output(folder=target, complete=True)
         return
     with locked(target):

@@ -35,10 +35,11 @@ from loky.process_executor import BrokenProcessPool
 from sliplens._version import __version__
 from sliplens.codec import load_record, open_table, regrouped, save_record, write_tables
 from sliplens.errors import InputError, PartError, RecordingError, SliplensError
-from sliplens.extras import Table, require_packages
+from sliplens.extras import pick, require_packages
 from sliplens.files import (
     hash_json,
     is_locked,
+    lock_file,
     locked,
     output_folder,
     partial_folder,
@@ -155,7 +156,7 @@ def run_parts(
         If the executor is unknown, or the work cannot be prepared.
     """
     name, _, argument = on.partition("=")
-    executor = EXECUTORS.pick(name)
+    executor = pick(EXECUTORS, name, noun="executor")
     tally = _Tally(total=sum(each.frames for each in parts), on_part=on_part)
     missing: deque[Part] = deque()
     for each in parts:
@@ -257,6 +258,7 @@ class _Tally:
     on_part: Callable[[Part], None] | None
     report: OnProgress = field(default_factory=current_reporter)
     done: int = 0
+    reported: int = 0
     partly: dict[str, int] = field(default_factory=dict)
     """Frames done of the parts that are being made, by key."""
     lock: Any = field(default_factory=threading.Lock)
@@ -275,7 +277,9 @@ class _Tally:
             self._report()
 
     def _report(self) -> None:
-        self.report(self.done + sum(self.partly.values()), self.total)
+        if (frames := self.done + sum(self.partly.values())) != self.reported:
+            self.reported = frames
+            self.report(frames, self.total)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -407,8 +411,13 @@ def _ray(work: Work, address: str, most: int) -> Iterator[_Pool]:
             ray.shutdown()
 
 
-EXECUTORS = Table("executor", "sliplens.executors", {"serial": _serial, "processes": _processes, "ray": _ray})
+EXECUTORS = {"serial": _serial, "processes": _processes, "ray": _ray}
 """Where parts are made. A row takes the work, what follows `=`, and the number of parts, and opens its workers."""
+
+
+def require_executor(on: str) -> None:
+    """Check the name of an executor (`--on`) before any work is done."""
+    pick(EXECUTORS, on.partition("=")[0], noun="executor")
 
 
 def run_table(
@@ -480,9 +489,10 @@ def require_new_table(out: Path, *, suffix: str | Sequence[str], overwrite: bool
     Parts that are older than the table are what a process left that was killed after writing it; they are removed.
     """
     parts = partial_folder(out)
-    if out.is_file() and parts.is_dir() and out.stat().st_mtime_ns >= parts.stat().st_mtime_ns:
+    if out.is_file() and (parts.is_dir() or lock_file(out).exists()):
         with locked(out):
-            remove(parts)
+            if not (parts.is_dir() and parts.stat().st_mtime_ns > out.stat().st_mtime_ns):
+                remove(parts)
     require_new_file(out, suffix=suffix, overwrite=overwrite)
 
 

@@ -12,12 +12,10 @@ from data_sets import save_dataset
 from own_recording import TARE, write_forces, write_video
 from there import there
 
-from sliplens.errors import InputError
 from sliplens.images import write_png
-from sliplens.runner import read_status
 from sliplens.recordings import Recording, load_dataset
-from sliplens.recordings.importing import import_recordings
 from sliplens.recordings.store import read_header, write_trial
+from sliplens.runner import read_status
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +208,7 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
     [kept] = (tmp_path / ".b.partial" / "parts").glob("trial=*/0*/trials/*.parquet")
     made_ns = kept.stat().st_mtime_ns
     (status,) = read_status(tmp_path / "b")
-    assert (status.title, status.done, status.shards) == ("Importing frames", 1, 2)
+    assert (status.title, status.done, status.parts) == ("Importing frames", 1, 2)
     assert run(*broken, "--on", "processes=1") == 0  # wherever it goes on
     assert (tmp_path / "b" / "trials" / kept.name).stat().st_mtime_ns == made_ns
     assert {path.name for path in (tmp_path / "b").iterdir()} == {path.name for path in (tmp_path / "w").iterdir()}
@@ -260,16 +258,3 @@ def test_a_real_bag_without_images_is_refused_with_its_topics(
     line = refused(capsys, "import", bag, "-o", tmp_path / "data", "--sensor", "mine")
     assert "/sensors/tactip" in line
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    "words", [("s3://lab/cup.mp4",), ("cup.mp4", "--forces", "s3://lab/cup.csv"), ("cup.mp4", "s3://lab/cup.mp4")]
-)
-def test_a_recording_in_a_store_is_refused_by_its_name(words: tuple[str, ...], tmp_path: Path, capsys):
-    told = refused(capsys, "import", *words, "-o", tmp_path / "data")
-    assert f"sliplens import reads and writes no {next(word for word in words if word[:2] == 's3')}; copy it" in told
-
-
-def test_a_store_is_no_place_for_a_data_set_and_that_is_told_first(tmp_path: Path):
-    with pytest.raises(InputError, match=r"^s3://lab/data is in a store, where this writes nothing"):
-        import_recordings(tmp_path / "nothing", out="s3://lab/data")

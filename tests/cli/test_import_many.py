@@ -12,10 +12,10 @@ from own_recording import write_forces, write_video
 from small import make_recording
 from there import there
 
-from sliplens.runner import TRIES
 from sliplens.recordings import Recording, load_dataset, trial_writer
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.trial_writer import import_trial
+from sliplens.runner import TRIES
 
 PROFILE = 'name = "mine"\ncamera_size_px = [112, 112]\nrotate_deg = 90\nnormal_axis = "z"\nnormal_sign = -1\n'
 

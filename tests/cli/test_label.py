@@ -12,7 +12,6 @@ from data_sets import contents, save_dataset
 from there import there
 
 from sliplens.images import write_png
-from sliplens.runner import read_status
 from sliplens.recordings import (
     ContactState,
     Corrections,
@@ -30,6 +29,7 @@ from sliplens.recordings.store import (
     read_header,
     save_forces,
 )
+from sliplens.runner import read_status
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 

@@ -45,7 +45,9 @@ def test_a_table_of_predictions_finds_its_frames(small_dataset: Dataset, tmp_pat
             View(source=table, output=output).run()
             assert name_of(output) == "test-wet-7"
             continue
-        with pytest.raises(InputError, match=r"which does not exist; name the source first, and the table with --predic"):
+        with pytest.raises(
+            InputError, match=r"which does not exist; name the source first, and the table with --predic"
+        ):
             View(source=table, output=tmp_path / "b.rrd").run()
     View(source=small_dataset.folder, trial="test-wet-7", predictions=table, output=tmp_path / "b.rrd").run()
 

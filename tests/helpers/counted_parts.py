@@ -68,6 +68,4 @@ class CountInThreads(Count):
 
 def parts(names: str = "abcde", *, recipe: object = 1) -> list[Part]:
     """Return parts of three frames, one for each letter."""
-    return [
-        part(name, trial=name, frames=3, recipe=recipe, content=name, suffix=".parquet") for name in names
-    ]
+    return [part(name, trial=name, frames=3, recipe=recipe, content=name, suffix=".parquet") for name in names]

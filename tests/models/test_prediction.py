@@ -18,20 +18,20 @@ from there import there
 
 import sliplens as sl
 from sliplens.codec import TABLE_SUFFIXES
-from sliplens.errors import ImageError, InputError, RecordingError, PartError
+from sliplens.errors import ImageError, InputError, PartError, RecordingError
 from sliplens.images import absolute_difference, write_png
 from sliplens.markers.camera import CAMERA_REASON
 from sliplens.models import Network, load_checkpoint
 from sliplens.models.checkpoint import STRANGE_REASON
 from sliplens.models.predictions import Predictions
 from sliplens.models.predictions import predict as predict_source
-from sliplens.runner import read_status
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.exporting import export_lerobot
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import ContactState
+from sliplens.runner import read_status
 
 TRIAL = "test-wet-7"
 

@@ -1,7 +1,7 @@
 """What commands share: options that mean the same in several, and the call that hands options to the library."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from inspect import signature
 from pathlib import Path

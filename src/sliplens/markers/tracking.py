@@ -16,7 +16,7 @@ from sliplens.extras import import_cv2
 from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
-from sliplens.progress import OnProgress, note, number_of
+from sliplens.progress import OnProgress, note, number_of, report_progress, reporting
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.options import ReadOptions
@@ -119,7 +119,7 @@ def track(
     split, trial, format, options, sensor
         As `open_source` takes them.
     on, retry_failed
-        Where the trials are followed, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
+        Where the trials are followed, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
         whether those are tried again that failed three times before.
     out
         Parquet file to write; without an ending a folder, a Parquet data set with a file a trial. Whole or not at all,

@@ -21,7 +21,7 @@ from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
 from sliplens.models.checkpoint import Estimate, Network, open_run, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
-from sliplens.progress import OnProgress, note, number_of, stage
+from sliplens.progress import OnProgress, note, number_of, report_progress, reporting, stage
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE
@@ -220,7 +220,7 @@ def predict(
     device
         Device of a network that is loaded here: cpu or cuda.
     on, retry_failed
-        Where the trials are read, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
+        Where the trials are read, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
         whether those are tried again that failed three times before.
     out
         File to write, Parquet, CSV or JSON by its ending; without an ending a folder, a Parquet data set with a file a

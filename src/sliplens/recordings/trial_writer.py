@@ -12,10 +12,9 @@ from jaxtyping import Bool, Float
 from threadpoolctl import threadpool_limits
 
 from sliplens.codec import RESULT_FILE, load_record, save_record
-from sliplens.errors import RecordingError, PartError, SliplensError
+from sliplens.errors import PartError, RecordingError, SliplensError
 from sliplens.files import remove
 from sliplens.images import require_rgb
-
 from sliplens.progress import number_of, open_stage, report_progress
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import LeftOut, TrialInfo, trial_info, trial_path

@@ -19,7 +19,6 @@ from sliplens.explainers.contract import Explainer
 from sliplens.explainers.table import EXPLAINERS, network_images
 from sliplens.models import Network
 from sliplens.models.engines import expecting
-from sliplens.runner import Part, part
 from sliplens.plots.saliency import NOMINAL_MARGINS
 from sliplens.progress import OnProgress, number_of
 from sliplens.recordings import Dataset
@@ -28,6 +27,7 @@ from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
 from sliplens.results.evaluation import ANSWER, SHARE
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes, require_saliency
+from sliplens.runner import Part, part
 from sliplens.study.stages import Find, Stage
 
 DEFAULT_LEVELS = NOMINAL_MARGINS

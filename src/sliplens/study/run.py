@@ -32,7 +32,7 @@ from sliplens.results.study import (
     UntrainedMaps,
     tell_left_out,
 )
-from sliplens.runner import EXECUTORS, MakePart, Work
+from sliplens.runner import MakePart, Work, require_executor
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.checks import CASCADE, Measuring, Randomising, Untrained, time_explainers
 from sliplens.study.choice import (
@@ -128,7 +128,7 @@ def run_study(
     steps
         Steps of the thesis's deletion score; as many as there are rows of pixels, as in the thesis, if None.
     on, retry_failed
-        Where maps are made and judged, a row of `shards.EXECUTORS`: `serial`, `processes`, `processes=4`; and whether
+        Where maps are made and judged, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`; and whether
         those are tried again that failed three times before. Processes need a script that starts its work under
         `if __name__ == "__main__":`, as all that starts processes does.
 
@@ -153,7 +153,7 @@ def run_study(
         raise InputError(f"{random_orders} random orders are too few; --random-orders must be at least 1")
     if unknown := sorted(set(tests) - set(TESTS)):
         raise InputError(f"a study has no test named {unknown[0]!r}; choose from {', '.join(TESTS)}")
-    EXECUTORS.pick(on.partition("=")[0])
+    require_executor(on)
     explainers = study_explainers(methods, budget=budget)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     if (count := min(trials, len(data.select(split=split, condition=condition)))) < FEWEST_UNITS:
