@@ -43,7 +43,6 @@ from sliplens import load_dataset, predict, simulate
 from sliplens.extras import missing_packages
 from sliplens.files import hash_file, hash_json, machine, partial_folder, versions, write_json
 from sliplens.markers.tracking import track
-from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.runner import MakePart, Part, Work, part, run_parts
 from sliplens.study.workspace import explain_source
