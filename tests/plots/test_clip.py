@@ -11,6 +11,7 @@ from sliplens.images import absolute_difference
 from sliplens.plots.clip import clip_frames, natural_rate, paint_outlines, write_clip
 from sliplens.plots.contact_sheet import brighten, brightening
 from sliplens.plots.style import PURPLE, SKY
+from sliplens.progress import reporting
 from sliplens.recordings import ContactState, GroundTruth, Recording
 
 av = pytest.importorskip("av")
@@ -64,7 +65,8 @@ def written(trial, tmp_path_factory) -> tuple[Path, list[tuple[int, int]]]:
     """The clip of the trial, and what was told while it was written."""
     path = tmp_path_factory.mktemp("clip") / "new" / "trial.mp4"
     told = []
-    write_clip(trial, path, on_progress=lambda done, total: told.append((done, total)))
+    with reporting(lambda done, total: told.append((done, total))):
+        write_clip(trial, path)
     return path, told
 
 
@@ -244,8 +246,8 @@ def test_interrupted_clip_leaves_no_file(trial, tmp_path, stop_at):
         if done == stop_at:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        write_clip(trial, tmp_path / "trial.mp4", on_progress=stop)
+    with pytest.raises(KeyboardInterrupt), reporting(stop):
+        write_clip(trial, tmp_path / "trial.mp4")
 
     assert not list(tmp_path.iterdir())
 
@@ -255,8 +257,8 @@ def test_interrupted_clip_leaves_the_one_before(trial, tmp_path):
         raise KeyboardInterrupt
 
     (tmp_path / "trial.mp4").write_bytes(b"yesterday's")
-    with pytest.raises(KeyboardInterrupt):
-        write_clip(trial, tmp_path / "trial.mp4", on_progress=stop)
+    with pytest.raises(KeyboardInterrupt), reporting(stop):
+        write_clip(trial, tmp_path / "trial.mp4")
 
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("trial.mp4", b"yesterday's")]
 

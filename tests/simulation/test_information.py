@@ -216,7 +216,7 @@ def test_the_camera_sees_the_rings_of_the_real_crop():
     [
         (lambda _: marker_sensitivity(np.array([0.0]), sensor=FLAT_GEL, touch=TOUCH), "inside"),
         (lambda one: margin_bound(one, noise_px=0.0, prior={}), "noise and priors must be positive"),
-        (lambda one: margin_bound(one, noise_px=0.1, prior={"log_friction": 0.0}), "leave out of `prior`"),
+        (lambda one: margin_bound(one, noise_px=0.1, prior={"log_friction": 0.0}), "leave fixed unknowns out"),
         (lambda one: margin_bound(one, noise_px=0.1, prior={"mu": 1.0}), "no unknown 'mu'; choose from margin"),
     ],
 )

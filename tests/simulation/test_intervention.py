@@ -43,7 +43,7 @@ RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=
 
 
 def simulate(folder: Path, recipe: SimulationRecipe) -> Dataset:
-    with output_folder(folder, stage="simulate", config={"recipe": recipe.told, "device": "cpu"}) as out:
+    with output_folder(folder, stage="simulate", config={"recipe": recipe.to_dict(), "device": "cpu"}) as out:
         simulate_dataset(out.folder, recipe)
     return load_dataset(folder)
 
@@ -168,30 +168,30 @@ def test_outlines_are_the_drawn_circles(trials):
     ],
 )
 def test_a_recipe_comes_back_from_its_folder(recipe: SimulationRecipe, tmp_path: Path):
-    with output_folder(tmp_path / "data", stage="simulate", config={"recipe": recipe.told, "device": "cpu"}):
+    with output_folder(tmp_path / "data", stage="simulate", config={"recipe": recipe.to_dict(), "device": "cpu"}):
         pass
     assert read_recipe(tmp_path / "data") == recipe
 
 
 def test_a_folder_that_tells_no_recipe_needs_one(data: Dataset, recordings, tmp_path: Path):
-    with pytest.raises(InputError, match=r"run\.json does not tell the recipe .*; give the recipe, or a data set"):
+    with pytest.raises(InputError, match=r"run\.json holds no recipe .*; give the recipe, or a data set"):
         rebuild_trial(tmp_path, recordings[0])
     assert rebuild_trial(tmp_path, recordings[0], recipe=RECIPE).plan.trial == recordings[0].trial
     own = replace(RECIPE, sensor=replace(CHROMATOUCH, name="of my own"))
     with output_folder(tmp_path / "own", stage="simulate", config={"recipe": own}):
         pass
-    with pytest.raises(InputError, match="does not tell the recipe"):
+    with pytest.raises(InputError, match="holds no recipe"):
         read_recipe(tmp_path / "own")
 
 
 def test_what_was_not_simulated_so_is_refused(data: Dataset, recordings):
     with pytest.raises(InputError, match=r"was simulated by another recipe, or by another version .*; simulate"):
         rebuild_trial(data.folder, recordings[0], recipe=replace(RECIPE, seed=6))
-    with pytest.raises(InputError, match="has no simulated truth and cannot be drawn anew"):
+    with pytest.raises(InputError, match="has no simulated truth and cannot be drawn again"):
         rebuild_trial(data.folder, replace(recordings[0], truth=None))
     frames = recordings[0].frames.copy()
     frames[-1, 100, 100] ^= 64
-    with pytest.raises(InputError, match="is drawn otherwise than it is stored"):
+    with pytest.raises(InputError, match="is drawn differently from its stored frames"):
         rebuild_trial(data.folder, replace(recordings[0], frames=frames))
 
 

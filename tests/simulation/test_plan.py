@@ -191,7 +191,7 @@ def test_days_are_spread_over_the_range_of_friction():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dry_trials": (2, 2)}, "dry_trials names 2 days but there are 4; give one a day"),
+        ({"dry_trials": (2, 2)}, "dry_trials has 2 days but there are 4; give one number a day"),
         ({"dry_trials": (0, 2, 2, 2)}, "but the first day trains; give it more trials"),
         ({"dry_trials": (3, 0, 0, -1)}, "no day has fewer than 0 trials"),
         ({"displacement": "magic"}, "displacement is 'magic', which sensor chromatouch does not have; choose calib"),
@@ -200,10 +200,10 @@ def test_days_are_spread_over_the_range_of_friction():
         ({"wet_trials": -1}, "wet_trials is -1, at least 0"),
         ({"frames_per_trial": 5}, "frames_per_trial is 5, at least 20 is needed"),
         ({"days": 1}, "days is 1, at least 2 is needed: the test needs a day of its own"),
-        ({"test_day": 1}, "test_day is 1, but the first of 4 days trains; name a day from 2 to 4"),
+        ({"test_day": 1}, "test_day is 1, but the first of 4 days trains; choose a day from 2 to 4"),
         ({"test_days": 4}, "test_days is 4, but of 4 days the first trains"),
         ({"test_days": 0}, "test_days is 0, but of 4 days"),
-        ({"test_days": 2, "test_day": 3}, "one that is named as test_day tests alone; ask for fewer"),
+        ({"test_days": 2, "test_day": 3}, "test_day tests alone; ask for fewer"),
         ({"validation_share": 1.0}, "validation_share must lie between 0 and 1, got 1"),
         ({"seed": -1}, "seed is -1, at least 0"),
     ],
@@ -244,11 +244,11 @@ def test_impossible_pulls_are_refused(change, message):
         Pulls(**change)
 
 
-def test_steady_pulls_are_told_as_before_there_were_others():
+def test_recipes_without_pulls_leave_the_field_out():
     steady, varied = make_recipe("small", pulls="steady"), make_recipe("small", pulls="varied")
     assert steady == make_recipe("small")
-    assert "pulls" not in steady.told
-    assert varied.told["pulls"] == to_builtins(Pulls())
+    assert "pulls" not in steady.to_dict()
+    assert varied.to_dict()["pulls"] == to_builtins(Pulls())
     assert varied.hash != steady.hash
     # the same days, sensors and grasps, pulled otherwise
     assert [plan.seed for plan in plan_trials(varied)] == [plan.seed for plan in plan_trials(steady)]

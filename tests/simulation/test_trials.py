@@ -9,6 +9,7 @@ import torch
 from realism.scene import nominal_unit
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
+from sliplens.progress import reporting
 from sliplens.simulation import (
     CHROMATOUCH,
     FLAT_GEL,
@@ -192,7 +193,8 @@ def test_different_trials_differ(recordings):
 
 def test_progress_is_told_in_frames():
     heard = []
-    simulate_trial(plan_trials(RECIPE)[0], on_progress=lambda done, total: heard.append((done, total)))
+    with reporting(lambda done, total: heard.append((done, total))):
+        simulate_trial(plan_trials(RECIPE)[0])
     assert heard[-1] == (30, 30)
     assert [done for done, _ in heard] == sorted({done for done, _ in heard})
     assert {total for _, total in heard} == {30}
@@ -205,7 +207,8 @@ def test_resuming_skips_what_is_there_and_gives_the_same_bytes(dataset, tmp_path
     stamp = kept.stat().st_mtime_ns
     (tmp_path / "part" / "trials" / "day4-wet-001.parquet").unlink()
     (tmp_path / "part" / "dataset.json").unlink()
-    resumed = simulate_dataset(tmp_path / "part", recipe, on_progress=lambda done, total: heard.append((done, total)))
+    with reporting(lambda done, total: heard.append((done, total))):
+        resumed = simulate_dataset(tmp_path / "part", recipe)
     assert kept.stat().st_mtime_ns == stamp
     assert [info.sha256 for info in resumed.trials] == [info.sha256 for info in dataset.trials]
     assert heard[-1] == (80, 80)
@@ -226,8 +229,8 @@ def test_an_interrupted_data_set_resumes_to_the_same_bytes(dataset, tmp_path):
         if done > 50:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        simulate_dataset(tmp_path, recipe, on_progress=interrupt)
+    with pytest.raises(KeyboardInterrupt), reporting(interrupt):
+        simulate_dataset(tmp_path, recipe)
     assert len(list((tmp_path / "trials").glob("*.parquet"))) == 2
     assert not (tmp_path / "dataset.json").exists()
     resumed = simulate_dataset(tmp_path, recipe)

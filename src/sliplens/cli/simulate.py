@@ -9,6 +9,7 @@ import tyro
 from sliplens.cli.command import Command
 from sliplens.cli.console import Terminal, print_table
 from sliplens.errors import InputError
+from sliplens.progress import open_stage, report_file, reporting
 
 if TYPE_CHECKING:
     from sliplens.simulation import SimulationRecipe
@@ -29,14 +30,14 @@ class Simulate(Command):
     """Folder to make. Not needed for --preview and --video alone."""
     preset: str = "small"
     """small: 104 short trials on 12 days, for a laptop. thesis: the days, splits and 160,757 frames of the thesis, some
-    14 GB. varied: 2,520 short trials on 820 days, 200 sensors and objects from slippery to rough, for a network that is
-    to meet others. The options below change it."""
+    14 GB. varied: 2,520 short trials on 820 days, 200 sensors and objects from slippery to rough, for a network that
+    meets others. The options below change it."""
     sensor: str = "chromatouch"
     """chromatouch: a dome with a fisheye inside, fitted to real images. flat-gel: a flat gel with dots, lit from three
     sides, like a GelSight; not fitted to one device."""
     displacement: Literal["calibrated", "half-space"] | None = None
     """How markers move. calibrated: as in real ChromaTouch images, its stick zone nominal. half-space: exact contact
-    mechanics. The sensor's own if not given."""
+    mechanics. That of the sensor if not given."""
     dry_trials: int | None = None
     """Trials on the dry object, dealt to all days."""
     wet_trials: int | None = None
@@ -46,12 +47,12 @@ class Simulate(Command):
     days: int | None = None
     """Days, each with its own friction, stiffness, light and camera; the last one tests."""
     test_days: int | None = None
-    """How many of the last days test."""
+    """Number of the last days that test."""
     dry_friction: tuple[float, float] | None = None
     """Least and largest coefficient of friction of the dry object; a wider range makes a network rely on it less."""
     pulls: Literal["steady", "varied"] | None = None
     """How objects are pulled. steady: in about 5.8 s, the margin falling evenly. varied: in 0.8 to 8 s, with rests,
-    jerks and lettings back. The preset's own if not given."""
+    jerks and lettings back. That of the preset if not given."""
     release: bool = False
     """Let go of the object at the end of each trial."""
     seed: int = 0
@@ -64,22 +65,23 @@ class Simulate(Command):
     """Clip to write: one trial with its forces and margin beside it (MP4)."""
 
     def run(self) -> None:
-        """Draw what was asked for; simulate and write the data set."""
+        """Draw the pictures; simulate and write the data set."""
         from sliplens.extras import require_device
         from sliplens.results import describe_simulation
         from sliplens.simulation import make_recipe, simulate
+        from sliplens.simulation.plan import RecipeChanges
 
         if self.output is None and self.preview is None and self.video is None:
             raise InputError("nothing to do; name a folder to make, or a picture with --preview")
         self._require_pictures()
         require_device(self.device)
-        own = {"output", "preset", "device", "preview", "video", "overwrite"}
-        changes = {name: value for name, value in vars(self).items() if name not in own}
-        recipe, terminal = make_recipe(self.preset, **changes), Terminal()
-        if self.preview is not None:
-            self._draw_preview(self.preview, recipe, terminal)
-        if self.video is not None:
-            self._draw_video(self.video, recipe, terminal)
+        changes = {name: value for name, value in vars(self).items() if name in RecipeChanges.__annotations__}
+        recipe, terminal = make_recipe(self.preset, sensor=self.sensor, **changes), Terminal()
+        with reporting(terminal):
+            if self.preview is not None:
+                self._draw_preview(self.preview, recipe)
+            if self.video is not None:
+                self._draw_video(self.video, recipe)
         if self.output is not None:
             data = self.call(simulate, out=self.output, on_progress=terminal, **changes)
             splits = describe_simulation(data).by_split.items()
@@ -97,26 +99,26 @@ class Simulate(Command):
 
             require_clip_path(self.video)
 
-    def _draw_preview(self, path: Path, recipe: "SimulationRecipe", terminal: Terminal) -> None:
+    def _draw_preview(self, path: Path, recipe: "SimulationRecipe") -> None:
         from sliplens.plots.contact_sheet import write_contact_sheet
         from sliplens.simulation import simulate_examples
 
-        with terminal.stage("Simulating trials for the preview") as count:
-            recordings = simulate_examples(recipe, device=self.device, on_progress=count)
+        with open_stage("Simulating trials for the preview"):
+            recordings = simulate_examples(recipe, device=self.device)
         title = f"Simulated {recipe.sensor.name}, {recipe.resolved_displacement} displacement, seed {recipe.seed}"
         write_contact_sheet(recordings, path, title=title)
-        terminal.wrote(path, f"{len(recordings)} of the trials that this recipe makes")
+        report_file(path, f"{len(recordings)} of the trials that this recipe makes")
 
-    def _draw_video(self, path: Path, recipe: "SimulationRecipe", terminal: Terminal) -> None:
+    def _draw_video(self, path: Path, recipe: "SimulationRecipe") -> None:
         from sliplens.plots.clip import write_clip
         from sliplens.simulation import plan_trials, simulate_trial
         from sliplens.simulation.loading import TRIAL_S
 
-        # sampled anew, for the eye: a data set may have few frames a second
+        # sampled at the clip's rate: a data set may have few frames a second
         plan = replace(plan_trials(recipe)[0], frames=round(TRIAL_S * _CLIP_FRAMES_PER_S))
-        with terminal.stage("Simulating the trial") as count:
-            recording = simulate_trial(plan, device=self.device, on_progress=count)
-        with terminal.stage("Writing the clip") as count:
-            write_clip(recording, path, frames_per_s=_CLIP_FRAMES_PER_S, on_progress=count)
+        with open_stage("Simulating the trial"):
+            recording = simulate_trial(plan, device=self.device)
+        with open_stage("Writing the clip"):
+            write_clip(recording, path, frames_per_s=_CLIP_FRAMES_PER_S)
         rate = f"{_CLIP_FRAMES_PER_S:g} frames/s"
-        terminal.wrote(path, f"trial {plan.trial} at {rate}; to watch, not to train on: video is lossy")
+        report_file(path, f"trial {plan.trial} at {rate}; to watch, not to train on: video is lossy")

@@ -29,7 +29,7 @@ from sliplens.plots.contact_sheet import (
     plot_margin,
 )
 from sliplens.plots.style import BLACK, GREY, PURPLE, SKY, VERMILLION, YELLOW, drawing_style, percent, written_whole
-from sliplens.progress import OnProgress
+from sliplens.progress import track
 from sliplens.recordings import Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
 
@@ -50,9 +50,7 @@ class _Stage(NamedTuple):
     cursor_column: Callable[[float], int]  # of a time in seconds
 
 
-def write_clip(
-    recording: Recording, path: Path, *, frames_per_s: float | None = None, on_progress: OnProgress | None = None
-) -> None:
+def write_clip(recording: Recording, path: Path, *, frames_per_s: float | None = None) -> None:
     """Write a trial as an MP4 that plays at real speed; it appears when complete.
 
     It shows the camera frames, outlines of contact and stick zone where they are known, the difference images, and the
@@ -67,10 +65,8 @@ def write_clip(
     stage = _set_stage(recording)
     with _open_clip(path, stage.still.shape[:2], rate) as add:
         indices = clip_frames(recording.time_s, rate)
-        for done, pixels in enumerate(_draw_frames(recording, indices, stage, rate), start=1):
+        for _, pixels in zip(track(indices), _draw_frames(recording, indices, stage, rate), strict=True):
             add(pixels)
-            if on_progress is not None:
-                on_progress(done, len(indices))
 
 
 def require_clip_path(path: Path) -> None:

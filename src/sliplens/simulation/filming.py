@@ -1,6 +1,5 @@
-"""A loaded fingertip filmed: its light, the reference frame and the frames of a trial, on any device."""
+"""Rendering of a loaded fingertip: light, reference frame and the frames of a trial, on any device."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias
@@ -22,18 +21,18 @@ Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
 _BATCHES = {"cpu": 4, "cuda": 512}
 """Frames drawn at once: few enough for a processor's caches, many enough for a GPU."""
 _PATCH = 32
-"""Side of the square in which a marker is drawn, in pixels; the widest marker's edge has faded by then."""
+"""Side of the square in which a marker is drawn, in pixels: the edge of the widest marker fades within it."""
 _WHITE = 258.0
-"""Glare ends a little above white: the markers in it are seen, the noise is not."""
+"""Level that glare is limited to, a little above white: markers in it show, noise does not."""
 _GRAIN_PX = 2.2
 """Size of the pressed skin's grain."""
 _GLOW_RADIUS = 0.935
-"""Where the glow of the contact fades, over the radius of a nominal contact."""
+"""Radius at which the glow of the contact fades, over that of a nominal contact."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Film:
-    """A trial ready to be drawn, any of its frames in any order; made by `prepare_film`."""
+    """Trial whose frames can be drawn in any order; made by `prepare_film`."""
 
     sensor: Sensor
     grasp: Grasp
@@ -42,7 +41,7 @@ class Film:
     motion: Motion
     noise: Noise | None
     marker_rest_px: Float[np.ndarray, "markers 2"]
-    """Untouched markers as the camera sees them, with the jitter of the print and the seat of the camera."""
+    """Untouched markers in the camera's image, with the jitter of the print and the camera's pose."""
     marker_px: Float[np.ndarray, "frames markers 2"]
     blur_px: Float[np.ndarray, " frames_and_reference"]
     """Blur of the untouched sensor, then of each frame."""
@@ -54,17 +53,17 @@ class Film:
     light: Planes
     """Brightness over the sensor's."""
     empty: Planes
-    """The untouched sensor without its markers, in grey levels."""
+    """Untouched sensor without its markers, in grey levels."""
     haze: Planes
     """Grey levels that full contact adds."""
     relief: Planes | None
-    """Relative change of brightness where the skin slopes by 1; None where slopes do not show."""
+    """Relative change of brightness where the skin slopes by 1; None for a sensor without lamps."""
 
     def __len__(self) -> int:
         return len(self.marker_px)
 
     def untouched(self) -> "Film":
-        """Film of one frame, the reference."""
+        """Return a film of the reference frame alone."""
         markers, first = len(self.marker_rest_px), np.zeros(2, dtype=int)
         nothing = dict.fromkeys(("touch", "indentation_m", "contact_radius_m", "stick_radius_m"), np.zeros(1))
         motion = replace(
@@ -78,9 +77,9 @@ class Film:
         return replace(self, motion=motion, marker_px=self.marker_rest_px[None], blur_px=blur_px, noise_picks=picks)
 
     def under(self, loading: Loading, *, rng: np.random.Generator) -> "Film":
-        """Film of another loading of the same grasp, by the same camera on the same day, its noise drawn anew.
+        """Return a film of another loading of the same grasp, by the same camera on the same day, with new noise.
 
-        The model that moves the markers is the sensor's default; the grasp's offset, direction and haze stay.
+        The markers move by the sensor's default model; the grasp's offset, direction and haze stay.
         """
         motion, _, marker_px = see_markers(self.sensor, loading=loading, grasp=self.grasp, day=self.day, unit=self.unit)
         frames = len(loading.time_s)
@@ -97,12 +96,12 @@ class Film:
         return self.untouched().draw(slice(0, 1), device=device)[0]
 
     def draw(self, frames: slice, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "frames height width 3"]:
-        """Draw some of the frames; nothing in one depends on which are drawn together.
+        """Draw some of the frames; a frame does not depend on those drawn with it.
 
-        Each marker is drawn in a patch of its own and added to the frame, so that a frame costs little more than its
-        noise. Devices agree within one grey level: they round sums of four terms in another order.
+        Each marker is drawn in a small patch and added to the frame, so that a frame costs little more than its noise.
+        Devices agree within one grey level: they round sums of four terms in another order.
         """
-        # one plane a channel: a channel's constant then meets whole rows of pixels, which vectorises
+        # one plane a channel: constants of a channel apply to whole rows of pixels, which vectorises
         sensor, motion, noise, shade = self.sensor, self.motion, self.noise, self._shade(frames, device=device)
         contrast = _tensor(self.light, device)[:, None] * _channels(sensor.look.contrast, device)
         planes = torch.addcmul(_tensor(self.empty, device)[:, None], shade, contrast, value=-1)
@@ -129,7 +128,7 @@ class Film:
         return pixels
 
     def look(self, frames: slice) -> DrawnMarkers:
-        """Look of the markers in some of the frames."""
+        """Compute the look of the markers in some of the frames."""
         return draw_look(
             self.sensor.look,
             geometry=self.sensor.geometry,
@@ -141,9 +140,9 @@ class Film:
         )
 
     def contact_map(self, frames: slice) -> UInt8[np.ndarray, "frames height width"]:
-        """Map of the contact as the camera sees it: 0 outside, 1 slipping, 2 sticking.
+        """Compute the contact in the camera's image: 0 outside, 1 slipping, 2 sticking.
 
-        The contact of a dome is seen as the flat lens that it is, displaced and enlarged by its indentation.
+        The contact of a dome is flat, displaced and enlarged by its indentation.
         """
         square = self._face_distance_squared(frames)
         touching = square < (self.motion.contact_radius_m[frames, None, None] ** 2).astype(np.float32)
@@ -156,14 +155,14 @@ class Film:
         )
 
     def _shade(self, frames: slice, *, device: str | torch.device) -> Float[Tensor, "3 frames height width"]:
-        """Share of the markers' contrast in each pixel: 0 in the background, about 1 in a marker."""
+        """Compute the share of the markers' contrast in each pixel: 0 in the background, about 1 in a marker."""
         centres_px, noise, size_px = self.marker_px[frames], self.noise, self.sensor.image_size_px
-        # markers that no pixel of the frame can see are left out; the padding takes the rest of those that stick out
-        seen = np.all((centres_px > -_PATCH / 2) & (centres_px < size_px - 1 + _PATCH / 2), axis=-1)
-        frame_index, marker_index = np.nonzero(seen)
-        centres, drawn = _tensor(centres_px[seen], device), self.look(frames)
+        # markers outside the frame are skipped; the padding takes what of the others sticks out
+        inside = np.all((centres_px > -_PATCH / 2) & (centres_px < size_px - 1 + _PATCH / 2), axis=-1)
+        frame_index, marker_index = np.nonzero(inside)
+        centres, drawn = _tensor(centres_px[inside], device), self.look(frames)
         radius, edge, contrast = (
-            _tensor(values[seen], device).T[:, :, None, None].contiguous()
+            _tensor(values[inside], device).T[:, :, None, None].contiguous()
             for values in (drawn.radius_px, drawn.edge_px, drawn.contrast)
         )
         corner = torch.floor(centres).to(torch.int64) - _PATCH // 2 + 1
@@ -187,10 +186,10 @@ def _after_reference(frames: slice) -> slice:
     return slice(frames.start + 1, frames.stop + 1)
 
 
-def batches(frames: int, *, device: str | torch.device) -> Iterator[slice]:
+def batches(frames: int, *, device: str | torch.device) -> list[slice]:
     """Cut a trial into batches that suit a device; the frames do not depend on it."""
     step = _BATCHES.get(torch.device(device).type, 64)
-    return (slice(start, min(start + step, frames)) for start in range(0, frames, step))
+    return [slice(start, min(start + step, frames)) for start in range(0, frames, step)]
 
 
 def prepare_film(
@@ -204,10 +203,7 @@ def prepare_film(
     noise: Noise | None,
     displacement: str | None = None,
 ) -> Film:
-    """Move the markers, set the light and draw all that is random: what is left is drawing.
-
-    `noise`: the camera's noise; None films without it.
-    """
+    """Move the markers, set the light and draw all random numbers of a trial; no camera noise if `noise` is None."""
     motion, rest_px, marker_px = see_markers(
         sensor, loading=loading, grasp=grasp, day=day, unit=unit, displacement=displacement
     )
@@ -226,7 +222,7 @@ def prepare_film(
         noise=noise,
         marker_rest_px=rest_px,
         marker_px=marker_px,
-        # drawn before the noise, so that a clean film differs in its noise alone
+        # drawn before the noise, so that a film without noise differs in that alone
         blur_px=grasp.blur_px * rng.uniform(0.8, 1.2, frames + 1),
         noise_picks=pick_noise(frames + 1, rng=rng),
         rays=geometry.rays(
@@ -243,7 +239,7 @@ def prepare_film(
 def see_markers(
     sensor: Sensor, *, loading: Loading, grasp: Grasp, day: Day, unit: Unit, displacement: str | None = None
 ) -> tuple[Motion, Float[np.ndarray, "markers 2"], Float[np.ndarray, "frames markers 2"]]:
-    """Move the markers; give the motion, and their places (pixels, x and y) at rest and in each frame, as seen."""
+    """Compute the motion, and the markers' places (pixels, x and y) in the image at rest and in each frame."""
     touch = Touch(grasp=grasp, modulus_factor=day.modulus_factor, marker_depth=unit.marker_depth)
     motion = move_markers(sensor, touch, loading=loading, displacement=displacement)
     see = partial(_see, centre_px=np.asarray(sensor.geometry.centre_px), day=day)
@@ -256,14 +252,14 @@ def _turn(day: Day) -> Float[np.ndarray, "2 2"]:
 
 
 def _see(points_px: Float[np.ndarray, "*batch 2"], *, centre_px: Point, day: Day) -> Float[np.ndarray, "*batch 2"]:
-    """Pixels of the day's camera, which sits turned about the image of the skin's middle, and shifted."""
+    """Turn points about the image of the skin's middle, and shift them, as the day's camera does."""
     return (points_px - centre_px) @ _turn(day) + centre_px + np.asarray(day.camera_shift_px)
 
 
 def move_camera(film: Film, nuisances: Nuisances, *, rng: np.random.Generator) -> Film:
     """Turn and magnify the markers of each frame about the middle of the image, against the reference frame.
 
-    The ranges are `frame_turn_deg` and `frame_zoom` of the nuisances. Skin, light and contact stay: they vary slowly.
+    Ranges are `frame_turn_deg` and `frame_zoom` of the nuisances. Skin, light and contact stay: they vary slowly.
     """
     if nuisances.frame_turn_deg == (0.0, 0.0) and nuisances.frame_zoom == (1.0, 1.0):
         return film
@@ -276,7 +272,7 @@ def move_camera(film: Film, nuisances: Nuisances, *, rng: np.random.Generator) -
 
 
 def brightness(sensor: Sensor, *, day: Day) -> Planes:
-    """Brightness of the untouched skin over the sensor's background.
+    """Compute the brightness of the untouched skin over the sensor's background.
 
     Gain, white balance, vignette, lamps, and a linear fall of brightness across the image.
     """
@@ -293,7 +289,7 @@ def brightness(sensor: Sensor, *, day: Day) -> Planes:
 
 
 def empty_view(sensor: Sensor, *, day: Day, light: Planes) -> Planes:
-    """Untouched sensor without its markers, the lamps' glare included, in grey levels."""
+    """Compute the untouched sensor without markers, with the glare of the lamps, in grey levels."""
     skin = np.asarray(sensor.background, dtype=np.float32)[:, None, None] * light
     glare = sensor.glare
     if glare is None:
@@ -306,7 +302,7 @@ def empty_view(sensor: Sensor, *, day: Day, light: Planes) -> Planes:
 
 
 def relief(sensor: Sensor, *, contact_px: Point) -> Planes | None:
-    """Relative change of brightness where the skin slopes by 1 away from a contact; None for a sensor without lamps.
+    """Compute the relative change of brightness where skin slopes by 1 away from a contact; None without lamps.
 
     The dent is a hill to the camera inside: its flank towards a lamp brightens.
     """
@@ -322,9 +318,9 @@ def relief(sensor: Sensor, *, contact_px: Point) -> Planes | None:
 
 
 def haze(sensor: Sensor, *, grasp: Grasp, contact_px: Point, radius_px: float, rng: np.random.Generator) -> Planes:
-    """Grey levels that full contact adds: a veil, a glow where the object reflects the light, the grain of the skin.
+    """Compute the grey levels that full contact adds: a veil, a glow where the object reflects light, skin grain.
 
-    `contact_px`, `radius_px`: where the camera sees the contact's centre, and how large its radius in a nominal grasp.
+    `contact_px` and `radius_px` are the contact's centre and its radius in a nominal grasp, in the image.
     """
     if not sensor.sees_contact:
         return np.zeros((3, sensor.image_size_px, sensor.image_size_px), dtype=np.float32)
@@ -335,7 +331,7 @@ def haze(sensor: Sensor, *, grasp: Grasp, contact_px: Point, radius_px: float, r
 
 
 def _smooth_noise(size: int, *, rng: np.random.Generator) -> Float[np.ndarray, "size size"]:
-    """Noise of unit variance that keeps its sign over a few pixels."""
+    """Draw noise of unit variance, correlated over a few pixels."""
     steps = np.arange(-8, 9)
     kernel = np.exp(-(steps**2) / (2 * _GRAIN_PX**2))
     kernel /= np.linalg.norm(kernel)
@@ -349,7 +345,7 @@ def _planes(image: Float[np.ndarray, "height width 3"]) -> Planes:
 
 
 def draw_texture(markers: int, *, rng: np.random.Generator) -> Float32[np.ndarray, "3 markers side side"]:
-    """Grain of the markers' print, of unit strength, red and green alike in half."""
+    """Draw the grain of the markers' print, of unit strength, red and green half correlated."""
     grain = rng.standard_normal((3, markers, _PATCH, _PATCH), dtype=np.float32)
     grain[1] = 0.5 * grain[0] + 0.75**0.5 * grain[1]
     return grain
@@ -364,9 +360,9 @@ def place(
     size_px: int,
     at_once: bool,
 ) -> Float[Tensor, "3 frames height width"]:
-    """Add each patch to its frame, its first pixel at a corner (x, y); what sticks out is cut off.
+    """Add each patch to its frame, its first pixel at a corner (x, y), cut off at the frame's edge.
 
-    All at once suits a GPU; on a processor, one after another is several times faster.
+    `at_once` suits a GPU; on a processor, one patch after another is several times faster.
     """
     side, width, corner = size_px + 2 * _PATCH, patch.shape[-1], corner + _PATCH
     canvas = torch.zeros((3, frames, side, side), dtype=torch.float32, device=patch.device)

@@ -1,4 +1,4 @@
-"""Shapes of fingertips: where the markers lie, where the camera sees them, and where the skin touches.
+"""Shapes of fingertips: places of the markers, their images, and the contact of the skin.
 
 Lengths are in metres: x right, y down, z towards the object; the skin's foremost point is at its middle.
 """

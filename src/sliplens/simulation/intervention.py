@@ -1,15 +1,17 @@
-"""What the markers of a frame tell of the safety margin, and stored trials made anew to put markers back.
+"""Information of the markers about the safety margin, and interventions on stored simulated trials.
 
-Seen are the displacements of the markers inside the image, each coordinate with Gaussian noise. The camera's seat and
-the print's jitter move a marker and its place at rest alike: the reference frame shows them, and they are no unknowns.
+Observations are the displacements of the markers inside the image, each coordinate with Gaussian noise. The camera's
+pose and the print's jitter move a marker and its place at rest alike: the reference frame shows them, so they are no
+unknowns.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -30,37 +32,35 @@ from sliplens.simulation.trials import prepare_trial
 Jacobian: TypeAlias = Float[np.ndarray, "coordinates unknowns"]
 
 MARGIN = "margin"
-"""The unknown that is asked for."""
+"""Unknown that is estimated."""
 _STEP = 1e-4
 """Step of the central differences: their error grows with its square, that of rounding (1e-12 px) over it."""
 
 
-def _grasp(field: str, axis: int | None = None) -> Callable[[Touch, float], Touch]:
-    """Shift a number of the grasp, or one of its pair."""
+def _shift(field: str, axis: int | None = None, *, relative: bool = False) -> Callable[[Touch, float], Touch]:
+    """Shift a number of the grasp, one of its pair, or its logarithm if `relative`."""
 
     def shift(touch: Touch, step: float) -> Touch:
         value = getattr(touch.grasp, field)
-        moved = value + step if axis is None else tuple(part + step * (axis == at) for at, part in enumerate(value))
+        if axis is None:
+            moved = value + (value * float(np.expm1(step)) if relative else step)
+        else:
+            moved = tuple(part + step * (axis == at) for at, part in enumerate(value))
         return replace(touch, grasp=replace(touch.grasp, **{field: moved}))
 
     return shift
 
 
-def _grow(field: str) -> Callable[[Touch, float], Touch]:
-    """Multiply a number of the grasp."""
-    return lambda touch, step: _grasp(field)(touch, getattr(touch.grasp, field) * float(np.expm1(step)))
-
-
 NUISANCES: dict[str, Callable[[Touch, float], Touch]] = {
-    "log_friction": _grow("friction"),
-    # force, its drift, creep and stiffness all act through the contact radius alone: one unknown
-    "log_load": _grow("normal_force_n"),
-    "offset_x": _grasp("contact_offset", 0),
-    "offset_y": _grasp("contact_offset", 1),
-    "tilt_x_rad": _grasp("tilt_rad", 0),
-    "tilt_y_rad": _grasp("tilt_rad", 1),
-    "direction_rad": _grasp("shear_direction_rad"),
-    "shear_exponent": _grasp("shear_exponent"),
+    "log_friction": _shift("friction", relative=True),
+    # force, drift, creep and stiffness all act through the contact radius: one unknown
+    "log_load": _shift("normal_force_n", relative=True),
+    "offset_x": _shift("contact_offset", 0),
+    "offset_y": _shift("contact_offset", 1),
+    "tilt_x_rad": _shift("tilt_rad", 0),
+    "tilt_y_rad": _shift("tilt_rad", 1),
+    "direction_rad": _shift("shear_direction_rad"),
+    "shear_exponent": _shift("shear_exponent"),
     "marker_depth": lambda touch, step: replace(touch, marker_depth=touch.marker_depth + step),
 }
 """Shift of a touch by each nuisance; lengths in radii of the contact's sphere, angles in radians, `log_` relative."""
@@ -68,15 +68,15 @@ NUISANCES: dict[str, Callable[[Touch, float], Touch]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Sensitivity:
-    """Derivatives of the marker positions in one frame for each margin, in pixels per unit of the unknown."""
+    """Derivatives of the marker positions at each margin, in pixels per unit of the unknown."""
 
     unknowns: tuple[str, ...]
-    """The margin first."""
+    """Names, the margin first."""
     jacobian: Float[np.ndarray, "frames coordinates unknowns"]
 
 
 def visible_markers(sensor: Sensor) -> Int[np.ndarray, " markers"]:
-    """Markers that lie inside the image at rest, at least their own radius from its border."""
+    """Find the markers that lie inside the image at rest, at least their radius from its border."""
     points = sensor.geometry.project(sensor.geometry.marker_positions())
     border = max(sensor.look.radius_px)
     return np.flatnonzero(np.all((points >= border) & (points <= sensor.image_size_px - 1 - border), axis=-1))
@@ -85,19 +85,16 @@ def visible_markers(sensor: Sensor) -> Int[np.ndarray, " markers"]:
 def marker_sensitivity(
     margins: Float[np.ndarray, " frames"], *, sensor: Sensor, touch: Touch, displacement: str | None = None
 ) -> Sensitivity:
-    """Shift of the visible markers with the safety margin and with every nuisance, by central differences.
-
-    `margins`: safety margins to look at, inside (0, 1).
-    """
+    """Compute the shift of the visible markers with the margin and with every nuisance, by central differences."""
     if not np.all((margins > 0) & (margins < 1)):
         raise ContactError("safety margins must lie inside (0, 1), where the derivative exists; leave out the ends")
-    seen, step = visible_markers(sensor), _STEP * np.minimum(margins, 1 - margins)
+    visible, step = visible_markers(sensor), _STEP * np.minimum(margins, 1 - margins)
 
     def positions(margins: np.ndarray, touch: Touch) -> np.ndarray:
         loading = load_at_margins(margins, grasp=touch.grasp)
         motion = move_markers(sensor, touch, loading=loading, displacement=displacement)
-        # from rest: a deeper marker also lies elsewhere at rest, and that the reference frame shows
-        return (motion.centres_px - motion.rest_px)[:, seen].reshape(len(margins), -1)
+        # from rest: a deeper marker also lies elsewhere at rest, as the reference frame shows
+        return (motion.centres_px - motion.rest_px)[:, visible].reshape(len(margins), -1)
 
     columns = [(positions(margins + step, touch) - positions(margins - step, touch)) / (2 * step[:, None])]
     # no marker lies above the skin
@@ -109,9 +106,9 @@ def marker_sensitivity(
 
 
 def prior_sigma(nuisances: Nuisances, *, wet: bool) -> dict[str, float]:
-    """Standard deviation of what a trial draws for each nuisance, with the friction of a wet or a dry object.
+    """Compute the standard deviation of each nuisance over trials, with the friction of a wet or a dry object.
 
-    The draws are even, not Gaussian: their variances are matched. Of the logarithm of a product the variances add.
+    The draws are even, not Gaussian: their variances are matched. Variances of the logarithms of a product add up.
     """
     if wet:
         friction = np.hypot(_log_sigma(nuisances.wet_friction), _drift_sigma(nuisances.wet_friction_drift))
@@ -139,12 +136,10 @@ def prior_sigma(nuisances: Nuisances, *, wet: bool) -> dict[str, float]:
 def reading_gain(
     jacobian: Jacobian, unknowns: tuple[str, ...], *, noise_px: float, prior: Mapping[str, float]
 ) -> Float[np.ndarray, " coordinates"]:
-    """Gain of the best linear estimator of the margin: how far its reading moves with each coordinate, per pixel.
+    """Compute the gain of the best linear estimator of the margin: its change with each coordinate, per pixel.
 
     The margin's row of (J^T J / sigma^2 + diag(1 / prior^2))^-1 J^T / sigma^2: with infinite priors the best linear
-    unbiased estimator, else the posterior mean.
-
-    `jacobian`, `unknowns`: derivatives of the coordinates, as in `Sensitivity`; the margin first.
+    unbiased estimator, else the posterior mean. `jacobian` and `unknowns` are as in `Sensitivity`.
     """
     rows, scale = observations(jacobian, unknowns, noise_px, prior)
     return np.linalg.pinv(rows / scale)[0, : len(jacobian)] / (scale[0] * noise_px)
@@ -152,28 +147,28 @@ def reading_gain(
 
 def observations(
     jacobian: Jacobian, unknowns: tuple[str, ...], noise_px: float, prior: Mapping[str, float]
-) -> tuple[Float[np.ndarray, "rows kept"], Float[np.ndarray, " kept"]]:
-    """Rows of the least squares, a prior being one more observation, and the length of each column.
+) -> tuple[Float[np.ndarray, "rows columns"], Float[np.ndarray, " columns"]]:
+    """Build the rows of the least squares, a prior being one more observation, and the length of each column.
 
     Metres, radians and shares stand in one matrix: a column over its length has no unit.
     """
     sigma = {MARGIN: np.inf, **prior}
     if not (noise_px > 0 and min(sigma.values()) > 0):
-        raise ContactError("noise and priors must be positive; leave out of `prior` what is known")
-    kept = [index for index, name in enumerate(unknowns) if name in sigma]
-    rows = np.concatenate([jacobian[:, kept] / noise_px, np.diag([1 / sigma[unknowns[index]] for index in kept])])
+        raise ContactError("noise and priors must be positive; leave fixed unknowns out of `prior`")
+    free = [index for index, name in enumerate(unknowns) if name in sigma]
+    rows = np.concatenate([jacobian[:, free] / noise_px, np.diag([1 / sigma[unknowns[index]] for index in free])])
     return rows, np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
 
 
 def least_sigma(jacobian: Jacobian, unknowns: tuple[str, ...], *, noise_px: float, prior: Mapping[str, float]) -> float:
-    """Standard deviation of the margin below which no unbiased reader comes: the bound of Cramer and Rao with priors.
+    """Compute the least standard deviation of an unbiased estimate of the margin: Cramer and Rao's bound with priors.
 
-    The square root of the margin's entry in (J^T J / sigma^2 + diag(1 / prior^2))^-1, infinite where nothing tells it.
+    The square root of the margin's entry in (J^T J / sigma^2 + diag(1 / prior^2))^-1, infinite without information.
     """
     if wrong := set(prior) - set(unknowns):
         raise ContactError(f"there is no unknown {sorted(wrong)[0]!r}; choose from {', '.join(unknowns)}")
     rows, scale = observations(jacobian, unknowns, noise_px, prior)
-    # what of the margin's column no nuisance can imitate is what tells it
+    # the part of the margin's column that no nuisance can imitate
     margin, nuisances = rows[:, 0], (rows / scale)[:, 1:]
     evidence = np.linalg.norm(margin - nuisances @ np.linalg.lstsq(nuisances, margin, rcond=None)[0])
     return float(1 / evidence) if evidence > 0 else float("inf")
@@ -184,7 +179,7 @@ def _sigma(limits: Range) -> float:
 
 
 def _drift_sigma(limits: Range) -> float:
-    """Standard deviation of a relative change d p, p even in [-1, 1] through a trial: its variance is E[d^2] / 3."""
+    """Standard deviation of a relative change d p, p even in [-1, 1] through a trial, of variance E[d^2] / 3."""
     low, high = limits
     return float(np.sqrt((low**2 + low * high + high**2) / 9))
 
@@ -195,21 +190,21 @@ def _log_sigma(limits: Range) -> float:
 
 
 _ROUNDING = 1
-"""Grey levels by which the same scene may differ where another device or library drew it."""
+"""Grey levels by which another device or library may draw the same scene differently."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FilmedTrial:
-    """A simulated trial with all that drew it."""
+    """A simulated trial with its plan, loading and film."""
 
     plan: TrialPlan
     loading: Loading
     film: Film
 
     def touch(self, frame: int) -> Touch:
-        """All that moves the markers of a frame, apart from its margin; what an earlier slip or pull left is not told.
+        """Return the parameters that move the markers of a frame besides its margin, without traces of earlier slips.
 
-        Drift and creep are in the force and the friction that hold in this frame.
+        Force and friction of the frame include drift and creep.
         """
         grasp, loading = self.film.grasp, self.loading
         creep = 1 + grasp.creep * (1 - np.exp(-loading.held_s[frame] / grasp.creep_time_s))
@@ -226,7 +221,7 @@ class FilmedTrial:
 
 @dataclass(frozen=True, kw_only=True)
 class Outlines:
-    """Circles that the markers of a frame fill, in camera pixels, and those that they filled at rest."""
+    """Circles that the markers fill in a frame and at rest, in camera pixels."""
 
     rest_px: Float[np.ndarray, "markers 2"]
     rest_radius_px: Float[np.ndarray, " markers"]
@@ -240,33 +235,28 @@ def read_recipe(folder: Path) -> SimulationRecipe:
     path = folder / RUN_FILE
     try:
         stored = read_json(path)["config"]["recipe"]
-        totals, pulls = stored["frame_totals"], stored.get("pulls")
-        records: dict[str, Any] = {
-            "sensor": SENSORS[stored["sensor"]["name"]],
-            "nuisances": Nuisances(**_tuples(stored["nuisances"])),
-            "frame_totals": None if totals is None else FrameTotals(**totals),
-            "pulls": None if pulls is None else Pulls(**_tuples(pulls)),
-        }
-        return SimulationRecipe(**(_tuples(stored) | records))
+        dry_trials = stored["dry_trials"]
+        return SimulationRecipe(
+            **stored
+            | {
+                "dry_trials": tuple(dry_trials) if isinstance(dry_trials, list) else dry_trials,
+                "sensor": SENSORS[stored["sensor"]["name"]],
+                "nuisances": msgspec.convert(stored["nuisances"], Nuisances),
+                "frame_totals": msgspec.convert(stored["frame_totals"], FrameTotals | None),
+                "pulls": msgspec.convert(stored.get("pulls"), Pulls | None),
+            }
+        )
     except (InputError, KeyError, TypeError, AttributeError, ValueError, ArithmeticError):
         raise InputError(
-            f"{path} does not tell the recipe of the simulated trials; give the recipe, or a data set that "
-            "sliplens simulate made"
+            f"{path} holds no recipe of simulated trials; give the recipe, or a data set that sliplens simulate made"
         ) from None
 
 
-def _tuples(values: dict[str, Any]) -> dict[str, Any]:
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-
-
 def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecipe | None = None) -> FilmedTrial:
-    """Make a stored simulated trial ready to be drawn anew, the same bytes as before.
-
-    `recipe`: what simulated it; read from the folder if None.
-    """
+    """Prepare a stored simulated trial to be drawn again with the same bytes; its recipe is read if None."""
     name, truth = recording.trial, recording.truth
     if truth is None:
-        raise InputError(f"trial {name} has no simulated truth and cannot be drawn anew; choose a simulated data set")
+        raise InputError(f"trial {name} has no simulated truth and cannot be drawn again; choose a simulated data set")
     recipe = read_recipe(folder) if recipe is None else recipe
     plans = {plan.trial: plan for plan in plan_trials(recipe)}
     if recipe.hash != truth.recipe or name not in plans:
@@ -275,31 +265,31 @@ def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecip
             f"{__version__}; simulate the data set again"
         )
     loading, film = prepare_trial(plans[name])
-    # the untouched sensor shows light, seat and print; the last frame all that came after
+    # the untouched sensor shows light, camera and print; the last frame depends on all the rest
     last = len(film) - 1
     drawn = torch.stack([film.draw_reference(), film.draw(slice(last, last + 1))[0]]).numpy().astype(np.int16)
     if np.abs(drawn - [recording.reference, recording.frames[last]]).max() > _ROUNDING:
         raise InputError(
-            f"trial {name} of {folder} is drawn otherwise than it is stored: its frames were changed, or other "
-            "versions of numpy and torch made it; simulate the data set again"
+            f"trial {name} of {folder} is drawn differently from its stored frames: they were changed, or other "
+            "versions of numpy and torch made them; simulate the data set again"
         )
     return FilmedTrial(plan=plans[name], loading=loading, film=film)
 
 
 def film_with_friction(trial: FilmedTrial, friction: Float[np.ndarray, " frames"]) -> FilmedTrial:
-    """Film a trial anew as if the object had another friction in each frame: same forces, light, sensor and noise.
+    """Film a trial as if the object had another friction in each frame: same forces, light, sensor and noise.
 
-    Margins are NaN where that cannot be told (`loading.with_friction`): those frames mean nothing.
+    Frames without a margin (NaN, see `loading.with_friction`) are meaningless.
     """
     loading, film = prepare_trial(trial.plan, change=partial(with_friction, friction=friction))
     return FilmedTrial(plan=trial.plan, loading=loading, film=film)
 
 
 def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants markers"]) -> Film:
-    """Film of one moment, in each of its frames with other markers put back; all else stays, the noise too.
+    """Film one moment several times, each time with other markers put back; all else stays, the noise too.
 
-    A marker that is put back lies where it lay untouched, as large as it was and pressed by nothing. The focus and the
-    paleness that the touch gives to all markers stay: they are of the gel, not of the marker.
+    A marker put back has its place, size and pressure of the untouched sensor. Focus and paleness, which the touch
+    gives to all markers, stay.
     """
     count, motion = len(back), film.motion
     at, taken = np.full(count, frame), np.full(count, frame + 1)  # the untouched sensor's picks come first
@@ -329,16 +319,13 @@ def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants ma
 def draw_with_markers_back(
     film: Film, frame: int, back: Bool[np.ndarray, "variants markers"]
 ) -> UInt8[Tensor, "variants height width 3"]:
-    """Draw a frame with markers put back (`put_markers_back`), once for each choice of them.
-
-    With none put back it is the frame as it is stored.
-    """
+    """Draw a frame with markers put back (`put_markers_back`), once for each choice; the stored frame for none."""
     changed = put_markers_back(film, frame, back)
     return torch.cat([changed.draw(part) for part in batches(len(back), device="cpu")])
 
 
 def marker_outlines(film: Film, frame: int) -> Outlines:
-    """Circles that the markers of a frame fill, and those that they filled at rest."""
+    """Compute the circles that the markers fill in a frame and at rest."""
     return Outlines(
         rest_px=film.marker_rest_px,
         rest_radius_px=film.untouched().look(slice(0, 1)).radius_px[0].max(axis=-1),
@@ -348,30 +335,29 @@ def marker_outlines(film: Film, frame: int) -> Outlines:
 
 
 NOISE_PX = 0.1
-"""Standard deviation of each coordinate of a marker that is followed in images of this noise (docs/limit.md)."""
+"""Standard deviation of each coordinate of a tracked marker in images of this noise (docs/limit.md)."""
 _NEAREST_END = 0.02
-"""Margins nearer to 0 or 1 are read with the gain of this one, or of one less this: the ends have no derivative."""
+"""Distance from 0 and 1 within which the gain of this margin is used: the ends have no derivative."""
 
 
 def marker_readings(
     trial: FilmedTrial, frame: int
 ) -> tuple[Int[np.ndarray, " markers"], Float[np.ndarray, " markers"]]:
-    """Part of each marker that lies wholly in the image in the best reading of a frame's margin.
+    """Compute the contribution of each marker inside the image to the best linear estimate of a frame's margin.
 
-    Gives numbers of the markers, and the reading as it is less the reading with that marker put back, in margin units.
+    Gives numbers of the markers, and the estimate less the estimate with that marker put back, in margin units.
     """
     gain, _ = _best_reading(trial, frame)
-    motion, seen = trial.film.motion, visible_markers(trial.plan.recipe.sensor)
-    moved = (motion.centres_px[frame] - motion.rest_px)[seen]
-    return seen, (gain.reshape(-1, 2) * moved).sum(axis=1)
+    motion, visible = trial.film.motion, visible_markers(trial.plan.recipe.sensor)
+    moved = (motion.centres_px[frame] - motion.rest_px)[visible]
+    return visible, (gain.reshape(-1, 2) * moved).sum(axis=1)
 
 
 def reading_slope(trial: FilmedTrial, frame: int) -> float:
-    """Rise of the best reading over that of the margin, where friction alone changes and the forces stay.
+    """Compute the change of the best estimate over that of the margin, where friction alone changes.
 
-    It is told from the same markers whether the margin or the friction differs, and how far the reader expects each:
-    below 1 the best reader, too, ascribes a part of what it sees to the friction. With friction mu and the same forces
-    d log(mu) = d Gamma / (1 - Gamma).
+    Below 1 even the best estimator ascribes part of the markers' motion to the friction. With friction mu and the same
+    forces d log(mu) = d Gamma / (1 - Gamma).
     """
     gain, sensitivity = _best_reading(trial, frame)
     moved = dict(zip(sensitivity.unknowns, sensitivity.jacobian[0].T, strict=True))
@@ -380,20 +366,20 @@ def reading_slope(trial: FilmedTrial, frame: int) -> float:
 
 
 def reading_limit(trial: FilmedTrial, frame: int) -> float:
-    """Standard deviation below which no unbiased reader of a frame's markers comes that knows if objects are wet."""
-    sensitivity, prior = _seen(trial, frame)
+    """Compute the least standard deviation of an unbiased estimate from a frame's markers, wet or dry being known."""
+    sensitivity, prior = _sensitivity(trial, frame)
     return least_sigma(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
 
 
 def _best_reading(trial: FilmedTrial, frame: int) -> tuple[np.ndarray, Sensitivity]:
-    """Gain of the best linear reading of a frame, and what it rests on."""
-    sensitivity, prior = _seen(trial, frame)
+    """Compute the gain of the best linear estimate at a frame, and the sensitivity of its markers."""
+    sensitivity, prior = _sensitivity(trial, frame)
     gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
     return gain, sensitivity
 
 
-def _seen(trial: FilmedTrial, frame: int) -> tuple[Sensitivity, dict[str, float]]:
-    """How the markers of a frame move with every unknown, and how far these range."""
+def _sensitivity(trial: FilmedTrial, frame: int) -> tuple[Sensitivity, dict[str, float]]:
+    """Compute the motion of a frame's markers with every unknown, and the standard deviations of these."""
     recipe, margin = trial.plan.recipe, float(trial.loading.safety_margin[frame])
     if np.isnan(margin):
         raise ContactError(

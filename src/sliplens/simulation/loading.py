@@ -1,4 +1,4 @@
-"""The load on the fingertip through a trial: touch, press, hold, pull until it slips, slide on, let go."""
+"""Load on the fingertip through a trial: touch, press, hold, pull until it slips, slide on, let go."""
 
 from dataclasses import dataclass, replace
 
@@ -19,24 +19,24 @@ _SLIP_SHARE = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Friction:
-    """Friction of a contact and how much of it is used, frame by frame."""
+    """Friction of a contact and the share of it that is used, frame by frame."""
 
     coefficient: Frames
-    """The one that holds: static, kinetic in slip, then what the contact has regained where it sticks."""
+    """Current coefficient: static, kinetic in slip, then what the contact has regained where it sticks."""
     used: Frames
-    """Tangential force over what this friction can hold."""
+    """Tangential force over the largest that this friction holds."""
     carried: Frames
     """Tangential over normal force at which the contact last slipped."""
     slips: Bool[np.ndarray, " frames"]
 
 
 def slide(since_slip_s: Frames, *, static_friction: Frames, grasp: Grasp, stuck_until: int) -> Friction:
-    """Friction of a sliding contact: a fall from static to kinetic, then stick-slip of a spring-slider.
+    """Compute the friction of a sliding contact: a fall from static to kinetic, then stick-slip of a spring-slider.
 
     The spring reloads the stuck contact at a steady rate from kinetic friction to what the contact regained in that
     short time (a share of static less kinetic: friction ages), then the contact slips back. With a share of 0 it slides
-    on evenly. Frames before the first slip mean nothing. From `stuck_until` frames after it on the contact is let go:
-    it slips for good, at the level it then has.
+    on evenly. Frames before the first slip are meaningless. From `stuck_until` frames after it the contact is let go:
+    it slips for good, at its level of that moment.
 
     Persson, *Sliding Friction* (2000), chapter 3 (spring-slider, stick-slip).
     """
@@ -67,7 +67,7 @@ TRIAL_S = 8.0
 """Length of a trial in seconds."""
 
 _PHASES = (0.06, 0.07, 0.07, 0.72, 0.08)
-"""Shares of a trial: no contact, press, hold, pull, slide; the pull gets most, for its margins are what is learnt."""
+"""Shares of a trial: no contact, press, hold, pull, slide; the pull is longest, for its margins are learnt."""
 _RELEASE = (0.05, 0.04)
 """Shares taken from the pull in a trial that ends with a release: letting go, and no contact after."""
 
@@ -79,17 +79,16 @@ MINIMUM_FRAMES = 20
 class Loading:
     """Forces and labels of every frame of a trial.
 
-    The friction coefficient is the one that holds: static until the contact slips, kinetic while it slides, and what
-    the contact has regained where it sticks again. So the margin of a sliding contact is 0 and every margin is
-    1 - F_t / (mu F_n). Without contact the margin is NaN.
+    The friction coefficient is static until the contact slips, kinetic while it slides, and partly regained where it
+    sticks again. So the margin of a sliding contact is 0 and every margin is 1 - F_t / (mu F_n). Without contact the
+    margin is NaN.
 
     The traction is that of `carried_friction` times the pressure everywhere, from sliding, and on top of it that of a
-    Cattaneo-Mindlin contact with the friction that is left and `stick_margin` (Ciavarella and Jaeger's superposition).
+    Cattaneo-Mindlin contact with the remaining friction and `stick_margin` (Ciavarella and Jaeger's superposition).
     Before the first slip nothing is carried, and the stick margin is the safety margin.
 
-    A pull that is let back slips anew from the rim of the contact, half as far for the same force, and so it does when
-    it is pulled again (Mindlin and Deresiewicz). Where the pull has come back to where it was let back from, nothing of
-    that is left.
+    A pull that is let back slips anew from the rim of the contact, half as far for the same force, and again when it is
+    pulled again (Mindlin and Deresiewicz). The traces vanish where the pull returns to where it was let back from.
     """
 
     time_s: Frames
@@ -101,18 +100,18 @@ class Loading:
     stick_ratio: Frames
     carried_friction: Frames
     stick_margin: Frames
-    """NaN without contact, as the safety margin; where the pull was let back, that of the newest slip from the rim."""
+    """NaN without contact; where the pull was let back, the margin of the newest slip from the rim."""
     let_back: Frames
     """Share of the friction by which the pull went back from its farthest; 0 while it is the farthest."""
     retaken: Frames
-    """Share of the friction by which it was pulled again since."""
+    """Share of the friction by which the object was pulled again since."""
     held_s: Frames
     """Time since the object was touched; 0 before."""
     contact_state: tuple[ContactState, ...]
 
     @property
     def tractions(self) -> list[tuple[float, Frames, Frames]]:
-        """Sign, friction and margin of the Cattaneo-Mindlin contacts whose sum the traction is."""
+        """Sign, friction and margin of the Cattaneo-Mindlin contacts that add up to the traction."""
         turned = self.let_back > 0
         farthest = np.clip(self.safety_margin - self.let_back + self.retaken, 0, 1)
         farthest = np.where(turned, farthest, self.stick_margin)
@@ -137,11 +136,11 @@ class Pull:
 def draw_pull(pulls: Pulls, *, progress: Frames, duration_s: float, rng: np.random.Generator) -> Pull:
     """Draw a pull that uses the friction up, from 0 at its beginning to 1 at its end.
 
-    `progress`: time since the first tug over the duration; below 0 nothing is pulled, above 1 all is used up.
+    `progress` is the time since the first tug over the duration, from 0 to 1.
     """
     events = rng.choice(["rest", "jerk", "let back"], size=rng.integers(pulls.most_events + 1))
     places = np.append(np.sort(rng.uniform(0.05, 0.95, len(events))), 1.0)
-    # time and level of each corner; times are weights first, but those of jerks
+    # time and level of each corner; times are weights at first, except those of jerks
     weights, jerks, levels, backs = [0.0], [0.0], [0.0], []
 
     def go(level: float, *, weight: float = 0.0, jerk: float = 0.0) -> None:
@@ -179,9 +178,9 @@ def load_grasp(
 ) -> Loading:
     """Load a grasp: press to its force, hold, pull until the friction is used up, then slide (`slide`).
 
-    `release`: let go at the end: the normal force falls to nothing while the object slides, and the last frames have no
-    contact. `pulls`: how the pull is drawn (`draw_pull`), and the trial lasts as long as that takes; if None the margin
-    falls evenly, in a trial of 8 s.
+    With `release` the normal force falls to nothing while the object slides, and the last frames have no contact. With
+    `pulls` the pull is drawn (`draw_pull`) and the trial lasts as long as that takes; if None the margin falls evenly,
+    in a trial of 8 s.
     """
     if frames < MINIMUM_FRAMES:
         raise ContactError(f"a trial of {frames} frames cannot hold all phases; ask for {MINIMUM_FRAMES} or more")
@@ -190,8 +189,7 @@ def load_grasp(
     progress = index / (frames - 1)
     time_s = index * (trial_s / frames)
 
-    # the camera knows nothing of the touch: the first frame of contact comes anywhere within its period, and where
-    # frames are few, some trials show the lightest touch and some do not
+    # the touch begins anywhere between two frames: where frames are few, only some trials show the lightest touch
     since_touch = index - touch + 1 - rng.uniform()
     normal = grasp.normal_force_n * _smooth(since_touch / (pressed - touch))
     normal *= 1 + grasp.normal_force_drift * (progress - 0.5) * 2
@@ -222,7 +220,7 @@ def load_grasp(
 def load_at_margins(margins: Frames, *, grasp: Grasp) -> Loading:
     """Load a grasp so that its frames have given margins, at its full normal force; NaN is no contact.
 
-    `grasp`: force and friction; drift, creep and the kinetic ratio are left out.
+    Of the grasp only force and friction count, not drift, creep and the kinetic ratio.
     """
     return load_at_states(
         np.where(np.isnan(margins), 0.0, grasp.normal_force_n),
@@ -234,9 +232,9 @@ def load_at_margins(margins: Frames, *, grasp: Grasp) -> Loading:
 def load_at_states(
     normal_force_n: Frames, *, friction: Frames, margins: Frames, held_s: Frames | None = None
 ) -> Loading:
-    """Load a contact so that its frames have given normal forces, frictions and margins; nothing of before is told.
+    """Load a contact so that its frames have given normal forces, frictions and margins, without a history.
 
-    A margin of 0 slips, one of NaN is no contact; `held_s` is the time since the touch, which creep grows with.
+    A margin of 0 slips, one of NaN is no contact; `held_s` is the time since the touch, with which creep grows.
     """
     if np.any((margins < 0) | (margins > 1)):
         raise ContactError("safety margins must lie in [0, 1]; give them as fractions, not in percent")
@@ -251,7 +249,7 @@ def load_at_states(
 def _label(
     time_s: Frames, *, normal: Frames, static: Frames, friction: Friction, held_s: Frames, course: Pull | None = None
 ) -> Loading:
-    """Label frames of which is known how much of the friction they use, and whether the pull was let back before."""
+    """Compute forces and labels of frames from the share of the friction that they use."""
     let_back = retaken = np.zeros(len(time_s))
     if course is not None:
         let_back, retaken = course.let_back, course.retaken
@@ -259,8 +257,8 @@ def _label(
     tangential = friction.used * coefficient * normal
     # rounding alone would leave a sliding contact a margin of 1e-16
     margin = np.where(slips & (normal > 0), 0.0, safety_margin(normal, tangential, coefficient))
-    left = coefficient - carried
-    on_top = np.clip((friction.used * coefficient - carried) / np.where(left > 0, left, 1), 0, 1)
+    rest = coefficient - carried
+    on_top = np.clip((friction.used * coefficient - carried) / np.where(rest > 0, rest, 1), 0, 1)
     again = ~np.isnan(margin) & ~slips & (carried > 0)
     stick_margin = _newest_margin(np.where(again, 1 - on_top, margin), let_back=let_back, retaken=retaken)
     return Loading(
@@ -281,26 +279,25 @@ def _label(
 
 
 def _newest_margin(margin: Frames, *, let_back: Frames, retaken: Frames) -> Frames:
-    """Margin of the slip that last began at the rim of the contact."""
+    """Compute the margin of the slip that last began at the rim of the contact."""
     newest = np.where(retaken > 0, 1 - retaken / 2, 1 - let_back / 2)
     return np.where((let_back > 0) & ~np.isnan(margin), newest, margin)
 
 
 def with_friction(loading: Loading, friction: Frames) -> Loading:
-    """Press and pull with the same forces on an object of another friction, one value a frame.
+    """Apply the same forces to an object of another friction, one value a frame.
 
-    A frame whose friction stays is as it was. Of the others the margin is NaN where that friction cannot hold the pull,
-    and after the first slip: what slipping leaves behind would have been another.
+    Frames whose friction stays do not change. The margin of the others is NaN where their friction cannot hold the
+    pull, and after the first slip, whose traces would have differed.
     """
     same = friction == loading.friction_coefficient
-    # the same forces are other shares of another friction
     ratio = loading.friction_coefficient / friction
     let_back, retaken = np.where(same, 1, ratio) * (loading.let_back, loading.retaken)
     normal, tangential = loading.normal_force_n, loading.tangential_force_n
     farthest = tangential + (let_back - retaken) * friction * normal
-    known = ((loading.safety_margin > 0) & (loading.carried_friction == 0) & (farthest < friction * normal)) | same
+    sticks = ((loading.safety_margin > 0) & (loading.carried_friction == 0) & (farthest < friction * normal)) | same
     margin = np.where(same, loading.safety_margin, safety_margin(normal, tangential, friction))
-    margin = np.where(known, margin, np.nan)
+    margin = np.where(sticks, margin, np.nan)
     newest = _newest_margin(margin, let_back=let_back, retaken=retaken)
     stick_margin = np.where(same, loading.stick_margin, newest)
     return replace(
@@ -320,9 +317,9 @@ def with_friction(loading: Loading, friction: Frames) -> Loading:
 def _phase_ends(
     frames: int, rng: np.random.Generator, *, release: bool, pulls: Pulls | None
 ) -> tuple[float, tuple[int, ...]]:
-    """Length of the trial in seconds, and the first frame after each phase.
+    """Draw the length of the trial in seconds, and the first frame after each phase.
 
-    Lengths of the phases vary by a fifth; the pull takes what is left, or the time that it is drawn to take.
+    Lengths of the phases vary by a fifth; the pull takes the rest, or its own drawn time.
     """
     shares, trial_s = np.array((*_PHASES, *(_RELEASE if release else (0.0, 0.0)))), TRIAL_S
     factors = rng.uniform(0.8, 1.2, len(shares))
@@ -338,6 +335,6 @@ def _phase_ends(
 
 
 def _smooth(progress: Frames) -> Frames:
-    """Rise from 0 to 1 with a soft start and stop, as a servo makes it."""
+    """Rise from 0 to 1 with a soft start and stop, like a servo."""
     inside = np.clip(progress, 0, 1)
     return inside**2 * (3 - 2 * inside)

@@ -1,7 +1,6 @@
-"""Where the markers go under load: a calibrated model and the exact half-space."""
+"""Motion of the markers under load: a calibrated model and the exact half-space."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -57,7 +56,7 @@ class Motion:
     rest_px: Float[np.ndarray, "markers 2"]
     centres_px: Float[np.ndarray, "frames markers 2"]
     scale: Float[np.ndarray, "frames markers"]
-    """Size over the size at rest: what comes nearer looks larger."""
+    """Size over the size at rest; a marker that comes nearer looks larger."""
     touch: Float[np.ndarray, " frames"]
     """Indentation over that of the nominal grasp; 0 without contact."""
     nominal_radius_m: float
@@ -71,7 +70,7 @@ class Motion:
 
 
 def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement: str | None = None) -> Motion:
-    """Displace a sensor's markers by a loading; of the touch's grasp count contact offset, tilt, shear and creep.
+    """Displace a sensor's markers by a loading, and by the offset, tilt, shear and creep of the touch.
 
     `displacement`: a row of `DISPLACEMENTS`; the sensor's default if None.
     """
@@ -100,9 +99,13 @@ def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement
     centre_m = np.asarray(grasp.contact_offset) * sphere_m
     from_centre = rest[:, :2] - centre_m
     distance = np.linalg.norm(from_centre, axis=-1)
-    contact: dict[str, Any] = {"contact_radius_m": contact_m[:, None], "sphere_radius_m": sphere_m}
-    contact["poisson_ratio"] = sensor.poisson_ratio
-    outward, inward = hertz_displacement(distance, depth_m, **contact)
+    outward, inward = hertz_displacement(
+        distance,
+        depth_m,
+        contact_radius_m=contact_m[:, None],
+        sphere_radius_m=sphere_m,
+        poisson_ratio=sensor.poisson_ratio,
+    )
     yielding = model.layer * clamp
     outward, inward = outward * yielding / np.where(distance > 0, distance, 1), inward * yielding
     pull = np.array([np.cos(grasp.shear_direction_rad), np.sin(grasp.shear_direction_rad)])
@@ -110,15 +113,17 @@ def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement
     # a tilted object pushes a little sideways
     moved = rest + outward[..., None] * np.append(from_centre, np.zeros((len(rest), 1)), axis=1)
     moved += inward[..., None] * np.append(np.tan(grasp.tilt_rad), -1)
-    for sign, *held in loading.tractions:
-        friction, margin = (values[:, None] for values in held)
+    for sign, *traction in loading.tractions:
+        friction, margin = (values[:, None] for values in traction)
         along, across, sunk = partial_slip_displacement(
             from_centre @ pull,
             from_centre @ athwart,
             depth_m,
             friction_coefficient=friction * model.local_friction,
             safety_margin=margin,
-            **contact,
+            contact_radius_m=contact_m[:, None],
+            sphere_radius_m=sphere_m,
+            poisson_ratio=sensor.poisson_ratio,
         )
         skin = model.skin_shear * sphere_m * friction / _FITTED_FRICTION * sunken[:, None]
         along = (along + skin * (1 - margin**grasp.shear_exponent)) * (sign * clamp)

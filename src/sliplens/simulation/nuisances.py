@@ -1,8 +1,8 @@
-"""What differs between days, sensors, trials and frames, and how it is drawn."""
+"""Nuisances: differences between days, sensors, trials and frames, and how they are drawn."""
 
 import math
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -14,11 +14,12 @@ Range: TypeAlias = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class Nuisances:
-    """Ranges of everything a network must not rely on, each (low, high) and drawn evenly.
+    """Ranges of all that a network must not rely on, each (low, high) and drawn evenly.
 
-    The friction is drawn apart from the normal force: were they tied, the lens of contact alone would tell the safety
-    margin. Offsets and depths are in radii of the contact's sphere, angles in degrees, image lengths in pixels,
-    brightness in grey levels. A range that is not finite, runs downwards or holds what cannot be is a `ContactError`.
+    Friction and normal force are drawn independently: were they tied, the size of the contact alone would give the
+    safety margin. Offsets and depths are in radii of the contact's sphere, angles in degrees, image lengths in pixels,
+    brightness in grey levels. A range that is not finite, runs downwards or holds impossible values is a
+    `ContactError`.
     """
 
     dry_friction: Range = (0.5, 1.2)
@@ -52,7 +53,7 @@ class Nuisances:
     camera_shift_px: Range = (-3.0, 3.0)
     camera_rotation_deg: Range = (-3.0, 3.0)
     sensor_gain: Range = (1.0, 1.0)
-    """Gain of a sensor's camera; `gain` is the change of a day, and so for the next five."""
+    """Gain of a sensor's camera, which `gain` changes by day; in the same way for the next five."""
     sensor_white_balance: Range = (1.0, 1.0)
     sensor_gradient: Range = (0.0, 0.0)
     sensor_glare: Range = (1.0, 1.0)
@@ -102,23 +103,23 @@ _UPPER |= {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "illumination_gradient
 
 @dataclass(frozen=True, kw_only=True)
 class Pulls:
-    """How objects are pulled where no pull is like another: a chain of ramps, each of a rate of its own.
+    """Ranges of pulls that all differ: chains of ramps, each with its own rate.
 
     Between ramps the pull rests, jerks, or is let back some way and pulled again. A range that is not positive, runs
-    downwards, or would let back more than all of the pull is a `ContactError`.
+    downwards, or lets back more than the whole pull is a `ContactError`.
     """
 
     duration_s: Range = (0.8, 8.0)
     """From the first tug to the slip, drawn evenly in the logarithm: a decade."""
     most_events: int = 3
-    """Rests, jerks and lettings back of a pull, at most."""
+    """Largest number of rests, jerks and lettings back of a pull."""
     rate: float = 3.0
-    """Ratio by which a ramp is faster or slower than the whole pull, at most, before all are made to fit."""
+    """Largest ratio of a ramp's rate to that of the whole pull, before all are scaled to fit."""
     rest: Range = (0.05, 0.3)
     """Length of a rest and of each way of a letting back, over that of the pull."""
     jerk_s: Range = (0.03, 0.1)
     let_back: Range = (0.2, 0.8)
-    """Share of the pull that is taken back."""
+    """Share of the pull that is let back."""
 
     def __post_init__(self) -> None:
         for name in ("duration_s", "rest", "jerk_s", "let_back"):
@@ -153,7 +154,7 @@ class Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class Day(Camera):
-    """Facts of a day: the friction of the dry object, the gel's stiffness, light and camera."""
+    """Draws of a day: the friction of the dry object, the gel's stiffness, light and camera."""
 
     friction: float = 0.775
     modulus_factor: float = 1.0
@@ -161,7 +162,7 @@ class Day(Camera):
 
 @dataclass(frozen=True, kw_only=True)
 class Unit:
-    """Facts of one built sensor: where its markers came to lie, their size and dye."""
+    """Draws of one built sensor: places, size and dye of its markers."""
 
     marker_jitter_px: Float[np.ndarray, "markers 2"]
     marker_depth: float
@@ -174,10 +175,10 @@ class Unit:
 
 @dataclass(frozen=True, kw_only=True)
 class Grasp:
-    """Facts of one trial; the defaults are the trial of the real images, as far as they tell."""
+    """Draws of one trial; the defaults are fitted to the trial of the real images, as far as they show it."""
 
     friction: float = 0.775
-    """Coefficient of friction; the images name none: the geometric mean of the dry range (assumed)."""
+    """Coefficient of friction: unpublished, so the geometric mean of the dry range (assumed)."""
     friction_drift: float = 0.0
     kinetic_ratio: float = 1.0
     stick_slip_share: float = 0.0
@@ -199,7 +200,7 @@ class Grasp:
 
 @dataclass(frozen=True, kw_only=True)
 class Touch:
-    """All that moves the markers of a frame, apart from the safety margin."""
+    """Parameters that move the markers of a frame, besides the safety margin."""
 
     grasp: Grasp
     modulus_factor: float = 1.0
@@ -228,10 +229,10 @@ def mount_camera(day: Day, camera: Camera) -> Day:
     >>> mount_camera(Day(camera_shift_px=(0.1, 0.0)), Camera(camera_shift_px=(2.0, 1.0))).camera_shift_px
     (2.1, 1.0)
     """
-    slopes = [one.gradient * np.exp(1j * one.gradient_direction_rad) for one in (day, camera)]
+    slopes = [part.gradient * np.exp(1j * part.gradient_direction_rad) for part in (day, camera)]
     slope = complex(sum(slopes))
-    red, green, blue = (ours * theirs for ours, theirs in zip(day.white_balance, camera.white_balance, strict=True))
-    (x, y), (seat_x, seat_y) = day.camera_shift_px, camera.camera_shift_px
+    red, green, blue = (change * fixed for change, fixed in zip(day.white_balance, camera.white_balance, strict=True))
+    (x, y), (fixed_x, fixed_y) = day.camera_shift_px, camera.camera_shift_px
     return replace(
         day,
         gain=day.gain * camera.gain,
@@ -239,16 +240,13 @@ def mount_camera(day: Day, camera: Camera) -> Day:
         gradient=abs(slope),
         gradient_direction_rad=float(np.angle(slope)),
         glare=day.glare * camera.glare,
-        camera_shift_px=(x + seat_x, y + seat_y),
+        camera_shift_px=(x + fixed_x, y + fixed_y),
         camera_rotation_rad=day.camera_rotation_rad + camera.camera_rotation_rad,
     )
 
 
 def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator) -> Day:
-    """Draw a day.
-
-    `quantile`: where in its range the day's dry friction lies, 0 to 1; the caller spreads the days.
-    """
+    """Draw a day; `quantile` places its dry friction in the range, from 0 to 1, so that days can be spread."""
     low, high = nuisances.dry_friction
     return Day(
         friction=low + quantile * (high - low),
@@ -264,7 +262,7 @@ def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator)
 
 
 def draw_unit(nuisances: Nuisances, *, markers: int, rng: np.random.Generator) -> Unit:
-    """Draw a built sensor with so many markers."""
+    """Draw a built sensor."""
     return Unit(
         marker_jitter_px=rng.normal(0, nuisances.marker_jitter_px, (markers, 2)),
         marker_depth=rng.uniform(*nuisances.marker_depth),
@@ -277,12 +275,12 @@ def draw_unit(nuisances: Nuisances, *, markers: int, rng: np.random.Generator) -
 
 def draw_grasp(nuisances: Nuisances, *, day: Day, wet: bool, rng: np.random.Generator) -> Grasp:
     """Draw a trial of a day."""
-    # every trial draws the same number of times, so that dry and wet twins differ in friction alone
+    # every trial draws equally often, so that dry and wet twins differ in friction alone
     dry_factor, wet_friction = rng.uniform(*nuisances.dry_friction_factor), rng.uniform(*nuisances.wet_friction)
     drift = rng.uniform(*nuisances.wet_friction_drift)
     reach, bearing = rng.uniform(*nuisances.contact_offset), rng.uniform(-np.pi, np.pi)
 
-    def drawn(*names: str) -> dict[str, Any]:
+    def drawn(*names: str) -> dict[str, float]:
         return {name: rng.uniform(*getattr(nuisances, name)) for name in names}
 
     return Grasp(

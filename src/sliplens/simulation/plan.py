@@ -1,9 +1,9 @@
-"""Which trials are simulated, on which day, and what they are for."""
+"""Plans of simulated trials: their days, sensors, splits and seeds, from a recipe."""
 
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Any, TypedDict, Unpack, cast
 
 import numpy as np
 
@@ -31,7 +31,7 @@ class FrameTotals:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulationRecipe:
-    """All that shapes a simulated data set; the same recipe gives the same bytes on the same machine.
+    """Settings of a simulated data set; the same recipe gives the same bytes on the same machine.
 
     The days and splits follow the thesis: the first day and three quarters of the dry trials of the days between train,
     the other quarter validates, evenly spaced over these days, and the test day tests. Wet trials are all of the test
@@ -45,15 +45,15 @@ class SimulationRecipe:
     frame_totals: FrameTotals | None = None
     """Frames of each split, if given: trials then differ in length by a tenth to make them up."""
     release: bool = False
-    """Let go of the object at the end of each trial."""
+    """If True, the object is let go at the end of each trial."""
     pulls: Pulls | None = None
-    """How pulls differ; if None all last about 5.8 s, and a sequence of frames tells the time."""
+    """How pulls differ; if None all last about 5.8 s, so that a sequence of frames shows the time."""
     days: int = 4
     test_day: int | None = None
     """The last day if None."""
     test_days: int = 1
-    """Number of last days that test, where no `test_day` is named: with one alone, one friction and one light decide
-    the score."""
+    """Number of last days that test, where `test_day` is None: with one alone, one friction and one light decide the
+    score."""
     validation_share: float = 0.25
     """Share of the dry trials of the days between that validates."""
     sensor: Sensor = CHROMATOUCH
@@ -83,12 +83,12 @@ class SimulationRecipe:
         if not 2 <= self.resolved_test_day <= self.days:
             raise InputError(
                 f"test_day is {self.test_day}, but the first of {self.days} days trains; "
-                f"name a day from 2 to {self.days}"
+                f"choose a day from 2 to {self.days}"
             )
         if not 1 <= self.test_days < self.days or (self.test_day is not None and self.test_days > 1):
             raise InputError(
-                f"test_days is {self.test_days}, but of {self.days} days the first trains, and one that is named as "
-                "test_day tests alone; ask for fewer"
+                f"test_days is {self.test_days}, but of {self.days} days the first trains, and test_day tests alone; "
+                "ask for fewer"
             )
         if not 0 < self.validation_share < 1:
             raise InputError(f"validation_share must lie between 0 and 1, got {self.validation_share:g}")
@@ -100,7 +100,7 @@ class SimulationRecipe:
 
     def _check_days(self, dry_trials: tuple[int, ...]) -> None:
         if len(dry_trials) != self.days:
-            raise InputError(f"dry_trials names {len(dry_trials)} days but there are {self.days}; give one a day")
+            raise InputError(f"dry_trials has {len(dry_trials)} days but there are {self.days}; give one number a day")
         if min(dry_trials) < 0:
             raise InputError(f"dry_trials is {dry_trials}, but no day has fewer than 0 trials")
         others = sum(trials for day, trials in enumerate(dry_trials, start=1) if day not in (1, *self.tested))
@@ -109,12 +109,12 @@ class SimulationRecipe:
 
     @property
     def resolved_test_day(self) -> int:
-        """The day that tests, the last of them if there are more."""
+        """The last day that tests."""
         return self.days if self.test_day is None else self.test_day
 
     @property
     def tested(self) -> range:
-        """The days that test."""
+        """Days that test."""
         last = self.resolved_test_day
         return range(last - self.test_days + 1, last + 1)
 
@@ -126,21 +126,20 @@ class SimulationRecipe:
     @property
     def hash(self) -> str:
         """Hash of the recipe and of the version of sliplens that follows it."""
-        return hash_json({"recipe": self.told, "sliplens": __version__})
+        return hash_json({"recipe": self.to_dict(), "sliplens": __version__})
 
-    @property
-    def told(self) -> dict[str, Any]:
-        """The recipe as `run.json` keeps it; pulls that are all alike are left out, as before there were others."""
-        told = to_builtins(self)
-        return told if self.pulls else {name: value for name, value in told.items() if name != "pulls"}
+    def to_dict(self) -> dict[str, Any]:
+        """Return the recipe as `run.json` holds it; None for `pulls` is left out, so that hashes stay."""
+        fields = to_builtins(self)
+        return fields if self.pulls else {name: value for name, value in fields.items() if name != "pulls"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialPlan:
-    """All that `simulate_trial` needs to make one trial."""
+    """Plan of one trial, from which `simulate_trial` makes it."""
 
     trial: str
-    """Its name, such as day1-dry-003."""
+    """Name, such as day1-dry-003."""
     day: int
     condition: str
     """dry or wet."""
@@ -148,40 +147,57 @@ class TrialPlan:
     """train, validation or test."""
     frames: int
     seed: int
-    """Seed of this trial alone: other trials come and go without changing it."""
+    """Seed of this trial alone, whatever other trials there are."""
     unit: int
     """Number of the built sensor, from 0."""
     unit_seed: int
     day_seed: int
     day_draw: Day
     recipe: SimulationRecipe
-    """Recipe that all trials have in common."""
+    """Recipe of the whole data set."""
     recipe_hash: str
+
+
+class RecipeChanges(TypedDict, total=False):
+    """Changes of a preset; None leaves a field as it is."""
+
+    dry_trials: int | tuple[int, ...] | None
+    wet_trials: int | None
+    frames_per_trial: int | None
+    days: int | None
+    test_day: int | None
+    test_days: int | None
+    validation_share: float | None
+    sensors: int | None
+    displacement: str | None
+    release: bool | None
+    pulls: str | None
+    """Row of `PULLS`."""
+    dry_friction: tuple[float, float] | None
+    """Least and largest coefficient of friction of the dry object."""
+    nuisances: Nuisances | None
+    series: str | None
+    seed: int | None
 
 
 def make_recipe(
     preset: str = "small",
     *,
     sensor: str | None = None,
-    pulls: str | None = None,
-    dry_friction: tuple[float, float] | None = None,
-    **changes: Any,
+    **changes: Unpack[RecipeChanges],
 ) -> SimulationRecipe:
-    """Recipe of a preset with changes.
+    """Return the recipe of a preset with changes.
 
     Parameters
     ----------
     preset
         Row of `PRESETS`.
     sensor
-        Row of `SENSORS`; the preset's own if None.
-    pulls
-        Row of `PULLS`; the preset's own if None.
-    dry_friction
-        Least and largest coefficient of friction of the dry object.
+        Row of `SENSORS`; that of the preset if None.
     changes
-        Other fields of `SimulationRecipe`, such as `dry_trials`, `frames_per_trial`, `days` or `seed`; None leaves one
-        as it is. With other numbers of trials, days or frames the preset's totals no longer hold.
+        `pulls`, a row of `PULLS`; `dry_friction`, the least and largest coefficient of friction of the dry object; or
+        fields of `SimulationRecipe`, such as `dry_trials`, `frames_per_trial`, `days` or `seed`. None leaves one as it
+        is. With other numbers of trials, days or frames the preset's totals no longer hold.
 
     Raises
     ------
@@ -194,22 +210,22 @@ def make_recipe(
     191
     """
     start = PRESETS.pick(preset)
-    changes = {name: value for name, value in changes.items() if value is not None}
-    if "days" in changes and "dry_trials" not in changes:
-        changes["dry_trials"] = int(np.sum(start.dry_trials))
-    if changes.keys() & {"dry_trials", "wet_trials", "days", "test_days", "frames_per_trial"}:
-        changes["frame_totals"] = None
+    fields: dict[str, object] = {name: value for name, value in changes.items() if value is not None}
+    if "days" in fields and "dry_trials" not in fields:
+        fields["dry_trials"] = int(np.sum(start.dry_trials))
+    if fields.keys() & {"dry_trials", "wet_trials", "days", "test_days", "frames_per_trial"}:
+        fields["frame_totals"] = None
     if sensor is not None:
-        changes["sensor"] = SENSORS.pick(sensor)
-    if pulls is not None:
-        changes["pulls"] = PULLS.pick(pulls)
-    if dry_friction is not None:
-        changes["nuisances"] = replace(start.nuisances, dry_friction=dry_friction)
-    return replace(start, **changes)
+        fields["sensor"] = SENSORS.pick(sensor)
+    if "pulls" in fields:
+        fields["pulls"] = PULLS.pick(cast("str", fields["pulls"]))
+    if (friction := fields.pop("dry_friction", None)) is not None:
+        fields["nuisances"] = replace(start.nuisances, dry_friction=friction)
+    return replace(start, **fields)
 
 
 def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
-    """Lay out the trials of a recipe: names, days, splits and seeds, the same for the same recipe; dry before wet.
+    """Plan the trials of a recipe: names, days, splits and seeds; dry before wet.
 
     Examples
     --------
@@ -230,7 +246,7 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
         dry = _spread(recipe.dry_trials, days=recipe.days, tested=tested)
     wet = {day: len(range(index, recipe.wet_trials, len(tested))) for index, day in enumerate(tested)}
     between = [(day, number) for day in sorted(dry) if day not in (1, *tested) for number in range(1, dry[day] + 1)]
-    # without days between, the first day has to give up some of its own
+    # without days between, the first day gives up some of its trials
     candidates = between or [(1, number) for number in range(1, dry[1] + 1)]
     validation = set(hold_out(candidates, recipe.validation_share))
 
@@ -240,7 +256,7 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
             for number in range(1, trials + 1):
                 held_out = condition == "dry" and (day, number) in validation
                 split = "test" if day in tested else "validation" if held_out else "train"
-                # each day begins with another sensor: where days have few trials, all sensors still come to be used
+                # each day begins with another sensor, so that all are used where days have few trials
                 unit = (number + day - 2) % recipe.sensors
                 plans.append(
                     TrialPlan(
@@ -262,7 +278,7 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
 
 
 def _with_totals(plans: Sequence[TrialPlan], totals: FrameTotals) -> tuple[TrialPlan, ...]:
-    """Give each trial a length of its own, so that the lengths of a split sum to its total."""
+    """Draw the lengths of the trials so that those of a split sum to its total."""
     lengths: dict[str, int] = {}
     for split, total in asdict(totals).items():
         chosen = [plan for plan in plans if plan.split == split]
@@ -271,7 +287,7 @@ def _with_totals(plans: Sequence[TrialPlan], totals: FrameTotals) -> tuple[Trial
                 f"{total} frames cannot fill {len(chosen)} {split} trials of at least {MINIMUM_FRAMES}; "
                 "change the frame totals or the trials"
             )
-        # one way to draw for each trial: others come and go without changing its share much
+        # drawn from each trial's seed, so that other trials hardly change its share
         shares = np.array([np.random.default_rng((plan.seed, 0)).uniform(0.9, 1.1) for plan in chosen])
         ends = np.round(np.cumsum(shares) / shares.sum() * total).astype(int)
         lengths |= {plan.trial: int(count) for plan, count in zip(chosen, np.diff(ends, prepend=0), strict=True)}
@@ -279,7 +295,7 @@ def _with_totals(plans: Sequence[TrialPlan], totals: FrameTotals) -> tuple[Trial
 
 
 def _spread(trials: int, *, days: int, tested: range) -> dict[int, int]:
-    """Deal dry trials to the days in turn, the first and a test day served first so that no split goes without."""
+    """Deal dry trials to the days in turn, to the first and a test day first so that no split is empty."""
     between = [day for day in range(2, days + 1) if day not in tested]
     order = [1, tested[-1], *between, *tested[:-1]]
     dealt = dict.fromkeys(order, 0)
@@ -294,7 +310,7 @@ def _spread(trials: int, *, days: int, tested: range) -> dict[int, int]:
 
 
 def _draw_days(recipe: SimulationRecipe) -> dict[int, Day]:
-    """Draw the days, their dry friction spread over its range: four independent draws may all be alike."""
+    """Draw the days, their dry friction spread over its range: few independent draws may all be alike."""
     spread = np.random.default_rng(_seed(recipe, _DAYS))
     strata = spread.permutation(recipe.days)
     return {
@@ -344,6 +360,6 @@ _ROWS = {
 }  # fmt: skip
 PRESETS = Table("preset", "sliplens.presets", _ROWS)
 """`small` fits a laptop and shows many days; `thesis` has the days, splits and number of frames of the thesis: Polak,
-*Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*. It does not say how many trials it
-had, nor how dry and wet shared the test day: that is assumed, from about 800 frames a trial. `varied` is for networks
-that are to meet other days, sensors and objects; it has no series, since the networks of the package learned it so."""
+*Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, which gives neither the number of
+trials nor the shares of dry and wet ones on the test day: both are assumed, from about 800 frames a trial. `varied` is
+for networks that meet other days, sensors and objects; it has no series, as when the shipped networks were trained."""

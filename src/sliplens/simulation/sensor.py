@@ -1,4 +1,4 @@
-"""What is simulated: fingertips with markers, as records."""
+"""Simulated fingertips with markers: shape, camera, gel, look and noise."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -53,7 +53,7 @@ def pick_noise(frames: int, *, rng: np.random.Generator) -> Int[np.ndarray, "fra
 def mix_noise(
     picks: Int[np.ndarray, "frames 2 3"], *, noise: Noise, image_size_px: int, device: str | torch.device
 ) -> Float[Tensor, "3 frames size size"]:
-    """Noise of unit variance for each frame.
+    """Compute noise of unit variance for each frame.
 
     The sum of two windows out of 32 fields repeats after some 10^10 frames, costs two reads and an addition, and is the
     same on every device.
@@ -69,7 +69,7 @@ def mix_noise(
 
 @lru_cache(maxsize=4)
 def _noise_bank(noise: Noise, side: int, device: str) -> Float[Tensor, "3 fields side side"]:
-    """Fields of variance 1/2, smooth over neighbours, red and green alike in part; always the same ones."""
+    """Draw fields of variance 1/2, smooth over neighbours, red and green correlated; always the same."""
     white = np.random.default_rng(0).standard_normal((3, _FIELDS, side + 1, side + 1), dtype=np.float32)
     rows = white[:, :, :-1] + noise.smoothness * white[:, :, 1:]
     smooth = rows[..., :-1] + noise.smoothness * rows[..., 1:]
@@ -107,19 +107,19 @@ class MarkerLook:
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnMarkers:
-    """Markers as they are drawn, by frame, marker and channel."""
+    """Look of the drawn markers, by frame, marker and channel."""
 
     radius_px: Float[np.ndarray, "frames markers 3"]
     edge_px: Float[np.ndarray, "frames markers 3"]
     """Width of the logistic edge."""
     contrast: Float[np.ndarray, "frames markers 3"]
-    """Over the sensor's own."""
+    """Contrast over that of the sensor."""
 
 
 def draw_look(
     look: MarkerLook, *, geometry: Geometry, unit: Unit, scale: Sizes, pressure: Sizes, touch: Frames, blur_px: Frames
 ) -> DrawnMarkers:
-    """Look of the markers under a load, as a `Motion` tells it, and under the trial's own blur (a standard deviation).
+    """Compute the look of the markers under the load of a `Motion` and the trial's blur (a standard deviation).
 
     A pressed marker is paler, for the object behind the thin skin throws light back, and it is sharp: pressing brings
     the gel into the focus that the untouched one is out of, most in red and to one side of the image. Markers seen
@@ -198,7 +198,7 @@ class Sensor:
     vignette: float
     """Brightness lost at half the image's diagonal, growing with the square of the distance from its middle."""
     sees_contact: bool = True
-    """Whether the object shines through the skin: a veil, a glow and the skin's grain in contact."""
+    """True where the object shines through the skin: a veil, a glow and the skin's grain in contact."""
     noise: Noise
 
     def __post_init__(self) -> None:
@@ -212,7 +212,7 @@ class Sensor:
 
     @property
     def displacements(self) -> tuple[str, ...]:
-        """Displacement models that this sensor can be moved by, its default first."""
+        """Displacement models of this sensor, its default first."""
         return ("half-space",) if self.effective_modulus_pa is None else ("calibrated", "half-space")
 
 

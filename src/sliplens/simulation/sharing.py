@@ -1,6 +1,6 @@
-"""What two data sets share: the trials, days and sensors that would make a test of one on the other too easy."""
+"""Trials, days and sensors that two data sets share, which make a test of one on the other too easy."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +14,13 @@ from sliplens.simulation.plan import TrialPlan, plan_trials
 
 @dataclass(frozen=True, kw_only=True)
 class SharedMaterial:
-    """What two data sets have in common; each pair names a thing in the first and in the second."""
+    """Material in both of two data sets; each pair has the names in the first and in the second."""
 
     by_seeds: bool
-    """Both are as they were simulated, so that seeds tell; otherwise the names of sensors, and of days with their
-    sensor, do, as of simulated trials that were imported or labelled anew."""
+    """True where both are as they were simulated, so that seeds identify days and sensors. Otherwise their names do, a
+    day with its sensor: simulated trials may have been imported or labelled anew."""
     trials: tuple[tuple[str, str], ...]
-    """Trials that show the same frames, or are drawn from the same seed: with other frames, but of one touch."""
+    """Trials with the same frames, or drawn from the same seed: with other frames, but of one touch."""
     days: tuple[tuple[str, str], ...]
     sensors: tuple[tuple[str, str], ...]
 
@@ -28,14 +28,14 @@ class SharedMaterial:
 def compare_datasets(
     first: Dataset | Path | str, second: Dataset | Path | str, *, splits: tuple[str | None, str | None] = (None, None)
 ) -> SharedMaterial:
-    """Tell which trials, days and sensors two data sets share.
+    """Find the trials, days and sensors that two data sets share.
 
     Parameters
     ----------
     first, second
-        The data sets, or their folders; one data set twice, with two splits, tells what these share.
+        The data sets, or their folders; one data set twice, with two splits, compares the splits.
     splits
-        Which trials of each; all if None.
+        Split of each; all trials if None.
 
     Raises
     ------
@@ -52,24 +52,30 @@ def compare_datasets(
     >>> shared.trials, shared.days, shared.sensors
     ((), (), (('chromatouch-1', 'chromatouch-1'),))
     """
-    sets = [one if isinstance(one, Dataset) else load_dataset(one) for one in (first, second)]
-    chosen = [one.select(split=split) for one, split in zip(sets, splits, strict=True)]
-    plans = [_plans(one, trials) for one, trials in zip(sets, chosen, strict=True)]
+    datasets = [data if isinstance(data, Dataset) else load_dataset(data) for data in (first, second)]
+    trials = [data.select(split=split) for data, split in zip(datasets, splits, strict=True)]
+    plans = [_plans(data, chosen) for data, chosen in zip(datasets, trials, strict=True)]
     by_seeds = all(plans)
-    keys = [
-        [_keys(trial, trial_path(one.folder, trial.trial), known if by_seeds else {}) for trial in trials]
-        for one, trials, known in zip(sets, chosen, plans, strict=True)
+    identities = [
+        [_identify(trial, data.folder, plan.get(trial.trial) if by_seeds else None) for trial in chosen]
+        for data, chosen, plan in zip(datasets, trials, plans, strict=True)
     ]
 
-    def share(*names: str) -> tuple[tuple[str, str], ...]:
-        pairs = [_pairs(*((one[name] for one in side if name in one) for side in keys)) for name in names]
-        return tuple(dict.fromkeys(pair for one in pairs for pair in one))
+    def shared(*facts: str) -> tuple[tuple[str, str], ...]:
+        pairs = []
+        for fact in facts:
+            left, right = ([trial[fact] for trial in side if fact in trial] for side in identities)
+            names = dict(right)
+            pairs += [(name, names[key]) for key, name in left if key in names]
+        return tuple(dict.fromkeys(pairs))
 
-    return SharedMaterial(by_seeds=by_seeds, trials=share("shown", "trial"), days=share("day"), sensors=share("sensor"))
+    return SharedMaterial(
+        by_seeds=by_seeds, trials=shared("frames", "trial"), days=shared("day"), sensors=shared("sensor")
+    )
 
 
 def _plans(data: Dataset, trials: Sequence[TrialInfo]) -> dict[str, TrialPlan]:
-    """Plans of simulated trials by name; none where the recipe of any is not known."""
+    """Return the plans of simulated trials by name; none where the recipe of any is unknown."""
     try:
         plans = {plan.trial: plan for plan in plan_trials(read_recipe(data.folder))} if data.simulated else {}
     except InputError:
@@ -77,19 +83,13 @@ def _plans(data: Dataset, trials: Sequence[TrialInfo]) -> dict[str, TrialPlan]:
     return plans if all(trial.trial in plans for trial in trials) else {}
 
 
-def _keys(trial: TrialInfo, path: Path, plans: dict[str, TrialPlan]) -> dict[str, tuple[object, str]]:
-    """What identifies a trial and its circumstances, each with its name; a sensor that is not told is no sensor."""
-    found: dict[str, tuple[object, str]] = {"shown": (hash_frames(path), trial.trial)}
-    if trial.trial in plans:
-        plan = plans[trial.trial]
-        found |= {"trial": (plan.seed, trial.trial), "day": (plan.day_seed, f"day {trial.day}")}
-        found["sensor"] = (plan.unit_seed, trial.sensor)
+def _identify(trial: TrialInfo, folder: Path, plan: TrialPlan | None) -> dict[str, tuple[object, str]]:
+    """Return a key and a name of a trial and of its circumstances; a sensor without a name has none."""
+    keys: dict[str, tuple[object, str]] = {"frames": (hash_frames(trial_path(folder, trial.trial)), trial.trial)}
+    if plan is not None:
+        keys |= {"trial": (plan.seed, trial.trial), "day": (plan.day_seed, f"day {trial.day}")}
+        keys["sensor"] = (plan.unit_seed, trial.sensor)
     elif trial.sensor:
         day = f"{trial.sensor}, day {trial.day}"
-        found |= {"day": (day, day), "sensor": (trial.sensor, trial.sensor)}
-    return found
-
-
-def _pairs(first: Iterable[tuple[object, str]], second: Iterable[tuple[object, str]]) -> list[tuple[str, str]]:
-    others = dict(second)
-    return [(name, others[key]) for key, name in first if key in others]
+        keys |= {"day": (day, day), "sensor": (trial.sensor, trial.sensor)}
+    return keys
