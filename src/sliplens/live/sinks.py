@@ -500,6 +500,6 @@ class Sender:
 
 
 __all__ = [
-    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "OpenSink", "RerunSink", "RosTopic", "Sender", "Sink", "SinkState",
-    "ZenohRos", "encode_reading", "open_sink", "parse_zenoh", "reading_schema",
+    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "OpenSink", "RerunSink", "RosTopic", "Sender", "Sink",
+    "SinkState", "ZenohRos", "encode_reading", "open_sink", "parse_zenoh", "reading_schema",
 ]  # fmt: skip
