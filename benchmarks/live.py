@@ -89,7 +89,7 @@ class TimedPage(LivePage):
 
     def look(self, *, maps: bool) -> None:
         """Have viewers show maps or not, and see whether the first has drawn a picture."""
-        for viewer in tuple(self.feed.viewers):
+        for viewer in tuple(self.feed.clients):
             viewer.shows_map = maps
             if np.isinf(self.opens_s) and viewer.takes_s > 0:
                 self.opens_s = time.monotonic() - self.asked_s

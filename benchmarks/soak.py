@@ -192,7 +192,7 @@ class Night:
     def explain(self) -> str:
         """Explain a frozen picture by the next method, and show maps of the running one from then on."""
         self._show_maps(wanted=True)
-        viewers = tuple(self._page.feed.viewers)
+        viewers = tuple(self._page.feed.clients)
         picture = viewers[0].freeze() if viewers else self._page.feed.picture
         method = next(self._methods)
         if picture is None:
@@ -228,7 +228,7 @@ class Night:
         return "reference"
 
     def _show_maps(self, *, wanted: bool) -> None:
-        for viewer in tuple(self._page.feed.viewers):
+        for viewer in tuple(self._page.feed.clients):
             viewer.shows_map = wanted
 
 

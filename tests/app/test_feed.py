@@ -1,4 +1,4 @@
-"""What one viewer is sent, and when."""
+"""What one client is sent, and when."""
 
 import asyncio
 import json
@@ -10,7 +10,7 @@ import numpy as np
 from starlette.websockets import WebSocketDisconnect
 
 import sliplens as sl
-from sliplens.app.feed import Feed, Picture, Viewer
+from sliplens.app.feed import Client, Feed, Picture
 from sliplens.live import SimulatedSource
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.sensor import SensorProfile
@@ -52,15 +52,15 @@ def picture(number: int) -> Picture:
     )
 
 
-def with_viewer(act, **reader) -> None:
-    """Let a viewer be served while something is done."""
+def with_client(act, **reader) -> None:
+    """Let a client be served while something is done."""
 
     async def run() -> None:
         # nothing happens in it by itself: it was not started
         feed, wire = Feed(sl.LiveReader("simulated", **reader)), Wire()
-        viewer = Viewer(feed)
-        served = asyncio.create_task(viewer.serve(cast("Any", wire)))
-        await act(feed, wire, viewer)
+        client = Client(feed)
+        served = asyncio.create_task(client.serve(cast("Any", wire)))
+        await act(feed, wire, client)
         await wire.answers.put(None)
         await served
 
@@ -68,35 +68,35 @@ def with_viewer(act, **reader) -> None:
 
 
 def test_an_answer_alone_is_not_answered():
-    async def act(_: Feed, wire: Wire, viewer: Viewer) -> None:
+    async def act(_: Feed, wire: Wire, client: Client) -> None:
         first = await wire.next()
         await wire.answers.put({"serial": first["serial"]})
-        while first["serial"] in viewer._unanswered:
+        while first["serial"] in client._unanswered:
             await asyncio.sleep(0.001)
         await asyncio.sleep(0.05)
         assert wire.sent.empty()
-        viewer.wake()
+        client.wake()
         assert (await wire.next())["serial"] == first["serial"] + 1
 
-    with_viewer(act)
+    with_client(act)
 
 
 def test_something_is_said_before_the_page_takes_silence_for_a_lost_connection():
-    async def act(_: Feed, wire: Wire, viewer: Viewer) -> None:
+    async def act(_: Feed, wire: Wire, client: Client) -> None:
         await wire.answers.put({"serial": (await wire.next())["serial"]})
         assert await wire.next()  # with no news
 
-    with_viewer(act)
+    with_client(act)
 
 
-def test_a_slow_viewer_sees_the_picture_move():
-    async def act(feed: Feed, wire: Wire, viewer: Viewer) -> None:
+def test_a_slow_client_sees_the_picture_move():
+    async def act(feed: Feed, wire: Wire, client: Client) -> None:
         owed = []
         for number in range(1, 6):
             # as the drawing thread does with each reading
-            if viewer.wants_picture:
+            if client.wants_picture:
                 feed.picture = picture(number)
-            viewer.wake()
+            client.wake()
             if number > 2:  # it answers after the next reading has come, never before
                 await wire.answers.put({"serial": owed.pop(0)["serial"]})
             owed.append(await wire.next())
@@ -105,43 +105,43 @@ def test_a_slow_viewer_sees_the_picture_move():
         assert feed.picture is not None
         assert feed.picture.frame.number >= 4
 
-    with_viewer(act)
+    with_client(act)
 
 
 def test_a_picture_that_nobody_fetches_is_not_drawn_again():
-    async def act(feed: Feed, wire: Wire, viewer: Viewer) -> None:
+    async def act(feed: Feed, wire: Wire, client: Client) -> None:
         await wire.next()
-        viewer.wake()
+        client.wake()
         await wire.next()  # two that stay without an answer
-        assert viewer.wants_picture is (feed.picture is None)
+        assert client.wants_picture is (feed.picture is None)
         feed.picture = picture(1)
-        assert not viewer.ready
-        assert not viewer.wants_picture
+        assert not client.ready
+        assert not client.wants_picture
 
-    with_viewer(act)
+    with_client(act)
 
 
-def test_a_viewer_that_comes_back_before_its_old_connection_is_given_up_goes_on():
-    async def act(feed: Feed, old: Wire, viewer: Viewer) -> None:
+def test_a_client_that_comes_back_before_its_old_connection_is_given_up_goes_on():
+    async def act(feed: Feed, old: Wire, client: Client) -> None:
         await old.next()
         new = Wire()
-        served = asyncio.create_task(viewer.serve(cast("Any", new)))
+        served = asyncio.create_task(client.serve(cast("Any", new)))
         await new.next()
         await old.answers.put(None)  # the old one is told to be gone only now
         await asyncio.sleep(0.01)
-        assert feed.viewers == {viewer}
+        assert feed.clients == {client}
         for _ in range(2):
-            viewer.wake()
+            client.wake()
             await new.answers.put({"serial": (await new.next())["serial"]})
         assert old.sent.empty()
         await new.answers.put(None)
         await served
-        assert not feed.viewers
+        assert not feed.clients
 
-    with_viewer(act)
+    with_client(act)
 
 
-def test_a_viewer_that_sending_found_gone_leaves_without_a_word():
+def test_a_client_that_sending_found_gone_leaves_without_a_word():
     class Gone(Wire):
         async def receive_text(self) -> str:
             await self.answers.get()
@@ -150,8 +150,8 @@ def test_a_viewer_that_sending_found_gone_leaves_without_a_word():
     async def run() -> None:
         feed, wire = Feed(sl.LiveReader("simulated")), Gone()
         await wire.answers.put(None)
-        await Viewer(feed).serve(cast("Any", wire))
-        assert not feed.viewers
+        await Client(feed).serve(cast("Any", wire))
+        assert not feed.clients
 
     asyncio.run(run())
 
@@ -168,7 +168,7 @@ def test_its_threads_have_ended_when_it_is_closed():
         source.load(normal_force_n=4.0, tangential_force_n=1.0)
         with sl.LiveReader(source, "chromatouch-difference", engine="torch", health=None, slip=None) as reader:
             feed = Feed(reader)
-            feed.viewers.add(cast("Any", Looks()))
+            feed.clients.add(cast("Any", Looks()))
             before = set(threading.enumerate())
             feed.start(asyncio.get_running_loop())
             while feed.picture is None:
@@ -181,9 +181,9 @@ def test_its_threads_have_ended_when_it_is_closed():
     assert asyncio.run(run()) == []
 
 
-def test_a_viewer_is_told_what_the_network_was_not_made_for(difference_run: Path):
-    async def act(_: Feed, wire: Wire, __: Viewer) -> None:
+def test_a_client_is_told_what_the_network_was_not_made_for(difference_run: Path):
+    async def act(_: Feed, wire: Wire, __: Client) -> None:
         [doubt] = (await wire.next())["troubles"]
         assert "reads frames of another" in doubt
 
-    with_viewer(act, network=difference_run, sensor=SensorProfile(name="another"))
+    with_client(act, network=difference_run, sensor=SensorProfile(name="another"))

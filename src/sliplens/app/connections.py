@@ -39,8 +39,10 @@ class HttpConnection(H11Protocol):
         super().connection_made(transport)
         self._set_deadline()
         if len(self.connections) > MOST_CONNECTIONS:
-            waiting = [one for one in self.connections if isinstance(one, HttpConnection) and one.waiting_since_s]
-            min(waiting, key=lambda one: one.waiting_since_s or 0.0).cut_off()
+            waiting = [
+                other for other in self.connections if isinstance(other, HttpConnection) and other.waiting_since_s
+            ]
+            min(waiting, key=lambda other: other.waiting_since_s or 0.0).cut_off()
 
     def data_received(self, data: bytes) -> None:
         """Take a part of a request."""

@@ -1,4 +1,4 @@
-"""What those who look at the page are sent: readings, pictures and maps, each made once for all of them."""
+"""Feed of the page: readings, pictures and maps, each made once for all connected browsers."""
 
 import asyncio
 import time
@@ -35,12 +35,12 @@ from sliplens.recordings.capture import Frame
 CHART_S = 30.0
 """Time that the chart of the page spans, in seconds."""
 LIVE_METHOD = "grad-cam"
-"""Explainer of the running picture, one of the cheapest; the recommended one, or any other, explains a frozen one."""
+"""Explainer of the running picture, one of the fastest; any other explains a frozen one."""
 _PICTURES_HZ, _LEAST_HZ, _MAPS_HZ = 30.0, 5.0, 2.0
 _LONGEST_PX = 800
 _QUALITY = 85
-_UNANSWERED = 2  # messages under way to one viewer: one is drawn while the next one travels
-_STILL_THERE_S = 1.0  # without news: the page takes a longer silence for a lost connection
+_UNANSWERED = 2  # messages under way to one client: one is drawn while the next one travels
+_KEEP_ALIVE_S = 1.0  # the page takes a longer silence for a lost connection
 _RATE_S = 2.0
 _PATIENCE_S = 10.0  # with a thread that is to end
 
@@ -50,7 +50,7 @@ class Point:
     """A reading on the chart: margins from 0 to 1, None where there is none."""
 
     at_s: float
-    """When it was told, as `time.monotonic` counts."""
+    """Time of the reading, as `time.monotonic` counts."""
     margin: float | None
     low: float | None
     """Lower end of the interval, in margin units."""
@@ -65,7 +65,7 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True)
 class Arrow:
-    """Way of a marker from where it rests, x and y in pixels of the frame."""
+    """Displacement of a marker from where it rests, x and y in pixels of the frame."""
 
     start_px: tuple[float, float]
     end_px: tuple[float, float]
@@ -73,7 +73,7 @@ class Arrow:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Picture:
-    """Frame as it is shown."""
+    """Frame as the page shows it."""
 
     reading: Reading
     frame: LiveFrame
@@ -95,7 +95,7 @@ class MarkerRelevance:
 
 @dataclass(frozen=True, kw_only=True)
 class MapFacts:
-    """What a map explains, and how its cells are read."""
+    """Header of a map."""
 
     number: int
     """Frame that is explained."""
@@ -109,7 +109,7 @@ class MapFacts:
     full: float
     """Relevance of a cell of 127, in margin units; cells are signed bytes, row by row."""
     alike: bool
-    """Whether both margins are the same but for the network's error, so that there is nothing to explain."""
+    """True where both margins are the same but for the network's error, so that there is nothing to explain."""
     markers: tuple[MarkerRelevance, ...]
     warnings: tuple[str, ...]
 
@@ -124,7 +124,7 @@ class Map:
 
 @dataclass(frozen=True, kw_only=True)
 class PictureFacts:
-    """Size of the frame that a JPEG shows, and what is drawn over it."""
+    """Size of the frame that a JPEG shows, and the arrows over it."""
 
     width: int
     height: int
@@ -133,35 +133,34 @@ class PictureFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class Update:
-    """Header of a message to a viewer; the JPEG and the cells of the map follow where they are new."""
+    """Header of a message to a client; the JPEG and the cells of the map follow where they are new."""
 
     serial: int
     now_s: float
-    """When it was made, as `time.monotonic` counts."""
+    """Time of the message, as `time.monotonic` counts."""
     reading: Reading | None
     words: ReadingWords | None
-    """The reading in words, as the terminal has them."""
-    held: Held | None
-    """What a simulated gripper does, and why."""
+    grip: Held | None
+    """State of a simulated gripper."""
     points: tuple[Point, ...]
     """Readings since the message before."""
     rate_hz: float
     """Readings a second, over the last two."""
     drawn_ms: float | None
-    """From the capture of a frame until this viewer had drawn it and said so, in milliseconds."""
+    """Time from the capture of a frame until this client had drawn it, in milliseconds."""
     viewers: int
     waiting: str
-    """What is being waited for, in words; empty for nothing."""
+    """Work in progress, in words; empty for none."""
     ended: str | None
     """Why no more readings come; None while they may."""
     recording: RecordingState | None
     sinks: tuple[SinkState, ...]
     troubles: tuple[str, ...]
-    """What the network was not made for, and what has ended beside the reading, with the cure."""
+    """Doubts about the network, and outputs that failed, with the cure."""
     frozen: str | None
     """Frame and reading of the picture in words, where it is frozen."""
     has_map: bool
-    """Whether a map lies over the picture: this one, or the one sent before."""
+    """True where a map lies over the picture: this one, or the one sent before."""
     picture: PictureFacts | None
     picture_bytes: int
     map: MapFacts | None
@@ -170,18 +169,18 @@ class Update:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What a viewer says to a message."""
+    """Answer of a client to a message."""
 
     serial: int
     drawn: bool = True
-    """Whether it was drawn, and not passed over in a hidden window."""
+    """False where it was passed over in a hidden window."""
 
 
 class Feed:
-    """Readings, pictures and maps of a reader, for any number of viewers.
+    """Readings, pictures and maps of a reader, for any number of clients.
 
-    Everything is made once, in threads of its own, and only while somebody waits for it: a viewer that does not answer
-    is sent no more, and nobody waits for it.
+    Everything is made once, in threads of its own, and only while a client waits for it: a client that does not answer
+    is sent no more, and delays no other.
 
     Parameters
     ----------
@@ -191,14 +190,14 @@ class Feed:
 
     def __init__(self, reader: LiveReader) -> None:
         self.reader = reader
-        self.viewers: set[Viewer] = set()
-        """Those who look now."""
-        self.expected: dict[str, Viewer] = {}
-        """Those who may, by the name under which they will ask for frames."""
+        self.clients: set[Client] = set()
+        """Connected clients."""
+        self.expected: dict[str, Client] = {}
+        """Clients that may connect, by the name in the address of their socket."""
         self.reading: Reading | None = None
         """Newest reading."""
-        self.held: Held | None = None
-        """What a simulated gripper did at it."""
+        self.grip: Held | None = None
+        """State of a simulated gripper at that reading."""
         self.picture: Picture | None = None
         """Newest picture."""
         self.map: Map | None = None
@@ -213,14 +212,14 @@ class Feed:
         self._end_subscription: Callable[[], None] = lambda: None
         self._before: Frame | None = None
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="explain")
-        # explainers listen inside the network: not in the one that reads
+        # explainers hook into the network: a copy, not the one that predicts
         network = reader.network
         self._network: Network | None = None if network is None else replace(network, model=deepcopy(network.model))
         self._thread = Thread(target=self._run, daemon=True)
-        self._mapper = Thread(target=self._map_on, daemon=True)
+        self._mapper = Thread(target=self._make_maps, daemon=True)
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Begin; viewers are served in this loop."""
+        """Begin; clients are served in this loop."""
         self._loop = loop
         self._end_subscription = self.reader.subscribe(self._take)
         self._thread.start()
@@ -243,20 +242,20 @@ class Feed:
 
     @property
     def waiting(self) -> str:
-        """What all viewers wait for, in words."""
+        """Instruction while a new reference is taken, else empty."""
         if self._before is not None and self._before is self.reader.reference:
             return "waiting for a still picture: leave the sensor untouched"
         self._before = None
         return ""
 
     def points_since(self, at_s: float) -> tuple[Point, ...]:
-        """Points of the chart after a time, as `time.monotonic` counts."""
+        """Return the points of the chart after a time, as `time.monotonic` counts."""
         with self._lock:  # the newest first: the thread that reads waits for this lock
             newest = tuple(takewhile(lambda point: point.at_s > at_s, reversed(self._points)))
         return newest[::-1]
 
     def take_reference(self) -> None:
-        """Have the reader take a new reference, and say so until it has."""
+        """Have the reader take a new reference, and show that until it has."""
         self._before = self.reader.reference
         self.reader.take_reference()
 
@@ -272,15 +271,15 @@ class Feed:
 
     def _take(self, reading: Reading, frame: LiveFrame | None) -> None:
         now_s, source = time.monotonic(), self.reader.source
-        self.held = held = source.held(reading.number) if isinstance(source, GripSource) else None
+        self.grip = grip = source.held(reading.number) if isinstance(source, GripSource) else None
         point = Point(
             at_s=now_s,
             margin=reading.margin,
             low=reading.low,
             high=reading.high,
             true_margin=reading.true_margin,
-            force_n=None if held is None else held.force_n,
-            least_force_n=None if held is None else held.least_force_n,
+            force_n=None if grip is None else grip.force_n,
+            least_force_n=None if grip is None else grip.least_force_n,
         )
         with self._lock:
             self._points.append(point)
@@ -290,62 +289,59 @@ class Feed:
         self._newest = None if frame is None else (reading, frame)
 
     def _run(self) -> None:
-        """Draw the newest reading, again and again, until there are no more."""
+        """Draw the newest reading, until there are no more."""
         drawn_s = -np.inf
         try:
             for _ in self.reader.readings():
                 if self._closed.is_set():
                     return
-                if time.monotonic() - drawn_s < self._pause_s:
+                # twice what the fastest client takes to draw one, on cores that may be ours
+                takes_s = min((client.takes_s for client in tuple(self.clients)), default=0.0)
+                # frames that come as fast as pictures are drawn are never early
+                if time.monotonic() - drawn_s < max(0.7 / _PICTURES_HZ, min(2 * takes_s, 1 / _LEAST_HZ)):
                     continue
                 drawn_s = time.monotonic()
                 newest = self._newest
-                if newest is not None and any(viewer.wants_picture for viewer in tuple(self.viewers)):
+                if newest is not None and any(client.wants_picture for client in tuple(self.clients)):
                     self.picture = self._draw(*newest)
                 self._wake()
             self.ended = f"{self.reader.source.name} has ended"
-        except Exception as error:  # whatever it was: who looks must not take the last margin for a new one
+        except Exception as error:  # whatever it was: the page must not show the last margin as a new one
             self.ended = str(error) or type(error).__name__
         if self.reading is not None:
             self.reading = replace(self.reading, margin=None, low=None, high=None, slip=None, withheld=self.ended)
         self._wake()
 
-    @property
-    def _pause_s(self) -> float:
-        """Time between two pictures: twice what the quickest viewer takes to draw one, on cores that may be ours."""
-        takes_s = min((viewer.takes_s for viewer in tuple(self.viewers)), default=0.0)
-        # frames that come as fast as pictures are drawn are never early
-        return max(0.7 / _PICTURES_HZ, min(2 * takes_s, 1 / _LEAST_HZ))
-
     def _wake(self) -> None:
         loop = self._loop
         assert loop is not None
         with suppress(RuntimeError):  # the server has gone
-            loop.call_soon_threadsafe(lambda: [viewer.wake() for viewer in tuple(self.viewers)])
+            loop.call_soon_threadsafe(lambda: [client.wake() for client in tuple(self.clients)])
 
     def _draw(self, reading: Reading, frame: LiveFrame) -> Picture:
-        shown = Image.fromarray(frame.image)
-        shown.thumbnail((_LONGEST_PX, _LONGEST_PX), reducing_gap=1.0)
+        thumbnail, markers_px = Image.fromarray(frame.image), self.reader.markers_px
+        thumbnail.thumbnail((_LONGEST_PX, _LONGEST_PX), reducing_gap=1.0)
+        ways = [] if markers_px is None else np.column_stack(markers_px).round(1).tolist()
         return Picture(
             reading=reading,
             frame=frame,
             reference=self.reader.reference,
-            jpeg=encode_jpeg(np.asarray(shown), _QUALITY),
-            arrows=_arrows(self.reader.markers_px),
+            jpeg=encode_jpeg(np.asarray(thumbnail), _QUALITY),
+            arrows=tuple(Arrow(start_px=(x, y), end_px=(to_x, to_y)) for x, y, to_x, to_y in ways if np.isfinite(to_x)),
         )
 
-    def _map_on(self) -> None:
-        """Explain the newest picture at a few hertz, while somebody wants that."""
+    def _make_maps(self) -> None:
+        """Explain the newest picture at a few hertz, while a client shows maps."""
         explained = None
         while not self._closed.wait(1 / _MAPS_HZ):
             picture = self.picture
-            wanted = any(viewer.shows_map and viewer.ready for viewer in tuple(self.viewers))
-            if self.ended is not None or not wanted or picture is None or picture is explained:
+            is_wanted = any(client.shows_map and client.ready for client in tuple(self.clients))
+            if self.ended is not None or not is_wanted or picture is None or picture is explained:
                 continue
             explained = picture
             try:
                 if picture.reading.margin is None:
-                    self.map = None  # nothing is told, so there is nothing to explain
+                    self.map = None  # without a margin there is nothing to explain
                 else:
                     self.map = self._pool.submit(self._explain, picture, LIVE_METHOD).result()
             except (SliplensError, RuntimeError, CancelledError):
@@ -354,9 +350,8 @@ class Feed:
 
     def _explain(self, picture: Picture, method: str) -> Map:
         assert self._network is not None
-        # the pixels of maps by hand, not a graph that other threads compile
-        frames, named = picture.frame.image[None], None if method == RECOMMENDED_METHOD else method
-        explanation = explain(self._network, frames, reference=picture.reference, method=named)
+        frames, chosen = picture.frame.image[None], None if method == RECOMMENDED_METHOD else method
+        explanation = explain(self._network, frames, reference=picture.reference, method=chosen)
         relevance = explanation.relevance[0].cpu().numpy()
         full = full_colour(relevance)
         # where both margins are the same but for the network's error, the strongest of nothing is not shown in colour
@@ -365,33 +360,22 @@ class Feed:
         return Map(
             facts=MapFacts(
                 number=picture.frame.number,
-                method=named or explanation.method,  # tiles where no markers are found
+                method=chosen or explanation.method,  # tiles where no markers are found
                 prediction=float(explanation.prediction[0]),
                 reference_prediction=float(explanation.reference_prediction[0]),
                 rows=rows,
                 columns=columns,
                 full=full,
                 alike=alike,
-                markers=() if alike else _marker_relevance(explanation, picture),
+                markers=() if alike else _sum_by_marker(explanation, picture),
                 warnings=tuple(warning.removeprefix("image 0: ") for warning in explanation.warnings),
             ),
             cells=np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8).tobytes(),
         )
 
 
-def _arrows(markers_px: tuple[np.ndarray, np.ndarray] | None) -> tuple[Arrow, ...]:
-    """Ways of the markers that are seen in the newest frame, or one just before."""
-    if markers_px is None:
-        return ()
-    return tuple(
-        Arrow(start_px=(x, y), end_px=(to_x, to_y))
-        for x, y, to_x, to_y in np.column_stack(markers_px).round(1).tolist()
-        if np.isfinite(to_x)
-    )
-
-
-def _marker_relevance(explanation: Attribution, picture: Picture) -> tuple[MarkerRelevance, ...]:
-    """Sum of the relevance around each marker."""
+def _sum_by_marker(explanation: Attribution, picture: Picture) -> tuple[MarkerRelevance, ...]:
+    """Sum the relevance around each marker."""
     if len(picture.arrows) < 2:
         return ()
     places = np.array([arrow.end_px for arrow in picture.arrows])
@@ -405,17 +389,17 @@ def _marker_relevance(explanation: Attribution, picture: Picture) -> tuple[Marke
     )
 
 
-class Viewer:
-    """One who looks: what was sent and answered, what is frozen and wished."""
+class Client:
+    """A connected browser: its last message, frozen picture and settings."""
 
     def __init__(self, feed: Feed) -> None:
         self.feed = feed
         self.frozen: Picture | None = None
         """Picture that stays until `thaw`; number and chart go on."""
         self.explained: Map | None = None
-        """Why, of the frozen picture."""
+        """Map of the frozen picture."""
         self.waiting = ""
-        """What this viewer waits for, in words."""
+        """Work in progress for this client, in words."""
         self.shows_map = self.shows_arrows = True
         self.takes_s = 0.0
         """Time from sending a message to its answer, over the last few, in seconds."""
@@ -424,31 +408,31 @@ class Viewer:
         self._has_news = True
         self._serial = 0
         self._unanswered: dict[int, tuple[float, float]] = {}
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
-        self._told_s, self._drawn_ms = -np.inf, None
+    def _reset(self) -> None:
+        self._sent_until_s, self._drawn_ms = -np.inf, None
         self._picture: Picture | None = None
         self._map: Map | None = None
         self._unanswered.clear()
 
     def wake(self) -> None:
-        """Send what is new as soon as this viewer has answered; called in the thread of the server."""
+        """Send the news as soon as this client has answered; called in the thread of the server."""
         self._has_news = True
         self._changed.set()
 
     @property
     def ready(self) -> bool:
-        """Whether it has answered what it was sent."""
+        """True where it has answered the message before the last."""
         return len(self._unanswered) < _UNANSWERED
 
     @property
     def wants_picture(self) -> bool:
-        """Whether a newer picture would be sent; one that waits for a slow viewer need not be drawn again."""
+        """True where a newer picture would be sent; one that waits for a slow client is not drawn again."""
         return self.ready or self._picture is self.feed.picture
 
     def freeze(self) -> Picture | None:
-        """Keep the picture that is seen; None before the first."""
+        """Stop at the picture on the screen; None before the first."""
         self.frozen = self.frozen or self._picture or self.feed.picture
         self.wake()
         return self.frozen
@@ -459,12 +443,12 @@ class Viewer:
         self.wake()
 
     async def serve(self, socket: WebSocket) -> None:
-        """Send what is new whenever the message before the last was answered, until the viewer is gone."""
+        """Send news whenever the message before the last was answered, until the client is gone."""
         await socket.accept()
         if self._sending is not None:
-            self._sending.cancel()  # to a connection that was lost, which nobody has been told yet
-        self._forget()
-        self.feed.viewers.add(self)
+            self._sending.cancel()  # to a connection that is lost without notice
+        self._reset()
+        self.feed.clients.add(self)
         self._sending = sending = asyncio.create_task(self._send(socket))
         try:
             while True:
@@ -481,7 +465,7 @@ class Viewer:
             sending.cancel()
             if self._sending is sending:
                 self._sending = None
-                self.feed.viewers.discard(self)
+                self.feed.clients.discard(self)
             await asyncio.gather(sending, return_exceptions=True)
             with suppress(RuntimeError, WebSocketDisconnect, OSError):
                 await socket.close()
@@ -490,59 +474,56 @@ class Viewer:
         self.wake()
         while True:
             with suppress(TimeoutError):
-                async with asyncio.timeout(_STILL_THERE_S):  # `wait_for` of Python 3.11 may miss that it is cancelled
+                async with asyncio.timeout(_KEEP_ALIVE_S):  # `wait_for` of Python 3.11 may miss that it is cancelled
                     await self._changed.wait()
-            still_there = not self._changed.is_set()
+            is_idle = not self._changed.is_set()
             self._changed.clear()
-            if self.ready and (self._has_news or still_there):
+            if self.ready and (self._has_news or is_idle):
                 self._has_news = False
                 await socket.send_bytes(self._message())
 
     def _message(self) -> bytes:
-        """Length of the header in 4 bytes, the header as JSON, the JPEG and the cells of the map."""
+        """Make a message: length of the header in 4 bytes, the header as JSON, the JPEG and the cells of the map."""
         feed, reader = self.feed, self.feed.reader
         picture = self.frozen or feed.picture
         overlay = self.explained if self.frozen is not None else feed.map
         overlay = overlay if self.shows_map else None
         jpeg = picture.jpeg if picture is not None and picture is not self._picture else b""
         cells = overlay.cells if overlay is not None and overlay is not self._map else b""
-        points = feed.points_since(self._told_s)
+        facts = frozen = None
+        if picture is not None and jpeg:
+            height, width = picture.frame.size
+            facts = PictureFacts(width=width, height=height, arrows=picture.arrows if self.shows_arrows else ())
+        if self.frozen is not None:
+            frozen = f"frame {self.frozen.frame.number}, {describe_reading(self.frozen.reading)}"
+        points = feed.points_since(self._sent_until_s)
         self._serial += 1
         update = Update(
             serial=self._serial,
             now_s=time.monotonic(),
             reading=feed.reading,
             words=None if feed.reading is None else describe_reading(feed.reading),
-            held=feed.held,
+            grip=feed.grip,
             points=points,
             rate_hz=feed.rate_hz,
             drawn_ms=self._drawn_ms,
-            viewers=len(feed.viewers),
+            viewers=len(feed.clients),
             waiting=self.waiting or feed.waiting,
             ended=feed.ended,
             recording=None if (recorder := reader.recorder) is None else recorder.state,
             sinks=tuple(sender.state for sender in reader.senders),
             troubles=(*reader.doubts, *reader.troubles),
-            frozen=None if self.frozen is None else _describe_picture(self.frozen),
+            frozen=frozen,
             has_map=overlay is not None,
-            picture=_picture_facts(picture, arrows=self.shows_arrows) if picture is not None and jpeg else None,
+            picture=facts,
             picture_bytes=len(jpeg),
             map=overlay.facts if overlay is not None and cells else None,
             map_bytes=len(cells),
         )
-        # what was not drawn anew tells nothing of how long drawing takes
+        # a picture that was drawn before says nothing of how long drawing takes
         captured_s = picture.frame.captured_s if jpeg and picture is not None else np.nan
         self._unanswered[self._serial] = captured_s, update.now_s
         self._picture, self._map = picture, overlay
-        self._told_s = points[-1].at_s if points else self._told_s
+        self._sent_until_s = points[-1].at_s if points else self._sent_until_s
         header = msgspec.json.encode(to_builtins(update))
         return b"".join([len(header).to_bytes(4, "little"), header, jpeg, cells])
-
-
-def _describe_picture(picture: Picture) -> str:
-    return f"frame {picture.frame.number}, {describe_reading(picture.reading)}"
-
-
-def _picture_facts(picture: Picture, *, arrows: bool) -> PictureFacts:
-    height, width = picture.frame.size
-    return PictureFacts(width=width, height=height, arrows=picture.arrows if arrows else ())

@@ -254,13 +254,13 @@ export default {
         lines: [["least_force_n", "--sl-faint", 1.5, [4, 4]], ["force_n", "--sl-ink", 2, []]],
         note: "grip force; dashed: the least that holds",
       });
-      const { held } = this.update ?? {};
-      if (!held) return;
-      const state = held.phase === "dropped" || held.phase === "crushed" ? "bad" : "";
+      const { grip } = this.update ?? {};
+      if (!grip) return;
+      const state = grip.phase === "dropped" || grip.phase === "crushed" ? "bad" : "";
       this.$refs.grip.dataset.state = state;
-      const slid = held.slip_m > 5e-5 ? `, slid ${(1e3 * held.slip_m).toFixed(1)} mm` : "";
-      const force = `${held.force_n.toFixed(2)} N, ${held.least_force_n.toFixed(2)} N would hold`;
-      set(this.$refs.grip, `${state ? "▲" : "●"} ${held.phase}: ${force}${slid}. ${held.controller}: ${held.why || "waits"}`);
+      const slid = grip.slip_m > 5e-5 ? `, slid ${(1e3 * grip.slip_m).toFixed(1)} mm` : "";
+      const force = `${grip.force_n.toFixed(2)} N, ${grip.least_force_n.toFixed(2)} N would hold`;
+      set(this.$refs.grip, `${state ? "▲" : "●"} ${grip.phase}: ${force}${slid}. ${grip.controller}: ${grip.why || "waits"}`);
     },
     drawChart(canvas, { most, ticks, words, zone, band: [below, above], lines, note }) {
       const dpr = fit(canvas, null), style = getComputedStyle(canvas);

@@ -1,4 +1,4 @@
-"""What a browser shows: controls made with NiceGUI around a view that draws what the feed sends."""
+"""Page of one browser: controls made with NiceGUI around a view that draws the messages of the feed."""
 
 import secrets
 from collections.abc import Awaitable, Callable
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from nicegui import binding, run, ui
 from nicegui.events import KeyEventArguments
 
-from sliplens.app.feed import CHART_S, Viewer
+from sliplens.app.feed import CHART_S, Client
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
 from sliplens.grip.controllers import CONTROLLERS
@@ -27,7 +27,7 @@ _MOST_WATER_KG, _MOST_GRIP_PULL_N = 0.06, 0.6
 
 
 class LiveView(ui.element, component="live_view.js"):
-    """Number, picture, chart and lamps: whatever changes with each reading."""
+    """Number, picture, chart and lamps, which change with each reading."""
 
     def __init__(self, page: "LivePage", name: str) -> None:
         super().__init__()
@@ -45,64 +45,62 @@ class LiveView(ui.element, component="live_view.js"):
 
 @binding.bindable_dataclass
 class Hand:
-    """What presses and pulls the simulated fingertip, the same for all viewers."""
+    """Forces on the simulated fingertip, which all clients share."""
 
     press_n: float = 1.5
     pull_n: float = 0.0
 
 
-class _Acts:
-    """What one viewer can do, by button or key."""
+class _Actions:
+    """Actions of one client, by button or key."""
 
-    def __init__(self, page: "LivePage", viewer: Viewer) -> None:
-        self._page, self._feed, self._reader, self.viewer = page, page.feed, page.reader, viewer
+    def __init__(self, page: "LivePage", client: Client) -> None:
+        self._page, self._feed, self._reader, self.client = page, page.feed, page.reader, client
         self.method = RECOMMENDED_METHOD
         """Explainer of a frozen picture."""
-        self.freeze_words = ""
-        self._name_freezing()
 
-    def _name_freezing(self) -> None:
-        self.freeze_words = "Freeze (F)" if self.viewer.frozen is None else "Go on (F)"
+    @property
+    def freeze_words(self) -> str:
+        """Label of the button that freezes."""
+        return "Freeze (F)" if self.client.frozen is None else "Go on (F)"
 
     async def take_reference(self) -> None:
         """Take a new reference as soon as the picture is still."""
         self._feed.take_reference()
 
     async def new_object(self) -> None:
-        """Drop what is known of the friction, and tell what was learnt."""
+        """Forget the friction of the object, and show what its slips taught."""
         lesson = self._reader.lesson
         self._reader.new_object()
         ui.notify(lesson or "nothing is known of the friction of the new object", timeout=10_000)
 
     async def freeze(self) -> None:
-        """Keep the picture, or let it run again."""
-        if self.viewer.frozen is None:
-            self.viewer.freeze()
+        """Stop at the picture, or let it run again."""
+        if self.client.frozen is None:
+            self.client.freeze()
         else:
-            self.viewer.thaw()
-        self._name_freezing()
+            self.client.thaw()
 
     async def explain(self) -> None:
-        """Keep the picture and say why."""
+        """Freeze the picture and explain it."""
         if self._reader.network is None:
             raise InputError(NO_NETWORK)
-        viewer, method = self.viewer, self.method
-        picture = viewer.freeze()
-        self._name_freezing()
-        if picture is None or viewer.waiting:
+        client, method = self.client, self.method
+        picture = client.freeze()
+        if picture is None or client.waiting:
             return
-        viewer.waiting = f"explaining frame {picture.frame.number} by {METHOD_NAMES.get(method, method)}"
-        viewer.wake()
+        client.waiting = f"explaining frame {picture.frame.number} by {METHOD_NAMES.get(method, method)}"
+        client.wake()
         try:
             explained = await self._feed.explain(picture, method)
-            if viewer.frozen is picture:
-                viewer.explained = explained
+            if client.frozen is picture:
+                client.explained = explained
         finally:
-            viewer.waiting = ""
-            viewer.wake()
+            client.waiting = ""
+            client.wake()
 
     async def record(self) -> None:
-        """Record, or end that."""
+        """Record, or end the recording."""
         if self._reader.recorder is None:
             await run.io_bound(self._reader.record, self._page.record_into, facts=self._page.facts)
             return
@@ -113,8 +111,8 @@ class _Acts:
             ui.notify(f"recorded into {data.folder}; look with `sliplens check {data.folder}`", type="positive")
 
 
-def _told(act: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
-    """Tell the viewer why something could not be done."""
+def _with_notice(act: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
+    """Show the client why an action failed."""
 
     @wraps(act)
     async def acted() -> None:
@@ -127,12 +125,12 @@ def _told(act: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
 
 
 def build_live(page: "LivePage") -> None:
-    """Page of one viewer."""
+    """Build the page of one client."""
     feed, reader = page.feed, page.reader
-    viewer, name = Viewer(feed), secrets.token_urlsafe(9)
-    feed.expected[name] = viewer
+    client, name = Client(feed), secrets.token_urlsafe(9)
+    feed.expected[name] = client
     ui.context.client.on_delete(lambda: feed.expected.pop(name, None))
-    acts = _Acts(page, viewer)
+    acts = _Actions(page, client)
     style = Path(__file__).with_name("live_view.css").read_text(encoding="utf-8")
     ui.add_head_html(f"<style>{style}</style>")  # add_css needs a script
     ui.colors(primary=BLUE)
@@ -143,16 +141,16 @@ def build_live(page: "LivePage") -> None:
         elif isinstance(reader.source, GripSource):
             _build_gripper(reader.source)
         with ui.element("div").classes("sl-buttons"):
-            ui.button("Reference (R)", on_click=_told(acts.take_reference)).tooltip(
+            ui.button("Reference (R)", on_click=_with_notice(acts.take_reference)).tooltip(
                 "take a new image of the untouched sensor, as soon as the picture is still"
             )
-            ui.button("New object (N)", on_click=_told(acts.new_object)).tooltip(
+            ui.button("New object (N)", on_click=_with_notice(acts.new_object)).tooltip(
                 "another one is held from now on, or this one was wetted: what is known of its friction is dropped"
             )
-            ui.button(on_click=_told(acts.freeze)).bind_text_from(acts, "freeze_words").tooltip(
+            ui.button(on_click=_with_notice(acts.freeze)).bind_text_from(acts, "freeze_words").tooltip(
                 "keep this picture; the margin runs on"
             )
-            ui.button(on_click=_told(acts.record)).bind_text_from(
+            ui.button(on_click=_with_notice(acts.record)).bind_text_from(
                 reader, "recorder", lambda recorder: "Record (C)" if recorder is None else "Stop recording (C)"
             ).tooltip(f"every frame into {page.record_into}")
         _build_overlays(acts, network=reader.network is not None)
@@ -162,20 +160,20 @@ def build_live(page: "LivePage") -> None:
 
     async def press_key(event: KeyEventArguments) -> None:
         modifiers = event.modifiers
-        held = modifiers.ctrl or modifiers.alt or modifiers.meta
+        is_plain = not (modifiers.ctrl or modifiers.alt or modifiers.meta)
         act = by_key.get(str(event.key.name).lower())
-        if act is not None and event.action.keydown and not event.action.repeat and not held:
-            await _told(act)()
+        if act is not None and event.action.keydown and not event.action.repeat and is_plain:
+            await _with_notice(act)()
 
     ui.keyboard(on_key=press_key, repeating=False, ignore=["input", "select", "textarea"])
 
 
-def _build_overlays(acts: _Acts, *, network: bool) -> None:
-    """What lies over the picture."""
+def _build_overlays(acts: _Actions, *, network: bool) -> None:
+    """Build the switches of map and markers, and the explainer."""
 
     def show() -> None:
-        acts.viewer.shows_map, acts.viewer.shows_arrows = bool(map_switch.value), bool(arrow_switch.value)
-        acts.viewer.wake()
+        acts.client.shows_map, acts.client.shows_arrows = bool(map_switch.value), bool(arrow_switch.value)
+        acts.client.wake()
 
     with ui.element("div").classes("sl-buttons"):
         map_switch = ui.switch("Map", value=network, on_change=show)
@@ -184,20 +182,22 @@ def _build_overlays(acts: _Acts, *, network: bool) -> None:
         if network:
             names = {method: METHOD_NAMES.get(method, method) for method in EXPLAINERS}
             ui.select(names, label="explain by").props("dense outlined options-dense").bind_value(acts, "method")
-            ui.button("Explain (E)", on_click=_told(acts.explain)).tooltip("why, of this picture, by the method beside")
+            ui.button("Explain (E)", on_click=_with_notice(acts.explain)).tooltip(
+                "why, of this picture, by the method beside"
+            )
 
 
 def _add_slider(
     label: str, shared: object, name: str, *, words: Callable[[float], str], most: float, act: Callable[[float], None]
 ) -> None:
-    """Slider of an attribute that all viewers share, beside what it says."""
+    """Add a slider of an attribute that all clients share, beside its value in words."""
     ui.label().bind_text_from(shared, name, words)
     slider = ui.slider(min=0, max=most, step=most / 60).props(f'aria-label="{label}"').bind_value_from(shared, name)
     slider.on("update:model-value", lambda event: act(float(event.args)), throttle=0.05)
 
 
 def _build_hand(hand: Hand, source: SimulatedSource) -> None:
-    """Sliders that press and pull, which all viewers share."""
+    """Build the sliders that press and pull the fingertip."""
 
     def load(**forces_n: float) -> None:
         for name, force_n in forces_n.items():
@@ -220,7 +220,7 @@ def _build_hand(hand: Hand, source: SimulatedSource) -> None:
 
 
 def _build_gripper(source: GripSource) -> None:
-    """What changes the object that the simulated gripper holds, and who holds it; all viewers share it."""
+    """Build the controls of a simulated gripper and its object, which all clients share."""
     with ui.element("div").classes("sl-hand"):
         _add_slider(
             "Pour water in, in kilograms",

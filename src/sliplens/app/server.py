@@ -1,4 +1,4 @@
-"""Server of pages: on this machine alone, or with a token."""
+"""Server of the page: on this machine alone, or with a token."""
 
 import asyncio
 import errno
@@ -6,7 +6,6 @@ import re
 import secrets
 import socket
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache, partial
@@ -14,7 +13,7 @@ from http.cookies import CookieError, SimpleCookie
 from ipaddress import ip_address
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Self
 from urllib.parse import parse_qs
 
 from sliplens.errors import InputError
@@ -24,8 +23,8 @@ from sliplens.recordings.trial import TrialFacts
 if TYPE_CHECKING:
     from fastapi import FastAPI
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
-    from starlette.websockets import WebSocket
 
+    from sliplens.app.feed import Feed
     from sliplens.live.loop import LiveReader
 
 _PORT = 8090
@@ -44,125 +43,10 @@ _ICON = (
 )
 
 
-_Page = TypeVar("_Page", bound="Page")
-
-
-class Page(ABC):
-    """Page for browsers; a context manager that serves it while it is entered. One at a time runs in a process.
-
-    `host` and `port` are those of `LivePage`.
-    """
-
-    def __init__(self, *, host: str = "127.0.0.1", port: int | None = None) -> None:
-        require_packages("nicegui", extra="live", purpose="the page")
-        if port is not None and not 0 <= port <= 65535:
-            raise InputError(f"--port must be from 0 to 65535, got {port}")
-        self._host, self._port = host, port
-        self.token = None if is_loopback(host) else secrets.token_urlsafe(24)
-        """What a visitor must show; None where only this machine can visit."""
-        self._stack = ExitStack()
-
-    @property
-    def address(self) -> str:
-        """Where a browser finds it, with the token where it needs one; known while it is entered."""
-        port = self._socket.getsockname()[1]
-        host = self._host
-        if not is_loopback(host) and _is_unspecified(host):
-            host = socket.gethostname()
-        host = f"[{host}]" if ":" in host else host
-        return f"http://{host}:{port}/" + ("" if self.token is None else f"?token={self.token}")
-
-    def __enter__(self: _Page) -> _Page:
-        with ExitStack() as stack:
-            self._socket = stack.enter_context(_listen(self._host, self._port))
-            self._open(stack)
-            app = _application()
-            if getattr(app.state, "page", None) is not None:
-                raise InputError("a page is being shown by this process already; close that one first")
-            app.state.page = self
-            stack.callback(setattr, app.state, "page", None)
-            gate = Gate(app, token=self.token, port=self._socket.getsockname()[1])
-            stack.enter_context(_serving(gate, self._socket, self))
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stack.close()
-
-    def _open(self, stack: ExitStack) -> None:  # noqa: B027 (most pages have nothing to open)
-        """Make what it shows, and let the stack end it."""
-
-    def start(self, loop: asyncio.AbstractEventLoop) -> None:  # noqa: B027 (some show only when asked)
-        """Begin to show; viewers are served in this loop."""
-
-    @abstractmethod
-    def build(self) -> None:
-        """Make the elements of one viewer, in the place where NiceGUI has called."""
-
-    async def serve(self, name: str, socket: "WebSocket") -> None:
-        """Serve the socket of a viewer; here is none."""
-        del name
-        await socket.close(code=1008)
-
-    def read_image(self, trial: str, number: int) -> bytes | None:
-        """Frame of a trial as PNG; None where there is none."""
-        del trial, number
-
-
-@cache
-def _application() -> "FastAPI":
-    """Application of this process, for NiceGUI has but one: it asks the page that is shown."""
-    import nicegui  # noqa: PLC0415 (the extra)
-    from fastapi import FastAPI, Response  # noqa: PLC0415 (comes with it)
-    from starlette.middleware.gzip import GZipMiddleware  # noqa: PLC0415
-    from starlette.websockets import WebSocket  # noqa: PLC0415
-
-    _sign_scripts()
-    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
-
-    @app.websocket("/frames/{name}")
-    async def frames(socket: WebSocket, name: str) -> None:
-        await app.state.page.serve(name, socket)
-
-    @app.get("/images/{trial}/{number}")
-    def images(trial: str, number: int) -> Response:
-        image = app.state.page.read_image(trial, number)
-        return Response(status_code=404) if image is None else Response(image, media_type="image/png")
-
-    @nicegui.ui.page("/", title="sliplens", dark=None)
-    def index() -> None:
-        app.state.page.build()
-
-    nicegui.ui.run_with(
-        app,
-        title="sliplens",
-        favicon=_ICON,
-        dark=None,
-        tailwind=False,
-        binding_refresh_interval=0.25,
-        show_welcome_message=False,
-        # the usual level takes ten times as long, of the cores that read
-        gzip_middleware_factory=partial(GZipMiddleware, compresslevel=1),
-    )
-    return app
-
-
-def _sign_scripts() -> None:
-    """Have NiceGUI's own scripts carry the nonce of the answer: signed in its template, before any value is in it."""
-    from jinja2 import ChoiceLoader, DictLoader  # noqa: PLC0415 (with the page alone)
-    from nicegui.client import templates  # noqa: PLC0415 (the extra)
-
-    loader = templates.env.loader
-    assert loader is not None
-    text, *_ = loader.get_source(templates.env, "index.html")
-    signed = text.replace("<script", "<script nonce=\"{{ request.scope['nonce'] }}\"")
-    templates.env.loader = ChoiceLoader([DictLoader({"index.html": signed}), loader])
-
-
-class LivePage(Page):
+class LivePage:
     """Page of a reader, for browsers; a context manager that serves it while it is entered.
 
-    Several may look at once: they see the same frames, and cost one inference. One page at a time runs in a process.
+    Several browsers see the same frames, and cost one inference. One page at a time runs in a process.
 
     Parameters
     ----------
@@ -173,7 +57,7 @@ class LivePage(Page):
     port
         Port to listen on, 0 for any; 8090, or any where that is taken, if None.
     record_into
-        Data set into which the page's button records, a new one or one that is there.
+        Data set into which the page's button records, a new or an existing one.
     facts
         Who, when and what of its trials.
 
@@ -200,36 +84,102 @@ class LivePage(Page):
         record_into: Path | str = "recorded",
         facts: TrialFacts | None = None,
     ) -> None:
-        super().__init__(host=host, port=port)
+        require_packages("nicegui", extra="live", purpose="the page")
+        if port is not None and not 0 <= port <= 65535:
+            raise InputError(f"--port must be from 0 to 65535, got {port}")
         self.reader, self.record_into, self.facts = reader, Path(record_into), facts
+        self._host, self._port = host, port
+        self.token = None if is_loopback(host) else secrets.token_urlsafe(24)
+        """Token that a visitor must show; None where only this machine can visit."""
+        self._stack = ExitStack()
 
-    def _open(self, stack: ExitStack) -> None:
+    @property
+    def address(self) -> str:
+        """Address for a browser, with the token where it needs one; set while the page is entered."""
+        port, host = self._socket.getsockname()[1], self._host
+        if host in {"", "0.0.0.0", "::"}:
+            host = socket.gethostname()
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{port}/" + ("" if self.token is None else f"?token={self.token}")
+
+    def __enter__(self) -> Self:
         # explainers, and with them torch
         from sliplens.app.feed import Feed  # noqa: PLC0415
         from sliplens.app.page import Hand  # noqa: PLC0415
 
-        self.feed, self.hand = Feed(self.reader), Hand()
-        stack.callback(self.feed.close)
+        with ExitStack() as stack:
+            self._socket = stack.enter_context(_listen(self._host, self._port))
+            self.feed, self.hand = Feed(self.reader), Hand()
+            stack.callback(self.feed.close)
+            app = _application()
+            if getattr(app.state, "page", None) is not None:
+                raise InputError("a page is being shown by this process already; close that one first")
+            app.state.page = self
+            stack.callback(setattr, app.state, "page", None)
+            gate = Gate(app, token=self.token, port=self._socket.getsockname()[1])
+            stack.enter_context(_serving(gate, self._socket, self.feed))
+            self._stack = stack.pop_all()
+        return self
 
-    def start(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Make pictures of readings from now on."""
-        self.feed.start(loop)
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
 
     def build(self) -> None:
-        """Make the page of one viewer."""
-        from sliplens.app.page import build_live  # noqa: PLC0415
+        """Build the page of one client, where NiceGUI asks for it."""
+        from sliplens.app.page import build_live  # noqa: PLC0415 (torch comes with it)
 
         build_live(self)
 
-    async def serve(self, name: str, socket: "WebSocket") -> None:
-        """Send readings to a viewer that was made, until it is gone."""
-        viewer = self.feed.expected.get(name)
-        await (super().serve(name, socket) if viewer is None else viewer.serve(socket))
+
+@cache
+def _application() -> "FastAPI":
+    """Make the one application of NiceGUI in this process; it shows the page that is entered."""
+    import nicegui  # noqa: PLC0415 (the extra)
+    from fastapi import FastAPI  # noqa: PLC0415 (comes with it)
+    from starlette.middleware.gzip import GZipMiddleware  # noqa: PLC0415
+    from starlette.websockets import WebSocket  # noqa: PLC0415
+
+    _sign_scripts()
+    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+
+    @app.websocket("/frames/{name}")
+    async def frames(socket: WebSocket, name: str) -> None:
+        client = app.state.page.feed.expected.get(name)
+        await (socket.close(code=1008) if client is None else client.serve(socket))
+
+    @nicegui.ui.page("/", title="sliplens", dark=None)
+    def index() -> None:
+        app.state.page.build()
+
+    nicegui.ui.run_with(
+        app,
+        title="sliplens",
+        favicon=_ICON,
+        dark=None,
+        tailwind=False,
+        binding_refresh_interval=0.25,
+        show_welcome_message=False,
+        # the usual level takes ten times as long, of the cores that read
+        gzip_middleware_factory=partial(GZipMiddleware, compresslevel=1),
+    )
+    return app
+
+
+def _sign_scripts() -> None:
+    """Give NiceGUI's own scripts the nonce of the answer, in its template, before any value is in it."""
+    from jinja2 import ChoiceLoader, DictLoader  # noqa: PLC0415 (with the page alone)
+    from nicegui.client import templates  # noqa: PLC0415 (the extra)
+
+    loader = templates.env.loader
+    assert loader is not None
+    text, *_ = loader.get_source(templates.env, "index.html")
+    signed = text.replace("<script", "<script nonce=\"{{ request.scope['nonce'] }}\"")
+    templates.env.loader = ChoiceLoader([DictLoader({"index.html": signed}), loader])
 
 
 @contextmanager
-def _serving(app: "ASGIApp", listening: socket.socket, page: Page) -> Iterator[None]:
-    """Serve in a thread of its own, which has started when this is entered and ended when it is left."""
+def _serving(app: "ASGIApp", listening: socket.socket, feed: "Feed") -> Iterator[None]:
+    """Serve in a thread that has started when this is entered and ended when it is left."""
     import nicegui  # noqa: PLC0415 (the extra)
     import uvicorn  # noqa: PLC0415 (comes with it)
 
@@ -238,7 +188,7 @@ def _serving(app: "ASGIApp", listening: socket.socket, page: Page) -> Iterator[N
     server = uvicorn.Server(server_config(app))
 
     async def serve() -> None:
-        page.start(asyncio.get_running_loop())
+        feed.start(asyncio.get_running_loop())
         # not by the lifespan that `ui.run_with` makes: it walks over all objects of the process, and a tuple that
         # another thread is just making then fails with a SystemError
         async with nicegui.app.router.lifespan_context(nicegui.app):
@@ -258,22 +208,15 @@ def _serving(app: "ASGIApp", listening: socket.socket, page: Page) -> Iterator[N
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach an address."""
+    """Return True where only this machine can reach an address."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 
 
-def _is_unspecified(host: str) -> bool:
-    try:
-        return ip_address(host).is_unspecified
-    except ValueError:
-        return False
-
-
 def _listen(host: str, port: int | None) -> socket.socket:
-    """Socket that listens on a port, or on any where none was named and the usual one is taken."""
+    """Listen on a port; on any where none was named and the default one is taken."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     reason = ""
     for wanted in (_PORT, 0) if port is None else (port,):
@@ -289,30 +232,30 @@ def _listen(host: str, port: int | None) -> socket.socket:
 
 
 class Ration:
-    """Allowance that fills again with time: so much a second, and so much at once."""
+    """Allowance that refills with time: an amount a second, up to the amount at once."""
 
     def __init__(self, a_second: int, *, at_once: int) -> None:
         self._a_second, self._most = a_second, at_once
-        self._left, self._seen_s = float(at_once), time.monotonic()
+        self._rest, self._last_s = float(at_once), time.monotonic()
 
     def take(self, amount: int = 1) -> bool:
-        """Take an amount, where so much is left."""
+        """Take an amount; False where less is left."""
         now_s = time.monotonic()
-        self._left = min(self._most, self._left + (now_s - self._seen_s) * self._a_second)
-        self._seen_s = now_s
-        if self._left < amount:
+        self._rest = min(self._most, self._rest + (now_s - self._last_s) * self._a_second)
+        self._last_s = now_s
+        if self._rest < amount:
             return False
-        self._left -= amount
+        self._rest -= amount
         return True
 
 
 class Gate:
-    """Lets in who may see the page, and no more of them than it bears: ASGI middleware around everything.
+    """Access control and rate limits of the page: ASGI middleware around everything.
 
-    Without a token, who speaks to this machine by its own name: a page of another site that leads a name of its own
-    here is refused. With one, who shows it, once in the address and from then on in a cookie. A page of another site
-    may in no case open a socket, send anything or load a part of this one. Who sends long messages, or many, is cut
-    off.
+    Without a token it admits requests to this machine's own names: a page of another site that resolves a name of its
+    own to this machine is refused. With one it admits whoever shows it, once in the address and from then on in a
+    cookie. A page of another site can neither open a socket, send anything nor load a part of this one. A client that
+    sends long messages, or many, is cut off.
     """
 
     def __init__(self, app: "ASGIApp", *, token: str | None, port: int) -> None:
@@ -335,17 +278,17 @@ class Gate:
             else:
                 await self.app(scope, _rationed(receive, send), send)
         elif scope["type"] == "http" and self._shows(_token_of(scope)):
-            kept = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict; Max-Age={_DAY_S}"
+            cookie = f"{self._cookie}={self._token}; Path=/; HttpOnly; SameSite=Strict; Max-Age={_DAY_S}"
             # whatever the path was: of //elsewhere/ a browser makes another host
-            await _answer(send, 303, [("location", "/"), ("set-cookie", kept)], "")
+            await _answer(send, 303, [("location", "/"), ("set-cookie", cookie)], "")
         else:
             await _refuse(scope, send, 401, "open the whole address that sliplens printed, with its token")
 
     def _refusal(self, headers: dict[str, str]) -> str | None:
         host = headers.get("host", "")
-        if (named := _HOST.fullmatch(host)) is None:
+        if (parts := _HOST.fullmatch(host)) is None:
             return "the request names no host; open the address that sliplens printed"
-        if self._token is None and not is_loopback(named[1].strip("[]").lower()):
+        if self._token is None and not is_loopback(parts[1].strip("[]").lower()):
             return f"this page is for this machine alone, and not at {host}; start it with --host to open it to others"
         origin = headers.get("origin")
         if origin is not None and origin.partition("://")[2] != host:
@@ -362,10 +305,10 @@ class Gate:
 
 def _cookie(header: str, name: str) -> str:
     try:
-        kept = SimpleCookie(header).get(name)
+        cookie = SimpleCookie(header).get(name)
     except CookieError:
         return ""
-    return "" if kept is None else kept.value
+    return "" if cookie is None else cookie.value
 
 
 def _token_of(scope: "Scope") -> str:
@@ -373,7 +316,7 @@ def _token_of(scope: "Scope") -> str:
 
 
 def _rationed(receive: "Receive", send: "Send") -> "Receive":
-    """Take no long messages, nor many: whoever sends them is gone, as far as the page knows."""
+    """Limit length and rate of messages; the page takes a client beyond them for disconnected."""
     ration, bytes_left = Ration(_MESSAGES_A_SECOND, at_once=2 * _MESSAGES_A_SECOND), MOST_BYTES
 
     async def received() -> "Message":
@@ -393,9 +336,9 @@ def _rationed(receive: "Receive", send: "Send") -> "Receive":
 
 
 def _guarded(send: "Send", host: str, nonce: str) -> "Send":
-    """Add to every answer that its page may load nothing from elsewhere, nor be shown within another one.
+    """Add the headers by which a page loads nothing from elsewhere and is not shown within another one.
 
-    Of scripts in the page itself those run that carry the nonce: NiceGUI's own (`_sign_scripts`).
+    Inline scripts run where they carry the nonce: NiceGUI's own (`_sign_scripts`).
     """
     sockets = f" ws://{host} wss://{host}" if _HOST.fullmatch(host) else ""  # Safari does not take them for 'self'
     policy = (
@@ -412,8 +355,8 @@ def _guarded(send: "Send", host: str, nonce: str) -> "Send":
                 "referrer-policy": "no-referrer",
                 "x-content-type-options": "nosniff",
             }
-            named = [(name.encode(), value.encode("latin-1")) for name, value in more.items()]
-            message = {**message, "headers": [*message.get("headers", []), *named]}
+            added = [(name.encode(), value.encode("latin-1")) for name, value in more.items()]
+            message = {**message, "headers": [*message.get("headers", []), *added]}
         await send(message)
 
     return sent
@@ -427,6 +370,6 @@ async def _refuse(scope: "Scope", send: "Send", status: int, why: str) -> None:
 
 
 async def _answer(send: "Send", status: int, headers: list[tuple[str, str]], text: str) -> None:
-    named = [(name.encode(), value.encode("latin-1")) for name, value in headers]
-    await send({"type": "http.response.start", "status": status, "headers": named})
+    encoded = [(name.encode(), value.encode("latin-1")) for name, value in headers]
+    await send({"type": "http.response.start", "status": status, "headers": encoded})
     await send({"type": "http.response.body", "body": text.encode()})
