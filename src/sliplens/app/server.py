@@ -13,7 +13,7 @@ from http.cookies import CookieError, SimpleCookie
 from ipaddress import ip_address
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import parse_qs
 
 from sliplens.errors import InputError
@@ -41,6 +41,9 @@ _ICON = (
     '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><path d="M2 12a6 6 0 1 1 12 0" fill="none" '
     'stroke="#009E73" stroke-width="3"/><path d="M8 12 5 6" stroke="#D55E00" stroke-width="2"/></svg>'
 )
+
+
+_Page = TypeVar("_Page", bound="LivePage")
 
 
 class LivePage:
@@ -102,7 +105,7 @@ class LivePage:
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{port}/" + ("" if self.token is None else f"?token={self.token}")
 
-    def __enter__(self) -> Self:
+    def __enter__(self: _Page) -> _Page:
         # explainers, and with them torch
         from sliplens.app.feed import Feed  # noqa: PLC0415
         from sliplens.app.page import Hand  # noqa: PLC0415
