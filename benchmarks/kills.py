@@ -82,10 +82,10 @@ CASES = {
     "simulate": Case((
         "simulate", "out", "--dry-trials", "3", "--wet-trials", "1", "--frames-per-trial", "20", "--days", "3",
     )),
-    "import": Case(("import", "@/own/many.csv", "-o", "out", "--frame-rate", "30", "--splits", "@/rules.toml")),
+    "import": Case(("import", "@/own/many.csv", "-o", "out", "--frame-rate", "30", "--splits", "@/splits.csv")),
     "label": Case(("label", "imported", "--mu", "0.5"), copies=("imported",)),
     "label -o": Case(("label", "@/imported", "-o", "out", "--mu", "0.5", "--no-audit")),
-    "split": Case(("split", "data", "--preset", "trials"), copies=("data",)),
+    "split": Case(("split", "data", "--splits", "trial"), copies=("data",)),
     "train": Case(("train", "@/data", "-o", "out", *_SMALL)),
     "predict": Case(("predict", "@/run", "@/data", "-o", "out.csv", "--plot", "out.png", "--engine", "torch")),
     "evaluate": Case(("evaluate", "@/run", "@/data", "-o", "out")),
@@ -272,7 +272,7 @@ def make_material(folder: Path) -> None:
     (folder / "own" / "many.csv").write_text(
         "trial,video,forces,day,mu,sensor\n" + "".join(f"{name},cup,forces.csv,1,0.6,tip\n" for name in ("a", "b"))
     )
-    (folder / "rules.toml").write_text('[[split]]\nshare = { train = 0.5, test = 0.5 }\nby = "trial"\n')
+    (folder / "splits.csv").write_text("trial,split\n*1,train\n*,test\n")
     table = []
     plan = [("train", "dry")] * 3 + [("validation", "dry")] * 2 + [("test", "dry")] * 2
     for index, (split, condition) in enumerate(plan):

@@ -40,7 +40,7 @@ from sliplens.recordings.labelling import Reason
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import load_profile
 from sliplens.recordings.source import open_source
-from sliplens.recordings.splits import assign_splits, read_splits
+from sliplens.recordings.splits import assign_splits, read_split_table
 from sliplens.recordings.store import forces_path, save_forces, save_recording
 from sliplens.recordings.trial import Labels, TrialFacts
 from sliplens.report.results import load_results
@@ -569,10 +569,6 @@ def _not_finite(path: Path, rng: Rng) -> None:
 
 
 def _toml(folder: Path) -> None:
-    (folder / "rules.toml").write_text(
-        '[[split]]\nobject = ["mug", "c*"]\nname = "test"\n'
-        '[[split]]\nshare = { train = 0.75, validation = 0.25 }\nby = "trial"\nseed = 3\n'
-    )
     (folder / "tip.toml").write_text(
         'name = "tip"\ncamera_size_px = [640, 480]\ncrop_px = [80, 0, 480, 480]\nresize_px = [224, 224]\n'
         "frame_rate_hz = 30.0\n"
@@ -593,10 +589,16 @@ TOML: dict[str, Change] = {**ANY, "value replaced": _value, "line dropped": _lin
 
 def _read_toml(folder: Path) -> object:
     profile = load_profile(folder / "tip.toml")
-    trials = [
-        TrialFacts(trial=f"{name}-{day}", day=day, object=name) for name in ("mug", "cup", "jar") for day in (1, 2)
-    ]
-    return profile, profile.output_size((480, 640)), assign_splits(read_splits(folder / "rules.toml"), trials).splits
+    return profile, profile.output_size((480, 640))
+
+
+def _splits(folder: Path) -> None:
+    (folder / "splits.csv").write_text("trial,split\nmug-1,test\nc*,validation\n*,train\n")
+
+
+def _read_splits(folder: Path) -> object:
+    trials = [TrialFacts(trial=f"{name}-{day}", day=day) for name in ("mug", "cup", "jar") for day in (1, 2)]
+    return assign_splits(trials, read_split_table(folder / "splits.csv")).splits
 
 
 def _corrections(folder: Path) -> None:
@@ -627,6 +629,7 @@ FORMATS = {
     "forces": Format(
         _own, ("forces.csv",), {**ANY, **TABLE}, lambda folder: _import(folder, forces=folder / "forces.csv")
     ),
+    "splits": Format(_splits, ("splits.csv",), MANY, _read_splits),
     "manifest": Format(_own, ("many.csv",), MANY, lambda folder: _import(folder, "many.csv")),
     "images": Format(_own, ("cup/0*.png",), PICTURE, _frames_of("cup", frame_rate=30.0)),
     "video": Format(_video, ("cup.mkv",), ANY, _frames_of("cup.mkv")),

@@ -57,7 +57,7 @@ WORKS: dict[str, tuple[Work, Work]] = {
     "replace": (make, lambda folder: make(folder, "y")),
     "file": (lambda _: None, lambda folder: write_json(folder / "x.json", {"x": 1})),
     "table": (lambda _: None, make_file),
-    "split": (prepare_split, lambda folder: split_dataset(folder, "trials")),
+    "split": (prepare_split, lambda folder: split_dataset(folder, "trial")),
 }
 
 

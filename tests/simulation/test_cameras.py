@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from sliplens.recordings.splits import TrialFacts, assign_splits, thesis_plan
 from sliplens.simulation import make_recipe, plan_trials
 from sliplens.simulation.filming import move_camera
 from sliplens.simulation.nuisances import Camera, Day, Nuisances, mount_camera
@@ -57,7 +56,3 @@ def test_validation_comes_from_every_day_between(days):
     counts = [held_out.count(day) for day in range(2, days)]
     assert set(held_out) == set(range(2, days))
     assert max(counts) - min(counts) <= 1
-    facts = [
-        TrialFacts(trial=plan.trial, sensor="tip", day=plan.day, condition=plan.condition, object="") for plan in plans
-    ]
-    assert list(assign_splits(thesis_plan(facts), facts).splits) == [plan.split for plan in plans]

@@ -26,7 +26,7 @@ EXAMPLES = {
     "import": "sliplens import cup.mp4 --forces cup.csv --sensor tip.toml -o runs/mine/data",
     "label": "sliplens label runs/mine/data --draft corrections.csv",
     "recover": "sliplens recover runs/mine/data",
-    "split": "sliplens split runs/mine/data --preset trials --dry-run",
+    "split": "sliplens split runs/mine/data --splits object --dry-run",
     "check": "sliplens check runs/mine/data",
     "view": "sliplens view runs/mine/data --trial cup --predictions margins.parquet --maps runs/mine/explain",
     "track": "sliplens track cup.mp4 --reference untouched.png -o markers.parquet",

@@ -5,46 +5,45 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from sliplens.cli.command import Data
 from sliplens.cli.console import print_table, say, wrote
-from sliplens.errors import InputError
 
 if TYPE_CHECKING:
     from sliplens.recordings import TrialInfo
 
-_SHOWN = 6
-"""So many names are shown before the rest is counted."""
+_MOST_NAMES = 6
+"""Names in a cell before the rest is counted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Split:
-    """Deal the trials of a data set to train, validation and test, as a file of rules or a preset says.
+    """Deal the trials of a data set to train, validation and test, or assign them by a table.
 
-    A trial is never torn apart. Shows what each split holds and which trials move; the rules are kept beside the table
-    of the data set, in splits.json.
+    Frames of one trial stay together. Shows the content of each split and the trials that move.
     """
 
     data: Data
-    rules: Path | None = None
-    """File of rules (TOML): the first that fits a trial decides."""
-    preset: Literal["thesis", "objects", "trials"] | None = None
-    """thesis: the last day tests, the first trains, a quarter of the dry trials between validates. objects: 70, 15 and
-    15 percent of the objects train, validate and test. trials: the same of the trials."""
+    splits: Annotated[Path, tyro.conf.arg(metavar="trial|object|day|TABLE.csv")]
+    """Trials that agree in it stay together: trial, object or day. Or a table with the columns trial and split (CSV), in
+    which a trial may be a pattern such as mug-*."""
+    shares: tuple[float, float, float] = (0.7, 0.15, 0.15)
+    """Parts of the trials, objects or days that train, validate and test."""
+    seed: int = 0
+    """Seed of the order in which they are dealt."""
     dry_run: bool = False
     """Show what would be done and write nothing."""
 
     def run(self) -> None:
         """Split, show and write."""
         from sliplens.recordings.dataset import load_dataset
-        from sliplens.recordings.splits import SPLITS_FILE, split_dataset
+        from sliplens.recordings.splits import split_dataset
 
-        rules = self.rules or self.preset
-        if rules is None or (self.rules and self.preset):
-            raise InputError("give the file of rules with --rules, or a --preset, one of the two")
         data = load_dataset(self.data)
-        result = split_dataset(data, rules, dry_run=self.dry_run)
+        result = split_dataset(data, self.splits, shares=self.shares, seed=self.seed, dry_run=self.dry_run)
         moved = [(info, to) for info, to in zip(data.trials, result.splits, strict=True) if info.split != to]
         _show_splits(data.trials, result.splits)
         _show_moves(moved)
@@ -53,7 +52,7 @@ class Split:
         if self.dry_run:
             say("nothing is written (--dry-run)")
             return
-        wrote(self.data, f"{len(moved)} of {len(data.trials)} trials moved; {SPLITS_FILE} keeps the rules")
+        wrote(self.data, f"{len(moved)} of {len(data.trials)} trials moved")
         if moved:
             say("networks trained before saw other splits: a trial that tests now may have trained them, train anew")
 
@@ -91,8 +90,8 @@ def _some(names: Iterable[str]) -> str:
     from sliplens.images import natural_key
 
     ordered = sorted(names, key=natural_key)
-    rest = len(ordered) - _SHOWN
-    shown = ordered if rest < 2 else [*ordered[:_SHOWN], f"{rest} more"]
+    rest = len(ordered) - _MOST_NAMES
+    shown = ordered if rest < 2 else [*ordered[:_MOST_NAMES], f"{rest} more"]
     return ", ".join(shown) or "-"
 
 

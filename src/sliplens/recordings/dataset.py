@@ -18,8 +18,6 @@ from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recordin
 from sliplens.recordings.trial import Recording, TrialFacts
 
 DATASET_FILE = "dataset.json"
-SPLITS_FILE = "splits.json"
-"""Rules that the splits of a data set come from, beside its table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,12 +261,10 @@ def save_profile(folder: Path, profile: SensorProfile) -> None:
         part.write_text(profile_text(profile), encoding="utf-8")
 
 
-def copy_settings(source: Path, folder: Path) -> None:
-    """Copy the sensor profiles and the split rules of a data set into another folder."""
+def copy_profiles(source: Path, folder: Path) -> None:
+    """Copy the sensor profiles of a data set into another folder."""
     if (source / SENSORS_FOLDER).is_dir():
         shutil.copytree(source / SENSORS_FOLDER, folder / SENSORS_FOLDER, dirs_exist_ok=True)
-    if (source / SPLITS_FILE).is_file():
-        shutil.copyfile(source / SPLITS_FILE, folder / SPLITS_FILE)
 
 
 def trial_path(folder: Path, trial: str) -> Path:

@@ -17,7 +17,7 @@ from sliplens.recordings.dataset import (
     Dataset,
     LeftOut,
     TrialInfo,
-    copy_settings,
+    copy_profiles,
     load_dataset,
     report_dataset,
     save_profile,
@@ -27,13 +27,7 @@ from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import SensorProfile, is_profile, load_profile
 from sliplens.recordings.source import open_source
-from sliplens.recordings.splits import (
-    SplitPlan,
-    SplitResult,
-    assign_splits,
-    read_splits,
-    write_split_record,
-)
+from sliplens.recordings.splits import Group, SplitResult, assign_splits, deal_splits, load_splits
 from sliplens.recordings.trial_writer import (
     TrialJob,
     TrialWork,
@@ -54,7 +48,7 @@ def import_recordings(
     condition: str | None = None,
     object: str | None = None,
     format: str | None = None,
-    splits: SplitPlan | Path | str | None = None,
+    splits: Mapping[str, str] | Path | str | None = None,
     validation_trials: int | None = None,
     test_trials: int | None = None,
     reading: ReadOptions | None = None,
@@ -91,7 +85,7 @@ def import_recordings(
     format
         Row of `FORMATS`; recognised by names if None.
     splits
-        Rules that deal the trials to splits, or their file (TOML).
+        Split of each trial, or a table of them (CSV), or `trial`, `object` or `day` to deal them; see `split_dataset`.
     validation_trials, test_trials
         So many of the last trials test, and so many before them validate, in place of rules.
     reading
@@ -144,17 +138,17 @@ def import_recordings(
             report_dataset(before, kept=True)
         return replace(before, left_out=tuple(left_out))
     _require_names(captures, left_out)
-    plan = splits if splits is None or isinstance(splits, SplitPlan) else read_splits(Path(splits))
+    plan = None if splits is None else load_splits(splits)
     config = {
         **asked.recipe(work.sources),
         "validation_trials": validation_trials,
         "test_trials": test_trials,
-        "splits": None if plan is None else plan.rules,
+        "splits": plan,
         **({} if before is None else {"added_to": before.hash}),
     }
 
     deal = partial(_deal, old, plan=plan, validation_trials=validation_trials, test_trials=test_trials)
-    _, dealt = deal(captures)  # a mistake in the rules is told before anything slow
+    _, dealt = deal(captures)  # a mistake in the splits is found before anything slow
     with output_folder(Path(out), stage="import", config=config, overwrite=overwrite or add) as output:
         if not output.complete:
             if before is not None:
@@ -168,8 +162,6 @@ def import_recordings(
                 written = [capture for capture in captures if capture.trial in names]
                 dealt_to, dealt = deal(written)
                 table = [replace(info, split=split) for info, split in zip([*old, *rows], dealt_to, strict=True)]
-                if plan is not None and dealt is not None:
-                    write_split_record(output.folder, plan, [*old, *written], dealt)
                 left_out = [*left_out, *failed]
                 told = {row.trial for row in table} | {one.trial for one in left_out}
                 left_out = [*(one for one in (before.left_out if before else ()) if one.trial not in told), *left_out]
@@ -325,7 +317,7 @@ def _link_trials(source: Path, folder: Path) -> None:
     for name in ("trials", "forces", "audit"):
         if (source / name).is_dir():
             shutil.copytree(source / name, folder / name, copy_function=link, dirs_exist_ok=True)
-    copy_settings(source, folder)
+    copy_profiles(source, folder)
 
 
 def _require_names(captures: Sequence[Capture], left_out: Sequence[LeftOut] = ()) -> None:
@@ -345,13 +337,14 @@ def _deal(
     old: Sequence[TrialInfo],
     captures: Sequence[Capture],
     *,
-    plan: SplitPlan | None,
+    plan: Mapping[str, str] | Group | None,
     validation_trials: int | None,
     test_trials: int | None,
 ) -> tuple[list[str], SplitResult | None]:
     """Splits of all trials, the old ones first, and how a plan dealt them."""
     if plan is not None:
-        dealt = assign_splits(plan, [*old, *captures])
+        trials = [*old, *captures]
+        dealt = assign_splits(trials, plan) if isinstance(plan, Mapping) else deal_splits(trials, by=plan)
         return list(dealt.splits), dealt
     kept = [info.split for info in old]
     if validation_trials is None and test_trials is None:

@@ -11,7 +11,7 @@ from sliplens.progress import OnProgress, add_note, number_of, reporting
 from sliplens.recordings.corrections import read_corrections
 from sliplens.recordings.dataset import (
     Dataset,
-    copy_settings,
+    copy_profiles,
     load_dataset,
     report_dataset,
     trial_path,
@@ -92,7 +92,7 @@ def label_dataset(
                 ) as (rows, _):
                     table = [replace(row, split=info.split) for row, info in zip(rows, data.trials, strict=True)]
                     write_dataset_table(output.folder, table, simulated=data.simulated, left_out=data.left_out)
-                    copy_settings(data.folder, output.folder)
+                    copy_profiles(data.folder, output.folder)
         if corrections:
             add_note(f"corrections of {number_of(len(corrections), 'trial')} applied")
         if removed := sorted(before.keys() - corrections.keys()):

@@ -11,7 +11,6 @@ from sliplens._version import __version__
 from sliplens.errors import InputError
 from sliplens.extras import Table
 from sliplens.files import hash_json, to_builtins
-from sliplens.recordings.splits import hold_out
 from sliplens.simulation.loading import MINIMUM_FRAMES
 from sliplens.simulation.nuisances import Day, Nuisances, Pulls, draw_camera, draw_day, mount_camera
 from sliplens.simulation.sensor import CHROMATOUCH, SENSORS, Sensor
@@ -248,7 +247,9 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     between = [(day, number) for day in sorted(dry) if day not in (1, *tested) for number in range(1, dry[day] + 1)]
     # without days between, the first day gives up some of its trials
     candidates = between or [(1, number) for number in range(1, dry[1] + 1)]
-    validation = set(hold_out(candidates, recipe.validation_share))
+    count = max(1, round(recipe.validation_share * len(candidates))) if candidates else 0
+    # evenly spaced over the days
+    validation = {candidates[int((index + 0.5) * len(candidates) / count)] for index in range(count)}
 
     plans = []
     for day in range(1, recipe.days + 1):
