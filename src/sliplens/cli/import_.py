@@ -53,7 +53,7 @@ class Import(Command):
     test_trials: int | None = None
     """How many trials test, the last ones; all others train. Trials are never split."""
     splits: Path | None = None
-    """Deal by trial, object or day; or a table with the columns trial and split (CSV). In place of the numbers above."""
+    """Deal by trial, object or day; or a table with the columns trial and split (CSV). In place of the two counts."""
     add: bool = False
     """Add to the data set in the output folder; trials that are there already stay as they are."""
     format: str | None = None

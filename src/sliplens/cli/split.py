@@ -28,7 +28,7 @@ class Split:
 
     data: Data
     splits: Annotated[Path, tyro.conf.arg(metavar="trial|object|day|TABLE.csv")]
-    """Trials that agree in it stay together: trial, object or day. Or a table with the columns trial and split (CSV), in
+    """Trials that agree in it stay together: trial, object or day. Or a table with columns trial and split (CSV), in
     which a trial may be a pattern such as mug-*."""
     shares: tuple[float, float, float] = (0.7, 0.15, 0.15)
     """Parts of the trials, objects or days that train, validate and test."""

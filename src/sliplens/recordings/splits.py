@@ -18,7 +18,9 @@ from sliplens.recordings.manifest import read_csv
 from sliplens.recordings.trial import TrialFacts
 
 SPLITS = ("train", "validation", "test")
+"""Splits that trials are dealt to."""
 Group: TypeAlias = Literal["trial", "object", "day"]
+"""Facts by which trials are grouped."""
 _SPLIT_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 # shares are written with few digits: thirds as 0.3333 should be corrected by whoever wrote them
 _SUM_TOLERANCE = 1e-6
