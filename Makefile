@@ -29,10 +29,10 @@ test: $(INSTALLED) ## run the tests on all cores; the last line says how long th
 	$(BIN)/pytest --durations 10
 
 fuzz: $(INSTALLED) ## read 10,000 hostile inputs, half an hour or more; given again it goes on
-	$(BIN)/python benchmarks/fuzz.py --inputs 10000 --keep runs/fuzz.jsonl
+	$(BIN)/python tests/fuzz/run_fuzz.py --inputs 10000 --keep runs/fuzz.jsonl
 
 kills: $(INSTALLED) ## disturb the commands that write 200 times, an hour or less; given again it goes on
-	$(BIN)/python benchmarks/kills.py --faults 200 --keep runs/kills.jsonl
+	$(BIN)/python tests/fuzz/run_kills.py --faults 200 --keep runs/kills.jsonl
 
 check: $(INSTALLED) ## lint, format, types, floors
 	$(BIN)/ruff check

@@ -32,8 +32,7 @@ _WEIGHTS: dict[str, tuple[tuple[float, ...], tuple[float, ...], float]] = {
 }
 """By kind of sensor, at the knots: weights of a displacement and of its outward part, and the standard deviation of
 the shear as a share of the mean outward displacement. Fitted by ridge regression to the tangential force of simulated
-trials pulled in every direction (`benchmarks/directions.py --fit --trials 150 --frames 5`); the deviation was measured
-on other days (series `direction-choose`). The row without a name is of all simulated sensors together."""
+150 trials pulled in every direction; the deviation was measured on other days. The row without a name is of all simulated sensors together."""
 _KNOTS = np.array([0, 0.33, 0.66, 1.0, 1.4])  # distances from the centre over half of the shorter side
 _NOISE_PX = 0.027  # of the reduced picture
 

@@ -38,8 +38,7 @@ class Displacement:
 
 
 DISPLACEMENTS = {
-    # fitted, with the defaults of `Grasp`, to 34 markers x 4 frames of the published difference images;
-    # `benchmarks/sim_vs_real.py` prints how well
+    # fitted, with the defaults of `Grasp`, to 34 markers x 4 frames of the published difference images
     "calibrated": Displacement(
         layer=0.69, local_friction=0.042 / _FITTED_FRICTION, clamp_exponent=0.76, skin_shear=0.0307
     ),

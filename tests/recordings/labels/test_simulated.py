@@ -1,4 +1,4 @@
-"""Labels come back from simulated trials; `benchmarks/labels.py` measures the same on many more."""
+"""Labels come back from simulated trials."""
 
 import numpy as np
 import pytest

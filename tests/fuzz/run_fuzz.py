@@ -23,7 +23,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # the children of a process must not inherit its threads
-_TESTS = Path(__file__).resolve().parent.parent / "tests"
+_TESTS = Path(__file__).resolve().parent.parent
 sys.path += [str(_TESTS / "fuzz"), str(_TESTS / "helpers")]
 
 import torch  # noqa: E402 (after the threads are told)

@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # the children of a process must not inherit its threads
-_TESTS = Path(__file__).resolve().parent.parent / "tests"
+_TESTS = Path(__file__).resolve().parent.parent
 sys.path += [str(_TESTS / "fuzz"), str(_TESTS / "helpers")]
 
 import lightning  # noqa: E402, F401 (after the threads are told; imported once for all children)
