@@ -1,7 +1,7 @@
-"""Compare what is installed with what is pinned: versions with requirements.txt, files with the hashes of their wheels.
+"""Compare what is installed with what is pinned: versions with .ci/requirements.txt, files with the hashes of their wheels.
 
 Asks nobody. What is not pinned is listed; a version or a file that differs ends it with exit code 1. Known
-vulnerabilities are another matter: `pip-audit -r requirements.txt` asks a database for those.
+vulnerabilities are another matter: `pip-audit -r .ci/requirements.txt` asks a database for those.
 """
 
 import sys
@@ -14,7 +14,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-_PINS = Path(__file__).parents[1] / "requirements.txt"
+_PINS = Path(__file__).with_name("requirements.txt")
 _OWN = {"sliplens", "uv", "pip", "setuptools"}
 """This project, and what a virtual environment begins with."""
 

@@ -155,7 +155,7 @@ def try_wheel(wheel: Path, python: str) -> None:
         steps: list[list[str | Path]] = [
             [LIBRARIES / "uv", "venv", "--quiet", "--python", python, place],
             # the tested versions; their hashes are for `make install`
-            [*install, "--constraint", ROOT / "requirements.txt", wheel],
+            [*install, "--constraint", ROOT / ".ci" / "requirements.txt", wheel],
             [LIBRARIES / "uv", "pip", "check", "--quiet", "--python", own],
             [own, "-W", "error::SyntaxWarning", "-c", SMOKE, ROOT / "README.md"],
             [command, "--help"],
