@@ -109,7 +109,7 @@ def test_one_frame_alone_has_nothing_to_move_against(tmp_path, moving):
     path = tmp_path / "one"
     path.mkdir()
     write_png(path / "frame.png", moving[1][0])
-    with pytest.raises(InputError, match="one frame only"):
+    with pytest.raises(InputError, match="one frame and no reference"):
         Track(source=path, output=tmp_path / "tracks.parquet").run()
 
 

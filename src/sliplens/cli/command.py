@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from inspect import signature
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
 
@@ -85,7 +85,11 @@ class Command:
     def call(self, function: Callable[..., Result], **others: Any) -> Result:
         """Call the library with every option that it has a parameter for, and with what is named here."""
         options = {"on_progress": Terminal(), **vars(self)}
-        takes = signature(function).parameters
+        takes = set(signature(function).parameters)
+        for parameter in signature(function).parameters.values():
+            if parameter.kind is parameter.VAR_KEYWORD:  # declared by a TypedDict
+                (bag,) = get_args(get_type_hints(function)[parameter.name])
+                takes |= set(bag.__annotations__)
         return function(**{**{name: value for name, value in options.items() if name in takes}, **others})
 
 

@@ -69,21 +69,19 @@ class Simulate(Command):
         from sliplens.extras import require_device
         from sliplens.results import describe_simulation
         from sliplens.simulation import make_recipe, simulate
-        from sliplens.simulation.plan import RecipeChanges
 
         if self.output is None and self.preview is None and self.video is None:
             raise InputError("nothing to do; name a folder to make, or a picture with --preview")
         self._require_pictures()
         require_device(self.device)
-        changes = {name: value for name, value in vars(self).items() if name in RecipeChanges.__annotations__}
-        recipe, terminal = make_recipe(self.preset, sensor=self.sensor, **changes), Terminal()
+        recipe, terminal = self.call(make_recipe), Terminal()
         with reporting(terminal):
             if self.preview is not None:
                 self._draw_preview(self.preview, recipe)
             if self.video is not None:
                 self._draw_video(self.video, recipe)
         if self.output is not None:
-            data = self.call(simulate, out=self.output, on_progress=terminal, **changes)
+            data = self.call(simulate, out=self.output, on_progress=terminal)
             splits = describe_simulation(data).by_split.items()
             rows = [(name, str(row.trials), f"{row.frames:,}") for name, row in splits]
             print_table("Simulated", ("split", "trials", "frames"), rows)

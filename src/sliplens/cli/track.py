@@ -16,16 +16,16 @@ from sliplens.progress import number_of
 
 @dataclass(frozen=True, kw_only=True)
 class Track(SourceCommand):
-    """Follow the markers of a data set, a folder of images, a video, or any recording.
+    """Track the markers of a data set, a folder of images, a video, or any recording.
 
-    Writes a row for each marker of each frame: where it is, how far it moved from the untouched sensor (the first frame
-    if neither you nor the source names one), and whether it was followed, missing, broken, outside, new, or lost.
+    Writes a row for each marker of each frame: its place, its displacement from the untouched sensor (the first frame
+    if neither you nor the source names one), and its status: followed, missing, broken, outside, new, or lost.
     """
 
     source: Source
     output: TableFile
     markers: str | None = None
-    """What the markers look like: chromatouch, gelsight-mini, tactip, or auto; as --sensor says if not given."""
+    """Look of the markers: chromatouch, gelsight-mini, tactip, or auto; as --sensor says if not given."""
     video: Annotated[Path | None, tyro.conf.arg(metavar="FILE.mp4")] = None
     """Also write a clip with rings and arrows, of one trial."""
     trial: str | None = None
@@ -34,7 +34,7 @@ class Track(SourceCommand):
     retry_failed: RetryFailed = False
 
     def run(self) -> None:
-        """Follow and write."""
+        """Track and write."""
         from sliplens.markers.tracking import track
         from sliplens.plots.clip import clip_writer
         from sliplens.recordings.sensor import load_profile
@@ -42,10 +42,10 @@ class Track(SourceCommand):
 
         profile = None if self.sensor is None else load_profile(self.sensor)
         markers = self.markers or (profile and profile.markers) or "auto"
-        given = {"source": self.source, "options": self.options, "sensor": profile}
+        source = {"source": self.source, "options": self.options, "sensor": profile}
         clip = nullcontext()
         if self.video is not None:
-            trials = self.call(open_source, **given)
+            trials = self.call(open_source, **source)
             if len(trials) != 1:
                 raise InputError(f"a clip shows one trial and {self.source} has {len(trials)}; name one with --trial")
             if self.on != "serial":
@@ -54,7 +54,7 @@ class Track(SourceCommand):
             require_new_file(self.video, overwrite=self.overwrite)
             clip = clip_writer(self.video, size=trial.frame_size, frames_per_s=trial.frame_rate_hz)
         with clip as draw:
-            tracking = self.call(track, **given, markers=markers, out=self.output, on_tracked=draw)
+            tracking = self.call(track, **source, markers=markers, out=self.output, on_tracked=draw)
         for trial in tracking.trials:
             say(str(trial))
         count = number_of(len(tracking.trials), "trial")

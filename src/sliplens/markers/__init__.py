@@ -1,4 +1,4 @@
-"""Markers: found, followed, and what their displacement tells of the grip."""
+"""Markers: detection, tracking, displacement fields, and estimators of the margin."""
 
 from sliplens.markers.detect import KINDS, Appearance, MarkerKind, Markers, detect_markers
 from sliplens.markers.tracker import Tracker, track_markers

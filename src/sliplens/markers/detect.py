@@ -1,4 +1,4 @@
-"""Markers of a frame: where they are, how large, and how well they are seen."""
+"""Detection of the markers of a frame: place, size and contrast."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -16,27 +16,29 @@ Contrast: TypeAlias = Literal["dark", "light", "colour"]
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerKind:
-    """Difference between the markers of a sensor and what they are printed on."""
+    """Look of a sensor's markers against their background."""
 
     name: str
     contrasts: tuple[Contrast, ...]
-    """Ways in which they may stand out; where there are several, the frame decides."""
+    """Possible contrasts; where there are several, the frame decides."""
     radius_px: tuple[float, float] = (2.0, 40.0)
-    """Smallest and largest radius that is looked for, in pixels."""
+    """Smallest and largest radius, in pixels."""
     channels: tuple[float, float, float] | None = None
-    """Weights of red, green and blue, by which centres are measured; found from the markers themselves if None."""
+    """Weights of red, green and blue for measuring centres; estimated from the markers if None."""
 
     def __post_init__(self) -> None:
         low, high = self.radius_px
         if not 0 < low < high:
             raise InputError(f"markers of {self.name} have radii from {low:g} to {high:g} px; give a low and a high")
         if self.channels is not None and (min(self.channels) < 0 or sum(self.channels) <= 0):
-            raise InputError(f"the channels of {self.name} weigh {self.channels}; give none less than 0, and one more")
+            raise InputError(
+                f"the channels of {self.name} weigh {self.channels}; give weights of 0 or more, one of them positive"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Appearance:
-    """Look of one sensor's markers to its camera, as one frame showed it."""
+    """Look of a sensor's markers in a frame."""
 
     weights: Float32[np.ndarray, "3"]
     """Weights of red, green and blue; their sum is high on a marker, whatever its colour, and in grey levels."""
@@ -63,7 +65,7 @@ KINDS = Table("kind of markers", "sliplens.markers", _KINDS)
 
 
 FEWEST = 4
-"""Markers without which a pattern cannot be told from dirt."""
+"""Fewest markers of a pattern: fewer may be dirt."""
 _BRIGHT, _DARK, _EXPOSED = 250, 5, 0.5
 _GREY = np.array([1, 1, 1], dtype=np.float32) / 3
 
@@ -78,7 +80,7 @@ class _Spots(NamedTuple):
 
 
 def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind) -> Appearance:
-    """Find the colour, size and contrast of a frame's markers: round spots of one size over Otsu's threshold."""
+    """Estimate colour, size and contrast of a frame's markers: round spots of one size over Otsu's threshold."""
     _require_exposed(frame)
     tries: dict[Contrast, _Spots] = {
         contrast: spots for contrast in kind.contrasts if (spots := _find_spots(frame, kind, contrast))
@@ -86,9 +88,9 @@ def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind
     if not tries:
         raise ImageError(
             f"fewer than {FEWEST} markers of kind {kind.name} were found in a frame of {frame.shape[0]} x "
-            f"{frame.shape[1]} pixels; name another kind, or use a frame in which the markers are seen"
+            f"{frame.shape[1]} pixels; choose another kind, or use a frame that shows the markers"
         )
-    contrast, spots = max(tries.items(), key=lambda one: one[1].score)
+    contrast, spots = max(tries.items(), key=lambda item: item[1].score)
     weights = _weights(frame, spots, kind, contrast)
     signal = frame.astype(np.float32) @ weights
     inside = np.isin(spots.labels, spots.chosen)
@@ -101,8 +103,8 @@ def _require_exposed(frame: UInt8[np.ndarray, "height width 3"]) -> None:
     for what, pixels in (("saturated", frame.min(axis=-1) >= _BRIGHT), ("black", frame.max(axis=-1) <= _DARK)):
         if np.mean(pixels) > _EXPOSED:
             raise ImageError(
-                f"{100 * np.mean(pixels):.0f} % of the frame is {what}, so that no marker can be told; mend the "
-                "exposure or name another frame"
+                f"{100 * np.mean(pixels):.0f} % of the frame is {what}, so that markers do not show; correct the "
+                "exposure or choose another frame"
             )
 
 
@@ -148,10 +150,10 @@ def _find_spots(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind, co
 
 
 def _round(stats: np.ndarray, kind: MarkerKind, size: tuple[int, int]) -> Bool[np.ndarray, " components"]:
-    left, top, width, height, area = stats[:, :5].astype(float).T
+    x, y, width, height, area = stats[:, :5].astype(float).T
     radius = np.sqrt(area / np.pi)
     low, high = kind.radius_px
-    inside = (left > 0) & (top > 0) & (left + width < size[1]) & (top + height < size[0])
+    inside = (x > 0) & (y > 0) & (x + width < size[1]) & (y + height < size[0])
     fill = area / (width * height)
     shape = (np.maximum(width, height) < 1.7 * np.minimum(width, height)) & (fill > 0.55) & (fill < 0.95)
     return inside & shape & (radius >= low) & (radius <= min(high, min(size) / 8)) & (np.arange(len(stats)) > 0)
@@ -170,7 +172,7 @@ def _weights(
     around = near & (spots.labels == 0)
     colour = np.median(frame[core > 0], axis=0) - np.median(frame[around], axis=0)
     if contrast == "colour":
-        # shadows change the brightness alone: what is left tells markers from them
+        # shadows change the brightness alone, so it does not count
         colour = colour - colour.mean()
     # a step from background to marker keeps its size in grey levels
     return (colour / max(np.abs(colour).sum(), 1e-6)).astype(np.float32)  # spots that differ in nothing have no colour
@@ -180,13 +182,13 @@ _INNER, _OUTER = 1.55, 2.1  # radii of the ring in which the background is seen
 _CORE = 0.5  # radii, of what is surely marker
 _REACH = 1.6  # radii, beyond which nothing belongs to the marker
 _LOW, _HIGH = 0.25, 0.75  # of the contrast: below is background, above marker, however it speckles
-_ROUNDS = 3  # of moving the window onto what it found
+_ROUNDS = 3  # of moving the window onto the measured centre
 _SLOPE_SHARE = 0.5  # of the contrast that the background may change by across a radius
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shapes:
-    """Measurements on spots; pixel coordinates are (x, y), pixel centres at whole numbers."""
+    """Measured spots; pixel coordinates are (x, y), pixel centres at whole numbers."""
 
     centre_px: Float[np.ndarray, "spots 2"]
     radius_px: Float[np.ndarray, " spots"]
@@ -219,19 +221,19 @@ def _window(radius_px: float) -> _Window:
     distance = np.hypot(x, y)
     ring, core = (distance > _INNER * radius_px) & (distance < _OUTER * radius_px), distance <= _CORE * radius_px
     means = [ring / ring.sum(), ring * x / (x[ring] @ x[ring]), ring * y / (y[ring] @ y[ring]), core / core.sum()]
-    one = np.ones_like(x)
-    moments = np.stack([one, x, y, x * x, y * y, x * y], axis=1)
-    return _Window(half, ring, np.stack(means, axis=1).astype(np.float32), np.stack([one, x, y]), moments)
+    ones = np.ones_like(x)
+    moments = np.stack([ones, x, y, x * x, y * y, x * y], axis=1)
+    return _Window(half, ring, np.stack(means, axis=1).astype(np.float32), np.stack([ones, x, y]), moments)
 
 
 def measure_spots(
     signal: Float32[np.ndarray, "height width"], near_px: Float[np.ndarray, "spots 2"], *, radius_px: float
 ) -> Shapes:
-    """Measure the spots near some places, given to a third of a radius, in a signal that is high on markers.
+    """Measure the spots near places, known to a third of a radius, in a signal that is high on markers.
 
     The background is a plane, fitted in a ring around each spot. A pixel counts as marker from a quarter (not at all)
-    to three quarters (wholly) of the contrast: so speckle inside a marker does not move its centre, while its edge
-    still does by fractions of a pixel.
+    to three quarters (wholly) of the contrast: speckle inside a marker does not move its centre, but its edge does, by
+    fractions of a pixel.
     """
     window = _window(round(max(radius_px, 1.5), 1))
     height, width = signal.shape
@@ -270,11 +272,11 @@ def measure_spots(
     )
 
 
-_SMALL_RADIUS = 3.0  # pixels: spots are looked for in frames reduced so far, and measured in the frame itself
-_LEAST_RESPONSE = 0.15  # of the markers' own
-_LEAST_CONTRAST = 0.3  # of the markers' own
+_SMALL_RADIUS = 3.0  # pixels: spots are searched in frames reduced to it, and measured in the frame itself
+_LEAST_RESPONSE = 0.15  # of that of the markers
+_LEAST_CONTRAST = 0.3  # of that of the markers
 _LEAST_OVER_NOISE = 4.0
-_RADII = (0.55, 1.6)  # of the markers' own
+_RADII = (0.55, 1.6)  # of that of the markers
 _LEAST_ROUNDNESS = 0.4
 
 
@@ -283,12 +285,12 @@ class Markers(Shapes):
     """Markers of one frame; pixel coordinates are (x, y), pixel centres at whole numbers."""
 
     whole: Bool[np.ndarray, " spots"]
-    """False where the edge of the frame cuts a marker, so that its centre is not seen."""
+    """False where the edge of the frame cuts a marker, so that its centre is unknown."""
     appearance: Appearance
-    """Look that they have in common."""
+    """Common look of the markers."""
 
     def only(self, chosen: Bool[np.ndarray, " spots"]) -> "Markers":
-        """Some of them."""
+        """Return some of the markers."""
         arrays = {name: values for name, values in vars(self).items() if name != "appearance"}
         return replace(self, **{name: values[chosen] for name, values in arrays.items()})
 
@@ -296,18 +298,18 @@ class Markers(Shapes):
 def detect_markers(
     frame: UInt8[np.ndarray, "height width 3"], kind: str | MarkerKind = "auto", *, appearance: Appearance | None = None
 ) -> Markers:
-    """Find the markers of a frame, and measure them to a fraction of a pixel.
+    """Detect the markers of a frame, and measure them to a fraction of a pixel.
 
-    Places are maxima of a difference of blurs at the markers' size; centre and radius are centroid and area of what
-    passes half of the contrast with the local background (`measure_spots`).
+    Places are maxima of a difference of blurs at the markers' size; centre and radius are centroid and area of the
+    pixels above half of the contrast with the local background (`measure_spots`).
 
     Parameters
     ----------
     kind
-        Row of `KINDS`, or a kind of one's own.
+        Row of `KINDS`, or another `MarkerKind`.
     appearance
-        What was found before on the same sensor, in place of `kind`: saves the time to find it, and keeps what is a
-        marker the same through a recording. No marker at all is then an answer, not an error.
+        Appearance of the same sensor's markers in an earlier frame, in place of `kind`: saves time, and applies the
+        same criteria through a recording. A frame without markers is then no error.
 
     Raises
     ------
@@ -319,24 +321,24 @@ def detect_markers(
     if appearance is not None:
         return _detect(frame, appearance)
     first = find_appearance(frame, KINDS.pick(kind) if isinstance(kind, str) else kind)
-    # the first impression errs in size by the threshold's place on the edge: measure, correct, measure again
+    # the first estimate of the size depends on where the threshold cuts the edge: measure, correct, measure again
     for _ in range(2):
-        found = _detect(frame, first)
-        sound = found.whole & (found.roundness > 0.7)
+        markers = _detect(frame, first)
+        sound = markers.whole & (markers.roundness > 0.7)
         if sound.sum() < FEWEST:
             raise ImageError(
-                f"only {int(sound.sum())} markers were found whole, at least {FEWEST} are needed; name another kind, "
-                "or use a frame in which the markers are seen"
+                f"only {int(sound.sum())} markers are whole, at least {FEWEST} are needed; choose another kind, or "
+                "use a frame that shows the markers"
             )
-        radius, contrast = (float(np.median(values[sound])) for values in (found.radius_px, found.contrast))
+        radius, contrast = (float(np.median(values[sound])) for values in (markers.radius_px, markers.contrast))
         first = replace(first, radius_px=radius, contrast=contrast)
-    found = _detect(frame, first)
-    if not _make_pattern(found.only(found.whole)):
+    markers = _detect(frame, first)
+    if not _make_pattern(markers.only(markers.whole)):
         raise ImageError(
-            f"{int(found.whole.sum())} spots were found that are neither round and alike nor in a pattern, as markers "
-            "are; use a frame in which the markers are seen, of a sensor that has some"
+            f"the frame shows {int(markers.whole.sum())} spots that are neither round and alike nor in a pattern: no "
+            "markers; use a frame that shows the markers of a sensor"
         )
-    return found
+    return markers
 
 
 # Chosen on pictures without markers (noise blurred by 1 to 8 px, fractal noise, blobs, discs of many sizes; seeds 1000
@@ -375,7 +377,7 @@ def _detect(frame: UInt8[np.ndarray, "height width 3"], appearance: Appearance) 
 
 
 def _find_places(signal: Float32[np.ndarray, "height width"], appearance: Appearance) -> Float[np.ndarray, "places 2"]:
-    """Maxima of a difference of blurs at the markers' size, to a pixel of the reduced frame, strongest first."""
+    """Find maxima of a difference of blurs at the markers' size, to a pixel of the reduced frame, strongest first."""
     cv2 = import_cv2()
     factor = max(1, int(appearance.radius_px / _SMALL_RADIUS))
     radius = appearance.radius_px / factor
@@ -387,7 +389,7 @@ def _find_places(signal: Float32[np.ndarray, "height width"], appearance: Appear
     response = cv2.GaussianBlur(small, (0, 0), 0.6 * radius) - cv2.blur(small, (side, side))
     reach = 2 * round(0.8 * radius) + 1
     highest = cv2.dilate(response, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
-    # what a disc of the full contrast answers is about 0.65 of it: 1 - exp(-r^2 / 2 (0.6 r)^2), less what the box sees
+    # a disc of full contrast gives about 0.65 of it: 1 - exp(-r^2 / 2 (0.6 r)^2), less the mean of the box
     rows, columns = np.nonzero((response == highest) & (response > _LEAST_RESPONSE * appearance.contrast))
     order = np.argsort(-response[rows, columns], kind="stable")
     # pixel centres are whole numbers in both frames

@@ -13,7 +13,7 @@ from sliplens.extras import Table
 from sliplens.markers.tracks import Tracks
 
 _FEWEST = 6
-_PRESSED_SHARE = 0.9  # of the trial's own largest spread: from here on the press is done, creep aside
+_PRESSED_SHARE = 0.9  # of the trial's largest spread, at which the press is complete, creep aside
 _PULL_PX = 0.2  # of the inner markers' mean motion: several times its noise
 INNER_SHARE = 1 / 3  # of the markers: what surely touches
 
@@ -26,11 +26,11 @@ class FieldTrial:
     displacement_px: Float[np.ndarray, "_ _ 2"]
     """Displacement from T_0, by frame and marker; NaN where a marker was not followed."""
     hold: int
-    """Last frame before the pull: slip is told by what moves from there, not from T_0."""
+    """Last frame before the pull, from which the motion of a slip is measured."""
 
     def __post_init__(self) -> None:
         if len(self.rest_px) < _FEWEST:
-            raise InputError(f"{len(self.rest_px)} markers are too few to tell slip, at least {_FEWEST} are needed")
+            raise InputError(f"{len(self.rest_px)} markers are too few to detect slip, at least {_FEWEST} are needed")
         if self.displacement_px.shape[1:] != self.rest_px.shape:
             raise InputError(
                 f"{len(self.rest_px)} markers at rest but displacements of {self.displacement_px.shape[1]}; give both "
@@ -44,33 +44,33 @@ class FieldTrial:
 
     @property
     def increment_px(self) -> Float[np.ndarray, "frames markers 2"]:
-        """Displacement since the end of normal loading; what came before it counts as none."""
+        """Displacement since the hold; 0 before."""
         moved = self.displacement_px - self.displacement_px[self.hold]
         moved[: self.hold] = np.where(np.isnan(moved[: self.hold]), np.nan, 0.0)
         return moved
 
     @property
     def spread(self) -> Float[np.ndarray, " frames"]:
-        """Divergence of the field since T_0, in pixels per pixel: how far the skin is pressed apart."""
+        """Divergence of the field since T_0, in pixels per pixel: how much the skin is stretched."""
         return affine_parts(self.rest_px, self.displacement_px)[:, 2]
 
     @property
     def inner(self) -> Bool[np.ndarray, " markers"]:
-        """The third of the markers nearest to where pressing moved nothing: what touches for sure."""
+        """Third of the markers nearest to the fixed point of the press: these surely touch."""
         return _ring(self.rest_px, self.displacement_px[self.hold], 0.0, INNER_SHARE)
 
     @property
     def outer(self) -> Bool[np.ndarray, " markers"]:
-        """The next third: the edge of the contact."""
+        """Next third: the edge of the contact."""
         return _ring(self.rest_px, self.displacement_px[self.hold], INNER_SHARE, 2 * INNER_SHARE)
 
 
 def _ring(
     rest_px: Float[np.ndarray, "markers 2"], pressed_px: Float[np.ndarray, "markers 2"], low: float, high: float
 ) -> Bool[np.ndarray, " markers"]:
-    """Markers between two shares of all, ranked by their distance from where pressing moved nothing.
+    """Select markers between two shares of all, ranked by their distance from the fixed point of the press.
 
-    That is told by the affine fit; the middle of the markers stands for it where the fit says nothing.
+    It is estimated by the affine fit, and is the middle of the markers where the skin is not stretched.
     """
     parts = affine_parts(rest_px, pressed_px[None])
     [rank] = rank_from_centre(rest_px[None], mean_px=parts[:, :2], divergence=parts[:, 2])
@@ -100,11 +100,11 @@ def rank_from_centre(
 def affine_parts(
     rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]
 ) -> Float[np.ndarray, "frames 6"]:
-    """Least-squares parts of a field: mean x and y, divergence, curl, and the two parts of pure shear.
+    """Compute the least-squares parts of a field: mean x and y, divergence, curl, and the two parts of pure shear.
 
     The Helmholtz-Hodge decomposition of an affine field: its source-free, its curl-free and its harmonic part (a shift
     and a deviator), about the middle of the markers. Means are in pixels, the rest in pixels per pixel; NaN where fewer
-    than 3 markers are known.
+    than 3 markers are followed.
 
     References
     ----------
@@ -122,32 +122,32 @@ def affine_parts(
     """
     offset = rest_px - rest_px.mean(axis=0)
     terms = np.concatenate([np.ones((len(offset), 1)), offset], axis=1)
-    known = np.all(np.isfinite(displacement_px), axis=-1)
-    weighted = terms[None] * known[..., None]
+    followed = np.all(np.isfinite(displacement_px), axis=-1)
+    weighted = terms[None] * followed[..., None]
     normal = np.swapaxes(weighted, 1, 2) @ terms + 1e-9 * np.eye(3)
-    fit = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ np.where(known[..., None], displacement_px, 0))
+    fit = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2) @ np.where(followed[..., None], displacement_px, 0))
     (mean_x, mean_y), (xx, yx), (xy, yy) = (fit[:, row].T for row in range(3))
     parts = np.stack([mean_x, mean_y, xx + yy, yx - xy, xx - yy, xy + yx], axis=1)
-    return np.where(known.sum(axis=1)[:, None] >= 3, parts, np.nan)
+    return np.where(followed.sum(axis=1)[:, None] >= 3, parts, np.nan)
 
 
 def find_hold(rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]) -> int:
-    """Find the last frame before the pull, in the whole trial: what `find_holds` says when all frames are seen."""
+    """Find the last frame before the pull of a whole trial."""
     return int(find_holds(rest_px, displacement_px)[-1])
 
 
 def find_holds(
     rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]
 ) -> Int[np.ndarray, " frames"]:
-    """Last frame before the pull as each frame knows it, from itself and those before it.
+    """Find the last frame before the pull, for each frame from itself and those before it.
 
-    It is pressed, and the inner markers have not yet moved by 0.2 px on average. Pressing ends where the divergence
-    first comes to nine tenths of the largest so far; where there was none yet the first frame is the hold.
+    The sensor is pressed then, and the inner markers have not yet moved by 0.2 px on average. Pressing ends where the
+    divergence first reaches nine tenths of the largest so far; before any press the first frame is the hold.
     """
     parts = affine_parts(rest_px, displacement_px)
     spread = np.nan_to_num(parts[:, 2], nan=-np.inf)
     largest, frames = np.maximum.accumulate(spread), np.arange(len(spread))
-    settled = np.array([int(np.argmax(spread >= _PRESSED_SHARE * one)) for one in largest])
+    settled = np.array([int(np.argmax(spread >= _PRESSED_SHARE * level)) for level in largest])
     holds = np.zeros(len(spread), dtype=np.int64)
     for first in np.unique(settled[largest > 0]):
         inner = _ring(rest_px, displacement_px[first], 0.0, INNER_SHARE)
@@ -160,25 +160,25 @@ def find_holds(
 
 
 def field_trial(tracks: Tracks, *, hold: int | None = None) -> FieldTrial:
-    """Displacements of a tracked trial, its hold found by `find_hold` if it is not given."""
-    kept = tracks.from_reference
-    rest, displacement = tracks.rest_px[kept], tracks.displacement_px[:, kept]
+    """Select the displacements of a tracked trial; its hold is found by `find_hold` if None."""
+    chosen = tracks.from_reference
+    rest, displacement = tracks.rest_px[chosen], tracks.displacement_px[:, chosen]
     hold = find_hold(rest, displacement) if hold is None else hold
     return FieldTrial(rest_px=rest, displacement_px=displacement, hold=hold)
 
 
 _BINS, _BIN_PX = 48, 0.25
 _STILL_PX = 0.05
-"""Added where a motion is divided by: half the noise of a marker."""
+"""Added to motions in a denominator: half the noise of a marker."""
 
 
 def mean_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    """Mean motion of all markers since the hold, in pixels."""
+    """Compute the mean motion of all markers since the hold, in pixels."""
     return np.linalg.norm(_mean(trial.increment_px), axis=-1)[:, None]
 
 
 def shear_over_divergence(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    """Mean motion over divergence, in pixels; divided by a tenth of the trial's largest divergence at least."""
+    """Compute the mean motion over divergence, in pixels; at least a tenth of the trial's largest divergence counts."""
     return mean_shear(trial) / _pressed(trial, np.nanmax(trial.spread))[:, None]
 
 
@@ -189,33 +189,33 @@ def _pressed(trial: FieldTrial, largest: np.ndarray | float) -> Float[np.ndarray
 def causal(
     motion: Callable[[FieldTrial], Float[np.ndarray, "frames features"]],
 ) -> Callable[[FieldTrial], Float[np.ndarray, "frames features"]]:
-    """A motion since the hold, over divergence, of which each frame knows no later one.
+    """Return a causal feature: a motion since the hold, over divergence, from a frame and those before it.
 
-    `motion` must say of a frame what it and the hold tell; the hold is that of `find_holds`, and the divergence to
-    divide by is no less than a tenth of the largest so far.
+    `motion` must depend on its frame and the hold alone; the hold is that of `find_holds`, and the divergence is at
+    least a tenth of the largest so far.
     """
 
     def values(trial: FieldTrial) -> Float[np.ndarray, "frames features"]:
         holds = find_holds(trial.rest_px, trial.displacement_px)
-        found = np.empty((len(trial), 1))
+        moved = np.empty((len(trial), 1))
         for hold in np.unique(holds):
-            found[holds == hold] = motion(replace(trial, hold=int(hold)))[holds == hold]
-        return found / _pressed(trial, np.fmax.accumulate(trial.spread))[:, None]
+            moved[holds == hold] = motion(replace(trial, hold=int(hold)))[holds == hold]
+        return moved / _pressed(trial, np.fmax.accumulate(trial.spread))[:, None]
 
     return values
 
 
 def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
-    """Largest, and root mean square, distance of the contact's markers from a rigid motion t + w x r, in pixels.
+    """Compute the largest and rms distance of the contact's markers from a rigid motion t + w x r, in pixels.
 
     Dong, Ma, Donlon and Rodriguez, *Maintaining Grasps within Slipping Bounds by Monitoring Incipient Slip*, ICRA 2019.
     """
-    # the paper looks at the largest alone; one bad marker moves the root mean square less
+    # the paper uses the largest alone; a bad marker moves the root mean square less
     distance = _from_rigid(trial, trial.inner | trial.outer)
-    known = np.isfinite(distance).any(axis=1)
+    tracked = np.isfinite(distance).any(axis=1)
     largest, rms = np.full(len(trial), np.nan), np.full(len(trial), np.nan)
-    largest[known] = np.nanmax(distance[known], axis=1)
-    rms[known] = np.sqrt(np.nanmean(distance[known] ** 2, axis=1))
+    largest[tracked] = np.nanmax(distance[tracked], axis=1)
+    rms[tracked] = np.sqrt(np.nanmean(distance[tracked] ** 2, axis=1))
     return np.stack([largest, rms], axis=1)
 
 
@@ -226,32 +226,32 @@ def stick_area(trial: FieldTrial, *, tolerance_px: float) -> Float[np.ndarray, "
     """
     distance = _from_rigid(trial, trial.inner)
     contact = trial.inner | trial.outer
-    known = np.isfinite(distance) & contact
-    count = known.sum(axis=1)
-    share = ((distance < tolerance_px) & known).sum(axis=1) / np.maximum(count, 1)
+    tracked = np.isfinite(distance) & contact
+    count = tracked.sum(axis=1)
+    share = ((distance < tolerance_px) & tracked).sum(axis=1) / np.maximum(count, 1)
     return np.where(count > 0, share, np.nan)[:, None]
 
 
 def displacement_entropy(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
-    """Entropy H = -sum p ln p of the histogram of motions since the hold, and its change to the next frame.
+    """Compute the entropy H = -sum p ln p of the histogram of motions since the hold, and its change by frame.
 
     Yuan, Li, Srinivasan and Adelson, *Measurement of Shear and Slip with a GelSight Tactile Sensor*, ICRA 2015; for the
     rate Hu et al., *Learning to Detect Slip through Tactile Estimation of the Contact Force Field and its Entropy*,
     arXiv:2303.00935.
     """
-    # the last one open: a width taken from the trial's own largest motion would tell of frames that are still to come
+    # the last bin is open: a width chosen from the trial's largest motion would depend on later frames
     bins = np.minimum(np.linalg.norm(trial.increment_px, axis=-1) / _BIN_PX, _BINS - 1)
     entropy = np.full(len(trial), np.nan)
     for frame, row in enumerate(bins):
-        known = row[np.isfinite(row)].astype(int)
-        if len(known):
-            share = np.bincount(known, minlength=_BINS) / len(known)
+        binned = row[np.isfinite(row)].astype(int)
+        if len(binned):
+            share = np.bincount(binned, minlength=_BINS) / len(binned)
             entropy[frame] = -np.sum(share[share > 0] * np.log(share[share > 0]))
     return np.stack([entropy, np.diff(entropy, prepend=entropy[:1])], axis=1)
 
 
 def edge_over_centre(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
-    """Motion of the contact's edge over that of its middle since the hold, and the motion of the middle in pixels.
+    """Compute the motion of the contact's edge over that of its middle since the hold, and the latter in pixels.
 
     Khamis, Albero, Salerno, Idil, Loizou and Redmond, *PapillArray: An incipient slip sensor for dexterous robotic or
     prosthetic manipulation*, Sensors and Actuators A 2018.
@@ -265,7 +265,7 @@ def edge_over_centre(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
 
 
 def helmholtz_hodge(trial: FieldTrial) -> Float[np.ndarray, "frames 8"]:
-    """Divergence and curl since T_0; all parts of the motion since the hold, that of the middle, and their ratio."""
+    """Compute divergence and curl since T_0, the parts and the middle of the motion since the hold, and a ratio."""
     whole, since = (affine_parts(trial.rest_px, field) for field in (trial.displacement_px, trial.increment_px))
     inner = np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=-1)
     scale = float(np.linalg.norm(trial.rest_px - trial.rest_px.mean(axis=0), axis=1).max())
@@ -277,28 +277,28 @@ def helmholtz_hodge(trial: FieldTrial) -> Float[np.ndarray, "frames 8"]:
 
 
 def _from_rigid(trial: FieldTrial, fitted: Bool[np.ndarray, " markers"]) -> Float[np.ndarray, "frames markers"]:
-    """Distance of each motion since the hold from the small rigid motion that fits some markers best."""
+    """Compute the distance of each motion since the hold from the best-fitting small rigid motion of some markers."""
     moved, place = trial.increment_px, trial.rest_px + trial.displacement_px[trial.hold]
-    known = np.all(np.isfinite(moved), axis=-1) & np.all(np.isfinite(place), axis=-1)
-    used = known & fitted
+    tracked = np.all(np.isfinite(moved), axis=-1) & np.all(np.isfinite(place), axis=-1)
+    used = tracked & fitted
     count = np.maximum(used.sum(axis=1), 1)[:, None]
     place = np.where(np.isfinite(place), place, 0)
     middle = (used[..., None] * place).sum(axis=1) / count
     shift = np.where(used[..., None], moved, 0).sum(axis=1) / count
     arm = place[None] - middle[:, None]
-    rest = np.where(known[..., None], moved, 0) - shift[:, None]
+    rest = np.where(tracked[..., None], moved, 0) - shift[:, None]
     turn = (used * (arm[..., 0] * rest[..., 1] - arm[..., 1] * rest[..., 0])).sum(axis=1)
     turn = turn / np.maximum((used * (arm**2).sum(axis=-1)).sum(axis=1), 1e-9)
-    left = rest - turn[:, None, None] * np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
-    distance = np.linalg.norm(left, axis=-1)
-    return np.where(known & (used.sum(axis=1) >= 2)[:, None], distance, np.nan)
+    residual = rest - turn[:, None, None] * np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
+    distance = np.linalg.norm(residual, axis=-1)
+    return np.where(tracked & (used.sum(axis=1) >= 2)[:, None], distance, np.nan)
 
 
 def _mean(values: Float[np.ndarray, "frames markers axes"]) -> Float[np.ndarray, "frames axes"]:
-    """Mean over the markers that are known; NaN where none is."""
-    known = np.all(np.isfinite(values), axis=-1)
-    count = known.sum(axis=1)[:, None]
-    total = np.where(known[..., None], values, 0).sum(axis=1)
+    """Compute the mean over the followed markers; NaN without any."""
+    tracked = np.all(np.isfinite(values), axis=-1)
+    count = tracked.sum(axis=1)[:, None]
+    total = np.where(tracked[..., None], values, 0).sum(axis=1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
@@ -309,23 +309,20 @@ _TOLERANCES_PX = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5)
 Margins: TypeAlias = Float[np.ndarray, " frames"]
 Trials: TypeAlias = Sequence[FieldTrial]
 Reader: TypeAlias = Callable[[FieldTrial], Margins]
-"""Reads the margin of each frame; not finite where the field tells nothing."""
+"""Estimates the margin of each frame; not finite where the field has no information."""
 
 
 @final
 class MarginEstimator:
-    """Reads the safety margin of every frame of a trial, after it was fitted on others."""
+    """Estimator of the safety margin of every frame of a trial, fitted on other trials."""
 
     def __init__(self, learn: Callable[[Trials, Margins], Reader]) -> None:
         self._learn = learn
         self._fitted: tuple[Reader, float] | None = None
 
     def fit(self, trials: Trials, margins: Sequence[Float[np.ndarray, " _"]]) -> "MarginEstimator":
-        """Fit on training trials; gives itself.
-
-        `margins`: safety margin of each frame of each trial, in [0, 1]; NaN where there is no label.
-        """
-        if len(trials) != len(margins) or any(len(one) != len(own) for one, own in zip(trials, margins, strict=False)):
+        """Fit on training trials and the margin of each of their frames, in [0, 1] or NaN; gives the estimator."""
+        if len(trials) != len(margins) or any(map(lambda trial, labels: len(trial) != len(labels), trials, margins)):
             raise InputError("trials and margins do not match; give a margin for every frame of every trial")
         labels = np.concatenate([*margins, np.zeros(0)])
         if not np.isfinite(labels).any():
@@ -334,7 +331,7 @@ class MarginEstimator:
         return self
 
     def estimate(self, trial: FieldTrial) -> Margins:
-        """Safety margin of each frame, in [0, 1]; the training mean where the field tells nothing."""
+        """Estimate the safety margin of each frame, in [0, 1]; the training mean without information."""
         if self._fitted is None:
             raise InputError("the estimator was not fitted; call fit with training trials first")
         read, mean = self._fitted
@@ -346,7 +343,7 @@ def _bounded(margin: Margins, mean: float) -> Margins:
 
 
 def _usable(labels: Margins, features: Float[np.ndarray, "frames features"]) -> Bool[np.ndarray, " frames"]:
-    """Labelled frames whose field tells something."""
+    """Select labelled frames with finite features."""
     usable = np.isfinite(labels) & np.all(np.isfinite(features), axis=1)
     if not usable.any():
         raise InputError("no labelled frame of the training trials has a field; follow more markers")
@@ -354,33 +351,35 @@ def _usable(labels: Margins, features: Float[np.ndarray, "frames features"]) -> 
 
 
 def _learn_mean(_: Trials, labels: Margins) -> Reader:
-    """The mean margin of the training frames: what a reader without any touch would say."""
+    """Learn the mean margin of the training frames, as an estimate without touch."""
     return lambda trial: np.full(len(trial), np.nanmean(labels))
 
 
 def _learn_features(features: Callable[[FieldTrial], np.ndarray], trials: Trials, labels: Margins) -> Reader:
-    """Ridge regression of the margin on a few numbers of the field, their squares and products."""
+    """Learn a ridge regression of the margin on features of the field, their squares and products."""
     values, mean = np.concatenate([features(trial) for trial in trials]), np.nanmean(labels)
     usable = _usable(labels, values)
     middle, scale = values[usable].mean(axis=0), values[usable].std(axis=0) + 1e-9
     rows, columns = np.triu_indices(values.shape[1])
 
     def terms(values: np.ndarray) -> np.ndarray:
-        # what lies far outside the training frames is taken for their border
+        # features far outside the training frames are clipped to their border
         unit = np.clip((values - middle) / scale, -5, 5)
         return np.concatenate([np.ones((len(unit), 1)), unit, unit[:, rows] * unit[:, columns]], axis=1)
 
-    known = terms(values[usable])
-    normal = known.T @ known / len(known) + _RIDGE * np.eye(known.shape[1])
-    weights = np.linalg.solve(normal, known.T @ (labels[usable] - mean) / len(known))
+    rows_used = terms(values[usable])
+    normal = rows_used.T @ rows_used / len(rows_used) + _RIDGE * np.eye(rows_used.shape[1])
+    weights = np.linalg.solve(normal, rows_used.T @ (labels[usable] - mean) / len(rows_used))
     return lambda trial: mean + terms(features(trial)) @ weights
 
 
 def _learn_stick_area(trials: Trials, labels: Margins) -> Reader:
-    """A quadratic in Sui's share of markers that stick, its tolerance chosen on the training trials."""
+    """Learn a quadratic in Sui's share of sticking markers, its tolerance chosen on the training trials."""
     # the relation depends on the contact's shape: for a sphere the area ratio is Gamma^(2/3)
     mean = float(np.nanmean(labels))
-    readers = [_learn_features(partial(stick_area, tolerance_px=one), trials, labels) for one in _TOLERANCES_PX]
+    readers = [
+        _learn_features(partial(stick_area, tolerance_px=tolerance), trials, labels) for tolerance in _TOLERANCES_PX
+    ]
     answers = [_bounded(np.concatenate([read(trial) for trial in trials]), mean) for read in readers]
     return readers[int(np.argmin([np.nanmean((answer - labels) ** 2) for answer in answers]))]
 
@@ -388,7 +387,7 @@ def _learn_stick_area(trials: Trials, labels: Margins) -> Reader:
 def _learn_eccentricity(
     eccentricity: Callable[[FieldTrial], Float[np.ndarray, "frames 1"]], trials: Trials, labels: Margins
 ) -> Reader:
-    """Ikeda's eccentricity e = delta_t / a: how far the contact's middle has moved, for how far it is pressed.
+    """Learn from Ikeda's eccentricity e = delta_t / a: motion of the contact's middle over its indentation.
 
     Gamma = (1 - delta_t / delta_full)^1.5 for a sphere, with delta_full = mu (2 - nu) delta / (2 (1 - nu)): full slip
     begins when the tangential displacement of the stuck middle reaches a multiple of the indentation delta, which for a
@@ -433,13 +432,13 @@ _ROWS: dict[str, Callable[[Trials, Margins], Reader]] = {
     "helmholtz-hodge": partial(_learn_features, helmholtz_hodge),
 }
 ESTIMATORS = Table("estimator", "sliplens.estimators", _ROWS)
-"""What each estimator learns from trials and their margins: the first four trivial, the others named for papers.
+"""Fits of each estimator to trials and their margins: the first four trivial, the others named after papers.
 
-What is causal says of a frame what it and those before it tell; the others need the hold of the trial as a whole."""
+Causal ones use a frame and those before it; the others need the hold of the whole trial."""
 
 
 def get_estimator(name: str) -> MarginEstimator:
-    """Unfitted estimator of a name, a row of `ESTIMATORS`."""
+    """Create an unfitted estimator, a row of `ESTIMATORS`."""
     return MarginEstimator(ESTIMATORS.pick(name))
 
 

@@ -1,4 +1,4 @@
-"""The gel in a camera's frames: where it is, what its markers are, and the sensor profile that follows."""
+"""Detection of the gel and the markers in a camera's frames, and the sensor profile that follows."""
 
 from dataclasses import dataclass
 from itertools import islice
@@ -16,30 +16,30 @@ from sliplens.recordings.formats.video import count_stale, small_copies
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import Frames, open_source
 
-_LOOKED_AT = 300  # frames of the beginning
+_FIRST_FRAMES = 300  # that are searched for the untouched sensor
 _EVERY = 10
 _BRIGHTER = 2.0  # a lit gel against what surrounds it
 _SURROUND = 0.03, 0.9  # shares of the frame that may be dark around a gel
-_REACH = 0.75  # of the markers' spacing, that the gel reaches beyond the outermost of them
+_REACH = 0.75  # of the markers' spacing, by which the gel extends beyond the outermost of them
 _SMALL_SHARE = 80  # the least marker is this part of the shorter side
 _COLOURED = 40.0  # grey levels between the channels of a coloured marker against its background
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorProposal:
-    """A profile that a recording suggests, with what it was read from."""
+    """A sensor profile proposed from a recording, with its evidence."""
 
     profile: SensorProfile
     frame: UInt8[np.ndarray, "height width 3"]
     """Frame of the camera, from the still beginning."""
     gel_px: tuple[int, int, int, int]
-    """Left, top, width and height of what is lit or has markers, in the camera's frame."""
+    """Left, top, width and height of the lit part with markers, in the camera's frame."""
     markers_px: Float[np.ndarray, "markers 2"]
-    """Markers in the camera's frame, (x, y); none where none were found."""
+    """Markers in the camera's frame, (x, y)."""
     spacing_px: float
-    """Median distance of a marker to the next in frames as the profile makes them, in pixels; NaN without markers."""
+    """Median distance of a marker to the next in the profile's frames, in pixels; NaN without markers."""
     notes: tuple[str, ...]
-    """What was found and what was assumed, a sentence each."""
+    """Findings and assumptions, a sentence each."""
 
 
 def propose_profile(
@@ -47,8 +47,8 @@ def propose_profile(
 ) -> SensorProposal:
     """Propose the profile of a sensor from a recording that begins untouched.
 
-    The gel is the largest part of the frame that is lit, cut down to where the markers are. The proposal is to be
-    looked at: turns, mirror images, the lens and the axes of a force sensor cannot be seen in frames.
+    The gel is the largest lit part of the frame, cropped to the markers. Check the proposal by eye: frames do not show
+    turns, mirror images, the lens and the axes of a force sensor.
 
     Parameters
     ----------
@@ -57,14 +57,14 @@ def propose_profile(
     name
         Name of the sensor.
     network
-        Network that is to read the frames, kept in the profile.
+        Network for the frames, named in the profile.
     size_px
-        Width and height of the frames it was trained on; None to leave the gel in the camera's resolution.
+        Width and height of the frames it was trained on; None keeps the camera's resolution.
 
     Raises
     ------
     InputError
-        If the source cannot be read, or nothing can be told from its frames.
+        If the source cannot be read, or its frames show no gel.
 
     Examples
     --------
@@ -77,21 +77,21 @@ def propose_profile(
     """
     capture, *others = open_source(Path(source) if isinstance(source, str) else source)
     # a camera that was just started hands out frames of another moment
-    untouched = count_stale(small_copies(islice(capture.read_frames(), _LOOKED_AT)))
-    first = islice(capture.read_frames(), untouched, untouched + _LOOKED_AT, _EVERY)
-    looked, (height, width) = np.stack(list(first)), capture.frame_size
-    frame = looked[0]
-    bright = looked.max(axis=-1).mean(axis=0)
+    untouched = count_stale(small_copies(islice(capture.read_frames(), _FIRST_FRAMES)))
+    first = islice(capture.read_frames(), untouched, untouched + _FIRST_FRAMES, _EVERY)
+    frames, (height, width) = np.stack(list(first)), capture.frame_size
+    frame = frames[0]
+    bright = frames.max(axis=-1).mean(axis=0)
     if bright.max() < 16:
-        raise ImageError(f"the first frames of {capture.source} are black; name a recording whose lamps are on")
-    notes = [f"read from {capture.source}, {len(looked)} of its first frames"]
+        raise ImageError(f"the first frames of {capture.source} are black; give a recording with the lamps on")
+    notes = [f"read from {capture.source}, {len(frames)} of its first frames"]
     if others:
-        notes.append(f"{len(others) + 1} trials are there; the first was looked at")
+        notes.append(f"{len(others) + 1} trials are there; the first was used")
     lit = _lit_box(bright)
     notes.append(
-        "the whole frame is lit, so that nothing was cut off by its brightness"
+        "the whole frame is lit, so it was not cropped by brightness"
         if lit == (0, 0, width, height)
-        else f"lit are {lit[2]} x {lit[3]} pixels from ({lit[0]}, {lit[1]}) on"
+        else f"{lit[2]} x {lit[3]} pixels from ({lit[0]}, {lit[1]}) on are lit"
     )
     kind, places, spacing = _find_markers(frame, lit)
     gel = lit
@@ -100,14 +100,14 @@ def propose_profile(
         gel = _within((low[0], low[1], high[0] + 1, high[1] + 1), lit)
         notes.append(f"{len(places)} markers of kind {kind}, {spacing:.1f} pixels apart")
     else:
-        notes.append("no markers were found; name their kind in `markers` if there are any")
+        notes.append("no markers were found; set their kind in `markers` if there are any")
     crop = gel if size_px is None else _shaped(gel, size_px, (width, height))
     if crop is None:
-        raise InputError(f"a gel of {gel[2]} x {gel[3]} pixels is too small to be read; film it nearer")
+        raise InputError(f"a gel of {gel[2]} x {gel[3]} pixels is too small; move the camera nearer")
     factor = 1.0 if size_px is None else size_px[0] / crop[2]
     notes += [
-        f"frame {untouched} is taken for the untouched sensor; change reference_frame if it was touched then",
-        "check by eye: rotate_deg, flip and colours; lens, force axes and pull_direction_deg cannot be seen in frames",
+        f"frame {untouched} is taken as the untouched sensor; change reference_frame if it was touched then",
+        "check by eye: rotate_deg, flip and colours; frames do not show lens, force axes and pull_direction_deg",
     ]
     profile = SensorProfile(
         name=name,
@@ -124,12 +124,12 @@ def propose_profile(
 
 
 def _lit_box(bright: Float[np.ndarray, "height width"]) -> tuple[int, int, int, int]:
-    """Left, top, width and height of the largest lit part; the whole frame where nothing around it is dark."""
+    """Find left, top, width and height of the largest lit part; the whole frame if its border is not dark."""
     cv2 = import_cv2()
     height, width = bright.shape
     soft = cv2.GaussianBlur(bright.astype(np.float32), (0, 0), max(1.0, min(height, width) / 100))
     level, lit = cv2.threshold(soft.clip(0, 255).astype(np.uint8), 0, 1, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    # markers are holes in what is lit: closed before its extent is measured
+    # markers are holes in the lit part, closed before its extent is measured
     side = 2 * (min(height, width) // 16) + 1
     lit = cv2.morphologyEx(np.pad(lit, side), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))[side:-side, side:-side]
     dark, inside = bright[lit == 0], bright[lit == 1]
@@ -140,28 +140,28 @@ def _lit_box(bright: Float[np.ndarray, "height width"]) -> tuple[int, int, int, 
     if not apart or not low < len(dark) / bright.size < high or np.mean(border == 0) < 0.25:
         return 0, 0, width, height
     _, _, stats, _ = cv2.connectedComponentsWithStats(lit)
-    left, top, across, down = stats[1 + np.argmax(stats[1:, cv2.CC_STAT_AREA]), :4].tolist()
-    return left, top, across, down
+    x, y, across, down = stats[1 + np.argmax(stats[1:, cv2.CC_STAT_AREA]), :4].tolist()
+    return x, y, across, down
 
 
 def marker_spacing(frame: Frame) -> float:
-    """Median distance of a marker to the next, in pixels; NaN where no pattern of markers is found."""
+    """Measure the median distance of a marker to the next, in pixels; NaN without a pattern of markers."""
     return _find_markers(frame, (0, 0, frame.shape[1], frame.shape[0]))[2]
 
 
 def _find_markers(
     frame: Frame, lit: tuple[int, int, int, int]
 ) -> tuple[str | None, Float[np.ndarray, "markers 2"], float]:
-    """Kind, places and spacing of the markers; none where too few are found, or they do not make a pattern."""
-    left, top, across, down = lit
-    part = frame[top : top + down, left : left + across]
+    """Find kind, places and spacing of the markers; None and NaN where they form no pattern."""
+    x, y, across, down = lit
+    part = frame[y : y + down, x : x + across]
     low = max(2.0, min(across, down) / _SMALL_SHARE)
     sized = MarkerKind(name="auto", contrasts=("dark", "light", "colour"), radius_px=(low, max(40.0, low + 1)))
     try:
-        found = detect_markers(part, sized)
+        markers = detect_markers(part, sized)
     except ImageError:
         return None, np.empty((0, 2)), np.nan
-    centres = found.centre_px[found.whole & (found.roundness > 0.6)]
+    centres = markers.centre_px[markers.whole & (markers.roundness > 0.6)]
     if len(centres) < FEWEST + 2:
         return None, np.empty((0, 2)), np.nan
     distance = KDTree(centres).query(centres, k=2)[0][:, 1]
@@ -170,11 +170,11 @@ def _find_markers(
     centres = centres[(distance > 0.6 * spacing) & (distance < 1.7 * spacing)]
     if len(centres) < FEWEST + 2:
         return None, np.empty((0, 2)), np.nan
-    return _kind(part, centres, found.appearance), centres + np.array([left, top]), spacing
+    return _kind(part, centres, markers.appearance), centres + np.array([x, y]), spacing
 
 
 def _kind(part: Frame, centres: Float[np.ndarray, "markers 2"], look: Appearance) -> str:
-    """Row of `KINDS` that markers of such a look belong to."""
+    """Choose the row of `KINDS` for markers of an appearance."""
     at = centres.round().astype(int)
     inside = np.median(part[at[:, 1], at[:, 0]].astype(float), axis=0)
     change = inside - np.median(part.reshape(-1, 3).astype(float), axis=0)
@@ -184,25 +184,24 @@ def _kind(part: Frame, centres: Float[np.ndarray, "markers 2"], look: Appearance
 
 
 def _within(box: tuple[float, float, float, float], lit: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """Left, top, width and height of what of a box (left, top, right, bottom) is lit."""
-    left, top = max(lit[0], int(np.floor(box[0]))), max(lit[1], int(np.floor(box[1])))
+    """Crop a box (left, top, right, bottom) to the lit one, as left, top, width and height."""
+    x, y = max(lit[0], int(np.floor(box[0]))), max(lit[1], int(np.floor(box[1])))
     right = min(lit[0] + lit[2], int(np.ceil(box[2])))
     bottom = min(lit[1] + lit[3], int(np.ceil(box[3])))
-    return left, top, right - left, bottom - top
+    return x, y, right - x, bottom - y
 
 
 def _shaped(
     gel: tuple[int, int, int, int], size_px: tuple[int, int], frame: tuple[int, int]
 ) -> tuple[int, int, int, int] | None:
-    """Box of a shape about the middle of the gel: all of it where the frame has room, else as much as there is."""
+    """Fit a box of a shape about the middle of the gel into the frame; None where it is too small."""
     shape = size_px[0] / size_px[1]
     across = min(max(gel[2], gel[3] * shape), frame[0], frame[1] * shape)
     width, height = round(across), round(across / shape)
     if min(width, height) < 8:
         return None
-    left = round(gel[0] + (gel[2] - width) / 2)
-    top = round(gel[1] + (gel[3] - height) / 2)
-    return min(max(left, 0), frame[0] - width), min(max(top, 0), frame[1] - height), width, height
+    x, y = round(gel[0] + (gel[2] - width) / 2), round(gel[1] + (gel[3] - height) / 2)
+    return min(max(x, 0), frame[0] - width), min(max(y, 0), frame[1] - height), width, height
 
 
 __all__ = ["SensorProposal", "marker_spacing", "propose_profile"]

@@ -1,9 +1,9 @@
-"""Markers of whole sources, followed into one table."""
+"""Tracking of the markers of whole sources into one table."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 import pyarrow as pa
@@ -16,16 +16,15 @@ from sliplens.extras import import_cv2
 from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
-from sliplens.progress import OnProgress, note, number_of, report_progress, reporting
+from sliplens.progress import OnProgress, add_note, number_of, report_progress, reporting
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.sensor import SensorProfile, load_profile
-from sliplens.recordings.source import Frame, Frames, Trials, open_trials
+from sliplens.recordings.sensor import load_profile
+from sliplens.recordings.source import Frame, Frames, SourceOptions, Trials, open_trials
 from sliplens.runner import MakePart, Work, require_new_table, run_table
 
 OnTracked: TypeAlias = Callable[[Frame, TrackedFrame, Float[np.ndarray, "markers 2"]], None]
-"""Takes a frame, its markers and where they were at rest, in pixels."""
+"""Takes a frame, its markers and their places at rest, in pixels."""
 
 _ROW_GROUP = 50_000
 _NUMBERS = ("x_px", "y_px", "rest_x_px", "rest_y_px", "dx_px", "dy_px", "radius_px", "deviation_px")
@@ -42,16 +41,16 @@ _COLUMNS = {
 
 @dataclass(frozen=True, kw_only=True)
 class TrialTracking:
-    """Outcome of following the markers of one trial."""
+    """Result of tracking the markers of one trial."""
 
     trial: str
     frames: int
     markers: int
     """Whole markers of the reference frame."""
     followed_share: float
-    """Share of them that was followed, over all frames in which they were in view."""
+    """Share of them that were followed, over all frames in which they were in view."""
     lost_frames: int
-    """Frames in which no marker could be told from the next."""
+    """Frames in which markers could not be identified."""
 
     def __str__(self) -> str:
         lost = f", lost in {number_of(self.lost_frames, 'frame')}" if self.lost_frames else ""
@@ -60,11 +59,11 @@ class TrialTracking:
 
 @dataclass(frozen=True, kw_only=True)
 class Tracking:
-    """Markers followed through the trials of a source, a row for each marker of each frame."""
+    """Tracked markers of the trials of a source, a row for each marker of each frame."""
 
     trials: tuple[TrialTracking, ...]
     path: Path | None
-    """Parquet file of the rows; None where they are kept in memory."""
+    """Parquet file of the rows; None where they are in memory."""
     rows: pa.Table | None
     """The rows; None where they are in the file."""
 
@@ -77,9 +76,9 @@ class Tracking:
         """Arrow table; `.to_pandas()` where pandas is installed.
 
         Columns are `trial`, `frame`, `time_s`, `marker`, `status` (`MarkerStatus`), and in pixels, x to the right and y
-        down, `x_px`, `y_px`, `rest_x_px`, `rest_y_px`, `dx_px`, `dy_px`, `radius_px` and `deviation_px`. What is not
-        known is null: the place of a marker that was not seen, the displacement of one that was not followed, the place
-        at rest of a new one.
+        down, `x_px`, `y_px`, `rest_x_px`, `rest_y_px`, `dx_px`, `dy_px`, `radius_px` and `deviation_px`. Unknown
+        values are null: the place of a marker that was not detected, the displacement of one that was not followed, the
+        place at rest of a new one.
         """
         if self.rows is not None:
             return self.rows
@@ -91,75 +90,61 @@ def track(
     source: Path | str | Frames | Dataset | Sequence[Capture],
     *,
     markers: str = "auto",
-    reference: Path | str | Frame | None = None,
-    reference_frame: int | None = None,
-    split: str | None = None,
-    trial: str | None = None,
-    format: str | None = None,
-    options: ReadOptions | None = None,
-    sensor: SensorProfile | Path | str | None = None,
     on: str = "serial",
     retry_failed: bool = False,
     out: Path | str | None = None,
     overwrite: bool = False,
     on_tracked: OnTracked | None = None,
     on_progress: OnProgress | None = None,
+    **source_options: Unpack[SourceOptions],
 ) -> Tracking:
-    """Follow the markers of every trial of a source.
+    """Track the markers of every trial of a source.
 
     Parameters
     ----------
     source
-        Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or what `open_source` gave.
+        Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or captures of
+        `open_source`.
     markers
         Row of `KINDS`.
-    reference, reference_frame
-        The sensor untouched: image, or number of the frame that shows it. Where neither is named and the source brings
-        none, displacements count from the first frame.
-    split, trial, format, options, sensor
-        As `open_source` takes them.
+    source_options
+        `reference`, `reference_frame`, `split`, `trial`, `format`, `options` and `sensor` of `open_source`. Without a
+        reference, displacements count from the first frame.
     on, retry_failed
-        Where the trials are followed, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
-        whether those are tried again that failed three times before.
+        Where the trials are tracked, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
+        whether trials that failed three times are tried again.
     out
-        Parquet file to write; without an ending a folder, a Parquet data set with a file a trial. Whole or not at all,
-        and interrupted it goes on after its last trial; rows are kept in memory if None.
+        Parquet file to write; without a suffix a folder, a Parquet data set with a file a trial. It appears when
+        complete, and an interrupted call continues after its last trial. If None, rows stay in memory.
+    on_tracked
+        Called with each tracked frame, in this process.
 
     Raises
     ------
     InputError
-        If something named is missing or does not fit, OpenCV is missing, or one frame is all there is.
+        If the source is missing or an option does not fit, OpenCV is missing, or a trial has a single frame.
     ImageError
         If a reference frame shows fewer than 4 whole markers, or frames are of another size.
     RecordingError
         If the source cannot be read.
     PartError
-        If some of many trials failed again and again, when all others are there.
+        If some of many trials failed repeatedly, after all others are complete.
     """
     path = None if out is None else Path(out)
     if path is not None and path.suffix:
         require_new_table(path, suffix=".parquet", overwrite=overwrite)
     KINDS.pick(markers)
     import_cv2()
-    trials = open_trials(
-        source,
-        on=on,
-        resumable=path is not None,
-        reference=reference,
-        reference_frame=reference_frame,
-        split=split,
-        trial=trial,
-        format=format,
-        options=options,
-        sensor=None if sensor is None else load_profile(sensor),
-    )
-    for sentence in dict.fromkeys(words for one in trials.kinds for words in (*one.notes, *_require_movement(one))):
-        note(on_progress, sentence)
+    if (sensor := source_options.get("sensor")) is not None:
+        source_options["sensor"] = load_profile(sensor)
+    trials = open_trials(source, on=on, resumable=path is not None, **source_options)
     metadata = {"sliplens.source": trials.kinds[0].opened, "sliplens.markers": markers}
     schema = pa.schema(list(_COLUMNS.items()), metadata={"sliplens.version": __version__, **metadata})
     recipe = {**metadata, "source": trials.recipe}
     outcomes: list[TrialTracking] = []
     with reporting(on_progress):
+        for note in dict.fromkeys(note for kind in trials.kinds for note in (*kind.notes, *_require_movement(kind))):
+            add_note(note)
         _, rows = run_table(
             _Following(trials=trials, markers=markers, schema=schema, on_tracked=on_tracked),
             # a marker is followed from the first frame on: a trial is not cut
@@ -171,18 +156,18 @@ def track(
             on=on,
             retry_failed=retry_failed,
             overwrite=overwrite,
-            on_rows=lambda own: outcomes.append(_outcome(own)),
+            on_rows=lambda trial_rows: outcomes.append(_outcome(trial_rows)),
         )
     return Tracking(trials=tuple(outcomes), path=path, rows=rows)
 
 
 def _require_movement(trial: Capture) -> Iterator[str]:
-    """Refuse a trial that cannot have moved; gives what is assumed of one without a reference."""
+    """Refuse a trial of one frame without a reference; yields a note on one of several frames."""
     if trial.read_reference is not None:
         return
     if trial.frames == 1:
         raise InputError(
-            f"{trial.name} has one frame only, which cannot have moved against itself; name the untouched sensor "
+            f"{trial.name} has one frame and no reference to measure displacements from; name the untouched sensor "
             "with --reference IMAGE"
         )
     yield f"{trial.name}: no untouched frame was named, so displacements count from the first frame."
@@ -190,7 +175,7 @@ def _require_movement(trial: Capture) -> Iterator[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Following(Work):
-    """Work on whole trials: a row for each marker of each frame, as a Parquet file."""
+    """Tracking of whole trials: a Parquet file with a row for each marker of each frame."""
 
     trials: Trials
     markers: str
@@ -219,18 +204,18 @@ class _Following(Work):
 
 
 def _outcome(rows: pa.Table) -> TrialTracking:
-    """Outcome of a trial from its rows."""
+    """Summarise a trial from its rows."""
     frame = rows["frame"].to_numpy()
     status = rows["status"].combine_chunks().indices.to_numpy()
     whole = rows["rest_x_px"].is_valid().to_numpy()  # a marker of the reference frame
     frames, markers = int(frame[-1]) + 1, int(whole[frame == 0].sum())
-    followed, seen = (status == MarkerStatus.FOLLOWED) & whole, (status != MarkerStatus.OUTSIDE) & whole
+    followed, in_view = (status == MarkerStatus.FOLLOWED) & whole, (status != MarkerStatus.OUTSIDE) & whole
     lost = np.bincount(frame[(status == MarkerStatus.LOST) & whole], minlength=frames)
     return TrialTracking(
         trial=rows["trial"][0].as_py(),
         frames=frames,
         markers=markers,
-        followed_share=int(followed.sum()) / max(1, int(seen.sum())),
+        followed_share=int(followed.sum()) / max(1, int(in_view.sum())),
         lost_frames=int((lost == markers).sum()),
     )
 

@@ -1,4 +1,4 @@
-"""Markers followed through a trial, and the displacement field between them."""
+"""Tracked markers of a trial, and the displacement field between them."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -10,22 +10,22 @@ from sliplens.errors import InputError
 
 
 class MarkerStatus(IntEnum):
-    """Knowledge of a marker in a frame; only what was followed has a displacement."""
+    """State of a marker in a frame; only followed markers have a displacement."""
 
     UNSEEN = 0
-    """Not there yet: a marker that appears later."""
+    """A marker that appears later."""
     FOLLOWED = 1
-    """Seen, and the same as in the reference frame."""
+    """Detected, and identified with a marker of the reference frame."""
     MISSING = 2
-    """Should be in view but was not found."""
+    """Should be in view but was not detected."""
     BROKEN = 3
-    """Seen, but its size or shape has changed, or it strays from its neighbours: its centre is not to be relied on."""
+    """Detected, but changed in size or shape, or astray from its neighbours: its centre is unreliable."""
     OUTSIDE = 4
     """Cut by the edge of the frame, or beyond it."""
     LOST = 5
-    """The pattern jumped so far that no marker can be told from the next."""
+    """The pattern jumped so far that markers cannot be identified."""
     NEW = 6
-    """Seen, but not in the reference frame: it has a place and no displacement."""
+    """Detected, but not in the reference frame: it has a place and no displacement."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +33,14 @@ class TrackedFrame:
     """Markers of one frame, in the order of the reference frame, new ones after them."""
 
     position_px: Float[np.ndarray, "markers 2"]
-    """x, y; NaN where a marker was not seen whole."""
+    """x, y; NaN where a marker was not detected whole."""
     motion_px: Float[np.ndarray, "markers 2"]
     """Displacement from the place at rest; NaN of new markers too."""
     size: tuple[int, int]
     """Height and width of the picture, in pixels."""
     radius_px: Float[np.ndarray, " markers"]
     deviation_px: Float[np.ndarray, " markers"]
-    """Distance of a marker's displacement from that of the skin around it; NaN where either is not known."""
+    """Distance of a marker's displacement from that of the skin around it; NaN where either is unknown."""
     status: UInt8[np.ndarray, " markers"]
     """`MarkerStatus` of each."""
 
@@ -53,7 +53,7 @@ class Tracks:
     """Places in the reference frame T_0; NaN for markers that it does not show."""
     rest_radius_px: Float[np.ndarray, " markers"]
     position_px: Float[np.ndarray, "frames markers 2"]
-    """NaN where a marker was not seen whole."""
+    """NaN where a marker was not detected whole."""
     radius_px: Float[np.ndarray, "frames markers"]
     deviation_px: Float[np.ndarray, "frames markers"]
     status: UInt8[np.ndarray, "frames markers"]
@@ -86,7 +86,7 @@ def stack_tracks(
     rest_px: Float[np.ndarray, "markers 2"],
     rest_radius_px: Float[np.ndarray, " markers"],
 ) -> Tracks:
-    """Join the frames of a trial; markers that came later are unseen before."""
+    """Join the frames of a trial; markers that appear later are unseen before."""
     count = max(len(frame.status) for frame in frames)
 
     def padded(values: np.ndarray) -> np.ndarray:
@@ -103,7 +103,7 @@ _RIDGE = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class DisplacementField:
-    """Displacement of the skin from T_0 to T_n, told where each piece of it was at rest.
+    """Displacement of the skin from T_0 to T_n, at its places at rest.
 
     Pixel coordinates are (x, y), y down; gradients are pixels of displacement per pixel.
     """
@@ -111,11 +111,11 @@ class DisplacementField:
     x_px: Float[np.ndarray, " columns"]
     y_px: Float[np.ndarray, " rows"]
     displacement_px: Float[np.ndarray, "rows columns 2"]
-    """x and y; what `confidence` calls a guess goes on as the nearest markers do."""
+    """x and y; extrapolated from the nearest markers where `confidence` is low."""
     gradient: Float[np.ndarray, "rows columns 2 2"]
     """[..., i, j]: change of displacement i along coordinate j."""
     confidence: Float[np.ndarray, "rows columns"]
-    """1 / (1 + v), v the variance of the value over that of one marker's own, times the weight of the markers near (at
+    """1 / (1 + v), v the variance of the value over that of a single marker, times the weight of the markers near (at
     most 1): 0.5 is as good as a marker, 0 is a guess."""
 
     @property
@@ -130,7 +130,7 @@ class DisplacementField:
 
     @property
     def shear(self) -> Float[np.ndarray, "rows columns"]:
-        """Magnitude of the change of shape, sqrt((u_xx - u_yy)^2 + (u_xy + u_yx)^2): the same in any axes."""
+        """Magnitude of the change of shape, sqrt((u_xx - u_yy)^2 + (u_xy + u_yx)^2), in any axes."""
         return np.hypot(
             self.gradient[..., 0, 0] - self.gradient[..., 1, 1], self.gradient[..., 0, 1] + self.gradient[..., 1, 0]
         )
@@ -144,14 +144,14 @@ def interpolate_field(
     step_px: float = 8.0,
     reach_px: float | None = None,
 ) -> DisplacementField:
-    """Field between markers: at each point the plane that fits the displacements around it best.
+    """Interpolate displacements between markers: at each point the best-fitting plane.
 
-    Moving least squares with Gaussian weights: where the skin deforms evenly the answer is exact.
+    Moving least squares with Gaussian weights: exact where the skin deforms evenly.
 
     Parameters
     ----------
     displacement_px
-        x, y of each marker's displacement; NaN where it is not known.
+        x, y of each marker's displacement; NaN where it is unknown.
     size
         Height and width of the frame, in pixels.
     reach_px
@@ -168,7 +168,7 @@ def interpolate_field(
 
     Examples
     --------
-    A skin that is pressed apart by 1 % has that for its divergence, 0.02, everywhere:
+    Skin that is stretched by 1 % both ways has a divergence of 0.02 everywhere:
 
     >>> import numpy as np
     >>> from sliplens.markers import interpolate_field
@@ -177,15 +177,15 @@ def interpolate_field(
     >>> bool(np.allclose(field.divergence, 0.02)), bool(np.allclose(field.shear, 0))
     (True, True)
     """
-    known = np.all(np.isfinite(displacement_px), axis=1) & np.all(np.isfinite(rest_px), axis=1)
-    if known.sum() < _FEWEST:
+    followed = np.all(np.isfinite(displacement_px), axis=1) & np.all(np.isfinite(rest_px), axis=1)
+    if followed.sum() < _FEWEST:
         raise InputError(
-            f"{int(known.sum())} markers have a displacement, at least {_FEWEST} are needed for a field; "
+            f"{int(followed.sum())} markers have a displacement, at least {_FEWEST} are needed for a field; "
             "choose a frame in which more are followed"
         )
     if step_px <= 0 or (reach_px is not None and reach_px <= 0):
         raise InputError(f"the grid's step and reach must be positive, got {step_px} and {reach_px} px")
-    place, value = rest_px[known], displacement_px[known]
+    place, value = rest_px[followed], displacement_px[followed]
     if reach_px is None:
         near = np.sort(np.linalg.norm(place[:, None] - place[None], axis=-1), axis=1)[:, 1 : _FEWEST + 1]
         reach_px = 0.75 * float(np.median(near[:, -1]))
@@ -199,7 +199,7 @@ def interpolate_field(
     weight = np.exp(-(squared - squared.min(axis=1, keepdims=True)) / 2)
     terms = np.concatenate([np.ones((*weight.shape, 1)), offset], axis=-1)
     weighted = terms * weight[..., None]
-    # slopes that nothing tells are none
+    # slopes without data are zero
     normal = np.swapaxes(weighted, 1, 2) @ terms + np.diag([0.0, _RIDGE, _RIDGE])
     inverse = np.linalg.inv(normal)
     influence = inverse @ np.swapaxes(weighted, 1, 2)
