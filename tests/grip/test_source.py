@@ -9,7 +9,7 @@ from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.grip.controllers import MarginLaw
 from sliplens.grip.source import GripSource, Held, open_grip, usual_network
-from sliplens.live.contract import Pace, SourceOptions
+from sliplens.live.contract import LiveOptions, Pace
 from sliplens.live.reading import Reading, SlipState
 from sliplens.recordings.sensor import SensorProfile
 
@@ -102,14 +102,14 @@ def test_what_cannot_be_done_is_refused(source: GripSource, told):
 
 
 def test_a_gripper_is_named_with_what_it_holds():
-    gripper = open_grip("grip:egg", SourceOptions(rate_hz=10.0))
+    gripper = open_grip("grip:egg", LiveOptions(rate_hz=10.0))
     assert gripper is not None
     assert gripper.name == "a simulated gripper (egg)"
-    assert open_grip("gripper.mp4", SourceOptions(speed=2.0)) is None
+    assert open_grip("gripper.mp4", LiveOptions(speed=2.0)) is None
     with pytest.raises(InputError, match="there is no object named 'anvil'"):
-        open_grip("grip:anvil", SourceOptions())
+        open_grip("grip:anvil", LiveOptions())
     with pytest.raises(InputError, match="the simulated gripper takes no --speed"):
-        open_grip("grip", SourceOptions(speed=2.0))
+        open_grip("grip", LiveOptions(speed=2.0))
 
 
 @pytest.mark.parametrize(

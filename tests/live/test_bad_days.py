@@ -19,7 +19,7 @@ from PIL import Image
 import sliplens as sl
 from sliplens.errors import ImageError, InputError, RecordingError, SourceError
 from sliplens.images import write_png
-from sliplens.live import FolderSource, SourceOptions, StreamSource, list_cameras, loop, open_live, sources
+from sliplens.live import FolderSource, LiveOptions, StreamSource, list_cameras, loop, open_live, sources
 from sliplens.live.camera import FrameDecoder
 from sliplens.live.contract import LiveSource
 from sliplens.live.reading import LiveFrame, Reading
@@ -482,16 +482,16 @@ def test_a_camera_keeps_the_stamps_and_numbers_of_the_kernel(driver: FakeDriver)
 @pytest.mark.parametrize(
     ("options", "chosen", "size"),
     [
-        (SourceOptions(), (480, 640, "MJPG"), (480, 640)),
-        (SourceOptions(size=(96, 128)), (96, 128, "MJPG"), (96, 128)),
-        (SourceOptions(size=(240, 320)), (480, 640, "MJPG"), (240, 320)),  # decoded scaled down
-        (SourceOptions(fit_size=(240, 320)), (480, 640, "MJPG"), (240, 320)),
-        (SourceOptions(fit_size=(224, 224)), (480, 640, "MJPG"), (480, 640)),  # of another shape: the network says so
-        (SourceOptions(pixel_format="YUYV", size=(480, 640)), (480, 640, "YUYV"), (480, 640)),
+        (LiveOptions(), (480, 640, "MJPG"), (480, 640)),
+        (LiveOptions(size=(96, 128)), (96, 128, "MJPG"), (96, 128)),
+        (LiveOptions(size=(240, 320)), (480, 640, "MJPG"), (240, 320)),  # decoded scaled down
+        (LiveOptions(fit_size=(240, 320)), (480, 640, "MJPG"), (240, 320)),
+        (LiveOptions(fit_size=(224, 224)), (480, 640, "MJPG"), (480, 640)),  # of another shape: the network says so
+        (LiveOptions(pixel_format="YUYV", size=(480, 640)), (480, 640, "YUYV"), (480, 640)),
     ],
 )
 def test_the_mode_of_a_camera_suits_the_wishes(
-    driver: FakeDriver, options: SourceOptions, chosen: tuple[int, int, str], size: tuple[int, int]
+    driver: FakeDriver, options: LiveOptions, chosen: tuple[int, int, str], size: tuple[int, int]
 ):
     with open_live("/dev/video0", options=options) as source:
         assert source.size == size
@@ -501,12 +501,12 @@ def test_the_mode_of_a_camera_suits_the_wishes(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (SourceOptions(size=(100, 100)), "has no mode that gives 100x100 .*128x96, 640x480"),
-        (SourceOptions(size=(480, 640), rate_hz=200.0), "or a lower --rate"),
-        (SourceOptions(pixel_format="H264"), "has no format H264; choose MJPG, YUYV with --pixel-format"),
+        (LiveOptions(size=(100, 100)), "has no mode that gives 100x100 .*128x96, 640x480"),
+        (LiveOptions(size=(480, 640), rate_hz=200.0), "or a lower --rate"),
+        (LiveOptions(pixel_format="H264"), "has no format H264; choose MJPG, YUYV with --pixel-format"),
     ],
 )
-def test_a_mode_that_a_camera_has_not_is_told(driver: FakeDriver, options: SourceOptions, words: str):
+def test_a_mode_that_a_camera_has_not_is_told(driver: FakeDriver, options: LiveOptions, words: str):
     with pytest.raises(SourceError, match=words):
         open_live("0", options=options).__enter__()
     assert driver.opened == 1

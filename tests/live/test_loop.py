@@ -159,7 +159,7 @@ def test_who_stops_asking_is_told_no_more(recording: Recording):
         reader.readings()
         next(reader.readings())
     # its threads have ended: while they tell somebody they hold on to them
-    assert not list(reader._listening)
+    assert not list(reader._mailboxes)
 
 
 def test_without_a_reference_the_first_still_picture_is_taken(recording: Recording, rng: np.random.Generator):

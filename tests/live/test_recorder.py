@@ -20,7 +20,7 @@ from data_sets import contents
 
 import sliplens as sl
 from sliplens.errors import RecordingError, SliplensError
-from sliplens.live import ForceStream, LiveFrame, Recorder, SimulatedSource, SourceOptions, open_live
+from sliplens.live import ForceStream, LiveFrame, LiveOptions, Recorder, SimulatedSource, open_live
 from sliplens.recordings import Dataset, Recording, TrialFacts, load_dataset
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import begin_recording, finish_recording, recover_dataset, save_profile
@@ -326,7 +326,7 @@ def test_a_folder_that_cannot_be_recorded_into_is_told(small_dataset: Dataset, t
 
 
 def test_a_reader_records_every_frame_whether_it_was_read_or_not(recording: Recording, tmp_path: Path):
-    source = open_live(recording.frames, options=SourceOptions(rate_hz=500.0))
+    source = open_live(recording.frames, options=LiveOptions(rate_hz=500.0))
     reader = sl.LiveReader(source, reference=recording.reference)
     reader.subscribe(lambda *_: time.sleep(0.05))  # most frames are dropped
     reader.record(tmp_path / "data")

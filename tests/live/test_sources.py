@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.live import ReplaySource, SimulatedSource, SourceOptions, open_live
+from sliplens.live import LiveOptions, ReplaySource, SimulatedSource, open_live
 from sliplens.live.sources import ProfiledSource
 from sliplens.mechanics import safety_margin
 from sliplens.recordings import Dataset, Recording
@@ -23,7 +23,7 @@ from sliplens.simulation.sensor import CHROMATOUCH
 def test_a_trial_is_replayed_whole_with_its_labels_and_forces(small_dataset: Dataset):
     info = small_dataset.trials[0]
     recording = small_dataset.load(info)
-    source = open_live(small_dataset.folder, options=SourceOptions(trial=info.trial, speed=20.0))
+    source = open_live(small_dataset.folder, options=LiveOptions(trial=info.trial, speed=20.0))
     frames = list(source.frames())
     assert source.count == len(frames) == len(recording.frames)
     np.testing.assert_array_equal([frame.image for frame in frames], recording.frames)
@@ -37,7 +37,7 @@ def test_a_trial_is_replayed_whole_with_its_labels_and_forces(small_dataset: Dat
 
 @pytest.mark.parametrize("speed", [1.0, 4.0])
 def test_no_frame_comes_before_its_time(small_dataset: Dataset, speed: float):
-    source = open_live(small_dataset.folder, options=SourceOptions(speed=speed))
+    source = open_live(small_dataset.folder, options=LiveOptions(speed=speed))
     frames = list(source.frames())
     spans = [(frame.captured_s - frames[0].captured_s) * speed for frame in frames]
     # clocks of the system tick in steps
@@ -60,7 +60,7 @@ def test_a_capture_of_fewer_frames_than_it_tells_ends_with_them(recording: Recor
 
 
 def test_a_closed_source_ends_soon(recording: Recording):
-    source = open_live(recording.frames, options=SourceOptions(rate_hz=0.1))
+    source = open_live(recording.frames, options=LiveOptions(rate_hz=0.1))
     frames = source.frames()
     next(frames)
     source.close()
@@ -118,27 +118,27 @@ def test_a_film_under_another_load_is_one_that_was_prepared_for_it(rng: np.rando
 @pytest.mark.parametrize(
     ("source", "options", "words"),
     [
-        ("nowhere.mp4", SourceOptions(), "nowhere.mp4 is no source that is known, nor a path that exists"),
-        ("simulated", SourceOptions(speed=2.0), "the simulated fingertip takes no --speed; leave it out"),
+        ("nowhere.mp4", LiveOptions(), "nowhere.mp4 is no source that is known, nor a path that exists"),
+        ("simulated", LiveOptions(speed=2.0), "the simulated fingertip takes no --speed; leave it out"),
         (
             "simulated:thumb",
-            SourceOptions(),
+            LiveOptions(),
             "no simulated sensor named 'thumb'; choose one of chromatouch, flat-gel",
         ),
-        ("7", SourceOptions(speed=2.0), "the camera /dev/video7 takes no --speed; leave it out"),
-        ("rtsp://10.0.0.1/", SourceOptions(trial="a"), "takes no --trial; leave it out"),
+        ("7", LiveOptions(speed=2.0), "the camera /dev/video7 takes no --speed; leave it out"),
+        ("rtsp://10.0.0.1/", LiveOptions(trial="a"), "takes no --trial; leave it out"),
     ],
 )
-def test_what_cannot_be_opened_is_told(source: str, options: SourceOptions, words: str):
+def test_what_cannot_be_opened_is_told(source: str, options: LiveOptions, words: str):
     with pytest.raises(InputError, match=words):
         open_live(source, options=options)
 
 
 def test_wishes_that_cannot_be_are_told():
     with pytest.raises(InputError, match="--rate must be positive, got -3"):
-        SourceOptions(rate_hz=-3.0)
+        LiveOptions(rate_hz=-3.0)
     with pytest.raises(InputError, match="--size must be positive, got 0"):
-        SourceOptions(size=(0, 640))
+        LiveOptions(size=(0, 640))
 
 
 def test_a_path_is_replayed_by_its_text_too(small_dataset: Dataset):

@@ -12,7 +12,7 @@ from there import there
 
 import sliplens as sl
 from sliplens.errors import CheckpointError, InputError, SliplensError
-from sliplens.live.contract import SourceOptions
+from sliplens.live.contract import LiveOptions
 from sliplens.models import Network, load_checkpoint, save_checkpoint
 from sliplens.models.calibration import Calibration
 from sliplens.models.checkpoint import Estimate
@@ -239,7 +239,7 @@ def test_frames_that_come_too_seldom_are_refused(run: Network, small_dataset: Da
     frames = load_frames(small_dataset, trials, encoding=run.encoding, image_size=32)
     with pytest.raises(InputError, match=r"the trial test-\S+ has a frame each 1 s"):
         evaluate_frames(run, replace(frames, time_s=30 * frames.time_s), sequence=True)
-    slow, reference = SourceOptions(rate_hz=1.0), small_dataset.load(trials[0]).reference
+    slow, reference = LiveOptions(rate_hz=1.0), small_dataset.load(trials[0]).reference
     reader = sl.LiveReader(seldom, run, options=slow, reference=reference, sequence=True, engine="torch")
     with pytest.raises(InputError, match="has a frame each 1 s"), reader:
         pass

@@ -107,7 +107,7 @@ class Hold(Command):
     def _readers(self) -> "list[LiveReader]":
         from sliplens.grip.source import open_grip, usual_network
         from sliplens.live import LiveReader
-        from sliplens.live.contract import SourceOptions
+        from sliplens.live.contract import LiveOptions
         from sliplens.models import load
         from sliplens.recordings.sensor import load_profile
 
@@ -115,7 +115,7 @@ class Hold(Command):
             raise InputError(f"--reference takes an image a source, {len(self.sources)}, got {len(self.reference)}")
         common = {name: getattr(self, name) for name in ("friction", "same_object", "sequence", "engine")}
         profile = common["sensor"] = None if self.sensor is None else load_profile(self.sensor)
-        sources = [open_grip(source, SourceOptions()) or source for source in self.sources]
+        sources = [open_grip(source, LiveOptions()) or source for source in self.sources]
         names = [self.network or usual_network(source, profile) for source in sources]
         networks = {name: load(name, device=self.device) for name in dict.fromkeys(names) if name is not None}
         references = self.reference or [None] * len(sources)

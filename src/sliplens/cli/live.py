@@ -82,7 +82,7 @@ class Live:
         """Read until the source ends."""
         from sliplens.grip.source import open_grip, usual_network
         from sliplens.live import LiveReader
-        from sliplens.live.contract import SourceOptions, parse_size
+        from sliplens.live.contract import LiveOptions, parse_size
         from sliplens.recordings import TrialFacts
         from sliplens.recordings.sensor import is_profile, load_profile
 
@@ -90,7 +90,7 @@ class Live:
             self._list()
             return
         wishes = {name: getattr(self, name) for name in ("speed", "trial", "pixel_format")}
-        options = SourceOptions(rate_hz=self.rate, size=parse_size(self.size), **wishes)
+        options = LiveOptions(rate_hz=self.rate, size=parse_size(self.size), **wishes)
         names = ("reference", "engine", "device", "seconds", "forces", "friction", "same_object", "sequence")
         named = {name: getattr(self, name) for name in names} | {"smoothing_s": self.smoothing, "options": options}
         profile = named["sensor"] = load_profile(self.sensor) if is_profile(self.sensor) else None

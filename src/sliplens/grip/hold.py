@@ -28,7 +28,7 @@ from sliplens.grip.controllers import (
 from sliplens.grip.gripper import DryRun, Gripper, GripperError, GripperState, GuardedGripper, open_gripper
 from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.source import GripSource, open_grip, usual_network
-from sliplens.live.contract import LiveSource, Pace, SourceOptions
+from sliplens.live.contract import LiveOptions, LiveSource, Pace
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading, describe_reading
 from sliplens.models.checkpoint import Network
@@ -345,7 +345,7 @@ def _readers(
     """Readers of the fingertips; one that is made here reads until the stack is left."""
     if isinstance(source, LiveSource | Path | str):
         if isinstance(source, str):
-            source = open_grip(source, SourceOptions()) or source
+            source = open_grip(source, LiveOptions()) or source
         return [stack.enter_context(LiveReader(source, network or usual_network(source, None)))]
     readers = [source] if isinstance(source, LiveReader) else list(source)
     if len(readers) not in {1, 2}:

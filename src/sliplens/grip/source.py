@@ -15,7 +15,7 @@ from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.gripper import GripperError, GripperState
 from sliplens.grip.plant import PERIOD_S, GripperModel, Plant, PlantState, World, least_force, pick_object
 from sliplens.grip.scripts import LIFT_S, hand_motion
-from sliplens.live.contract import LiveSource, Pace, SourceOptions
+from sliplens.live.contract import LiveOptions, LiveSource, Pace
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.sensor import SensorProfile
@@ -260,7 +260,7 @@ def _towards(value: float, wanted: float, step: float) -> float:
     return value + min(max(wanted - value, -step), step)
 
 
-def open_grip(name: str, options: SourceOptions) -> GripSource | None:
+def open_grip(name: str, options: LiveOptions) -> GripSource | None:
     """Gripper of a name such as `grip` or `grip:egg`; None where it is that of another source."""
     kind, _, held = name.partition(":")
     if kind != "grip":

@@ -1,7 +1,7 @@
-"""The margin of a running sensor: sources, the loop that reads them, and what it says of its own health."""
+"""Live margin of a running sensor: sources, the loop that reads them, its health, and outputs."""
 
 from sliplens.live.camera import Camera, CameraMode, CameraSource, list_cameras
-from sliplens.live.contract import LiveSource, SourceKind, SourceOptions
+from sliplens.live.contract import LiveOptions, LiveSource, SourceKind
 from sliplens.live.health import HealthMonitor
 from sliplens.live.loop import LiveReader, read_live
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, SlipState
@@ -10,8 +10,8 @@ from sliplens.live.slip import SlipDetector, SlipLimits
 from sliplens.live.sources import SOURCES, FolderSource, ReplaySource, SimulatedSource, StreamSource, open_live
 
 __all__ = [
-    "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "ForceStream",
-    "HealthMonitor", "Latency", "LiveFrame", "LiveReader", "LiveSource", "MarkerReading", "Reading", "Recorder",
+    "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthMonitor",
+    "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "Reading", "Recorder",
     "RecordingState", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipLimits", "SlipState", "SourceKind",
-    "SourceOptions", "StreamSource", "list_cameras", "open_live", "read_live",
+    "StreamSource", "list_cameras", "open_live", "read_live",
 ]  # fmt: skip

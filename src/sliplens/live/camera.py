@@ -19,7 +19,7 @@ from av.video.reformatter import VideoReformatter
 
 from sliplens.errors import SourceError
 from sliplens.extras import require_packages
-from sliplens.live.contract import LiveSource, SourceOptions
+from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Frame
 
@@ -134,7 +134,7 @@ class CameraSource(LiveSource):
 
     reconnects = True
 
-    def __init__(self, path: Path, options: SourceOptions) -> None:
+    def __init__(self, path: Path, options: LiveOptions) -> None:
         require_packages("linuxpy", extra="live", purpose="reading a camera")
         options.require_only("rate_hz", "size", "pixel_format", what=f"the camera {path}")
         self.name, self._path, self._options = f"the camera {path}", path, options

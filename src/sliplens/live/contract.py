@@ -12,7 +12,7 @@ from sliplens.recordings.capture import Frame
 
 
 @dataclass(frozen=True, kw_only=True)
-class SourceOptions:
+class LiveOptions:
     """Wishes of a user for a source; each takes those that it understands and refuses the others."""
 
     rate_hz: float | None = None
@@ -125,8 +125,8 @@ class SourceKind:
     """What it is, for people."""
     recognises: Callable[[str], bool]
     """Told by the name that the user gave, without opening anything."""
-    open: Callable[[str, SourceOptions], LiveSource]
+    open: Callable[[str, LiveOptions], LiveSource]
     """Nothing runs before the source is entered."""
 
 
-__all__ = ["LiveSource", "SourceKind", "SourceOptions"]
+__all__ = ["LiveOptions", "LiveSource", "SourceKind"]

@@ -67,7 +67,7 @@ CHECKS = {
         harm=(0.33, 1.18),
     ),
     "touch": CheckKind(
-        limit=LEAST_TOUCH, unit="grey levels", cure="press the sensor on something", harm=(0.97, 1.20), is_minimum=True
+        limit=LEAST_TOUCH, unit="grey levels", cure="press it on something", harm=(0.97, 1.20), is_minimum=True
     ),
     "direction": CheckKind(limit=DIRECTION_LIMIT, unit="standard deviations", cure="", harm=(0.96, 0.67)),
     "novelty": CheckKind(

@@ -1,4 +1,4 @@
-"""The loop of a running sensor: one thread captures, one reads, and what is too late is dropped and counted."""
+"""Loop of a running sensor: one thread captures, one reads; late frames are dropped and counted."""
 
 import gc
 import sys
@@ -6,10 +6,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from inspect import signature
 from pathlib import Path
 from threading import Event, Lock, Thread
-from typing import ParamSpec, TypeVar
+from typing import TypeAlias, TypedDict, Unpack
 from weakref import WeakSet
 
 import numpy as np
@@ -21,7 +20,7 @@ from sliplens.errors import InputError, RecordingError, SourceError
 from sliplens.extras import import_cv2, missing_packages
 from sliplens.friction import Friction, FrictionLike
 from sliplens.images import read_image
-from sliplens.live.contract import LiveSource, SourceOptions
+from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.frame_reader import FrameReader, HealthWatch, SlipWatch
 from sliplens.live.health import HealthMonitor
 from sliplens.live.mailbox import Mailbox
@@ -38,8 +37,6 @@ from sliplens.recordings.dataset import Dataset, save_profile
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.trial import TrialFacts
 
-Given = ParamSpec("Given")
-Result = TypeVar("Result")
 Subscriber = Callable[[Reading, LiveFrame | None], None]
 """Called with each reading and its frame, in the thread that reads; None where there is no frame to it."""
 
@@ -50,9 +47,9 @@ _SWITCH_S = 5e-4
 
 
 class _SharedCores:
-    """Threads of the whole process, held down from when the first reader is entered until the last one is left.
+    """Thread limits of the whole process, from when the first reader is entered until the last one is left.
 
-    A frame is checked in one thread and read by the network in another, and the page draws beside them. Threads that
+    A frame is checked in one thread while the network runs in another, and the page draws beside them. Threads that
     share one step of that wait for each other, and some spin meanwhile: on cores that are all in use a matrix of
     markers takes ten times as long by two threads as by one.
     """
@@ -62,12 +59,11 @@ class _SharedCores:
 
     @contextmanager
     def __call__(self) -> Iterator[None]:
-        """Hold them down."""
         with self._lock:
             if not self._readers:
-                with ExitStack() as held:
-                    self._hold(held.callback)
-                    self._restore = held.pop_all()
+                with ExitStack() as stack:
+                    _limit_threads(stack.callback)
+                    self._restore = stack.pop_all()
             self._readers += 1
         try:
             yield
@@ -77,24 +73,67 @@ class _SharedCores:
                 if not self._readers:
                     self._restore.close()
 
-    def _hold(self, later: Callable[..., object]) -> None:
-        later(threadpool_limits(1, user_api="blas").restore_original_limits)
-        threads = torch.get_num_threads()
-        later(torch.set_num_threads, threads)
-        torch.set_num_threads(max(1, threads - 1))  # the checks have a core
-        # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
-        later(sys.setswitchinterval, sys.getswitchinterval())
-        sys.setswitchinterval(_SWITCH_S)
-        # what is there by now stays: to look through all of it for garbage takes as long as half a frame
-        later(gc.unfreeze)
-        gc.freeze()
-        if not missing_packages("cv2", extra="markers"):
-            cv2 = import_cv2()
-            later(cv2.setNumThreads, cv2.getNumThreads())
-            cv2.setNumThreads(1)
+
+def _limit_threads(restore: Callable[..., object]) -> None:
+    """Limit the threads of NumPy, torch and OpenCV; `restore` takes calls that undo it."""
+    restore(threadpool_limits(1, user_api="blas").restore_original_limits)
+    threads = torch.get_num_threads()
+    restore(torch.set_num_threads, threads)
+    torch.set_num_threads(max(1, threads - 1))  # the checks have a core
+    # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
+    restore(sys.setswitchinterval, sys.getswitchinterval())
+    sys.setswitchinterval(_SWITCH_S)
+    # existing objects stay: to search all of them for garbage takes as long as half a frame
+    restore(gc.unfreeze)
+    gc.freeze()
+    if not missing_packages("cv2", extra="markers"):
+        cv2 = import_cv2()
+        restore(cv2.setNumThreads, cv2.getNumThreads())
+        cv2.setNumThreads(1)
 
 
 _share_cores = _SharedCores()
+LiveInput: TypeAlias = "str | Path | Images | Capture | LiveSource"
+
+
+class ReaderSettings(TypedDict, total=False):
+    """Settings of `LiveReader` and `read_live`, each optional."""
+
+    reference: Path | str | Frame | None
+    """The sensor untouched, as an image or its path. By default the image that the source brings, else the first still
+    picture: leave the sensor untouched until then."""
+    options: LiveOptions | None
+    """Options of the source."""
+    sensor: SensorProfile | Path | str | None
+    """Profile of the sensor that frames and reference go through, its file, or the name of one that comes with
+    sliplens; it names the network where none is given."""
+    friction: FrictionLike | None
+    """Coefficient of friction, as `predict` takes it, for a network that predicts F_t / F_n. A slip that the markers
+    show narrows a range, until the object is let go; `Reading.friction` states the value used."""
+    same_object: bool
+    """If True, every grasp is of one object, until `new_object`: the friction that a slip taught counts in later
+    grasps."""
+    sequence: bool
+    """If True, the earlier frames of a contact count, as `predict` takes it. Health and markers show when a contact
+    ends: without both, all frames count as one."""
+    engine: str
+    """Row of `ENGINES`; `auto`, the default, for the fastest that pays for `seconds`, or for hours without it."""
+    device: str
+    """Device of a network that is loaded here: cpu (default) or cuda."""
+    smoothing_s: float
+    """Time constant of a low-pass on margin and interval, in seconds, 0 by default (`Reading.lag_s`)."""
+    seconds: float | None
+    """Time after which it ends; with the source by default."""
+    stall_s: float
+    """Time without a frame after which a reading says so, 1 second by default."""
+    forces: Path | str | None
+    """File or named pipe into which another program writes the samples of a force sensor (`ForceStream`)."""
+    health: Callable[[Frame], HealthWatch] | None
+    """Called with each new reference, returns the checks of frames: `HealthMonitor` by default; None for none, not
+    even of the network's novelty."""
+    slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None
+    """Called with the places of the markers in each new reference, returns the slip detector: `SlipDetector` by
+    default; None to track no markers."""
 
 
 class LiveReader:
@@ -110,48 +149,13 @@ class LiveReader:
         As `open_live` takes it: `simulated`, a path, frames, or a source.
     network
         Network, its folder, or the name of one that comes with sliplens; None for markers and health alone.
-    reference
-        The sensor untouched, as an image or its path; what the source brings if None, else it is taken when the picture
-        is still at first: leave the sensor untouched until then.
-    options
-        Wishes for the source.
-    sensor
-        Profile of the sensor that frames and reference go through, its file, or the name of one that comes along;
-        where it names a network and `network` is None, that one is read by.
-    friction
-        What is known of the coefficient of friction, as `predict` takes it, for a network that tells F_t / F_n. A slip
-        that the markers tell narrows a range down, until the object is let go; `Reading.friction` says what was
-        assumed.
-    same_object
-        Whether every grasp is of one object, until `new_object`: what a slip taught of its friction then counts in the
-        grasps that follow. Left out, it does not: the next grasp may be of something else.
-    sequence
-        Whether what the frames of a contact so far tell counts too, as `predict` takes it. Health and markers tell when
-        a contact ends: without both, all frames count as one.
-    engine
-        `torch`, `openvino`, or `auto` for OpenVINO where it pays for `seconds`, or for hours where that is None, and
-        that may take seconds to be made.
-    device
-        Device of a network that is loaded here: cpu or cuda.
-    smoothing_s
-        Time constant of a low-pass on margin and interval, in seconds; `Reading.lag_s` tells the delay. 0 for none.
-    seconds
-        Time after which it ends; with the source if None.
-    stall_s
-        Time without a frame after which a reading says so, in seconds.
-    forces
-        File or named pipe into which another program writes the samples of a force sensor, as `ForceStream` reads it.
-    health
-        Called with each new reference, gives what checks the frames; None for no checks, not even of the network's
-        answer (`check_novelty`).
-    slip
-        Called with the places of the markers in each new reference, gives what tells slip from their motion; None for
-        not following them. A sensor without markers is read without.
+    **settings
+        As `ReaderSettings` lists them.
 
     Raises
     ------
     InputError
-        If the source or the network is not there, or an option cannot be used.
+        If the source or the network is not there, or a setting cannot be used.
     ImageError
         If the frames are of another size than those of the network's sensor.
 
@@ -168,62 +172,52 @@ class LiveReader:
 
     def __init__(
         self,
-        source: "str | Path | Images | Capture | LiveSource" = "simulated",
+        source: LiveInput = "simulated",
         network: Network | Path | str | None = None,
-        *,
-        reference: Path | str | Frame | None = None,
-        options: SourceOptions | None = None,
-        sensor: SensorProfile | Path | str | None = None,
-        friction: FrictionLike | None = None,
-        same_object: bool = False,
-        sequence: bool = False,
-        engine: str = "auto",
-        device: str = "cpu",
-        smoothing_s: float = 0.0,
-        seconds: float | None = None,
-        stall_s: float = 1.0,
-        forces: Path | str | None = None,
-        health: Callable[[Frame], HealthWatch] | None = HealthMonitor,
-        slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None = SlipDetector,
+        **settings: Unpack[ReaderSettings],
     ) -> None:
+        if unknown := settings.keys() - ReaderSettings.__annotations__.keys():
+            raise TypeError(f"LiveReader takes no {', '.join(sorted(unknown))}")
+        smoothing_s, self._seconds = settings.get("smoothing_s", 0.0), settings.get("seconds")
         if not smoothing_s >= 0:
             raise InputError(f"--smoothing must be 0 or more seconds, got {smoothing_s:g}")
-        if seconds is not None and not seconds > 0:
-            raise InputError(f"--seconds must be positive, got {seconds:g}")
+        if self._seconds is not None and not self._seconds > 0:
+            raise InputError(f"--seconds must be positive, got {self._seconds:g}")
+        sensor, reference, forces = (settings.get(name) for name in ("sensor", "reference", "forces"))
         profile = None if sensor is None else load_profile(sensor)
         if network is None and profile is not None:
             network = profile.network
-        self.network = None if network is None else open_run(network, device=device)
-        options = options or SourceOptions()
+        self.network = None if network is None else open_run(network, device=settings.get("device", "cpu"))
+        options = settings.get("options") or LiveOptions()
         if self.network is not None and profile is None:
             options = replace(options, fit_size=self.network.manifest.frame_size)
         self.source = open_live(source, options=options)
-        named = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
+        untouched = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
         if profile is not None:
             self.source = ProfiledSource(self.source, profile)
-            named = None if named is None else profile.apply(named)
+            untouched = None if untouched is None else profile.apply(untouched)
         self.recorder: Recorder | None = None
-        """What records, while something is recorded."""
+        """Recorder, while it records."""
         self.senders: list[Sender] = []
-        """What sends readings to other programs."""
-        self._recorded: Recorder | None = None
-        self._named, self._profile = named, profile
-        self._engine_name, self._seconds, self._stall_s = engine, seconds, stall_s
+        """Senders of readings to other programs."""
+        self._last_recorder: Recorder | None = None
+        self._untouched, self._profile = untouched, profile
+        self._engine_name, self._stall_s = settings.get("engine", "auto"), settings.get("stall_s", 1.0)
         self._forces = None if forces is None else ForceStream(forces)
         self._reader = FrameReader(
             self.source,
             self.network,
-            friction=friction,
-            same_object=same_object,
-            sequence=sequence,
+            friction=settings.get("friction"),
+            same_object=settings.get("same_object", False),
+            sequence=settings.get("sequence", False),
             smoothing_s=smoothing_s,
-            health=health,
-            slip=slip,
+            health=settings.get("health", HealthMonitor),
+            slip=settings.get("slip", SlipDetector),
         )
         self._frames: Mailbox[LiveFrame] = Mailbox()
-        self._telling = Lock()
+        self._lock = Lock()
         self._newest: Reading | None = None
-        self._listening: WeakSet[Mailbox[Reading]] = WeakSet()  # until nobody takes from them any more
+        self._mailboxes: WeakSet[Mailbox[Reading]] = WeakSet()  # until nobody takes from them any more
         self._subscribers: list[Subscriber] = []
         self._stopped, self._over = Event(), Event()
         self._error: BaseException | None = None
@@ -238,29 +232,28 @@ class LiveReader:
 
     @property
     def engine(self) -> Engine | None:
-        """What runs the network, while it is entered."""
+        """Engine of the network, while the reader is entered."""
         return self._reader.engine
 
     @property
     def markers_px(self) -> tuple[Float[np.ndarray, "markers 2"], Float[np.ndarray, "markers 2"]] | None:
         """Places (x, y) of the markers at rest and in the newest frame, in pixels, NaN where one is not seen.
 
-        None where none are followed.
+        None where no markers are tracked.
         """
         return self._reader.markers_px
 
     @property
     def outputs(self) -> tuple[RecordingState | SinkState, ...]:
-        """How far the recording is, the last one where none goes on, and each sink."""
-        recorder = self._recorded
+        """Progress of the newest recording and of each sink."""
+        recorder = self._last_recorder
         return (*(() if recorder is None else (recorder.state,)), *(sender.state for sender in self.senders))
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What the network was not made for, a sentence each.
+        """Ways in which this use differs from the network's training, a sentence each.
 
-        Another sensor, one that is pulled in another direction, friction that it was not trained on, and grey frames
-        once one was compared.
+        Another sensor or direction of the pull, other friction, and grey frames once a reference was taken.
         """
         network, profile, doubts = self.network, self._profile, [self._reader.doubt]
         if network is not None:
@@ -270,13 +263,13 @@ class LiveReader:
 
     @property
     def troubles(self) -> tuple[str, ...]:
-        """What has ended beside the reading, with the cure: the recording, a sink, or the forces."""
+        """Why the recording, a sink or the forces have ended, with the cure."""
         troubles = [state.trouble for state in self.outputs] + [self._forces.trouble if self._forces else None]
         return tuple(trouble for trouble in troubles if trouble is not None)
 
     @property
     def entered(self) -> bool:
-        """Whether it reads, or has read."""
+        """True from when it is first entered."""
         return bool(self._threads)
 
     @property
@@ -290,7 +283,7 @@ class LiveReader:
 
     @property
     def failed(self) -> bool:
-        """Whether it ended because the source or a frame failed."""
+        """True where it ended because the source or a frame failed."""
         return self._over.is_set() and self._error is not None
 
     def __enter__(self) -> "LiveReader":
@@ -306,7 +299,7 @@ class LiveReader:
             if self.network is not None:
                 self.network.require_frame_size(self.source.size, what=f"the frames of {self.source.name}")
                 engine = self._make_engine(self.network)
-            self._reader.begin(engine, self.source.reference if self._named is None else self._named)
+            self._reader.begin(engine, self.source.reference if self._untouched is None else self._untouched)
             self._stack = stack.pop_all()
         jobs = (self._capture, self._frames.close), (self._infer, self._finish)
         self._threads = [Thread(target=self._run, args=job, daemon=True) for job in jobs]
@@ -318,7 +311,7 @@ class LiveReader:
         self.close()
 
     def close(self) -> None:
-        """Stop capturing and reading; those who wait for readings are told that there are no more."""
+        """Stop capturing and reading; iterators of readings end."""
         self._end()
         for thread in self._threads:
             thread.join(_PATIENCE_S)  # a driver that hangs is left to itself
@@ -326,9 +319,9 @@ class LiveReader:
         self._end_outputs()
 
     def readings(self) -> Iterator[Reading]:
-        """Readings as they come; who asks late, even after the end, gets the newest.
+        """Iterate over readings as they come; a slow or late caller, even after the end, gets the newest.
 
-        `Reading.number` tells what was left out.
+        Gaps in `Reading.number` show what was left out.
 
         Raises
         ------
@@ -340,12 +333,12 @@ class LiveReader:
         if not self._threads:
             raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
         place: Mailbox[Reading] = Mailbox()
-        with self._telling:  # from now on, not from when the first is asked for
+        with self._lock:  # from now on, not from the first `next`
             if self._newest is not None:
                 place.put(self._newest)
             if self._over.is_set():
                 place.close()
-            self._listening.add(place)
+            self._mailboxes.add(place)
         return self._take_all(place)
 
     def _take_all(self, place: Mailbox[Reading]) -> Iterator[Reading]:
@@ -355,9 +348,9 @@ class LiveReader:
             raise self._error
 
     def subscribe(self, callback: Subscriber) -> Callable[[], None]:
-        """Have every reading and its frame told, none left out; gives what ends it.
+        """Call back with every reading and its frame; returns a function that ends it.
 
-        The callback is called in the thread that reads, which waits for it: hand on what takes long.
+        The callback runs in the thread that reads, which waits for it: do long work elsewhere.
         """
         self._subscribers.append(callback)
 
@@ -369,33 +362,33 @@ class LiveReader:
 
     @property
     def learnt(self) -> Friction | None:
-        """What slips taught of the friction of the object that slipped last, for a grasp to come; None before any."""
+        """Friction of the object that slipped last, for a later grasp; None before any slip."""
         return self._reader.learner.learnt
 
     @property
     def lesson(self) -> str | None:
-        """The same in a sentence, with what to type the next time; None before any slip."""
+        """That friction in a sentence, with the option for the next time; None before any slip."""
         learner = self._reader.learner
         if learner.learnt is None:
             return None
         slips = number_of(learner.slips, "slip")
         return (
             f"the object that slipped: friction {learner.learnt.mean:.2f} +- {learner.learnt.sigma:.2f}, from {slips}; "
-            f"tell it when you hold the same again, with --friction {learner.learnt.text}"
+            f"set it when you hold the same again, with --friction {learner.learnt.text}"
         )
 
     def new_object(self, friction: FrictionLike | None = None) -> None:
-        """Say that another object is held from now on: what was told or learnt of the friction is dropped.
+        """Begin another object: the friction that was set or learnt is dropped.
 
         Parameters
         ----------
         friction
-            What is known of the new one's, as `LiveReader` takes it; nothing if None.
+            Friction of the new one, as `LiveReader` takes it; unknown if None.
 
         Raises
         ------
         InputError
-            If the friction is none, or the network cannot be told any.
+            If the friction is none, or the network takes none.
         """
         self._reader.begin_object(friction, same_object=self._reader.learner.same_object)
 
@@ -406,8 +399,8 @@ class LiveReader:
     def send_to(self, *sinks: str) -> None:
         """Send every reading and its frame to other programs from now on, until it is closed.
 
-        Each is the name of a row of `SINKS`, with its address after a colon. A slow one loses readings and counts them,
-        and one that breaks off tells that in `troubles`; the reading goes on.
+        Each is the name of a row of `SINKS`, with its address after a colon. A slow sink loses readings and counts
+        them, and one that fails is listed in `troubles`; the reading goes on.
 
         Raises
         ------
@@ -443,11 +436,11 @@ class LiveReader:
             except BaseException:
                 recorder.close()
                 raise
-        self.recorder = self._recorded = recorder
+        self.recorder = self._last_recorder = recorder
         return recorder
 
     def stop_recording(self) -> Dataset | None:
-        """End the recording; gives its data set, None where there is none, or no frame of it."""
+        """End the recording; returns its data set, None where nothing was recorded."""
         recorder, self.recorder = self.recorder, None
         return None if recorder is None else recorder.close()
 
@@ -457,7 +450,7 @@ class LiveReader:
         self.stop_recording()
 
     def _make_engine(self, network: Network) -> Engine:
-        """The engine that was named, or the fastest that pays for the frames to come."""
+        """Make the chosen engine, or the fastest that pays for the frames to come."""
         rate_hz, seconds = self.source.rate_hz or 30.0, self._seconds or np.inf
         frames = min(self.source.count or np.inf, rate_hz * seconds, _MOST_FRAMES)
         # before any thread runs: torch's tracing changes what every thread calls
@@ -473,7 +466,7 @@ class LiveReader:
             job()
         except BaseException as error:
             self._error = self._error or error
-        finally:  # whoever is woken by the end asks for the error
+        finally:  # a caller that the end wakes raises the error
             end()
 
     def _capture(self) -> None:
@@ -510,7 +503,7 @@ class LiveReader:
             except SourceError as error:
                 self._trouble = str(error)
                 continue
-            if self._stopped.is_set():  # nobody else gives it back any more
+            if self._stopped.is_set():  # `close` has left it already
                 self.source.__exit__(None, None, None)
             return
 
@@ -520,47 +513,36 @@ class LiveReader:
         while (left_s := ends_s - time.monotonic()) > 0:
             frame = self._frames.take(min(self._stall_s, left_s))
             if frame is not None:
-                self._tell(self._reader.read(frame), frame)
+                self._publish(self._reader.read(frame), frame)
             elif self._frames.closed:
                 break
             elif time.monotonic() < ends_s:
-                self._tell(self._reader.missing(self._trouble or silent), None)
+                self._publish(self._reader.missing(self._trouble or silent), None)
 
     def _finish(self) -> None:
         self._end()
-        with self._telling:
+        with self._lock:
             self._over.set()
-            for place in self._listening:
+            for place in self._mailboxes:
                 place.close()
 
-    def _tell(self, reading: Reading, frame: LiveFrame | None) -> None:
+    def _publish(self, reading: Reading, frame: LiveFrame | None) -> None:
         self.source.hear(reading)
-        with self._telling:
+        with self._lock:
             self._newest = reading
-            for place in self._listening:
+            for place in self._mailboxes:
                 place.put(reading)
         for callback in tuple(self._subscribers):
             callback(reading, frame)
 
 
-def _takes_what(function: Callable[Given, object]) -> Callable[[Callable[..., Result]], Callable[Given, Result]]:
-    """Declare that a function takes what another one takes."""
+def read_live(
+    source: LiveInput = "simulated", network: Network | Path | str | None = None, **settings: Unpack[ReaderSettings]
+) -> Iterator[Reading]:
+    """Iterate over the readings of a running sensor; a slow caller gets the newest.
 
-    def declare(declared: Callable[..., Result]) -> Callable[Given, Result]:
-        vars(declared)["__signature__"] = signature(function).replace(
-            return_annotation=signature(declared).return_annotation
-        )
-        return declared
-
-    return declare
-
-
-@_takes_what(LiveReader)
-def read_live(*given: object, **options: object) -> Iterator[Reading]:
-    """Readings of a running sensor, one after another; who is slow gets the newest.
-
-    Parameters are those of `LiveReader`, such as the coefficient of `friction` that is told; that also takes a new
-    reference while it runs, and tells every reading to whoever subscribes.
+    Parameters are those of `LiveReader`, which also takes a new reference while it runs, and calls back with every
+    reading.
 
     Raises
     ------
@@ -574,8 +556,8 @@ def read_live(*given: object, **options: object) -> Iterator[Reading]:
     >>> reading.margin is None, reading.true_margin is None  # no network, no touch yet
     (True, True)
     """
-    with LiveReader(*given, **options) as reader:  # pyright: ignore[reportArgumentType] (declared above)
+    with LiveReader(source, network, **settings) as reader:
         yield from reader.readings()
 
 
-__all__ = ["HealthWatch", "LiveReader", "SlipWatch", "Subscriber", "read_live"]
+__all__ = ["HealthWatch", "LiveReader", "ReaderSettings", "SlipWatch", "Subscriber", "read_live"]

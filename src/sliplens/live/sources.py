@@ -19,7 +19,7 @@ from sliplens.extras import Table
 from sliplens.files import require_folder
 from sliplens.images import is_image, list_images, natural_key
 from sliplens.live.camera import CameraSource
-from sliplens.live.contract import LiveSource, Pace, SourceKind, SourceOptions
+from sliplens.live.contract import LiveOptions, LiveSource, Pace, SourceKind
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import recognise
@@ -429,7 +429,7 @@ class SimulatedSource(LiveSource):
         self._closed.set()
 
 
-def _open_simulated(name: str, options: SourceOptions) -> LiveSource:
+def _open_simulated(name: str, options: LiveOptions) -> LiveSource:
     options.require_only("rate_hz", what="the simulated fingertip")
     _, _, sensor = name.partition(":")
     return SimulatedSource(sensor or "chromatouch", rate_hz=options.rate_hz or 30.0)
@@ -442,23 +442,23 @@ def _camera_path(name: str) -> Path | None:
     return Path(name) if name.startswith("/dev/") else None
 
 
-def _open_camera(name: str, options: SourceOptions) -> LiveSource:
+def _open_camera(name: str, options: LiveOptions) -> LiveSource:
     path = _camera_path(name)
     assert path is not None
     return CameraSource(path, options)
 
 
-def _open_stream(name: str, options: SourceOptions) -> LiveSource:
+def _open_stream(name: str, options: LiveOptions) -> LiveSource:
     options.require_only("size", what=f"the stream {name}")
     return StreamSource(name, size=options.size)
 
 
-def _open_folder(name: str, options: SourceOptions) -> LiveSource:
+def _open_folder(name: str, options: LiveOptions) -> LiveSource:
     options.require_only(what=f"the folder {name}")
     return FolderSource(Path(name))
 
 
-def _open_replay(name: str, options: SourceOptions) -> LiveSource:
+def _open_replay(name: str, options: LiveOptions) -> LiveSource:
     options.require_only("rate_hz", "speed", "trial", what=f"replaying {name}")
     capture, *_ = open_source(Path(name), trial=options.trial, options=ReadOptions(), whole=True)
     return ReplaySource(capture, speed=options.speed or 1.0, rate_hz=options.rate_hz)
@@ -498,7 +498,7 @@ Images: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 
 
 def open_live(
-    source: str | Path | Images | Capture | LiveSource = "simulated", *, options: SourceOptions | None = None
+    source: str | Path | Images | Capture | LiveSource = "simulated", *, options: LiveOptions | None = None
 ) -> LiveSource:
     """Find the source of a name; a device is opened when the source is entered.
 
@@ -521,7 +521,7 @@ def open_live(
     >>> open_live("simulated").name
     'a simulated chromatouch'
     """
-    options = options or SourceOptions()
+    options = options or LiveOptions()
     if isinstance(source, LiveSource):
         options.require_only(what=source.name)
         return source
