@@ -36,6 +36,7 @@ class CheckKind:
     """Row of `CHECKS`: limit and cure of one check."""
 
     limit: float
+    """Bound of healthy values, in the unit of `unit`: seconds, newtons, pixels, grey levels, or a ratio."""
     unit: str
     cure: str
     harm: tuple[float, float] = (0.0, 0.0)
