@@ -25,6 +25,7 @@ from sliplens.intervals import Difference
 from sliplens.recordings import load_dataset
 from sliplens.report.verdict import recommend
 from sliplens.results import Study
+from sliplens.results.study import StudyConfig
 from sliplens.simulation import simulate
 from sliplens.study import run_study
 
@@ -45,9 +46,8 @@ def look(networks: list[str], folder: Path, *, days: dict[str, Any], options: ar
     return run_study(
         simulated,
         networks,
+        StudyConfig(trials=options.trials, tests=("truth",)),
         out=folder / "study",
-        trials=options.trials,
-        tests=("truth",),
         on=options.on,
         on_progress=terminal,
     )

@@ -1,6 +1,5 @@
 """What the README shows in Python runs as it stands, on small networks and data."""
 
-import inspect
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -14,8 +13,8 @@ from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import LiveReader
 from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.recordings import Dataset, Recording
+from sliplens.results.study import StudyConfig
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
-from sliplens.study.run import run_study
 from sliplens.training import RECIPES
 
 README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
@@ -57,7 +56,7 @@ def folder(
     small = replace(RECIPES["default"], image_size=IMAGE_SIZE, batch_size=16)
     monkeypatch.setitem(RECIPES._rows, "default", small)
     for option in ("random_orders", "trials"):
-        monkeypatch.setitem(inspect.unwrap(run_study).__kwdefaults__, option, 1)
+        monkeypatch.setitem(StudyConfig.__init__.__kwdefaults__, option, 1)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sliplens.recordings.relabelling import label_dataset
     from sliplens.recordings.splits import split_dataset
     from sliplens.report.page import write_report
+    from sliplens.results.study import StudyConfig
     from sliplens.runner import read_status
     from sliplens.simulation.sharing import compare_datasets
     from sliplens.simulation.trials import simulate
@@ -40,6 +41,7 @@ _MODULES = {
     "LiveReader": "sliplens.live.loop",
     "Friction": "sliplens.friction",
     "SliplensError": "sliplens.errors",
+    "StudyConfig": "sliplens.results.study",
     "check_dataset": "sliplens.recordings.check",
     "compare_datasets": "sliplens.simulation.sharing",
     "diagnose": "sliplens.study.diagnose",
@@ -74,6 +76,7 @@ __all__ = [
     "Friction",
     "LiveReader",
     "SliplensError",
+    "StudyConfig",
     "__version__",
     "check_dataset",
     "compare_datasets",

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from sliplens.codec import load_record, load_result, save_record, save_result
 from sliplens.errors import InputError
@@ -15,9 +16,10 @@ from sliplens.progress import OnProgress, stage, wrote
 from sliplens.recordings import Dataset
 from sliplens.report import write_report
 from sliplens.results.explanation import Strip
+from sliplens.results.study import Setting, StudyConfig
 from sliplens.simulation.trials import simulate
 from sliplens.study import explain_source, explain_trial, run_study, score_explained
-from sliplens.study.scoring import STEPS, Setting
+from sliplens.study.scoring import STEPS
 from sliplens.training import evaluate, train
 
 NETWORKS = {"difference": DIFFERENCE_NETWORK, "raw": "thesis-raw"}
@@ -27,13 +29,10 @@ METHODS = ("grad-cam-thesis", "integrated-gradients-thesis", "poly-cam-thesis", 
 """The three methods of the thesis as they were run there, and the one to look at."""
 STRIP_METHOD = RECOMMENDED_METHOD
 """Method of the first picture."""
-_BUDGET = 0.1
-"""Share of the channels that Poly-CAM measures at first."""
-_study = partial(
-    run_study,
+DEMO_STUDY = StudyConfig(
     methods=METHODS,
     trials=2,
-    budget=_BUDGET,
+    budget=0.1,
     tests=("score", "faithfulness"),
     settings=(Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel")),
     random_orders=3,
@@ -42,11 +41,13 @@ _study = partial(
 """The study of a first look: too few trials to decide anything, as the page says, but there within minutes."""
 DEMO_SEED = 20261122
 """No seed of the data that the networks of the package were trained on."""
-_to_look_at = partial(simulate, dry_trials=8, wet_trials=4, frames_per_trial=40, days=4, test_days=3)
-_to_train_on = partial(simulate, dry_trials=96, wet_trials=8, frames_per_trial=48, days=12)
+SHOWN_DATA: dict[str, Any] = {"dry_trials": 8, "wet_trials": 4, "frames_per_trial": 40, "days": 4, "test_days": 3}
+"""Trials that networks of the package predict on."""
+TRAINING_DATA: dict[str, Any] = {"dry_trials": 96, "wet_trials": 8, "frames_per_trial": 48, "days": 12}
+"""Trials to train networks of one's own on."""
 _OTHER_MINUTES = 3.5
 """What the path takes beside the training, on two cores."""
-_SHORTEST_TRAINING = 1.4
+SHORTEST_TRAINING = 1.4
 """Minutes below which a network has not learned enough to be worth explaining."""
 
 
@@ -102,11 +103,11 @@ def run_demo(
     later = ("how well both networks read", "which explanation can be believed") + (
         ("what the network reads from real frames",) if real is not None else ()
     )
-    make = _to_look_at if train_minutes is None else _to_train_on
-    data = make(folder / "data", seed=seed, on_progress=on_progress)
+    trials = SHOWN_DATA if train_minutes is None else TRAINING_DATA
+    data = simulate(folder / "data", seed=seed, on_progress=on_progress, **trials)
     networks = dict(NETWORKS)
     if train_minutes is not None:
-        minutes = max(_SHORTEST_TRAINING, (train_minutes - _OTHER_MINUTES) / len(INPUTS))
+        minutes = max(SHORTEST_TRAINING, (train_minutes - _OTHER_MINUTES) / len(INPUTS))
         for name in INPUTS:
             networks[name] = str(folder / f"train-{name}")
             trained = partial(train, image_size=image_size, epochs=60, max_minutes=minutes, seed=seed)
@@ -116,7 +117,8 @@ def run_demo(
     for name in INPUTS:
         evaluate(networks[name], data, folder / f"evaluate-{name}", on_progress=on_progress)
     show(*later[1:])
-    _study(data, tuple(networks.values()), out=folder, on=on, seed=seed, on_progress=on_progress)
+    config = replace(DEMO_STUDY, seed=seed)
+    run_study(data, tuple(networks.values()), config, out=folder, on=on, on_progress=on_progress)
     if real is not None:
         maps = folder / "explain-real"
         network = networks["difference"]

@@ -1,13 +1,13 @@
 """The demo, small: every stage, the page that grows, and a second run that has nothing to do."""
 
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from command_line import refused, run
 
 import sliplens.demo
-from sliplens.demo import NETWORKS, find_real_frames, run_demo
+from sliplens.demo import DEMO_STUDY, NETWORKS, find_real_frames, run_demo
 from sliplens.files import read_json, shipped_names
 from sliplens.models import load
 from sliplens.report.page import Written
@@ -18,12 +18,12 @@ SMALL = {"dry_trials": 3, "wet_trials": 1, "frames_per_trial": 24, "days": 2, "t
 @pytest.fixture(autouse=True)
 def _small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SLIPLENS_REFERENCE", str(tmp_path / "nothing"))
-    monkeypatch.setattr(sliplens.demo, "_to_look_at", partial(sliplens.demo._to_look_at, **SMALL))
-    monkeypatch.setattr(sliplens.demo, "_to_train_on", partial(sliplens.demo._to_train_on, **SMALL | {"dry_trials": 8}))
-    study = {"methods": ("grad-cam", "integrated-gradients"), "trials": 1, "random_orders": 2}
-    monkeypatch.setattr(sliplens.demo, "_study", partial(sliplens.demo._study, **study))
+    monkeypatch.setattr(sliplens.demo, "SHOWN_DATA", SMALL)
+    monkeypatch.setattr(sliplens.demo, "TRAINING_DATA", SMALL | {"dry_trials": 8})
+    methods = ("grad-cam", "integrated-gradients")
+    monkeypatch.setattr(sliplens.demo, "DEMO_STUDY", replace(DEMO_STUDY, methods=methods, trials=1, random_orders=2))
     monkeypatch.setattr(sliplens.demo, "STRIP_METHOD", "grad-cam")
-    monkeypatch.setattr(sliplens.demo, "_SHORTEST_TRAINING", 0.01)
+    monkeypatch.setattr(sliplens.demo, "SHORTEST_TRAINING", 0.01)
 
 
 def train_two(out: Path, *, on_page=None) -> Path:

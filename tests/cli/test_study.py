@@ -7,6 +7,7 @@ import pytest
 from command_line import refused, run
 
 from sliplens.recordings import Dataset
+from sliplens.results.study import StudyConfig
 from sliplens.study.run import run_study
 
 STAGES = ("evaluate", "explain", "score", "remedies", "faithfulness", "randomisation", "map-quality", "timing")
@@ -73,7 +74,7 @@ def test_two_networks_of_one_input_are_refused(
     [
         (("--method", "guess"), "no explainer named 'guess'"),
         (("--random-orders", 0), "at least 1"),
-        (("--on", "cloud"), "no place to work named 'cloud'"),
+        (("--on", "cloud"), "no executor named 'cloud'"),
         (("--preset", "thesis"), "name a data set, or --preset"),
     ],
 )
@@ -91,16 +92,16 @@ def test_mistakes_are_told_before_anything_is_made(
 def test_too_few_trials_are_told_before_a_network_is_loaded(
     fine_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    told: list[str] = []
+    notes: list[str] = []
 
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sliplens.study.run.note", lambda _, words: told.append(words))
+    monkeypatch.setattr("sliplens.study.run.add_note", notes.append)
     monkeypatch.setattr("sliplens.study.run.load_networks", stop)
     with pytest.raises(KeyboardInterrupt):
-        run_study(fine_dataset, out=tmp_path / "study", trials=2)
-    assert told == [
+        run_study(fine_dataset, out=tmp_path / "study", config=StudyConfig(trials=2))
+    assert notes == [
         "2 test trials of condition dry: fewer than 5 decide nothing, whatever the page then shows; --trials is 2"
     ]
     assert not list(tmp_path.iterdir())

@@ -55,6 +55,7 @@ from sliplens.recordings import load_dataset  # noqa: E402
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table  # noqa: E402
 from sliplens.recordings.journal import journals_of  # noqa: E402
 from sliplens.recordings.store import save_recording  # noqa: E402
+from sliplens.results.study import StudyConfig  # noqa: E402
 
 FAULTS = ("kill", "kill at a change", "interrupt", "memory", "disk", "read-only", "removed", "twice", "clock")
 UNLIKE = ("*metrics.csv", "*curve.parquet", "imported/run.json")
@@ -292,9 +293,9 @@ def make_material(folder: Path) -> None:
 
 def shorten_study() -> None:
     """Take few tests, and no page (that of `grip` is one): the whole takes minutes."""
-    tests = {"tests": ("score", "faithfulness", "truth"), "settings": study.SETTINGS[:1], "steps": 8}
     study.SETTINGS = study.SETTINGS[:1]
-    study.run_study = partial(study.run_study, **tests)
+    defaults = {"tests": ("score", "faithfulness", "truth"), "settings": study.SETTINGS, "steps": 8}
+    StudyConfig.__init__.__kwdefaults__ = {**(StudyConfig.__init__.__kwdefaults__ or {}), **defaults}
     study.JudgingByTruth = partial(study.JudgingByTruth, pairs=2)
     sliplens.cli.study.Report.run = lambda self: None  # noqa: ARG005
 

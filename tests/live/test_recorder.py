@@ -98,11 +98,7 @@ def test_a_recording_is_studied(fine_dataset: Dataset, difference_run: Path, tmp
     study = sl.run_study(
         data,
         difference_run,
-        methods=["grad-cam"],
-        trials=1,
-        tests=("score",),
-        steps=4,
-        random_orders=1,
+        sl.StudyConfig(methods=("grad-cam",), trials=1, tests=("score",), steps=4, random_orders=1),
         out=tmp_path / "study",
     )
     assert set(study.deletion) == {"difference"}

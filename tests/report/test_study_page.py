@@ -14,7 +14,7 @@ from command_line import refused, run
 
 from sliplens.codec import save_record
 from sliplens.report import Written, load_results, write_report
-from sliplens.results.study import ASKED_FILE, Asked
+from sliplens.results.study import CONFIG_FILE, StudyConfig
 
 from .study_results import Made, write_choice, write_others
 
@@ -257,7 +257,7 @@ def test_a_stage_alone_makes_a_page_that_names_the_others(pristine_study, tmp_pa
 def test_a_page_misses_nothing_that_was_not_asked_for(pristine_study, tmp_path):
     for kept in ("choice", "states", "truth-raw"):
         shutil.copytree(pristine_study / kept, tmp_path / kept)
-    save_record(Asked(tests=("truth", "timing")), tmp_path / ASKED_FILE)
+    save_record(StudyConfig(tests=("truth", "timing")), tmp_path / CONFIG_FILE)
 
     page = write_report(tmp_path).page.read_text(encoding="utf-8")
 

@@ -14,10 +14,11 @@ from sliplens.explainers.table import get_explainer
 from sliplens.faithfulness.controls import cascade, gini, total_variation
 from sliplens.recordings import Dataset
 from sliplens.results.faithfulness import NEW_WEIGHTS
+from sliplens.results.study import Setting, StudyConfig
 from sliplens.study.checks import Measuring, Randomising, Untrained, time_explainers
 from sliplens.study.choice import Material
-from sliplens.study.run import _Judging
-from sliplens.study.scoring import Removal, Setting, influences
+from sliplens.study.run import Records, judge_by_truth
+from sliplens.study.scoring import Removal, influences
 
 
 class ShowsTheImage:
@@ -120,28 +121,23 @@ def test_a_map_of_what_raises_the_answer_ranks_by_its_order_and_is_held_against_
     rose = [replace(one, prediction=one.reference_prediction + 0.3) for one in others]
     explained = replace(explained, frames=(fell, *rose), relevance={**explained.relevance, name: relevance})
     explainers = {**material.explainers, name: get_explainer(name)}
-    study = _Judging(
+    records = Records(
         folder=Path("nowhere"),
         data=fine_dataset,
         networks={"difference": material.trained},
-        explainers=explainers,
-        settings=(),
-        random_orders=1,
-        steps=None,
-        seed=0,
-        redrawn=False,
+        config=StudyConfig(),
+        network="difference",
     )
-    network = study.open("difference")
     own = replace(material, explained=explained, explainers=explainers)
     control = {f"{name}{NEW_WEIGHTS}": relevance}
-    vars(network).update(material=own, influence={**influences(own), **control})
+    vars(records).update(material=own, influence={**influences(own), **control})
     # parts are removed in the published order
-    np.testing.assert_array_equal(network.influence[name], relevance)
-    held = network.by_truth().maps
+    np.testing.assert_array_equal(records.influence[name], relevance)
+    compared = judge_by_truth(records).maps
     for kind in (name, *control):
-        np.testing.assert_array_equal(held[kind][0], -relevance[0])
-        np.testing.assert_array_equal(held[kind][1:], relevance[1:])
-    np.testing.assert_array_equal(held["grad-cam"], network.influence["grad-cam"])
+        np.testing.assert_array_equal(compared[kind][0], -relevance[0])
+        np.testing.assert_array_equal(compared[kind][1:], relevance[1:])
+    np.testing.assert_array_equal(compared["grad-cam"], records.influence["grad-cam"])
 
 
 def test_a_method_that_ignores_the_weights_shows_nothing_about_the_network(material: Material):

@@ -10,13 +10,13 @@ from sliplens.errors import InputError
 from sliplens.faithfulness.removal import Faithfulness
 from sliplens.intervals import paired_difference
 from sliplens.results.faithfulness import RemovalScores
+from sliplens.results.study import Setting
 from sliplens.study.choice import Material
 from sliplens.study.scoring import (
     EQUAL_AREAS,
     STUDY_AREAS,
     Influence,
     Removal,
-    Setting,
     compare_fills,
     influences,
     judge_curves,

@@ -1,6 +1,6 @@
 """`sliplens study` and `sliplens diagnose`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -61,23 +61,25 @@ class Study(Command):
 
     def run(self) -> None:
         """Run every stage that is not there yet, and draw the report."""
-        from sliplens.study.choice import STUDY_METHODS, study_explainers
+        from sliplens.results.study import STUDY_METHODS, StudyConfig
+        from sliplens.study.choice import study_explainers
         from sliplens.study.run import load_networks, run_study
 
         if (self.data is None) == (self.preset is None):
             raise InputError("name a data set, or --preset thesis to simulate one")
         require_device(self.device)
-        own = ("thesis-difference", "thesis-raw") if self.preset else (DEFAULT_NETWORK,)
-        # a mistake is told before a data set is simulated
-        networks = load_networks(self.network or own, device=self.device)
-        study_explainers(methods := self.method or STUDY_METHODS, budget=self.budget)
-        data = self.data or self._simulate()
+        default = ("thesis-difference", "thesis-raw") if self.preset else (DEFAULT_NETWORK,)
+        # mistakes are reported before a data set is simulated
+        networks = load_networks(self.network or default, device=self.device)
+        methods = self.method or STUDY_METHODS
+        study_explainers(methods, budget=self.budget)
+        options = {field.name: vars(self)[field.name] for field in fields(StudyConfig) if field.name in vars(self)}
         self.call(
             run_study,
-            data=data,
+            data=self.data or self._simulate(),
             networks=tuple(networks.values()),
+            config=StudyConfig(methods=methods, **options),
             out=self.output,
-            methods=methods,
             on=self.on or ("serial" if self.device != "cpu" else "processes=2"),
         )
         Report(workspace=self.output).run()

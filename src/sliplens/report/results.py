@@ -12,7 +12,7 @@ from sliplens.results.evaluation import Diagnosis, Evaluation, Simulation, Train
 from sliplens.results.explanation import Explanation, Strip, load_explanation
 from sliplens.results.faithfulness import DeletionScores
 from sliplens.results.grip import Grip
-from sliplens.results.study import ASKED_FILE, STAGES, TABLES, Asked, Choice, Study
+from sliplens.results.study import CONFIG_FILE, RECORDS, TABLES, Choice, Study, StudyConfig
 
 _OF_A_COMMAND: dict[str, type] = {
     "train": Training,
@@ -82,11 +82,13 @@ def load_results(workspace: Path) -> Results:
     folder_of: dict[tuple[str, str, str], Path] = {}
     notes = []
     for folder, run in runs.items():
+        if run.stage == "control":  # large maps, which no page shows
+            continue
         if run.stage == "simulate":
             result = describe_simulation(load_dataset(folder))
         elif run.stage == "explain":
             result = load_explanation(folder)
-        elif kind := (_OF_A_COMMAND | STAGES).get(run.stage):
+        elif kind := (RECORDS | _OF_A_COMMAND).get(run.stage):
             command = run.stage if run.stage in _OF_A_COMMAND else "study"
             result = load_result(folder, kind, command=f"sliplens {command}")
         else:
@@ -109,7 +111,7 @@ def load_results(workspace: Path) -> Results:
         return {name: value for (own, name, _), value in found.items() if own == stage}
 
     choice: Choice | None = of("choice").get("")
-    asked = workspace / ASKED_FILE
+    config = workspace / CONFIG_FILE
     of_study = {stage: of(stage) for stage in TABLES}
     if choice is not None:
         for stage in _BY_SOURCE:
@@ -127,7 +129,7 @@ def load_results(workspace: Path) -> Results:
         strip=next(iter(of("strip").values()), None),
         study=Study(
             folder=workspace,
-            asked=load_record(asked, Asked, command="sliplens study") if asked.exists() else None,
+            config=load_record(config, StudyConfig, command="sliplens study") if config.exists() else None,
             choice=choice,
             states=of("states").get(""),
             **{table: of_study[stage] for stage, table in TABLES.items()},  # pyright: ignore[reportArgumentType]

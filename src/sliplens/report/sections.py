@@ -67,7 +67,7 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
         # a study that stopped was asked for what it says; single commands are asked for one by one
         study = results.study
         unasked = section.apart or not study or (section.simulated and study.source == "real")
-        if not blocks and (unasked or (section.test and study.asked and section.test not in study.asked.tests)):
+        if not blocks and (unasked or (section.test and study.config and section.test not in study.config.tests)):
             continue
         if not blocks:
             absent.append(section.short_title)

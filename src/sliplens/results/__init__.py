@@ -20,7 +20,7 @@ from sliplens.results.evaluation import (
 from sliplens.results.explanation import ExplainedFrame, Explanation, load_explanation
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores, Remedies, RemovalCurve, RemovalScores
 from sliplens.results.grip import EpisodeTable, Grip, GripTrace, Hold, HoldSteps
-from sliplens.results.study import Choice, MapQuality, Randomisation, States, Study, Timing, Truth
+from sliplens.results.study import Choice, MapQuality, Randomisation, Setting, States, Study, StudyConfig, Timing, Truth
 
 __all__ = [
     "BaselinePredictions",
@@ -49,10 +49,12 @@ __all__ = [
     "RemovalCurve",
     "RemovalScores",
     "ScoredFrames",
+    "Setting",
     "Simulation",
     "SplitCount",
     "States",
     "Study",
+    "StudyConfig",
     "Timing",
     "Training",
     "Truth",

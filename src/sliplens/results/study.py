@@ -365,39 +365,101 @@ class Truth(OfNetwork):
 _Test = Remedies | RemovalScores | Randomisation | MapQuality | Timing | Truth
 
 
-STAGES: dict[str, type] = {
+RECORDS: dict[str, type] = {
     "choice": Choice,
     "states": States,
+    "explain": Explanation,
+    "score": DeletionScores,
     "remedies": Remedies,
+    "control": UntrainedMaps,
     "faithfulness": RemovalScores,
     "randomisation": Randomisation,
     "map-quality": MapQuality,
-    "timing": Timing,
     "truth": Truth,
+    "timing": Timing,
 }
-"""Record of each stage that a study alone makes."""
-TABLES = {"evaluate": "evaluations", "explain": "explanations", "score": "deletion"}
-TABLES |= {stage: stage.replace("-", "_") for stage in STAGES if stage not in ("choice", "states")}
-"""Tables of a study by the stage that fills them, a record an input."""
-
-
-ASKED_FILE = "study.json"
-"""File of a study's workspace that holds what was asked for (`Asked`)."""
+"""Record of each step of a study."""
+TABLES = {
+    "evaluate": "evaluations",
+    "explain": "explanations",
+    "score": "deletion",
+    "remedies": "remedies",
+    "faithfulness": "faithfulness",
+    "randomisation": "randomisation",
+    "map-quality": "map_quality",
+    "timing": "timing",
+    "truth": "truth",
+}
+"""Field of `Study` with the records of each step, one a network."""
+CONFIG_FILE = "study.json"
+"""File of a study's folder that holds its `StudyConfig`."""
+TESTS = ("score", "remedies", "faithfulness", "randomisation", "map-quality", "truth", "timing")
+"""Steps that a study may leave out: the thesis's score and its remedies, removal curves, new weights, ..."""
+STUDY_METHODS = (
+    "grad-cam-thesis",
+    "integrated-gradients-thesis",
+    "poly-cam-thesis",
+    "grad-cam",
+    "integrated-gradients",
+    "poly-cam",
+    "occlusion",
+    "shapley-marker",
+)
+"""The thesis's three as published, the same against the untouched sensor, occlusion, Shapley values of the markers."""
+STUDY_BUDGET = 0.15
+"""Share of the channels that Poly-CAM measures at first: more where the map asks for it."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asked:
-    """What a study was asked for: its page misses nothing else."""
+class Setting:
+    """Way to remove parts: their fill and their unit."""
 
-    tests: tuple[str, ...]
-    """Some of `sliplens.study.TESTS`."""
+    fill: str
+    unit: str
 
 
-def tell_left_out(left: int, chosen: int, name: str) -> str:
+SETTINGS = (
+    Setting(fill="reference", unit="pixel"),
+    Setting(fill="grey", unit="pixel"),
+    Setting(fill="blur", unit="pixel"),
+    Setting(fill="noisy-linear", unit="pixel"),
+    Setting(fill="reference", unit="tile"),
+    Setting(fill="reference", unit="marker"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StudyConfig:
+    """Options of a study, kept in its folder."""
+
+    methods: tuple[str, ...] = STUDY_METHODS
+    """Explainers to compare."""
+    budget: float = STUDY_BUDGET
+    """Share of the channels that Poly-CAM measures at first."""
+    split: str = "test"
+    condition: str = "dry"
+    """Split and condition of the trials to choose from."""
+    trials: int = 14
+    """Number of trials; where too few qualify, the next best are taken."""
+    tolerance: float = 0.03
+    """Largest error of a prediction in a trial that qualifies, in margin units."""
+    tests: tuple[str, ...] = TESTS
+    """Some of `TESTS`."""
+    settings: tuple[Setting, ...] = SETTINGS
+    """Fills and units of the removal curves."""
+    random_orders: int = 10
+    """Random orders that every method has to beat."""
+    steps: int | None = None
+    """Steps of the thesis's deletion score; the rows of pixels, as in the thesis, if None."""
+    seed: int = 0
+    """Seed of random orders, new weights and noise."""
+
+
+def say_left_out(dropped: int, chosen: int, name: str) -> str:
     """Say how many of the frames to score are left out of the scores of an input."""
     return (
-        f"{left} of {chosen} frames to score are left out with the {name} network: it says nearly what it says of the "
-        "untouched sensor, so that there is nothing to explain and the direction is chance"
+        f"{dropped} of {chosen} frames to score are left out with the {name} network: it predicts nearly the margin "
+        "of the untouched sensor there, so that there is nothing to explain and the direction is chance"
     )
 
 
@@ -407,8 +469,8 @@ class Study:
 
     folder: Path = Path()
     """Workspace that holds the stages; a temporary one is there as long as the study."""
-    asked: Asked | None = None
-    """None where nobody tells: all that its data can tell."""
+    config: StudyConfig | None = None
+    """None where its folder has none: all that its data can tell is expected."""
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     choice: Choice | None = None
     states: States | None = None
@@ -442,9 +504,7 @@ class Study:
         chosen = sum(frame.scored for frame in self.choice.frames)
         tested = {**self.faithfulness, **self.truth}
         return {
-            name: tell_left_out(chosen - one.frames, chosen, name)
-            for name, one in tested.items()
-            if one.frames < chosen
+            name: say_left_out(chosen - one.frames, chosen, name) for name, one in tested.items() if one.frames < chosen
         }
 
     def __bool__(self) -> bool:

@@ -30,7 +30,7 @@ from sliplens.faithfulness.controls import (
 )
 from sliplens.intervals import paired_difference
 from sliplens.models import Network
-from sliplens.progress import OnProgress, counted
+from sliplens.progress import OnProgress, counted, track
 from sliplens.recordings import Dataset
 from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.results.study import (
@@ -160,9 +160,7 @@ _LONGEST_S = 120.0
 _FEWEST_TIMED = 3
 
 
-def time_explainers(
-    material: Material, *, longest_s: float = _LONGEST_S, on_progress: OnProgress | None = None
-) -> Timing:
+def time_explainers(material: Material, *, longest_s: float = _LONGEST_S) -> Timing:
     """Time each method on every frame of the sample, one at a time: the median and the extremes.
 
     The thesis's Poly-CAM is timed with all its channels, as it was run, even where a budget makes its maps. A method
@@ -173,7 +171,7 @@ def time_explainers(
     frames = [(material.inputs[row, None], material.references[row, None]) for row in order]
     forward = float(np.median(_seconds(frames, lambda images, _: material.trained.predict(images), longest_s)))
     methods = {}
-    for name, explainer in counted(as_the_thesis_ran(material.explainers).items(), on_progress):
+    for name, explainer in track(as_the_thesis_ran(material.explainers).items()):
 
         def explain(images: Tensor, reference: Tensor, explainer: Explainer = explainer) -> Tensor:
             return explainer(model, images, reference=reference).relevance

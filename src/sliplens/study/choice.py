@@ -22,10 +22,20 @@ from sliplens.images import absolute_difference
 from sliplens.markers import track_markers
 from sliplens.models import Network
 from sliplens.plots.style import input_name, listed
-from sliplens.progress import OnProgress, counted, number_of
+from sliplens.progress import number_of, track
 from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.results.explanation import Explanation
-from sliplens.results.study import Choice, ChosenFrame, ChosenTrial, MarkerPlaces, MarkerTable, ShownFrame, States
+from sliplens.results.study import (
+    STUDY_BUDGET,
+    STUDY_METHODS,
+    Choice,
+    ChosenFrame,
+    ChosenTrial,
+    MarkerPlaces,
+    MarkerTable,
+    ShownFrame,
+    States,
+)
 from sliplens.runner import Part, part
 from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
 from sliplens.study.explaining import frames_at, nearest_frame, network_inputs, require_methods
@@ -45,7 +55,6 @@ def choose_frames(
     condition: str = "dry",
     trials: int = 14,
     tolerance: float = 0.03,
-    on_progress: OnProgress | None = None,
 ) -> Choice:
     """Choose trials in which every network reads the frames along the margin within a tolerance, in margin units.
 
@@ -62,7 +71,7 @@ def choose_frames(
     if not 0 <= tolerance <= 1:
         raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
     infos = data.select(split=split, condition=condition)
-    looked = (_look_at(info, networks, data, tolerance=tolerance) for info in counted(infos, on_progress))
+    looked = (_look_at(info, networks, data, tolerance=tolerance) for info in track(infos))
     candidates = [one for one in looked if one is not None]
     if not candidates:
         raise RecordingError(
@@ -167,7 +176,7 @@ def _summarise(choice: Choice, trials: int) -> str:
     return summary
 
 
-def show_states(choice: Choice, data: Dataset, *, on_progress: OnProgress | None = None) -> States:
+def show_states(choice: Choice, data: Dataset) -> States:
     """Pictures of the shown frames, raw and difference, and the markers of every chosen frame.
 
     The simulator knows the markers' places; in recorded trials they are followed from the untouched sensor on. A trial
@@ -179,7 +188,7 @@ def show_states(choice: Choice, data: Dataset, *, on_progress: OnProgress | None
     shown, raw, difference, untracked = [], [], [], []
     simulated = True
     groups = [(trial, list(own)) for trial, own in groupby(choice.frames, key=lambda frame: frame.trial)]
-    for trial, chosen in counted(groups, on_progress):
+    for trial, chosen in track(groups):
         recording = data.load(infos[trial])
         simulated = simulated and recording.truth is not None
         try:
@@ -238,11 +247,6 @@ def network_places(
 
 
 THESIS_POLY_CAM = "poly-cam-thesis"
-_THESIS = ("grad-cam-thesis", "integrated-gradients-thesis", THESIS_POLY_CAM)
-STUDY_METHODS = (*_THESIS, "grad-cam", "integrated-gradients", "poly-cam", "occlusion", "shapley-marker")
-"""The thesis's three as published, the same against the untouched sensor, occlusion, Shapley values of the markers."""
-STUDY_BUDGET = 0.15
-"""Share of the channels that Poly-CAM measures at first: more where the map asks for it."""
 _AS_PUBLISHED = Likeness(pearson_r=0.999, top_overlap=0.97)
 """Of the thesis's map, compared with what was published; its weights are nearly all 1, so that this costs little."""
 
@@ -421,11 +425,11 @@ def gather(
         references=frames.references.to(trained.device),
         chosen=chosen,
         markers=markers,
-        explainers=with_markers(explainers, inputs, lambda: seen_places(trained, chosen, markers)),
+        explainers=with_markers(explainers, inputs, lambda: marker_places(trained, chosen, markers)),
     )
 
 
-def seen_places(
+def marker_places(
     trained: Network, chosen: Sequence[ChosenFrame], markers: Mapping[str, MarkerPlaces]
 ) -> list[Float[Tensor, "_markers 2"]]:
     """Where the markers of each frame are, in the network's pixels; those that were not followed are left out."""

@@ -49,6 +49,7 @@ from sliplens.results.faithfulness import (
     VariantTable,
     is_control,
 )
+from sliplens.results.study import SETTINGS, Setting
 from sliplens.runner import Part
 from sliplens.study.choice import Material, MaterialStage, trial_seed
 from sliplens.study.explaining import network_inputs
@@ -337,23 +338,6 @@ EQUAL_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
 STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Fewer than `removal.AREAS`, so that many settings can be scored: the equal areas, and enough for trapezoids."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class Setting:
-    """Way to remove parts: what is removed at once, and what takes its place."""
-
-    fill: str
-    unit: str
-
-
-SETTINGS = (
-    Setting(fill="reference", unit="pixel"),
-    Setting(fill="grey", unit="pixel"),
-    Setting(fill="blur", unit="pixel"),
-    Setting(fill="noisy-linear", unit="pixel"),
-    Setting(fill="reference", unit="tile"),
-    Setting(fill="reference", unit="marker"),
-)
 
 Curves = Mapping[Setting, Mapping[str, Faithfulness]]
 """Curves by setting and method, controls included."""
