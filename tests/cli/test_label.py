@@ -214,7 +214,7 @@ def test_labels_cannot_be_found_without_forces(tmp_path: Path, thesis_lists: Pat
 def test_a_source_that_does_not_tell_its_sensor_needs_it_told(
     tmp_path: Path, thesis_lists: Path, capsys: pytest.CaptureFixture[str]
 ):
-    assert "does not tell its sensor" in refused(capsys, "import", thesis_lists, "-o", tmp_path / "data")
+    assert "does not name its sensor" in refused(capsys, "import", thesis_lists, "-o", tmp_path / "data")
 
 
 def test_real_clips_come_with_what_is_known_of_them_and_no_label(tmp_path: Path, reference_folder: Path):
