@@ -67,11 +67,10 @@ class Import(Command):
 
     def run(self) -> None:
         """Read, label, write, and show what was found."""
-        from sliplens.recordings.importing import ImportOptions, import_recordings
+        from sliplens.recordings.importing import import_recordings
 
         terminal = Terminal()
-        options = {name: getattr(self, name) for name in ImportOptions.__annotations__}
-        data = self.call(import_recordings, out=self.output, on_progress=terminal, **options)
+        data = self.call(import_recordings, out=self.output, on_progress=terminal)
         if self.audit:
             draw_audits(data, data.folder / "audit", terminal)
         show_labelling("Imported", data)
