@@ -6,7 +6,7 @@ from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import get_args
+from typing import Unpack, get_args, get_origin, get_type_hints
 
 import pytest
 from command_line import refused
@@ -30,7 +30,9 @@ def heeded(text: str) -> set[str]:
     functions = [getattr(import_module(str(origin[name])), name) for name in names & origin.keys()]
     if "getattr(self" in text:
         read |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    return read.union(*(inspect.signature(function).parameters for function in functions))
+    hints = [hint for function in functions for hint in get_type_hints(function).values()]
+    grouped = [get_args(hint)[0].__annotations__ for hint in hints if get_origin(hint) is Unpack]
+    return read.union(*(inspect.signature(function).parameters for function in functions), *grouped)
 
 
 @pytest.mark.parametrize("offers", get_args(Command), ids=lambda offers: offers.__name__)
