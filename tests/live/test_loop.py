@@ -396,14 +396,14 @@ def test_a_new_object_may_be_told_its_friction(ratio_run: Path, difference_run: 
 
 
 def test_only_a_network_that_tells_f_t_over_f_n_can_learn_friction(difference_run: Path):
-    with pytest.raises(InputError, match="--same-object learns of what a network reads"):
+    with pytest.raises(InputError, match="--same-object needs a network; name one with --network"):
         plain_reader("simulated", same_object=True)
     with pytest.raises(InputError, match="--same-object learns friction from F_t / F_n"):
         plain_reader("simulated", difference_run, same_object=True)
 
 
 def test_friction_needs_a_network_that_tells_f_t_over_f_n(difference_run: Path):
-    with pytest.raises(InputError, match="makes a margin of what a network reads; name one with --network"):
+    with pytest.raises(InputError, match="--friction needs a network; name one with --network"):
         plain_reader("simulated", friction=0.6)
     with pytest.raises(InputError, match="answers with the margin alone and cannot use it"):
         plain_reader("simulated", difference_run, friction=0.6)

@@ -1,4 +1,4 @@
-"""V4L2 cameras: their modes, and their frames with the stamps and numbers that the kernel gave them."""
+"""V4L2 cameras: their modes, and their frames with the kernel's stamps and numbers."""
 
 import errno
 import select
@@ -8,7 +8,6 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING
 
 import av
@@ -46,19 +45,19 @@ _MOST_BAD = 30  # frames in a row that cannot be decoded
 
 @dataclass(frozen=True, kw_only=True)
 class CameraMode:
-    """One way in which a camera gives frames."""
+    """Format, size and rates of a camera."""
 
     pixel_format: str
     """Four letters, such as MJPG."""
     size: tuple[int, int]
     """Height and width, in pixels."""
     rates_hz: tuple[float, ...]
-    """Frames a second; empty where the camera does not tell."""
+    """Frames a second; empty where unknown."""
 
     def in_words(self) -> tuple[str, str, str]:
-        """Format, size and rates, for people."""
+        """Describe format, size and rates."""
         rates = ", ".join(f"{rate:g}" for rate in self.rates_hz)
-        return self.pixel_format, f"{self.size[1]}x{self.size[0]}", rates or "not told"
+        return self.pixel_format, f"{self.size[1]}x{self.size[0]}", rates or "unknown"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,20 +67,20 @@ class Camera:
     path: Path
     """Device file, such as /dev/video0."""
     name: str
-    """Name that the driver tells."""
+    """Name of the driver."""
     modes: tuple[CameraMode, ...]
-    """Modes that sliplens can read; empty where the camera is held by another program, or cannot be asked."""
+    """Modes that sliplens can read; empty where the camera cannot be opened."""
 
 
 class FrameDecoder:
-    """Decodes what a camera sends, scaled down while it is decoded where the format can do that.
+    """Decoder of a camera's frames; it scales them down while it decodes, where the format allows.
 
     Parameters
     ----------
     pixel_format
         Four letters of V4L2.
     size, wanted
-        Height and width of what comes and of what is wanted, in pixels.
+        Height and width of the camera's frames and of the decoded ones, in pixels.
     """
 
     def __init__(self, pixel_format: str, *, size: tuple[int, int], wanted: tuple[int, int] | None = None) -> None:
@@ -101,7 +100,7 @@ class FrameDecoder:
         self._to_rgb = VideoReformatter()
 
     def decode(self, data: bytes, *, row_bytes: int = 0) -> Frame | None:
-        """Pixels of one frame as RGB; None where the bytes are no whole frame. `row_bytes`: of a padded row."""
+        """Decode one frame as RGB; None where the bytes are no whole frame. `row_bytes`: length of a padded row."""
         height, width = self._size
         full = width * self._pixel_bytes
         if row_bytes > full > 0 and len(data) >= height * row_bytes:
@@ -122,14 +121,14 @@ class FrameDecoder:
 
 
 class CameraSource(LiveSource):
-    """V4L2 camera, MJPG where it can; its frames carry the kernel's stamps and numbers.
+    """V4L2 camera, in MJPG where it has that; its frames carry the kernel's stamps and numbers.
 
     Parameters
     ----------
     path
         Device file.
     options
-        Rate, size and pixel format that are wished for.
+        Rate, size and pixel format; the camera's own where None.
     """
 
     reconnects = True
@@ -138,12 +137,12 @@ class CameraSource(LiveSource):
         require_packages("linuxpy", extra="live", purpose="reading a camera")
         options.require_only("rate_hz", "size", "pixel_format", what=f"the camera {path}")
         self.name, self._path, self._options = f"the camera {path}", path, options
-        self._closed, self._held = Event(), ExitStack()
+        self._stack = ExitStack()
 
     def __enter__(self) -> "CameraSource":
         from linuxpy.video.device import Device, VideoCapture  # noqa: PLC0415 (an extra)
 
-        self._closed.clear()
+        self.closed.clear()
         with ExitStack() as stack:
             try:
                 self._device = stack.enter_context(Device(self._path))
@@ -160,45 +159,39 @@ class CameraSource(LiveSource):
                 rate_hz = float(self._capture.get_fps())
                 stack.enter_context(self._capture)
             except (OSError, ZeroDivisionError) as error:
-                raise self._told(error) from None
+                raise self._explained(error) from None
             self.rate_hz = rate_hz
-            self._held = stack.pop_all()
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
         with suppress(OSError):  # it may be gone already
-            self._held.close()
-
-    def close(self) -> None:
-        """Stop within a tenth of a second; the device is given back on leaving."""
-        self._closed.set()
+            self._stack.close()
 
     def frames(self) -> Iterator[LiveFrame]:
-        """Frames as the kernel hands them out; those that it marks as broken, or that cannot be decoded, are missing
-        in the numbers.
-        """
+        """Iterate over frames; those that are broken, or cannot be decoded, are missing in the numbers."""
         from linuxpy.video.device import BufferFlag  # noqa: PLC0415 (an extra)
 
-        buffers, heard_s, bad = self._capture.buffer, time.monotonic(), 0
+        buffers, last_s, bad = self._capture.buffer, time.monotonic(), 0
         assert buffers is not None
-        while not self._closed.is_set():
+        while not self.closed.is_set():
             try:
                 ready, _, _ = select.select([self._device], [], [], _POLL_S)
                 sent = buffers.raw_read() if ready else None
             except BlockingIOError:
                 sent = None
             except (OSError, ValueError) as error:
-                raise self._told(error) from None
+                raise self._explained(error) from None
             now_s = time.monotonic()
             if sent is None:
-                if now_s - heard_s > _STALL_S:
+                if now_s - last_s > _STALL_S:
                     raise SourceError(
                         f"{self.name} has given no frame for {_STALL_S:g} s; check its cable, "
                         "or plug it into a port of its own"
                     )
                 continue
-            heard_s = now_s
+            last_s = now_s
             image = None
             if BufferFlag.ERROR not in sent.flags:
                 image = self._decoder.decode(bytes(sent.data), row_bytes=self._row_bytes)
@@ -220,26 +213,26 @@ class CameraSource(LiveSource):
             )
 
     def _choose(self, modes: Sequence[CameraMode]) -> CameraMode | None:
-        """Mode that suits the wishes; None to leave the camera as it is."""
-        wished, wanted = self._options.pixel_format, self._options.size or self._options.fit_size
-        known = [mode for mode in modes if wished is None or mode.pixel_format == wished]
-        if wished is not None and not known and modes:
+        """Choose the mode that suits the options; None to leave the camera as it is."""
+        pixel_format, wanted = self._options.pixel_format, self._options.size or self._options.fit_size
+        usable = [mode for mode in modes if pixel_format in {None, mode.pixel_format}]
+        if pixel_format is not None and not usable and modes:
             formats = ", ".join(sorted({mode.pixel_format for mode in modes}))
-            raise SourceError(f"{self.name} has no format {wished}; choose {formats} with --pixel-format")
+            raise SourceError(f"{self.name} has no format {pixel_format}; choose {formats} with --pixel-format")
         # compressed first: what is not compressed fills the cable, and the rate falls
-        known.sort(key=lambda mode: list(_DECODERS).index(mode.pixel_format))
-        if wanted is None or not known:
-            return None if wished is None or not known else known[0]
+        usable.sort(key=lambda mode: list(_DECODERS).index(mode.pixel_format))
+        if wanted is None or not usable:
+            return None if pixel_format is None or not usable else usable[0]
         rate_hz = self._options.rate_hz or 0.0
-        for mode in sorted(known, key=lambda mode: mode.size):
+        for mode in sorted(usable, key=lambda mode: mode.size):
             larger = all(have >= want for have, want in zip(mode.size, wanted, strict=True))
             alike = mode.size[0] * wanted[1] == mode.size[1] * wanted[0]
             fast = not mode.rates_hz or max(mode.rates_hz) >= rate_hz
-            if larger and alike and fast and mode.pixel_format == known[0].pixel_format:
+            if larger and alike and fast and mode.pixel_format == usable[0].pixel_format:
                 return mode
         if self._options.size is None:
-            return None  # nobody asked for a size: whoever reads the frames says what is wrong with them
-        sizes = ", ".join(dict.fromkeys(f"{mode.size[1]}x{mode.size[0]}" for mode in known))
+            return None  # no size was set: the network refuses frames of another size
+        sizes = ", ".join(dict.fromkeys(f"{mode.size[1]}x{mode.size[0]}" for mode in usable))
         raise SourceError(
             f"{self.name} has no mode that gives {wanted[1]}x{wanted[0]} at {rate_hz:g} frames a second; "
             f"choose a --size of the same shape as one of {sizes}, or a lower --rate"
@@ -256,7 +249,7 @@ class CameraSource(LiveSource):
         self.size = self._options.size or (fit if fit is not None and alike else size)
         return FrameDecoder(pixel_format, size=size, wanted=self.size)
 
-    def _told(self, error: Exception) -> SourceError:
+    def _explained(self, error: Exception) -> SourceError:
         number = getattr(error, "errno", None)
         cures = {
             errno.EBUSY: "is taken by another program; close that one",
@@ -271,9 +264,9 @@ class CameraSource(LiveSource):
 
 
 def read_modes(device: "Device") -> tuple[CameraMode, ...]:
-    """Modes of an open camera that can be read, the largest rate first in each."""
+    """List the modes of an open camera that can be read, the largest rate first in each."""
     assert device.info is not None
-    found = sorted(
+    kinds = sorted(
         (kind.pixel_format.human_str(), (kind.height, kind.width), float(kind.max_fps))
         for kind in device.info.frame_types
     )
@@ -283,13 +276,13 @@ def read_modes(device: "Device") -> tuple[CameraMode, ...]:
             size=size,
             rates_hz=tuple(sorted({rate for *_, rate in same if rate > 0}, reverse=True)),
         )
-        for (pixel_format, size), same in groupby(found, key=lambda mode: mode[:2])
+        for (pixel_format, size), same in groupby(kinds, key=lambda mode: mode[:2])
         if pixel_format in _DECODERS
     )
 
 
 def list_cameras(folder: Path = Path("/dev")) -> tuple[Camera, ...]:
-    """Cameras of this machine, with their modes.
+    """List the cameras of this machine, with their modes.
 
     Raises
     ------

@@ -1,9 +1,10 @@
-"""What a running source is, and what a user may wish of it."""
+"""Contract of running sources, and their options."""
 
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Event
 
 from sliplens.errors import InputError
@@ -13,7 +14,7 @@ from sliplens.recordings.capture import Frame
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions:
-    """Wishes of a user for a source; each takes those that it understands and refuses the others."""
+    """Options of a source; each takes those that apply to it and refuses the others."""
 
     rate_hz: float | None = None
     """Frames a second; the source's own if None."""
@@ -27,7 +28,7 @@ class LiveOptions:
     """Format of a camera, four letters such as MJPG or YUYV; MJPG where the camera has it if None."""
 
     fit_size: tuple[int, int] | None = None
-    """Height and width that a network was trained on, in pixels: taken where the source can give it, else let be."""
+    """Height and width that a network was trained on, in pixels: used where the source can give it, else ignored."""
 
     def __post_init__(self) -> None:
         for name, value in (
@@ -39,7 +40,7 @@ class LiveOptions:
                 raise InputError(f"--{name} must be positive, got {value:g}")
 
     def require_only(self, *names: str, what: str) -> None:
-        """Refuse wishes that a source does not understand."""
+        """Refuse options that do not apply to a source."""
         for name, value in vars(self).items():
             if value is not None and name not in (*names, "fit_size"):
                 option = name.removesuffix("_hz").replace("_", "-")
@@ -47,7 +48,7 @@ class LiveOptions:
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
-    """Height and width of a text such as 640x480, which names the width first; None stays None."""
+    """Parse height and width of a text such as 640x480, which has the width first; None stays None."""
     if text is None:
         return None
     width, times, height = text.lower().partition("x")
@@ -59,30 +60,35 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 class LiveSource(ABC):
     """Running source of frames; a context manager that holds a device, file or connection while it is open.
 
-    It says what is wrong by a `SourceError`: a source that `reconnects` is then left and entered again until it comes
-    back.
+    It raises `SourceError` where it fails; a source that `reconnects` is then left and entered again until it is back.
     """
 
     name: str
-    """What it is, for people."""
+    """Name in messages, such as "the camera /dev/video0"."""
     size: tuple[int, int]
-    """Height and width of its frames, in pixels; known when it is open."""
+    """Height and width of its frames, in pixels; set while it is open."""
     rate_hz: float | None = None
-    """Frames a second that it gives, as far as it knows."""
+    """Frames a second; None where unknown."""
     reference: Frame | None = None
     """The sensor untouched, where the source brings its image."""
     count: int | None = None
-    """Frames that it will give; None where nobody knows."""
+    """Number of its frames; None where unknown."""
     speed: float = 1.0
     """Ratio of its time to that of the world: other than 1 where something is replayed."""
     cure: str = "check its cable or connection"
-    """What to do where it gives no frame."""
+    """Cure where it gives no frame."""
     simulated: bool = False
-    """Whether no real sensor is behind it."""
+    """True where no real sensor is behind it."""
     reconnects: bool = False
-    """Whether it may come back after a `SourceError`."""
+    """True where it may come back after a `SourceError`."""
+
+    @cached_property
+    def closed(self) -> Event:
+        """Event that `close` sets, and entering the source clears."""
+        return Event()
 
     def __enter__(self) -> "LiveSource":
+        self.closed.clear()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -90,13 +96,14 @@ class LiveSource(ABC):
 
     @abstractmethod
     def frames(self) -> Iterator[LiveFrame]:
-        """Frames as they come; it ends when the source does, or soon after `close`."""
+        """Iterate over frames as they come; ends when the source does, or soon after `close`."""
 
     def hear(self, reading: Reading) -> None:  # noqa: B027 (most act on nothing)
-        """Take what was read of a frame: for a source that acts on it, as a gripper does."""
+        """Take the reading of a frame: for a source that acts on it, as a gripper does."""
 
-    def close(self) -> None:  # noqa: B027 (most have nothing to give back)
+    def close(self) -> None:
         """Stop giving frames, soon; may be called from another thread, and again."""
+        self.closed.set()
 
 
 class Pace:
@@ -108,23 +115,23 @@ class Pace:
     def wait(self, due_s: float) -> bool:
         """Wait until so many seconds after the start; False if the source was closed.
 
-        What comes late moves the start: a source that is slow falls behind once, and does not hurry afterwards.
+        A late frame moves the start: a slow source falls behind once, and does not hurry afterwards.
         """
-        left_s = self._start_s + due_s - time.monotonic()
-        if left_s > 0:
-            return not self._closed.wait(left_s)
-        self._start_s -= left_s
+        wait_s = self._start_s + due_s - time.monotonic()
+        if wait_s > 0:
+            return not self._closed.wait(wait_s)
+        self._start_s -= wait_s
         return not self._closed.is_set()
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceKind:
-    """How a running source is recognised and opened."""
+    """Row of `SOURCES`: how a running source is recognised and opened."""
 
     words: str
-    """What it is, for people."""
+    """Description in lists and messages."""
     recognises: Callable[[str], bool]
-    """Told by the name that the user gave, without opening anything."""
+    """Returns True for the names of this kind, without opening anything."""
     open: Callable[[str, LiveOptions], LiveSource]
     """Nothing runs before the source is entered."""
 

@@ -1,4 +1,4 @@
-"""From a frame to its reading: the untouched sensor, markers, health, network and smoothing, all in one thread."""
+"""From a frame to its reading: reference, markers, health, network and smoothing, in one thread."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -29,16 +29,16 @@ from sliplens.shear import ShearEstimator
 
 @runtime_checkable
 class HealthWatch(Protocol):
-    """Judges frames against the reference that it was made for."""
+    """Checks frames against a reference."""
 
     def check(self, frame: LiveFrame, markers: TrackedFrame | None, /) -> tuple[Check, ...]:
-        """Check a frame, and its markers where they are followed; a check that is not fine withholds its margin."""
+        """Check a frame, and its markers where they are tracked; a check that fails withholds its margin."""
         ...
 
 
 @runtime_checkable
 class SlipWatch(Protocol):
-    """Tells slip from the motion of the markers, frame after frame."""
+    """Detects slip from the motion of the markers, frame after frame."""
 
     def update(self, positions_px: Float[np.ndarray, "markers 2"], time_s: float, /) -> MarkerReading:
         """Take the markers of a frame, NaN where one is not seen."""
@@ -55,7 +55,7 @@ _WIDE_PX = 5.0
 
 
 class _ReferenceTaker:
-    """Looks for a moment in which the picture is still and well exposed, and keeps a frame of it."""
+    """Search for a moment in which the picture is still and well exposed."""
 
     def __init__(self) -> None:
         self._since: LiveFrame | None = None
@@ -63,7 +63,7 @@ class _ReferenceTaker:
         self._frames = 0
 
     def offer(self, frame: LiveFrame) -> Frame | None:
-        """Take the next frame; gives the reference once the picture was still for long enough."""
+        """Take the next frame; returns it as the reference once the picture was still for long enough."""
         soft = soften(frame.image)
         moved = self._soft is None or float(np.abs(soft - self._soft).mean()) > _STILL_GREY
         if moved or self._since is None:
@@ -79,7 +79,7 @@ class _ReferenceTaker:
 
 
 class LowPass:
-    """Exponential filter of values that come at any times; it delays slow changes by its time constant."""
+    """Exponential filter of irregularly timed values; it delays slow changes by its time constant."""
 
     def __init__(self, *, time_constant_s: float) -> None:
         self.time_constant_s = time_constant_s
@@ -90,7 +90,7 @@ class LowPass:
         self._before = None
 
     def update(self, values: Float[np.ndarray, " values"], time_s: float) -> Float[np.ndarray, " values"]:
-        """Filtered values at a time; the values themselves where the time constant is 0."""
+        """Filter values at a time; returns the values themselves where the time constant is 0."""
         if self.time_constant_s > 0 and self._before is not None:
             before, then_s = self._before
             values = before + (values - before) * -np.expm1(-max(0.0, time_s - then_s) / self.time_constant_s)
@@ -99,11 +99,10 @@ class LowPass:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Answers:
-    """What the network said of a frame."""
+class _Output:
+    """Output of the network for a frame, and the time that it took."""
 
     parts: tuple[Tensor, ...]
-    """As `Answers` gives them."""
     encode_ms: float
     network_ms: float
 
@@ -111,9 +110,9 @@ class _Answers:
 class FrameReader:
     """Reads frames one after another, each against the untouched sensor; `read` is called in one thread.
 
-    The frame is checked while the network reads it, for as long as the frame before it had a margin: what the checks
-    then withhold was read in vain. An engine that has threads of its own, as OpenVINO and ONNX Runtime, needs no second
-    thread of Python for that, which would wait for the first.
+    The frame is checked while the network runs, as long as the frame before had a margin: the output is dropped where
+    the checks then withhold it. An engine with threads of its own, as OpenVINO, needs no second thread of Python for
+    that, which would wait for the first.
 
     Parameters are those of `LiveReader`.
     """
@@ -132,20 +131,20 @@ class FrameReader:
     ) -> None:
         self.source, self.network = source, network
         self.engine: Engine | None = None
-        """What runs the network; known once it has begun."""
+        """Engine of the network; set by `begin`."""
         self.reference: Frame | None = None
         """The sensor untouched, as the next frame is compared with it."""
         self.doubt: str | None = None
-        """That its colours are not those that the network was made for; None where they are, or there is none."""
-        self.asked = Event()
-        """Set to have a new reference taken as soon as the picture is still."""
+        """Doubt about the colours of the reference for this network; None without."""
+        self.new_reference = Event()
+        """Set to take a new reference as soon as the picture is still."""
         self.markers_px: tuple[np.ndarray, np.ndarray] | None = None
-        """Places (x, y) of the markers at rest and in the newest frame, in pixels; None where they are not followed."""
+        """Places (x, y) of the markers at rest and in the newest frame, in pixels; None where they are not tracked."""
         self.learner: SlipLearner
-        """What is known of the friction, and what slips teach of it."""
+        """Friction that was set, and that slips teach."""
         self.begin_object(friction, same_object=same_object)
         if sequence and network is None:
-            raise InputError("--sequence reads what a network says of several frames; name one with --network")
+            raise InputError("--sequence needs a network; name one with --network")
         self._follower = network.follow(friction=friction) if network is not None and sequence else None
         self._smooth = LowPass(time_constant_s=smoothing_s)
         self._make_health, self._make_slip = health, slip
@@ -160,18 +159,18 @@ class FrameReader:
         self._dropped = 0
 
     def begin_object(self, friction: FrictionLike | None, *, same_object: bool) -> None:
-        """Take what is known of an object's friction; what was known or learnt of one before is dropped."""
+        """Take the friction of an object; that of the one before is dropped."""
         network = self.network
         if friction is not None or same_object:
             if network is None:
-                option, does = ("--friction", "makes a margin") if friction is not None else ("--same-object", "learns")
-                raise InputError(f"{option} {does} of what a network reads; name one with --network")
+                option = "--same-object" if friction is None else "--friction"
+                raise InputError(f"{option} needs a network; name one with --network")
             network.require_ratio(learns=friction is None)
-        # made anew, not emptied: what the reading thread is just learning goes with the object before
+        # a new one, not emptied: the reading thread may still teach the one before
         self.learner = SlipLearner(None if friction is None else as_friction(friction), same_object=same_object)
 
     def begin(self, engine: Engine | None, reference: Frame | None) -> None:
-        """Take the source, which is open, as it is now, and an image of the untouched sensor if there is one."""
+        """Prepare for frames of the open source, with an image of the untouched sensor if there is one."""
         self.engine, self._size = engine, self.source.size
         if self._follower is not None and self.source.rate_hz:
             require_frequent(np.arange(2) * self.source.speed / self.source.rate_hz, what=self.source.name)
@@ -187,7 +186,7 @@ class FrameReader:
         self._set_reference(reference)
 
     def missing(self, why: str) -> Reading:
-        """Reading where no frame came."""
+        """Make the reading of a moment without a frame."""
         last = self._last
         return Reading(
             number=-1 if last is None else last.number,
@@ -211,33 +210,38 @@ class FrameReader:
         )
         if jump_s := 0.0 if last is None else self._clock_jump(last, frame):
             self._begin_anew()
-            told = f"the clock of {self.source.name} jumped by {jump_s:+.3g} s; the next frame is read again"
-            return self._withhold(begin, frame, told)
+            why = f"the clock of {self.source.name} jumped by {jump_s:+.3g} s; the next frame is read again"
+            return self._withhold(begin, frame, why)
         if frame.size != self._size:
-            told = f"the frames of {self.source.name} are now {_in_pixels(frame.size)} pixels, they were "
-            cure = "set the camera as it was, or start again"
-            return self._withhold(begin, frame, f"{told}{_in_pixels(self._size)}; {cure}")
-        self._look_for_reference(frame)
+            sizes = f"{_in_pixels(frame.size)} pixels, they were {_in_pixels(self._size)}"
+            why = f"the frames of {self.source.name} are now {sizes}; set the camera as it was, or start again"
+            return self._withhold(begin, frame, why)
+        if self.new_reference.is_set():
+            self.new_reference.clear()
+            self._taker = _ReferenceTaker()
+        if self._taker is not None and (image := self._taker.offer(frame)) is not None:
+            self._taker = None
+            self._set_reference(image)
         if self.reference is None:
             still = "the picture must be still for a moment: leave the sensor untouched"
             return self._withhold(begin, frame, f"there is no reference frame yet; {still}")
         checked: list[tuple[Reading, str | None]] = []
-        answers = self._ask(frame, lambda: checked.append(self._check(begin, frame))) if self._has_margin else None
+        output = self._predict(frame, lambda: checked.append(self._check(begin, frame))) if self._has_margin else None
         [(reading, withheld)] = checked or [self._check(begin, frame)]
         if self.network is None or withheld is not None:
             return self._withhold(reading, frame, withheld)
-        return self._estimate(reading, frame, answers or self._ask(frame))
+        return self._estimate(reading, frame, output or self._predict(frame))
 
     def _check(self, begin: Reading, frame: LiveFrame) -> tuple[Reading, str | None]:
-        """Follow the markers of a frame and look at its health; gives the reading so far, and why it has no margin."""
+        """Track the markers of a frame and check its health; returns its reading, and why it has no margin."""
         begun = time.perf_counter()
-        followed = markers = None
+        tracked = markers = None
         if self._tracker is not None and self._slip is not None:
-            followed = self._tracker.update(frame.image if self._smaller == 1 else frame.small)
+            tracked = self._tracker.update(frame.image if self._smaller == 1 else frame.small)
             rest_px = self._tracker.rest.centre_px
-            self.markers_px = self._in_frame(rest_px), self._in_frame(followed.position_px[: len(rest_px)])
+            self.markers_px = self._in_frame(rest_px), self._in_frame(tracked.position_px[: len(rest_px)])
             markers = self._slip.update(self.markers_px[1], frame.time_s)
-        health = () if self._health is None else self._health.check(frame, followed)
+        health = () if self._health is None else self._health.check(frame, tracked)
         if self._shear is not None and self.network is not None and all(check.ok for check in health):
             health = (*health, check_direction(self.network, self._shear.estimate(frame.image)))
         latency = Latency(decode_ms=frame.decode_ms, checks_ms=1e3 * (time.perf_counter() - begun))
@@ -260,8 +264,8 @@ class FrameReader:
         latency = replace(reading.latency, decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
         return replace(reading, withheld=why, latency=latency)
 
-    def _ask(self, frame: LiveFrame, meanwhile: Callable[[], None] = lambda: None) -> _Answers:
-        """Have the network read a frame, and do something meanwhile."""
+    def _predict(self, frame: LiveFrame, meanwhile: Callable[[], None] = lambda: None) -> _Output:
+        """Run the network on a frame, and something else meanwhile."""
         assert self.network is not None
         assert self.engine is not None
         assert self.reference is not None
@@ -278,14 +282,14 @@ class FrameReader:
 
         [parts] = self.engine.answers(batches())
         waited_s = time.perf_counter() - encoded - spent_s
-        return _Answers(parts=parts, encode_ms=1e3 * (encoded - begun), network_ms=1e3 * waited_s)
+        return _Output(parts=parts, encode_ms=1e3 * (encoded - begun), network_ms=1e3 * waited_s)
 
-    def _estimate(self, reading: Reading, frame: LiveFrame, answers: _Answers) -> Reading:
+    def _estimate(self, reading: Reading, frame: LiveFrame, output: _Output) -> Reading:
         assert self.network is not None
         friction = self.learner.friction
-        follower = self._follower if friction is None else None  # it looks for what is known then
-        estimate = self.network.to_estimate(*answers.parts, friction=friction)
-        latency = replace(reading.latency, encode_ms=answers.encode_ms, network_ms=answers.network_ms)
+        follower = self._follower if friction is None else None  # it takes no friction
+        estimate = self.network.to_estimate(*output.parts, friction=friction)
+        latency = replace(reading.latency, encode_ms=output.encode_ms, network_ms=output.network_ms)
         reading = replace(reading, latency=latency)
         novelty = None if self._health is None else check_novelty(estimate)
         if novelty is not None:
@@ -318,24 +322,16 @@ class FrameReader:
             latency=replace(latency, total_ms=_since_ms(frame.captured_s)),
         )
 
-    def _look_for_reference(self, frame: LiveFrame) -> None:
-        if self.asked.is_set():
-            self.asked.clear()
-            self._taker = _ReferenceTaker()
-        if self._taker is not None and (image := self._taker.offer(frame)) is not None:
-            self._taker = None
-            self._set_reference(image)
-
     def _set_reference(self, image: Frame) -> None:
         self.reference = image
         self.doubt = None if self.network is None else self.network.doubt_colour(image)
         self._health = None if self._make_health is None else self._make_health(image)
-        checked = None if self._health is None else self.network
-        self._shear = None if checked is None else checked.shear_estimator(image)
+        network = None if self._health is None else self.network
+        self._shear = None if network is None else network.shear_estimator(image)
         self._begin_anew()
 
     def _begin_anew(self) -> None:
-        """Forget what came before, where frames no longer follow each other."""
+        """Forget earlier frames, where frames no longer follow each other."""
         self._smooth.forget()
         self.learner.release()
         if self._follower is not None:
@@ -349,20 +345,20 @@ class FrameReader:
                 self._tracker = self._slip = None  # it shows no markers, or too few
 
     def _in_frame(self, places_px: Float[np.ndarray, "markers 2"]) -> Float[np.ndarray, "markers 2"]:
-        """Places in the frame of places in the picture in which markers are followed; pixel centres are whole."""
+        """Convert places of the picture in which markers are tracked to the frame; pixel centres are whole numbers."""
         return (places_px + 0.5) * self._smaller - 0.5
 
     def _clock_jump(self, last: LiveFrame, frame: LiveFrame) -> float:
-        """Seconds by which the clock of the source jumped; 0 where it went on."""
+        """Return the seconds by which the clock of the source jumped; 0 where it went on."""
         passed_s = frame.time_s - last.time_s
         off_s = passed_s - self.source.speed * (frame.captured_s - last.captured_s)
         return 0.0 if passed_s > 0 and abs(off_s) <= _JUMP_S else off_s
 
 
 def _follow(reference: Frame) -> tuple[Tracker, int]:
-    """Tracker of a sensor's markers, and how many times smaller than the frame it wants its pictures.
+    """Make a tracker of a sensor's markers, and the factor by which its pictures are reduced.
 
-    A disc as wide as several pixels is measured as well in means of blocks, in a third of the time.
+    A disc as wide as several pixels is measured as well in block means, in a third of the time.
     """
     tracker, factor = Tracker(reference), small_factor(reference.shape)
     if factor == 1 or tracker.rest.appearance.radius_px < _WIDE_PX * factor:

@@ -394,7 +394,7 @@ class LiveReader:
 
     def take_reference(self) -> None:
         """Take a new reference as soon as the picture is still; the old one holds until then."""
-        self._reader.asked.set()
+        self._reader.new_reference.set()
 
     def send_to(self, *sinks: str) -> None:
         """Send every reading and its frame to other programs from now on, until it is closed.

@@ -1,4 +1,4 @@
-"""What threads hand to each other: a place for the newest items, and an outlet that works them off."""
+"""Hand-over between threads: a mailbox for the newest items, and an outlet that works them off."""
 
 from collections import deque
 from collections.abc import Callable
@@ -9,12 +9,12 @@ Item = TypeVar("Item")
 
 
 class Mailbox(Generic[Item]):
-    """Place where one thread leaves what another takes; where too many wait, the oldest is lost and counted."""
+    """Queue between two threads; where too many items wait, the oldest is lost and counted."""
 
     def __init__(self) -> None:
         self._changed, self._items = Condition(), deque[Item]()
         self.closed = False
-        """Whether no more come; what waits can still be taken."""
+        """True once no more items come; those that wait can still be taken."""
         self.lost = 0
         """Items that were left here and never taken."""
 
@@ -31,13 +31,13 @@ class Mailbox(Generic[Item]):
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Let whoever waits know that no more come."""
+        """Wake the waiting thread: no more items come."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
 
     def discard(self) -> None:
-        """Close it, and lose what waits."""
+        """Close it, and lose the waiting items."""
         self.close()
         with self._changed:
             self.lost += len(self._items)
@@ -51,12 +51,12 @@ class Mailbox(Generic[Item]):
 
 
 class Outlet(Generic[Item]):
-    """Thread that hands items on, one after another, so that whoever makes them waits for nothing.
+    """Thread that hands items on, one after another, so that their producer never waits.
 
     Parameters
     ----------
     send
-        Called with each item; after an exception nothing more is sent, and `error` tells it.
+        Called with each item; after an exception nothing more is sent, and `error` is set.
     end
         Called once, in the same thread, when no more will be sent.
     most_bytes
@@ -69,7 +69,7 @@ class Outlet(Generic[Item]):
         self.sent = 0
         """Items that were handed on."""
         self.error: Exception | None = None
-        """What ended it before it was closed."""
+        """Exception that ended it before it was closed."""
         self._thread = Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -102,7 +102,7 @@ class Outlet(Generic[Item]):
             while (item := self._box.take()) is not None:
                 self._send(item)
                 self.sent += 1
-        except Exception as error:  # whatever it was, it is told where the items come from
+        except Exception as error:  # any: the producer reports it
             self.error = error
             self._box.lost += 1
             self._box.discard()

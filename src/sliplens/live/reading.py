@@ -1,4 +1,4 @@
-"""What a running sensor gives: frames, and for each a reading with its health."""
+"""Frames of a running sensor, and their readings."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -17,12 +17,12 @@ _SMALL_PX = 224
 
 
 def small_factor(size: tuple[int, ...]) -> int:
-    """How many times smaller `small_picture` makes a frame of a size (height, width), in pixels."""
+    """Return the factor by which `small_picture` reduces a frame of a size (height, width), in pixels."""
     return max(1, min(size[:2]) // _SMALL_PX)
 
 
 def small_picture(image: Frame) -> SmallPicture:
-    """Picture of 224 to 448 pixels, in which limits in pixels mean the same for every camera; means of blocks."""
+    """Reduce a frame to 224 to 448 pixels by block means, so that limits in pixels suit every camera."""
     return shrink(image, small_factor(image.shape))
 
 
@@ -32,17 +32,17 @@ class LiveFrame:
 
     image: Frame
     number: int
-    """Count of the source itself, so that a gap tells of frames that were lost before they came here."""
+    """Count of the source itself, so that a gap shows lost frames."""
     time_s: float
-    """On the clock of the source."""
+    """Time on the clock of the source."""
     captured_s: float
-    """When it was captured, as `time.monotonic` counts."""
+    """Time of the capture, as `time.monotonic` counts."""
     decode_ms: float = 0.0
     """Time that decoding took, in milliseconds."""
     forces: Forces | None = None
     """Samples of a force sensor since the frame before, on the clock of the source; None where there is none."""
     safety_margin: float | None = None
-    """True margin, where the source knows it: a simulated fingertip, or a labelled trial."""
+    """True margin, of a simulated fingertip or a labelled trial."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -51,22 +51,22 @@ class LiveFrame:
 
     @cached_property
     def small(self) -> SmallPicture:
-        """What `small_picture` makes of it, made once for all who look at the picture as a whole."""
+        """Reduced picture (`small_picture`), made once."""
         return small_picture(self.image)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Latency:
-    """Where the time between a frame and its reading went, in milliseconds."""
+    """Parts of the time between a frame and its reading, in milliseconds."""
 
     decode_ms: float = 0.0
     """From the bytes of the camera to pixels; a replayed frame is decoded before it is due."""
     checks_ms: float = 0.0
-    """Following the markers, and the checks of the frame's health."""
+    """Tracking of the markers, and the checks of the frame's health."""
     encode_ms: float = 0.0
     """From pixels to the network's input."""
     network_ms: float = 0.0
-    """From the network's input to its answer, but for the checks that were made meanwhile."""
+    """From the network's input to its output, without the checks that ran meanwhile."""
     total_ms: float = 0.0
     """From the capture to the reading, waiting included."""
 
@@ -77,16 +77,16 @@ class Check:
 
     name: str
     value: float
-    """What was measured, in its unit: pixels, grey levels, seconds, or a share."""
+    """Measured value in its unit: pixels, grey levels, seconds, or a share."""
     limit: float
     """Bound of the healthy values, in the same unit."""
     ok: bool
     sentence: str
-    """What is wrong, with the cure; what was measured where nothing is wrong."""
+    """Statement of the measured value, and the cure where the check fails."""
 
 
 class SlipState(StrEnum):
-    """What the motion of the markers tells."""
+    """Slip as the markers show it."""
 
     SLIP = "slip"
     STICKING = "no full slip"
@@ -96,70 +96,68 @@ class SlipState(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerReading:
-    """What the markers of one frame tell without any network."""
+    """Contact and slip as the markers of one frame show them."""
 
     state: SlipState
     contact: bool | None = None
-    """Whether something touches; None while that cannot be told."""
+    """True where something touches; None while that is unknown."""
     shear_px: float | None = None
     """Mean motion of the contact's middle since it was pressed, in pixels; None without a contact."""
     stick_share: float | None = None
     """Share of the contact's markers that move with its middle, from 0 to 1; None without a contact."""
     slipping_s: float | None = None
-    """Time since the slip began, as the markers tell it afterwards; None where there is none."""
+    """Time since the slip began; None where there is none."""
     slipped_s: float | None = None
-    """Time since a slip began, in the one frame in which it is confirmed: the load is still there, and was not let go.
-    Confirmed slips teach friction."""
+    """Time since a slip began, in the one frame that confirms it: the load was not let go. Confirmed slips teach
+    friction."""
 
 
 NO_NETWORK = "no network, so no margin is read; name one with --network"
-"""What is told where no network reads."""
+"""Advice where there is no network."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """What a running sensor tells at one frame; margins are from 0 to 1, 1 sticks fully, 0 slips.
+    """Margin, contact and health at one frame; margins are from 0 to 1, 1 sticks fully, 0 slips.
 
-    `margin`, `low` and `high` are None without a network, and where `withheld` says why they are not to be believed.
+    `margin`, `low` and `high` are None without a network, and where `withheld` says why.
     """
 
     number: int
-    """Frame, as its source counts; -1 where none has come yet."""
+    """Number of the frame, as its source counts; -1 before the first."""
     time_s: float
     """Time of the frame on the clock of its source."""
     captured_s: float
-    """When the frame was captured, as `time.monotonic` counts."""
+    """Time of the capture, as `time.monotonic` counts."""
     margin: float | None = None
     low: float | None = None
-    """Lower end of the interval that holds the true margin with 90 % confidence, in margin units; None of a network
-    that was never calibrated."""
+    """Lower end of the 90 % interval, in margin units; None of a network that was never calibrated."""
     high: float | None = None
     """Upper end of it, in margin units."""
     ratio: float | None = None
-    """Traction ratio F_t / F_n, of a network that tells it."""
+    """Traction ratio F_t / F_n, of a network that predicts it."""
     friction: str | None = None
-    """Coefficient of friction that the margin was read with, in words; None where none was told."""
+    """Coefficient of friction that the margin assumes, in words; None where none was set."""
     sequence: bool = False
-    """Whether the margin was read in order: what the frames of the contact before this one told counts too."""
+    """True where the earlier frames of the contact count too."""
     risk: float | None = None
-    """Chance that the margin is off by more than 0.2, from all of health and the network's own spread
-    (`margin_risk`); None without a margin."""
+    """Chance that the margin is off by more than 0.2 (`margin_risk`); None without a margin."""
     lag_s: float = 0.0
     """Delay of margin and interval by smoothing; 0 without."""
     contact_state: ContactState = ContactState.UNKNOWN
     slip: SlipState | None = None
-    """What the markers tell; None where they are not followed."""
+    """Slip as the markers show it; None where they are not tracked."""
     markers: MarkerReading | None = None
-    """What else the markers tell; None where they are not followed."""
+    """Reading of the markers; None where they are not tracked."""
     health: tuple[Check, ...] = ()
-    """Checks of the frame; empty where health is not watched."""
+    """Checks of the frame; empty without a health monitor."""
     withheld: str | None = None
-    """Why a network tells no margin, with the cure; None where it tells one, or there is no network."""
+    """Why there is no margin, with the cure; None where there is one, or no network."""
     latency: Latency = Latency()
     dropped: int = 0
-    """Frames since the start that were captured, or counted by the source, and never read."""
+    """Number of frames since the start that were lost or never read."""
     true_margin: float | None = None
-    """Where the source knows it, to compare with."""
+    """True margin, where the source has it."""
 
     def __str__(self) -> str:
         words = describe_reading(self)
@@ -167,7 +165,7 @@ class Reading:
 
 
 TARGET = 0.2, 0.4
-"""Margins that people keep when they hold something."""
+"""Margins at which people hold objects."""
 OFF = 0.2
 """Error from which on a margin is off."""
 _RISK, _DOUBT = 0.1, 0.5
@@ -201,13 +199,13 @@ class ReadingWords:
 
     zone: Zone
     advice: str
-    """What the reading means for a grip, or why there is no margin."""
+    """Meaning for a grip, or why there is no margin."""
     margin: str
     """Margin in percent; empty where there is none."""
     interval: str
-    """Both ends of the interval in percent, and the risk where it is more than the interval says; empty without."""
+    """Both ends of the interval in percent, and the risk where the interval understates it; empty without."""
     contact: ContactState
-    """State of the contact, as far as interval and markers agree on it; else unknown."""
+    """State of the contact where interval and markers agree; else unknown."""
 
     def __str__(self) -> str:
         interval = f" ({self.interval})" if self.interval else ""
@@ -215,7 +213,7 @@ class ReadingWords:
 
 
 def describe_reading(reading: Reading) -> ReadingWords:
-    """Describe a reading in words that follow its interval, risk and markers, not the margin alone.
+    """Describe a reading by its interval, risk and markers, not by the margin alone.
 
     Examples
     --------
@@ -234,7 +232,7 @@ def describe_reading(reading: Reading) -> ReadingWords:
         ((reading.risk or 0) > _DOUBT, Zone.UNCERTAIN, "cannot tell: the margin is more likely wrong than right"),
         (True, zone, _ADVICE[zone]),
     )
-    zone, advice = next((judged, words) for applies, judged, words in rules if applies)
+    zone, advice = next((then, words) for applies, then, words in rules if applies)
     margin = interval = ""
     if reading.margin is not None:
         margin = f"{100 * reading.margin:.0f} %"
@@ -247,7 +245,7 @@ def describe_reading(reading: Reading) -> ReadingWords:
 
 
 def _ends(reading: Reading, *, risk: float | None) -> tuple[float, float]:
-    """Ends of the interval in whole percents, as they are shown; moved apart where the risk is more than they say."""
+    """Round the ends of the interval to percents; widen it where the risk is more than it states."""
     margin, low, high = reading.margin, reading.low, reading.high
     if margin is None or low is None or high is None:
         return 0.0, 1.0

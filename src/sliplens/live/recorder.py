@@ -31,13 +31,13 @@ _STUCK_S = 30.0  # in which not a single frame could be written
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingState:
-    """How far a recording is."""
+    """Progress of a recording."""
 
     folder: Path
     frames: int
     """Frames that are on disk."""
     seconds: float
-    """Time that they span."""
+    """Time that they span, in seconds."""
     lost: int
     """Frames that were not recorded, the disk being too slow or full."""
     trouble: str | None
@@ -62,11 +62,11 @@ class Recorder:
     facts
         Who, when and what; `trial` is the NAME.
     source
-        Camera, stream or file, for people.
+        Name of the camera, stream or file.
     simulated
-        Whether no real sensor is behind it.
+        True where no real sensor is behind it.
     reference
-        The sensor untouched, where it is known.
+        The sensor untouched, where there is an image.
 
     Raises
     ------
@@ -92,13 +92,13 @@ class Recorder:
         self._journal: Journal | None = None
         self._last: LiveFrame | None = None
         self._first_s = self._seconds = 0.0
-        self._shown: Frame | None = None
+        self._trial_reference: Frame | None = None
         self._closed = False
         self._outlet = Outlet(self._append, self._end_trial, most_bytes=_MOST_WAITING_BYTES)
 
     @property
     def state(self) -> RecordingState:
-        """How far it is now."""
+        """Current progress."""
         outlet, trouble = self._outlet, None
         if outlet.error is not None:
             trouble = (
@@ -110,15 +110,15 @@ class Recorder:
         )
 
     def set_reference(self, image: Frame) -> None:
-        """Frames to come are recorded as a new trial, with this image of the untouched sensor."""
+        """Begin a new trial with the next frame, with this image of the untouched sensor."""
         self._reference = image
 
     def add(self, frame: LiveFrame) -> None:
-        """Take a frame; it is written in another thread, and lost where that one is far behind."""
+        """Take a frame; another thread writes it, or loses it where that is far behind."""
         self._outlet.put((frame, self._reference), size_bytes=frame.image.nbytes)
 
     def close(self) -> Dataset | None:
-        """Write what waits and make trials of it; None where there is no frame at all.
+        """Write the waiting frames and make trials; None where there is no frame at all.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class Recorder:
             or last is None
             or frame.size != last.size
             or frame.time_s <= last.time_s
-            or reference is not self._shown
+            or reference is not self._trial_reference
         ):
             self._begin_trial(frame, reference)
         assert self._journal is not None
@@ -180,7 +180,7 @@ class Recorder:
         fits = reference is not None and reference.shape == frame.image.shape
         self._journal = Journal(self._lock.folder, header, reference=reference if fits else None)
         self._taken.add(facts.trial)
-        self._first_s, self._shown = frame.time_s, reference
+        self._first_s, self._trial_reference = frame.time_s, reference
 
 
 _TAIL_S = 0.01
@@ -218,7 +218,7 @@ class ForceStream:
         self._closed.set()
 
     def attach(self, frame: LiveFrame) -> LiveFrame:
-        """The frame, with the samples that came since the one before."""
+        """Add to a frame the samples that came since the one before."""
         with self._lock:
             samples, self._samples = self._samples, []
             delay_s = self._delay_s
@@ -230,10 +230,10 @@ class ForceStream:
         time_s: np.ndarray = np.where(np.isnan(stamps_s), arrived_s, stamps_s + delay_s) + shift_s
         force_n = np.array([force for *_, force in samples])
         # samples that dropped out, and those that come after a later one
-        kept = np.isfinite(force_n).all(axis=1) & (time_s > np.maximum.accumulate(np.append(-np.inf, time_s))[:-1])
-        if not kept.any():
+        good = np.isfinite(force_n).all(axis=1) & (time_s > np.maximum.accumulate(np.append(-np.inf, time_s))[:-1])
+        if not good.any():
             return frame
-        return replace(frame, forces=Forces(time_s=time_s[kept], force_n=force_n[kept], source=str(self.path)))
+        return replace(frame, forces=Forces(time_s=time_s[good], force_n=force_n[good], source=str(self.path)))
 
     def _follow(self, begin: int) -> None:
         try:
@@ -249,7 +249,7 @@ class ForceStream:
             self.trouble = f"{error}; the forces of {self.path} end here"
 
     def _next_line(self, file: TextIO) -> str:
-        """Next whole line; empty when closed."""
+        """Wait for the next whole line; empty when closed."""
         text = ""
         while not self._closed.is_set():
             text += file.readline()

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from threading import Event, Lock
+from threading import Lock
 from typing import TypeAlias
 
 import av
@@ -35,30 +35,30 @@ from sliplens.simulation.sensor import SENSORS
 
 
 class ReplaySource(LiveSource):
-    """Trial of a data set, video or bag replayed at its own pace, over and over if asked to.
+    """Trial of a data set, video or bag replayed at its own pace, once or over and over.
 
     Parameters
     ----------
     capture
-        What `open_source` gave.
+        Recording, as `open_source` returns it.
     speed
         Ratio of the recorded time to that of the replay: 2 is twice as fast.
     rate_hz
         Frames a second in place of the recorded times.
     repeat
-        Begin anew at the end; times and numbers go on.
+        If True, begin anew at the end; times and numbers go on.
     """
 
     def __init__(
         self, capture: Capture, *, speed: float = 1.0, rate_hz: float | None = None, repeat: bool = False
     ) -> None:
-        self._capture, self._repeat, self._closed = capture, repeat, Event()
+        self._capture, self._repeat = capture, repeat
         self.name, self.simulated = f"{capture.name} of {capture.opened}", capture.simulated
         self.size = capture.frame_size
         self.count = None if repeat else len(capture)
-        known = capture.time_s if rate_hz is None else None
+        recorded_s = capture.time_s if rate_hz is None else None
         step_s = 1 / (rate_hz or capture.frame_rate_hz)
-        self._time_s = np.arange(len(capture)) * step_s if known is None else known - known[0]
+        self._time_s = np.arange(len(capture)) * step_s if recorded_s is None else recorded_s - recorded_s[0]
         self._length_s = float(self._time_s[-1]) + step_s
         self.speed = speed
         self.rate_hz = speed / step_s
@@ -66,8 +66,8 @@ class ReplaySource(LiveSource):
         self.reference = None if read_reference is None else read_reference()
 
     def frames(self) -> Iterator[LiveFrame]:
-        """Frames at their times, of the first pass and of those after it."""
-        pace, number, begun_s = Pace(self._closed), 0, 0.0
+        """Iterate over frames at their times, of the first pass and of those after it."""
+        pace, number, begun_s = Pace(self.closed), 0, 0.0
         capture = self._capture
         first_s = 0.0 if capture.time_s is None else float(capture.time_s[0])
         while True:
@@ -109,17 +109,13 @@ class ReplaySource(LiveSource):
             time_s=forces.time_s[first:last] + shift_s, force_n=forces.force_n[first:last], source=forces.source
         )
 
-    def close(self) -> None:
-        """Stop at the next frame."""
-        self._closed.set()
-
 
 _POLL_S = 0.02
 _WRITTEN_S = 1.0  # after which a file that cannot be read is damaged, not half written
 
 
 class FolderSource(LiveSource):
-    """Folder into which some other program saves images; the newest is the first frame, then those to come.
+    """Folder into which another program saves images; the newest is the first frame.
 
     An image's time is that of its file.
     """
@@ -127,34 +123,30 @@ class FolderSource(LiveSource):
     cure = "nothing new was saved there"
 
     def __init__(self, folder: Path) -> None:
-        self.name, self._folder, self._closed = f"the folder {folder}", folder, Event()
-        self._seen: set[str] = set()
+        self.name, self._folder = f"the folder {folder}", folder
+        self._taken: set[str] = set()
 
     def __enter__(self) -> "FolderSource":
-        self._closed.clear()
+        self.closed.clear()
         if not any(map(is_image, require_folder(self._folder, what="the folder").iterdir())):
             raise InputError(f"{self.name} holds no image yet; begin when the first has been saved there")
         *before, newest = list_images(self._folder)
         self.size = frame_size(newest)
-        self._seen = {path.name for path in before}
+        self._taken = {path.name for path in before}
         return self
 
-    def close(self) -> None:
-        """Stop within some hundredths of a second."""
-        self._closed.set()
-
     def frames(self) -> Iterator[LiveFrame]:
-        """Images in the natural order of their names; one that stays damaged is missing in the numbers."""
-        looked, number, last_s, broken_s = -1, 0, -np.inf, np.inf
-        while not self._closed.is_set():
+        """Iterate over images in the natural order of their names; a damaged one is missing in the numbers."""
+        listed, number, last_s, broken_s = -1, 0, -np.inf, np.inf
+        while not self.closed.is_set():
             try:
                 changed = self._folder.stat().st_mtime_ns
-                new = self._new_images() if changed != looked else []
+                new = self._new_images() if changed != listed else []
             except OSError as error:
                 raise SourceError(
                     f"{self.name} cannot be read ({error.strerror}); make it again, and begin anew"
                 ) from None
-            looked = changed
+            listed = changed
             for path in new:
                 before = time.monotonic()
                 try:
@@ -162,11 +154,11 @@ class FolderSource(LiveSource):
                 except (ImageError, OSError):
                     broken_s = min(broken_s, before)
                     if path.exists() and before - broken_s < _WRITTEN_S:
-                        looked = -1  # it may be half written; the next ones wait too, so that they come in order
+                        listed = -1  # it may be half written; the next ones wait too, so that they come in order
                         break
                     written_s, image = 0.0, None
                 broken_s = np.inf
-                self._seen.add(path.name)
+                self._taken.add(path.name)
                 number += 1
                 if image is None:
                     continue
@@ -179,18 +171,18 @@ class FolderSource(LiveSource):
                     captured_s=now_s - max(0.0, time.time() - written_s),
                     decode_ms=1e3 * (now_s - before),
                 )
-            self._closed.wait(_POLL_S)
+            self.closed.wait(_POLL_S)
 
     def _new_images(self) -> list[Path]:
-        """Images that were not seen yet, in the natural order of their names; only those are looked at."""
-        paths = (path for path in self._folder.iterdir() if path.name not in self._seen)
+        """List the images that are new, in the natural order of their names."""
+        paths = (path for path in self._folder.iterdir() if path.name not in self._taken)
         return sorted(filter(is_image, paths), key=lambda path: natural_key(path.name))
 
 
 _NETWORK = ("rtsp", "rtp", "udp", "tcp", "http", "https", "rtmp", "srt")
 _OPEN_S, _READ_S = 5.0, 2.0
 _QUICK = {
-    # what comes from outside may lead to no file of this machine
+    # a stream must not lead to a file of this machine
     "protocol_whitelist": ",".join((*_NETWORK, "rtsps", "tls", "crypto", "rtmps")),
     "rtsp_transport": "tcp",
     "fflags": "nobuffer",
@@ -207,7 +199,7 @@ class ProfiledSource(LiveSource):
     source
         Source of the camera's frames.
     profile
-        What they go through.
+        Profile of the sensor.
     """
 
     def __init__(self, source: LiveSource, profile: SensorProfile) -> None:
@@ -225,7 +217,7 @@ class ProfiledSource(LiveSource):
         self._source.__exit__(*error)
 
     def hear(self, reading: Reading) -> None:
-        """Hand on what was read."""
+        """Hand on a reading."""
         self._source.hear(reading)
 
     def close(self) -> None:
@@ -233,7 +225,7 @@ class ProfiledSource(LiveSource):
         self._source.close()
 
     def frames(self) -> Iterator[LiveFrame]:
-        """Frames as the profile makes them; a frame of another size than the camera's comes as it is, to be told."""
+        """Iterate over frames as the profile makes them; a frame of an unexpected size stays as it is."""
         for frame in self._source.frames():
             begun_s = time.perf_counter()
             fits = frame.size == self._source.size
@@ -248,16 +240,15 @@ class StreamSource(LiveSource):
     reconnects = True
 
     def __init__(self, address: str, *, size: tuple[int, int] | None = None) -> None:
-        self.name, self._address, self._size, self._closed = f"the stream {address}", address, size, Event()
-        self._held = ExitStack()
+        self.name, self._address, self._size, self._stack = f"the stream {address}", address, size, ExitStack()
 
     def __enter__(self) -> "StreamSource":
-        self._closed.clear()
+        self.closed.clear()
         with ExitStack() as stack:
             try:
                 opened = av.open(self._address, options=_QUICK, timeout=(_OPEN_S, _READ_S))
             except (FFmpegError, OSError, ValueError) as error:
-                raise self._told(error) from None
+                raise self._explained(error) from None
             self._container = stack.enter_context(opened)
             if not opened.streams.video:
                 raise SourceError(f"{self.name} shows no pictures; name the address of a camera")
@@ -266,22 +257,18 @@ class StreamSource(LiveSource):
             self.size = self._size or (self._video.codec_context.height, self._video.codec_context.width)
             rate = self._video.average_rate
             self.rate_hz = float(rate) if rate else None
-            self._held = stack.pop_all()
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-        self._held.close()
-
-    def close(self) -> None:
-        """Stop at the next frame, or when none comes for two seconds."""
-        self._closed.set()
+        self._stack.close()
 
     def frames(self) -> Iterator[LiveFrame]:
-        """Frames as they arrive; those that cannot be decoded are missing in the numbers."""
+        """Iterate over frames as they arrive; those that cannot be decoded are missing in the numbers."""
         to_rgb, number = VideoReformatter(), 0
         packets = self._container.demux(self._video)
-        while not self._closed.is_set():
+        while not self.closed.is_set():
             try:
                 packet = next(packets)
                 arrived_s = time.monotonic()
@@ -291,9 +278,9 @@ class StreamSource(LiveSource):
                     number += 1
                     continue
             except (FFmpegError, OSError) as error:
-                if self._closed.is_set():
+                if self.closed.is_set():
                     return
-                raise self._told(error) from None
+                raise self._explained(error) from None
             except StopIteration:
                 raise SourceError(f"{self.name} has ended; start the camera again") from None
             for frame in frames:
@@ -309,20 +296,20 @@ class StreamSource(LiveSource):
                 )
                 number += 1
 
-    def _told(self, error: Exception) -> SourceError:
+    def _explained(self, error: Exception) -> SourceError:
         reason = getattr(error, "strerror", None) or str(error)
         return SourceError(f"{self.name} cannot be read ({reason}); check its address and that the camera runs")
 
 
 _GRIP_S = 10.0
-"""Length of the grip that the simulated fingertip repeats until somebody takes it in hand."""
+"""Length of the grip that the simulated fingertip repeats until `load` is called."""
 _GRIP_TIMES_S = (0.0, 1.0, 2.0, 2.5, 7.5, 8.5, 9.0, _GRIP_S)
 _GRIP_PRESS = (0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
 _GRIP_PULL = (0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
 
 
 class SimulatedSource(LiveSource):
-    """Fingertip of the simulator that can be pressed and pulled while it runs.
+    """Simulated fingertip that can be pressed and pulled while it runs.
 
     Until `load` is called it repeats a grip by itself: touch, press, pull until it slips, let go.
 
@@ -356,8 +343,8 @@ class SimulatedSource(LiveSource):
             raise InputError(f"there is no simulated sensor named {sensor!r}; choose one of {', '.join(SENSORS)}")
         self.name, self.rate_hz = f"a simulated {sensor}", rate_hz
         self._rng = np.random.default_rng(seed)
-        self._grasp, self._closed, self._lock = Grasp(friction=friction), Event(), Lock()
-        self._held: tuple[float, float] | None = None
+        self._grasp, self._lock = Grasp(friction=friction), Lock()
+        self._forces_n: tuple[float, float] | None = None
         chosen = SENSORS[sensor]
         self.size = chosen.image_size_px, chosen.image_size_px
         self._film: Film = prepare_film(
@@ -382,23 +369,23 @@ class SimulatedSource(LiveSource):
                 "give forces of 0 or more"
             )
         with self._lock:
-            self._held = normal_force_n, tangential_force_n
+            self._forces_n = normal_force_n, tangential_force_n
 
     def let_go(self) -> None:
         """Repeat the grip again."""
         with self._lock:
-            self._held = None
+            self._forces_n = None
 
     def frames(self) -> Iterator[LiveFrame]:
-        """Frames of the load that holds when each is due."""
-        pace, number = Pace(self._closed), 0
+        """Iterate over frames, each of the load at its time."""
+        pace, number = Pace(self.closed), 0
         rate_hz = self.rate_hz or 30.0
         while pace.wait(number / rate_hz):
             captured_s, time_s = time.monotonic(), number / rate_hz
             normal_n, pull_n = self._forces_at(time_s)
-            friction, known = self._grasp.friction, normal_n > 0
-            held_n = min(pull_n, friction * normal_n)
-            margin = 1 - held_n / (friction * normal_n) if known else np.nan
+            friction, touches = self._grasp.friction, normal_n > 0
+            tangential_n = min(pull_n, friction * normal_n)
+            margin = 1 - tangential_n / (friction * normal_n) if touches else np.nan
             grasp = replace(self._grasp, normal_force_n=normal_n)
             film = self._film.under(load_at_margins(np.array([margin]), grasp=grasp), rng=self._rng)
             yield LiveFrame(
@@ -409,43 +396,32 @@ class SimulatedSource(LiveSource):
                 decode_ms=1e3 * (time.monotonic() - captured_s),
                 forces=Forces(
                     time_s=np.array([time_s]),
-                    force_n=np.array([[held_n, 0.0, normal_n]]),
+                    force_n=np.array([[tangential_n, 0.0, normal_n]]),
                     source="the simulated fingertip",
                 ),
-                safety_margin=float(margin) if known else None,
+                safety_margin=float(margin) if touches else None,
             )
             number += 1
 
     def _forces_at(self, time_s: float) -> tuple[float, float]:
         with self._lock:
-            held = self._held
-        if held is not None:
-            return held
+            forces_n = self._forces_n
+        if forces_n is not None:
+            return forces_n
         normal_n = 1.5 * float(np.interp(time_s % _GRIP_S, _GRIP_TIMES_S, _GRIP_PRESS))
         return normal_n, float(np.interp(time_s % _GRIP_S, _GRIP_TIMES_S, _GRIP_PULL)) * self._grasp.friction * 1.5
-
-    def close(self) -> None:
-        """Stop at the next frame."""
-        self._closed.set()
 
 
 def _open_simulated(name: str, options: LiveOptions) -> LiveSource:
     options.require_only("rate_hz", what="the simulated fingertip")
-    _, _, sensor = name.partition(":")
-    return SimulatedSource(sensor or "chromatouch", rate_hz=options.rate_hz or 30.0)
+    return SimulatedSource(name.partition(":")[2] or "chromatouch", rate_hz=options.rate_hz or 30.0)
 
 
 def _camera_path(name: str) -> Path | None:
-    """Device file of a number, or of its own path."""
+    """Return the device file of a camera's number or path; None for other names."""
     if name.isdecimal():
         return Path(f"/dev/video{int(name)}")
     return Path(name) if name.startswith("/dev/") else None
-
-
-def _open_camera(name: str, options: LiveOptions) -> LiveSource:
-    path = _camera_path(name)
-    assert path is not None
-    return CameraSource(path, options)
 
 
 def _open_stream(name: str, options: LiveOptions) -> LiveSource:
@@ -473,7 +449,7 @@ _ROWS = {
     "camera": SourceKind(
         words="camera by its number or device file (0, or /dev/video0)",
         recognises=lambda name: _camera_path(name) is not None,
-        open=_open_camera,
+        open=lambda name, options: CameraSource(_camera_path(name) or Path(name), options),
     ),
     "stream": SourceKind(
         words="network stream by its address (rtsp://, http://, udp://)",
@@ -500,15 +476,15 @@ Images: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 def open_live(
     source: str | Path | Images | Capture | LiveSource = "simulated", *, options: LiveOptions | None = None
 ) -> LiveSource:
-    """Find the source of a name; a device is opened when the source is entered.
+    """Make the source of a name; a device is opened when the source is entered.
 
     Parameters
     ----------
     source
         `simulated`; the number of a camera; the address of a stream; the path of a video, a bag, a data set, or a
-        folder that grows; or uint8 RGB frames, what `open_source` gave, or a source.
+        folder that grows; or uint8 RGB frames, a `Capture`, or a source.
     options
-        Wishes for it.
+        Options of the source.
 
     Raises
     ------
@@ -534,8 +510,8 @@ def open_live(
     for row in (*added, *_ROWS):
         if SOURCES[row].recognises(name):
             return SOURCES[row].open(name, options)
-    known = "; ".join(SOURCES[row].words for row in SOURCES)
-    raise InputError(f"{name} is no source that is known, nor a path that exists; name a {known}")
+    kinds = "; ".join(SOURCES[row].words for row in SOURCES)
+    raise InputError(f"{name} is no source that is known, nor a path that exists; name a {kinds}")
 
 
 __all__ = ["SOURCES", "FolderSource", "ProfiledSource", "ReplaySource", "SimulatedSource", "StreamSource", "open_live"]
