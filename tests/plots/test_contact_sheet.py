@@ -312,7 +312,7 @@ def test_unwritable_place_is_told(tmp_path):
 
 
 def test_no_trial_is_no_sheet():
-    with pytest.raises(InputError, match="needs a trial; name at least one"):
+    with pytest.raises(InputError, match="needs a trial; give at least one"):
         draw_contact_sheet([])
 
 

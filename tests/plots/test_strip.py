@@ -35,8 +35,8 @@ def strip() -> Strip:
 def test_a_strip_says_what_was_read_and_what_was_true(strip):
     figure = draw_strip(strip)
     titles = [ax.get_title(loc="center") for ax in figure.axes]
-    assert "1: 90 % read\n100 % true" in titles
-    assert "2: 18 % read\n20 % true" in titles
+    assert "1: 90 % predicted\n100 % true" in titles
+    assert "2: 18 % predicted\n20 % true" in titles
 
 
 def test_colours_tell_the_sign_and_nothing_is_coloured_where_nothing_speaks(strip):

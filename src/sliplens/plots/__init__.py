@@ -1,1 +1,1 @@
-"""Figures, clips and the viewer: what draws a record, without a page and without torch."""
+"""Figures and clips of records, drawn without torch."""

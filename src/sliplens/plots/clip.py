@@ -1,4 +1,4 @@
-"""Clips for people to watch: a trial with its forces and labels, or frames with their markers."""
+"""Clips to watch: a trial with its forces and labels, or frames with their markers."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -34,14 +34,14 @@ from sliplens.recordings import Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
 
 _SLOWEST, _FASTEST = 25, 30  # frames a second that every player shows smoothly
-_SAMPLES = 32  # frames that are looked at for the brightness of all
+_SAMPLES = 32  # frames that set the brightness of all
 # pixels; pictures are enlarged up to the first size and reduced down to the second one, given as (height, width)
 _SMALL, _LARGE = (480, 640), (720, 960)
 _DPI, _EDGE, _HEAD, _FOOT, _AXIS, _CHART, _STATUS, _LEAST = 100, 18, 74, 54, 76, 560, 84, 448
 
 
 class _Stage(NamedTuple):
-    """What no frame of a clip changes, and where the rest goes, in pixels as (top, left)."""
+    """Constant part of a clip's frames, and the places of the rest, in pixels as (top, left)."""
 
     factor: float  # of the differences' brightness
     still: UInt8[np.ndarray, "rows columns 3"]
@@ -53,9 +53,9 @@ class _Stage(NamedTuple):
 def write_clip(recording: Recording, path: Path, *, frames_per_s: float | None = None) -> None:
     """Write a trial as an MP4 that plays at real speed; it appears when complete.
 
-    It shows the camera frames, outlines of contact and stick zone where they are known, the difference images, and the
-    forces and safety margin under a moving cursor. It is for the eye only: lossy video moves markers, so measure in the
-    recording, never in its clip.
+    It shows the camera frames, outlines of the true contact and stick zone of simulated trials, the difference images,
+    and the forces and safety margin under a moving cursor. Lossy video moves markers: measure in the recording, never
+    in its clip.
 
     Frames of the recording are repeated or left out to keep time; by default the clip has its frames a second if they
     are between 25 and 30, otherwise 30.
@@ -70,22 +70,19 @@ def write_clip(recording: Recording, path: Path, *, frames_per_s: float | None =
 
 
 def require_clip_path(path: Path) -> None:
-    """Check that a file is named as a clip."""
+    """Check that a file name is that of a clip."""
     if path.suffix.lower() != ".mp4":
         raise InputError(f"{path} does not end in .mp4; name a clip, such as trial.mp4")
 
 
 def natural_rate(time_s: Float[np.ndarray, " frames"]) -> float:
-    """Frames a second of a clip: the recording's own where players show that smoothly, otherwise 30."""
-    own = round(1 / _interval(time_s, otherwise=1 / _FASTEST), 2)  # stored times are rounded
-    return own if _SLOWEST <= own <= _FASTEST else float(_FASTEST)
+    """Choose the frames a second of a clip: those of the recording where players show them smoothly, otherwise 30."""
+    rate = round(1 / _interval(time_s, otherwise=1 / _FASTEST), 2)  # stored times are rounded
+    return rate if _SLOWEST <= rate <= _FASTEST else float(_FASTEST)
 
 
-def clip_frames(time_s: Float[np.ndarray, " frames"], frames_per_s: float) -> Int[np.ndarray, " shown"]:
-    """Index of the recorded frame that each frame of the clip shows: the nearest in time.
-
-    The last one is shown for the typical time between two.
-    """
+def clip_frames(time_s: Float[np.ndarray, " frames"], frames_per_s: float) -> Int[np.ndarray, " clip"]:
+    """Find the recorded frame nearest in time to each frame of the clip; the last is shown for a typical interval."""
     duration = time_s[-1] - time_s[0] + _interval(time_s, otherwise=1 / frames_per_s)
     moments = time_s[0] + np.arange(max(1, round(duration * frames_per_s))) / frames_per_s
     return np.searchsorted((time_s[1:] + time_s[:-1]) / 2, moments)
@@ -96,21 +93,21 @@ def _interval(time_s: Float[np.ndarray, " frames"], *, otherwise: float) -> floa
 
 
 def _draw_frames(
-    recording: Recording, indices: Int[np.ndarray, " shown"], stage: _Stage, frames_per_s: float
+    recording: Recording, indices: Int[np.ndarray, " clip"], stage: _Stage, frames_per_s: float
 ) -> Iterator[UInt8[np.ndarray, "rows columns 3"]]:
     scene, drawn = stage.still.copy(), None
-    for shown, index in enumerate(indices.tolist()):
+    for place, index in enumerate(indices.tolist()):
         if index != drawn:
             frame, drawn = recording.frames[index], index
             camera = _resize(frame)
             if recording.truth is not None:
                 paint_outlines(camera, recording.truth.contact_map[index])
             difference = _resize(brighten(absolute_difference(frame, recording.reference), stage.factor))
-            pictures = (camera, difference, _tell_state(recording, index))
-            for picture, (top, left) in zip(pictures, stage.places, strict=True):
-                scene[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+            pictures = (camera, difference, _draw_state(recording, index))
+            for picture, (y, x) in zip(pictures, stage.places, strict=True):
+                scene[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
         pixels = scene.copy()
-        column = stage.cursor_column(min(recording.time_s[0] + shown / frames_per_s, recording.time_s[-1]))
+        column = stage.cursor_column(min(recording.time_s[0] + place / frames_per_s, recording.time_s[-1]))
         pixels[stage.cursor_rows, column - 1 : column + 2] = _bytes(PURPLE)
         yield pixels
 
@@ -119,25 +116,25 @@ def _set_stage(recording: Recording) -> _Stage:
     some = recording.frames[:: -(-len(recording) // _SAMPLES)]
     factor = brightening([absolute_difference(some, recording.reference)])
     rows, columns = _resize(recording.reference).shape[:2]
-    second, left = 2 * _EDGE + columns, 3 * _EDGE + 2 * columns + _AXIS
+    second, charts = 2 * _EDGE + columns, 3 * _EDGE + 2 * columns + _AXIS
     # even sizes: H.264 keeps one colour for two by two pixels
-    width, height = -(-(left + _CHART + _EDGE) // 2) * 2, -(-(_HEAD + max(rows, _LEAST) + _FOOT) // 2) * 2
+    width, height = -(-(charts + _CHART + _EDGE) // 2) * 2, -(-(_HEAD + max(rows, _LEAST) + _FOOT) // 2) * 2
     first, last = _HEAD + _STATUS, height - _FOOT
     middle = first + round(0.55 * (last - first))
-    told = f"{recording.trial}: {recording.condition}, day {recording.day}, {recording.sensor}"
+    title = f"{recording.trial}: {recording.condition}, day {recording.day}, {recording.sensor}"
     small = {"fontsize": 8, "ha": "right", "color": GREY}
     with drawing_style():
         figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
         canvas = FigureCanvasAgg(figure)
         forces, margin = (
-            figure.add_axes((left / width, 1 - end / height, _CHART / width, (end - begin) / height))
+            figure.add_axes((charts / width, 1 - end / height, _CHART / width, (end - begin) / height))
             for begin, end in ((first, middle - 8), (middle + 8, last))
         )
         plot_forces(recording, ax=forces).tick_params(labelbottom=False)
         plot_margin(recording, ax=margin)
         figure.align_ylabels([forces, margin])
         for x, y, text, settings in (
-            (_EDGE, 32, told, {"fontsize": 13, "fontweight": "bold", "parse_math": False}),
+            (_EDGE, 32, title, {"fontsize": 13, "fontweight": "bold", "parse_math": False}),
             (_EDGE, _HEAD - 8, "camera", {}),
             (second, _HEAD - 8, f"difference $|T_n - T_0|$ {TIMES} {factor:g}", {}),
             (second + columns, height - 20, "for the eye only: lossy video", small),
@@ -151,21 +148,21 @@ def _set_stage(recording: Recording) -> _Stage:
     return _Stage(
         factor=factor,
         still=np.asarray(canvas.buffer_rgba())[..., :3].copy(),
-        places=((_HEAD, _EDGE), (_HEAD, second), (_EDGE, left)),
+        places=((_HEAD, _EDGE), (_HEAD, second), (_EDGE, charts)),
         cursor_rows=slice(first, last),
         cursor_column=lambda time_s: round(float(forces.transData.transform((time_s, 0))[0])),
     )
 
 
-def _tell_state(recording: Recording, index: int) -> UInt8[np.ndarray, "rows columns 3"]:
+def _draw_state(recording: Recording, index: int) -> UInt8[np.ndarray, "rows columns 3"]:
     image = Image.new("RGB", (_CHART, 100), "white")
     draw, margin, state = ImageDraw.Draw(image), float(recording.safety_margin[index]), recording.contact_state[index]
     force, pull = recording.normal_force_n[index], recording.tangential_force_n[index]
-    told = f"{recording.time_s[index]:.2f} s   Fₙ {force:.2f} N   Fₜ {pull:.2f} N"
+    numbers = f"{recording.time_s[index]:.2f} s   Fₙ {force:.2f} N   Fₜ {pull:.2f} N"
     draw.text((0, 78), f"Γ {percent(None if np.isnan(margin) else margin)}", fill=BLACK, font=_font(64), anchor="ls")
     draw.rectangle((302, 22, 324, 44), fill=STATE_COLOURS[state])
     draw.text((336, 43), str(state), fill=BLACK, font=_font(25), anchor="ls")
-    draw.text((302, 77), told, fill=GREY, font=_font(16), anchor="ls")
+    draw.text((302, 77), numbers, fill=GREY, font=_font(16), anchor="ls")
     return np.asarray(image)
 
 
@@ -176,7 +173,7 @@ def _font(size_px: int) -> ImageFont.FreeTypeFont:
 
 
 def _scale(height: int, width: int) -> tuple[int, int]:
-    """Whole factors to enlarge and to reduce a picture by, one of them 1."""
+    """Choose whole factors to enlarge and to reduce a picture by, one of them 1."""
     return max(1, min(_SMALL[0] // height, _SMALL[1] // width)), max(-(-height // _LARGE[0]), -(-width // _LARGE[1]))
 
 
@@ -207,9 +204,9 @@ _MAGNIFIED = 3  # arrows, so that a pixel of motion shows
 def draw_tracked(
     frame: UInt8[np.ndarray, "height width 3"], tracked: TrackedFrame, rest_px: np.ndarray, scale: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Frame, enlarged, with a ring round every marker that is seen and an arrow, magnified, along its displacement.
+    """Draw a ring round every detected marker of an enlarged frame, and a magnified arrow along its displacement.
 
-    Yellow was followed, orange is broken, blue is new; what is missing has no ring.
+    Followed markers are yellow, broken ones orange, new ones blue.
     """
     image = Image.fromarray(frame).resize((frame.shape[1] * scale, frame.shape[0] * scale), Image.Resampling.BICUBIC)
     draw = ImageDraw.Draw(image)
@@ -236,7 +233,7 @@ def _arrow(draw: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[flo
     side = np.array([-head[1], head[0]]) * 0.5
     tip = np.array(end)
     corners = [tuple(tip), tuple(tip - head + side), tuple(tip - head - side)]
-    # dark below bright: seen on any ground
+    # dark below bright: visible on any ground
     draw.line([start, end], fill="black", width=width + 2)
     draw.line([start, end], fill="white", width=width)
     draw.polygon(corners, fill="white", outline="black")
@@ -246,10 +243,10 @@ def _arrow(draw: ImageDraw.ImageDraw, start: tuple[float, float], end: tuple[flo
 def clip_writer(
     path: Path, *, size: tuple[int, int], frames_per_s: float
 ) -> Iterator[Callable[[UInt8[np.ndarray, "height width 3"], TrackedFrame, Float[np.ndarray, "markers 2"]], None]]:
-    """Write an MP4 of frames with their markers; it appears when complete, and not at all when something fails.
+    """Write an MP4 of frames with their markers; it appears when complete.
 
-    It is for the eye only: lossy video moves markers, so measure in the table, never in its clip. What is given takes a
-    frame of that height and width, its markers and where they were at rest.
+    Gives a function that adds a frame of that height and width, its markers and their places at rest. Lossy video moves
+    markers: measure in the table, never in its clip.
     """
     scale = max(1, _LEAST_SIDE // max(size))
     # H.264 keeps one colour for two by two pixels
@@ -262,7 +259,7 @@ def clip_writer(
 def _open_clip(
     path: Path, size: tuple[int, int], frames_per_s: float
 ) -> Iterator[Callable[[UInt8[np.ndarray, "rows columns 3"]], None]]:
-    """Give what adds a picture to a clip of a height and width."""
+    """Open a clip of a height and width; gives a function that adds a picture."""
     require_clip_path(path)
     if not 1 <= frames_per_s <= 120:
         raise InputError(f"{frames_per_s:g} frames a second cannot be watched; ask for {_SLOWEST} to {_FASTEST}")
@@ -276,7 +273,7 @@ def _open_clip(
         rate = Fraction(frames_per_s).limit_denominator(1001)
         stream = container.add_stream("libx264", rate=rate, options={"crf": "20", "preset": "veryfast"})
         stream.height, stream.width, stream.pix_fmt = *size, "yuv420p"
-        # what FFmpeg turns RGB into, BT.601: untold, a player guesses by the size
+        # BT.601, into which FFmpeg converts RGB: without it players guess by the size
         stream.codec_context.colorspace = 5
         yield lambda pixels: container.mux(
             stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24"))

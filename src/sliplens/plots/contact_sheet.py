@@ -1,4 +1,4 @@
-"""Contact sheet: what trials look like from the untouched sensor to full slip, on one picture."""
+"""Contact sheet: frames of trials from the untouched sensor to full slip, on one picture."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -37,18 +37,18 @@ from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
 
 STATE_COLOURS = dict(zip(ContactState, (GREY, BLUE, ORANGE, VERMILLION, "white"), strict=True))
-# full slip darker than the rest: told from incipient slip by its lightness too
+# full slip is darker, so that lightness too separates it from incipient slip
 STATE_TINTS = dict(zip(ContactState, (0.2, 0.2, 0.2, 0.55, 0), strict=True))
 NAMED_STATES = tuple(state for state in ContactState if state is not ContactState.UNKNOWN)
-"""What a legend tells of."""
+"""States in legends."""
 TIMES = "\N{MULTIPLICATION SIGN}"
 
 _BRIGHT_PERCENTILE = 99.5  # of the differences: a few outlying pixels would leave the rest dark
 
 
 def brightening(differences: Sequence[UInt8[np.ndarray, "_ _ _ 3"]]) -> float:
-    """Give the factor, at least 1 and of one decimal, that makes the brightest half percent of pixels white."""
-    levels = [float(np.percentile(some.max(axis=-1), _BRIGHT_PERCENTILE)) for some in differences if some.size]
+    """Compute the factor, at least 1 and of one decimal, that makes the brightest half percent of pixels white."""
+    levels = [float(np.percentile(pixels.max(axis=-1), _BRIGHT_PERCENTILE)) for pixels in differences if pixels.size]
     return max(1.0, round(255 / max([1.0, *levels]), 1))
 
 
@@ -82,21 +82,21 @@ def plot_margin(recording: Recording, *, ax: Axes) -> Axes:
 
 
 def outline_handles(recordings: Sequence[Recording]) -> list[Line2D]:
-    """Legend of the outlines, empty where no trial has any."""
-    known = [one.truth.displacement for one in recordings if one.truth is not None]
-    stick = "outline of its stick zone" + (" (nominal)" if "calibrated" in known else "")
-    told = (("white", "outline of the contact"), (SKY, stick)) if known else ()
+    """Create the legend of the outlines, empty where no trial has any."""
+    models = [recording.truth.displacement for recording in recordings if recording.truth is not None]
+    stick = "outline of its stick zone" + (" (nominal)" if "calibrated" in models else "")
+    lines = (("white", "outline of the contact"), (SKY, stick)) if models else ()
     rim = [Stroke(linewidth=3.4, foreground=BLACK), Normal()]
-    return [Line2D([], [], color=colour, linewidth=1.8, path_effects=rim, label=label) for colour, label in told]
+    return [Line2D([], [], color=colour, linewidth=1.8, path_effects=rim, label=label) for colour, label in lines]
 
 
 _REACHED_WITHIN = 0.1 - 1e-9  # half the distance between two columns: no frame stands in both
-_ALIKE = 0.005  # margins that whole percents do not tell apart
+_ALIKE = 0.005  # margins that are equal in whole percents
 
-# inches, from left to right: what is told of the trial, the pictures, the charts
+# inches, from left to right: facts of the trial, pictures, charts
 _WIDTH, _EDGE, _INFO, _GAP, _AXIS, _CHART = 16.0, 0.2, 1.9, 0.07, 0.62, 2.9
 _PICTURE = (_WIDTH - 2 * _EDGE - _INFO - _AXIS - _CHART) / (1 + len(NOMINAL_MARGINS)) - _GAP
-# from top to bottom; the charts need some height, and what is very long or very high is shown smaller
+# from top to bottom; charts need some height, and very long or very high pictures are reduced
 _HEAD, _TIME, _FOOT, _LEGEND, _LEAST, _PICTURE_HEIGHT = 0.42, 0.42, 0.18, 0.75, 2.6, (0.8, 2.4)
 
 
@@ -105,16 +105,18 @@ def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = N
 
     A band shows the frames of `choose_untouched` and `choose_margins`, beneath each its absolute difference image,
     brightened by one factor for the whole sheet so that trials compare, and at the right forces and safety margin over
-    time. Where a recording knows the true contact, its outline and that of its stick zone lie over the camera frames.
+    time. Outlines of the true contact and its stick zone lie over the camera frames of simulated trials.
     """
     if not recordings:
-        raise InputError("a contact sheet needs a trial; name at least one recording")
-    rows = [[choose_untouched(one), *choose_margins(one)] for one in recordings]
-    shown = [one.frames[[at for at in row if at is not None]] for one, row in zip(recordings, rows, strict=True)]
+        raise InputError("a contact sheet needs a trial; give at least one recording")
+    rows = [[choose_untouched(recording), *choose_margins(recording)] for recording in recordings]
     factor = brightening(
-        [absolute_difference(some, one.reference) for some, one in zip(shown, recordings, strict=True)]
+        [
+            absolute_difference(recording.frames[[at for at in row if at is not None]], recording.reference)
+            for recording, row in zip(recordings, rows, strict=True)
+        ]
     )
-    aspects = [one.reference.shape[0] / one.reference.shape[1] for one in recordings]
+    aspects = [recording.reference.shape[0] / recording.reference.shape[1] for recording in recordings]
     heights = [float(np.clip(_PICTURE * aspect, *_PICTURE_HEIGHT)) for aspect in aspects]
     bands = [_HEAD + max(2 * height + _GAP, _LEAST) + _FOOT for height in heights]
     top = 0.1 if title is None else 0.55
@@ -125,7 +127,7 @@ def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = N
         for recording, row, height, band in zip(recordings, rows, heights, bands, strict=True):
             _draw_pictures(figure, recording, row, top=top + _HEAD, height=height, factor=factor)
             chosen = [at for at in row[1:] if at is not None]
-            _tell_trial(figure, recording, chosen, top=top + _HEAD)
+            _write_facts(figure, recording, chosen, top=top + _HEAD)
             marked = chosen if row[0] is None else [row[0], *chosen]
             _draw_charts(figure, recording, marked, top=top + _HEAD, height=band - _HEAD - _TIME - _FOOT)
             top += band
@@ -140,29 +142,29 @@ def write_contact_sheet(recordings: Sequence[Recording], path: Path, *, title: s
 
 
 def choose_margins(recording: Recording) -> list[int | None]:
-    """Frames nearest to Γ = 100, 80, 60, 40, 20 and 0 %; None where none is within 10 percentage points.
+    """Choose the frames nearest to Γ = 100, 80, 60, 40, 20 and 0 %; None where none is within 10 percentage points.
 
     100 % is taken from contact without slip, 0 % from full slip and the others from before the first full slip, where
-    that reaches the margin. Of frames alike to half a percentage point the one pressed hardest wins: at first touch the
-    margin is 100 % too, but there is little to see.
+    possible. Of frames equal to half a percentage point the one pressed hardest is chosen: at first touch the margin is
+    100 % too, but little shows.
     """
     labelled, states = np.isfinite(recording.safety_margin), np.array(recording.contact_state)
     sliding = states == ContactState.FULL_SLIP
     wanted = {1.0: states == ContactState.CONTACT, 0.0: sliding}
     chosen: list[int | None] = []
     for nominal in NOMINAL_MARGINS:
-        found = None
+        nearest = None
         for fitting in (labelled, labelled & wanted.get(nominal, ~np.logical_or.accumulate(sliding))):
             distance = np.where(fitting, np.abs(recording.safety_margin - nominal), np.inf)
             if distance.min() < _REACHED_WITHIN:
                 alike = distance <= distance.min() + _ALIKE
-                found = int(np.argmax(np.where(alike, np.nan_to_num(recording.normal_force_n), -np.inf)))
-        chosen.append(found)
+                nearest = int(np.argmax(np.where(alike, np.nan_to_num(recording.normal_force_n), -np.inf)))
+        chosen.append(nearest)
     return chosen
 
 
 def choose_untouched(recording: Recording) -> int | None:
-    """Frame in the middle of those without contact; None where there is none."""
+    """Choose the middle frame of those without contact; None without any."""
     free = [index for index, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
     return free[len(free) // 2] if free else None
 
@@ -170,12 +172,12 @@ def choose_untouched(recording: Recording) -> int | None:
 def _draw_pictures(
     figure: Figure, recording: Recording, row: list[int | None], *, top: float, height: float, factor: float
 ) -> None:
-    left, second = _EDGE + _INFO, top + height + _GAP
+    first, second = _EDGE + _INFO, top + height + _GAP
     for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
         turned = {"rotation": 90, "ha": "right", "va": "center", "multialignment": "center"}
-        place_text(figure, left - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
+        place_text(figure, first - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
     for column, index in enumerate(row):
-        x = left + column * (_PICTURE + _GAP)
+        x = first + column * (_PICTURE + _GAP)
         camera, below = (place_axes(figure, x, y, _PICTURE, height) for y in (top, second))
         for ax in (camera, below):
             ax.set(xticks=[], yticks=[])
@@ -190,14 +192,14 @@ def _draw_pictures(
         if index is not None and recording.truth is not None:
             _plot_outlines(recording.truth.contact_map[index], ax=camera)
         name = f"Γ {percent(float(recording.safety_margin[index]))}" if index is not None and column else "untouched"
-        told = "reference" if index is None else f"{recording.time_s[index]:.1f} s, {recording.contact_state[index]}"
-        for words, up, settings in ((name, 0.2, {"weight": "bold"}), (told, 0.05, {"fontsize": 8, "color": GREY})):
+        when = "reference" if index is None else f"{recording.time_s[index]:.1f} s, {recording.contact_state[index]}"
+        for words, up, settings in ((name, 0.2, {"weight": "bold"}), (when, 0.05, {"fontsize": 8, "color": GREY})):
             place_text(figure, x + _PICTURE / 2, top - up, words, ha="center", va="bottom", **settings)
 
 
 def _plot_outlines(contact: UInt8[np.ndarray, "height width"], *, ax: Axes) -> None:
     touches, sticks = contact != OUTSIDE, contact == STICKS
-    # dark rims first, then wide under narrow: where the outlines run together each still shows
+    # dark rims first, then wide under narrow, so that outlines that run together both show
     lines = ((touches, BLACK, 2.2), (sticks, BLACK, 1.6), (touches, "white", 1.5), (sticks, SKY, 0.9))
     for zone, colour, width in lines:
         if zone.any() and not zone.all():  # else there is no line to draw
@@ -205,10 +207,10 @@ def _plot_outlines(contact: UInt8[np.ndarray, "height width"], *, ax: Axes) -> N
 
 
 def _draw_charts(figure: Figure, recording: Recording, marked: list[int], *, top: float, height: float) -> None:
-    left, tall, gap = _WIDTH - _EDGE - _CHART, 0.56 * height, 0.1
-    forces = plot_forces(recording, ax=place_axes(figure, left, top, _CHART, tall))
+    x, tall, gap = _WIDTH - _EDGE - _CHART, 0.56 * height, 0.1
+    forces = plot_forces(recording, ax=place_axes(figure, x, top, _CHART, tall))
     forces.tick_params(labelbottom=False)
-    margin = plot_margin(recording, ax=place_axes(figure, left, top + tall + gap, _CHART, height - tall - gap))
+    margin = plot_margin(recording, ax=place_axes(figure, x, top + tall + gap, _CHART, height - tall - gap))
     for ax in (forces, margin):
         for time_s in recording.time_s[marked]:
             ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1)
@@ -216,16 +218,16 @@ def _draw_charts(figure: Figure, recording: Recording, marked: list[int], *, top
     figure.align_ylabels([forces, margin])
 
 
-def _tell_trial(figure: Figure, recording: Recording, chosen: list[int], *, top: float) -> None:
-    # whoever names a trial may write a dollar sign, which begins no formula here
+def _write_facts(figure: Figure, recording: Recording, chosen: list[int], *, top: float) -> None:
+    # a dollar sign in a name begins no formula
     name = fill(recording.trial, 17, max_lines=3, placeholder="…")
     place_text(figure, _EDGE, top, name, fontsize=10, fontweight="bold", parse_math=False)
     top += 0.19 * len(name.splitlines()) + 0.05
     facts = (f"{recording.condition}, day {recording.day}", recording.sensor)
     length = f"{number_of(len(recording), 'frame')} in {np.ptp(recording.time_s):.1f} s"
-    told = "\n".join(fill(fact, 20, max_lines=2, placeholder="…") for fact in (*facts, length))
-    place_text(figure, _EDGE, top, told, fontsize=9.5, linespacing=1.5, parse_math=False)
-    top += 0.205 * len(told.splitlines()) + 0.08
+    lines = "\n".join(fill(fact, 20, max_lines=2, placeholder="…") for fact in (*facts, length))
+    place_text(figure, _EDGE, top, lines, fontsize=9.5, linespacing=1.5, parse_math=False)
+    top += 0.205 * len(lines.splitlines()) + 0.08
     force, friction = recording.normal_force_n[chosen], recording.friction_coefficient[chosen]
     place_text(figure, _EDGE, top, f"$F_n$ {_range(force)} N\n$\\mu$ {_range(friction)}", fontsize=9.5, linespacing=1.5)
 

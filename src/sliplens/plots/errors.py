@@ -67,16 +67,16 @@ def plot_bins(bins: Mapping[str, tuple[BinScore, ...]], *, ax: Axes) -> Axes:
 
 
 def _draw_bins(rows: Sequence[tuple[str, str, Sequence[BinScore]]], *, ax: Axes) -> None:
-    """Bars of the MSE in each bin, side by side, each row with its name and colour."""
+    """Draw bars of the MSE in each bin, side by side, each row with its name and colour."""
     width = 0.8 / max(1, len(rows))
     for index, (name, colour, bins) in enumerate(rows):
         at = np.arange(len(bins)) + (index - (len(rows) - 1) / 2) * width
-        heights = [np.nan if one.mse is None else one.mse for one in bins]
+        heights = [np.nan if score.mse is None else score.mse for score in bins]
         ax.bar(at, heights, width=width, color=colour, label=name)
 
 
 def plot_predictions(predictions: ScoredFrames, *, colour: str, ax: Axes) -> Axes:
-    """Draw the answer against the label of every frame, in percent, with the line of perfect answers."""
+    """Draw prediction against label of every frame, in percent, with the line of perfect predictions."""
     ax.plot([0, 100], [0, 100], color=BLACK, linewidth=1, linestyle="--", label="perfect", zorder=3)
     label, read = 100 * predictions.safety_margin, 100 * predictions.prediction
     ax.scatter(label, read, s=9, color=colour, alpha=0.45, label="one frame", **_DOTS)
@@ -114,11 +114,11 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
 
 
 def plot_margin_over_time(trials: Mapping[str, ScoredFrames], *, ax: Axes) -> Axes:
-    """Draw the label and each network's answer through one trial, its frames by input."""
+    """Draw the label and the prediction of each network through one trial, by input."""
     ordered = {name: trials[name].where(np.argsort(trials[name].time_s)) for name in inputs_in_order(trials)}
     label = next(iter(ordered.values()))
     ax.plot(label.time_s, 100 * label.safety_margin, color=BLACK, linewidth=2.4, label="true")
-    # of several networks one that withholds shows a gap in its line
+    # where only some networks withhold, their lines have gaps
     together = zip(*(trial.withheld.tolist() for trial in ordered.values()), strict=False)
     shade_withheld(label.time_s, [reasons[0] if all(reasons) else "" for reasons in together], ax=ax)
     for name, trial in ordered.items():
@@ -138,50 +138,50 @@ def _legend_above(ax: Axes) -> None:
 
 
 def _limits(prediction: np.ndarray) -> tuple[float, float]:
-    # answers are not clipped to 0-100 %: show all of them
+    # predictions are not clipped to 0-100 %: show all of them
     return min(-5.0, 100 * float(prediction.min()) - 3), max(105.0, 100 * float(prediction.max()) + 3)
 
 
 _WIDTH, _HEIGHT, _LEFT, _TOP, _GAP, _CHART = 12.0, 7.5, 0.75, 1.25, 0.95, (3.05, 2.25)
 _MOST_DOTS = 4000
-_READER = 0.36  # inches a reader of the margin
-_LOWEST_R2 = -0.3  # further down it does not matter how far; the number says it
+_ESTIMATOR = 0.36  # inches of a row
+_LOWEST_R2 = -0.3  # of the axis; numbers are written beside the bars
 
 
 def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     """Save a page of six charts as .png, .pdf or .svg, or of eight where there are baselines.
 
-    Answers against labels; mean squared error in ten bins of the margin (thesis, Fig. 7); bias of each trial; how often
-    intervals hold; the error as frames are withheld; the trial of median error over time. Below, R2 and mean absolute
-    error of the network beside those of model-based estimators, where there are any.
+    Predictions against labels; mean squared error in ten bins of the margin (thesis, Fig. 7); bias of each trial;
+    coverage of intervals; the error as frames are withheld; the trial of median error over time. Below, R2 and mean
+    absolute error of the network beside those of model-based estimators, where there are any.
     """
     require_picture_path(path, example="evaluation.png")
     conditions = conditions_in_order(evaluation.conditions)
     estimators = {} if evaluation.baselines is None else evaluation.baselines.estimators
     with drawing_style():
-        figure = Figure(figsize=(_WIDTH, _HEIGHT + (0.9 + _READER * (len(estimators) + 1) if estimators else 0)))
-        lefts, tops = [_LEFT + at * (_CHART[0] + _GAP) for at in range(3)], (_TOP, _TOP + _CHART[1] + 1.05)
-        charts = [place_axes(figure, left, top, *_CHART) for top in tops for left in lefts]
+        figure = Figure(figsize=(_WIDTH, _HEIGHT + (0.9 + _ESTIMATOR * (len(estimators) + 1) if estimators else 0)))
+        columns, tops = [_LEFT + at * (_CHART[0] + _GAP) for at in range(3)], (_TOP, _TOP + _CHART[1] + 1.05)
+        charts = [place_axes(figure, column, top, *_CHART) for top in tops for column in columns]
         predictions = evaluation.predictions
         plot_answers(predictions, conditions, ax=charts[0])
         bins = [(name, CONDITION_COLOURS.get(name, GREEN), evaluation.conditions[name].bins) for name in conditions]
         _draw_bins(bins, ax=charts[1])
         charts[1].set(xlabel="True Γ, lower edge of the bin (%)", ylabel=_MSE_LABEL, title="Error by margin")
-        charts[1].set_xticks(range(10), [str(10 * one) for one in range(10)])
+        charts[1].set_xticks(range(10), [str(10 * edge) for edge in range(10)])
         charts[1].legend(fontsize=8)
         _plot_trials(predictions, conditions, ax=charts[2])
         _plot_coverage(evaluation.reliability, conditions, ax=charts[3])
         _plot_risk(evaluation.risk, ax=charts[4])
         _plot_typical(predictions, evaluation.trials, ax=charts[5])
         if estimators:
-            _plot_readers(figure, {"network": evaluation, **estimators}, conditions, top=_HEIGHT + 0.25)
+            _plot_estimators(figure, {"network": evaluation, **estimators}, conditions, top=_HEIGHT + 0.25)
         place_text(figure, _LEFT - 0.5, 0.2, title, fontsize=13, fontweight="bold", parse_math=False)
         place_text(figure, _LEFT - 0.5, 0.52, _summary(evaluation, conditions), fontsize=9, color=GREY)
     save_page(figure, path)
 
 
 def plot_answers(predictions: ScoredFrames, conditions: list[str], *, ax: Axes) -> None:
-    """Draw the answer against the label of every frame, in percent, a colour a condition."""
+    """Draw prediction against label of every frame, in percent, a colour a condition."""
     for name in conditions:
         rows = np.flatnonzero(predictions.condition == name)
         rows = rows[:: max(1, len(rows) // _MOST_DOTS)]
@@ -189,15 +189,15 @@ def plot_answers(predictions: ScoredFrames, conditions: list[str], *, ax: Axes) 
         size = np.clip(3000 / max(len(rows), 1), 5, 30)  # few dots are seen as well as many
         ax.scatter(label, read, s=size, alpha=0.5, color=CONDITION_COLOURS.get(name, GREEN), label=name, **_DOTS)
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
-    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Answers")
+    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Predictions")
     ax.legend(markerscale=2, fontsize=8, loc="upper left")
 
 
 def _plot_trials(predictions: ScoredFrames, conditions: list[str], *, ax: Axes) -> None:
     for place, name in enumerate(conditions):
-        shown = predictions.where(predictions.condition == name)
-        error = 100 * (shown.prediction - shown.safety_margin)
-        biases = [float(error[shown.trial == trial].mean()) for trial in np.unique(shown.trial)]
+        rows = predictions.where(predictions.condition == name)
+        error = 100 * (rows.prediction - rows.safety_margin)
+        biases = [float(error[rows.trial == trial].mean()) for trial in np.unique(rows.trial)]
         spread = np.linspace(-0.25, 0.25, len(biases)) if len(biases) > 1 else np.zeros(1)
         ax.scatter(np.sort(biases), place + spread, s=14, color=CONDITION_COLOURS.get(name, GREEN), linewidths=0)
     ax.axvline(0, color=BLACK, linewidth=1, linestyle="--")
@@ -207,25 +207,27 @@ def _plot_trials(predictions: ScoredFrames, conditions: list[str], *, ax: Axes) 
 
 
 def _plot_coverage(reliability: Mapping[str, Reliability], conditions: list[str], *, ax: Axes) -> None:
-    known = {name: reliability[name].coverage for name in conditions if reliability[name].coverage}
-    for name, shares in known.items():
-        promised, held = zip(*sorted((100 * float(level), 100 * share) for level, share in shares.items()), strict=True)
-        ax.plot(promised, held, label=name, color=CONDITION_COLOURS.get(name, GREEN), marker="o", markersize=4)
-    ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="as promised")
-    ax.set(xlabel="Promised (% of the frames)", ylabel="Held (%)", xlim=(40, 100), ylim=(0, 102), title="Intervals")
-    if not known:
+    calibrated = {name: reliability[name].coverage for name in conditions if reliability[name].coverage}
+    for name, shares in calibrated.items():
+        nominal, actual = zip(
+            *sorted((100 * float(level), 100 * share) for level, share in shares.items()), strict=True
+        )
+        ax.plot(nominal, actual, label=name, color=CONDITION_COLOURS.get(name, GREEN), marker="o", markersize=4)
+    ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="nominal")
+    ax.set(xlabel="Nominal (% of the frames)", ylabel="Covered (%)", xlim=(40, 100), ylim=(0, 102), title="Intervals")
+    if not calibrated:
         write_over(ax, "this network was never calibrated")
     ax.legend(markerscale=2, fontsize=8, loc="upper left")
 
 
 def _plot_risk(risk: RiskCoverage | None, *, ax: Axes) -> None:
     ax.set(xlabel="Withheld (% of the frames)", ylabel="MAE of the rest (points of Γ)", xlim=(0, 96))
-    ax.set_title("Saying “I do not know”")
+    ax.set_title("Error after withholding")
     if risk is None:
         write_over(ax, "not measured")
         return
     colours = {"known": BLUE, "spread": PURPLE, "perfect": GREY}
-    words = {"known": "least known first", "spread": "widest first", "perfect": "worst first (nobody knows)"}
+    words = {"known": "least known first", "spread": "widest first", "perfect": "worst first (ideal)"}
     for name, errors in risk.error.items():
         line = "--" if name == "perfect" else "-"
         shares = 100 * (1 - np.array(risk.covered))
@@ -238,36 +240,36 @@ def _plot_typical(predictions: ScoredFrames, trials: Mapping[str, RegressionScor
     ranked = sorted(trials, key=lambda name: trials[name].mse)
     trial = ranked[(len(ranked) - 1) // 2]
     rows = np.flatnonzero(predictions.trial == trial)
-    shown = predictions.where(rows[np.argsort(predictions.time_s[rows], kind="stable")])
-    shade_withheld(shown.time_s, shown.withheld.tolist(), ax=ax)
+    frames = predictions.where(rows[np.argsort(predictions.time_s[rows], kind="stable")])
+    shade_withheld(frames.time_s, frames.withheld.tolist(), ax=ax)
     read, low, high = (
-        np.where(shown.withheld == "", 100 * values, np.nan)
-        for values in (shown.prediction, shown.low_90, shown.high_90)
+        np.where(frames.withheld == "", 100 * values, np.nan)
+        for values in (frames.prediction, frames.low_90, frames.high_90)
     )
     if np.isfinite(low).any():
         interval = {"color": VERMILLION, "alpha": 0.2, "linewidth": 0, "label": "90 % interval"}
-        ax.fill_between(shown.time_s, low, high, **interval)
+        ax.fill_between(frames.time_s, low, high, **interval)
     if np.isfinite(read).any():
-        ax.plot(shown.time_s, read, color=VERMILLION, label="predicted")
-    ax.plot(shown.time_s, 100 * shown.safety_margin, color=BLACK, linestyle="--", label="true")
+        ax.plot(frames.time_s, read, color=VERMILLION, label="predicted")
+    ax.plot(frames.time_s, 100 * frames.safety_margin, color=BLACK, linestyle="--", label="true")
     ax.set(xlabel="Time (s)", ylabel="Γ (%)")
     ax.set_title(f"Median error: {trial if len(trial) <= 18 else f'…{trial[-17:]}'}", parse_math=False)
     ax.legend(fontsize=8)
 
 
-def _plot_readers(
-    figure: Figure, readers: Mapping[str, Evaluation | BaselineScores], conditions: list[str], *, top: float
+def _plot_estimators(
+    figure: Figure, estimators: Mapping[str, Evaluation | BaselineScores], conditions: list[str], *, top: float
 ) -> None:
-    """Bars of R2 and of the mean absolute error, a row a reader of the margin."""
-    left, gap = 2.35, 0.5
-    size = (_WIDTH - left - gap - 0.5) / 2, _READER * len(readers)
-    first, second = (place_axes(figure, left + at * (size[0] + gap), top, *size) for at in range(2))
+    """Draw bars of R2 and of the mean absolute error, a row an estimator."""
+    start, gap = 2.35, 0.5
+    size = (_WIDTH - start - gap - 0.5) / 2, _ESTIMATOR * len(estimators)
+    first, second = (place_axes(figure, start + at * (size[0] + gap), top, *size) for at in range(2))
     thick = 0.8 / max(1, len(conditions))
     for index, name in enumerate(conditions):
-        scores = [one.conditions[name] for one in readers.values()]
-        at = np.arange(len(readers)) + (index - (len(conditions) - 1) / 2) * thick
-        r2 = np.array([np.nan if one.r2 is None else one.r2 for one in scores])
-        mae = np.array([100 * one.mae for one in scores])
+        scores = [estimator.conditions[name] for estimator in estimators.values()]
+        at = np.arange(len(estimators)) + (index - (len(conditions) - 1) / 2) * thick
+        r2 = np.array([np.nan if score.r2 is None else score.r2 for score in scores])
+        mae = np.array([100 * score.mae for score in scores])
         for ax, values, digits in ((first, r2, 2), (second, mae, 1)):
             ax.barh(
                 at, np.maximum(values, _LOWEST_R2), height=thick, color=CONDITION_COLOURS.get(name, GREEN), label=name
@@ -280,9 +282,9 @@ def _plot_readers(
     first.set(xlabel="R²", title="Network, and estimators from the markers alone")
     first.set_xlim(max(first.get_xlim()[0], _LOWEST_R2), 1.08)
     second.set(xlabel="Mean absolute error (points of Γ)")
-    for ax, names in ((first, list(readers)), (second, [""] * len(readers))):
-        ax.set_yticks(range(len(readers)), names)
-        ax.set_ylim(len(readers) - 0.4, -0.6)
+    for ax, names in ((first, list(estimators)), (second, [""] * len(estimators))):
+        ax.set_yticks(range(len(estimators)), names)
+        ax.set_ylim(len(estimators) - 0.4, -0.6)
         ax.grid(visible=False, axis="y")
     second.legend(fontsize=8, loc="lower right")
 
@@ -328,7 +330,7 @@ def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
         ax.yaxis.set_minor_locator(NullLocator())
         ax.legend()
         place_text(figure, 0.25, 0.15, title, fontsize=12, fontweight="bold", parse_math=False)
-        kept = f"kept: epoch {epoch[best]:.4g}, validation MSE {validation[best]:.4g}"
-        kept += f", root mean square error {100 * np.sqrt(validation[best]):.1f} points of Γ"
-        place_text(figure, 0.25, 0.42, kept, fontsize=9, color=GREY)
+        summary = f"kept: epoch {epoch[best]:.4g}, validation MSE {validation[best]:.4g}"
+        summary += f", root mean square error {100 * np.sqrt(validation[best]):.1f} points of Γ"
+        place_text(figure, 0.25, 0.42, summary, fontsize=9, color=GREY)
         save_page(figure, path)

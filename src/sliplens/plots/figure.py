@@ -1,6 +1,6 @@
-"""One figure of a result, whatever it is; and of what a profile of a sensor finds."""
+"""One figure for each kind of result, and one of a proposed sensor profile."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from textwrap import fill as wrap
@@ -42,28 +42,27 @@ __all__ = ["draw_proposal", "plot", "write_proposal"]
 
 
 def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
-    """Draw what a person would look at first in a result.
+    """Draw the main figure of a result.
 
-    An evaluation shows answers against labels; a training its learning curve; an explanation the map over the image;
-    scores of explanations their curves or gains; predictions the margin over time; tracked markers how far they moved;
-    a study the gain of each method with its 95 % interval; a diagnosis where the error is larger than elsewhere;
-    a grip the force over the least that holds; a hold the force that was told. Margins are in percent, gains in margin
-    units.
+    An evaluation shows predictions against labels; a training its learning curve; an explanation the map over the
+    image; scores of explanations their curves or gains; predictions the margin over time; tracked markers their
+    displacement; a study the gain of each method with its 95 % interval; a diagnosis the slices with a larger error; a
+    grip the force over the least that holds; a hold the commanded force. Margins are in percent, gains in margin units.
 
     Parameters
     ----------
     result
-        What `evaluate`, `train`, `explain`, `score`, `predict`, `track`, `run_study` or `diagnose` gave, or a record of
-        `sliplens.results`.
+        Result of `evaluate`, `train`, `explain`, `score`, `predict`, `track`, `run_study` or `diagnose`, or a record
+        of `sliplens.results`.
     ax
-        Axes to draw on; a figure of its own if not given.
+        Axes to draw on; a new figure if None.
     index
-        Which image of an explanation, or which trial of predictions and markers.
+        Number of the image of an explanation, or of the trial of predictions and markers.
 
     Returns
     -------
     Figure
-        `.savefig(path)` keeps it; a notebook shows it.
+        `.savefig(path)` saves it; a notebook shows it.
 
     Raises
     ------
@@ -80,7 +79,7 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     >>> [line.get_label() for line in figure.axes[0].lines]
     ['most influential first', 'least influential first', 'random orders']
     """
-    # by name along the bases: records of networks live above, and drawing them needs no torch
+    # by the names of the classes: some records live on higher floors, and drawing them needs no torch
     drawer = next((DRAWERS[kind.__name__] for kind in type(result).__mro__ if kind.__name__ in DRAWERS), None)
     if drawer is None:
         raise InputError(f"there is no picture of a {type(result).__name__}; there is one of {', '.join(DRAWERS)}")
@@ -120,7 +119,7 @@ def _faithfulness(faithfulness: Any, ax: Axes, _: int) -> None:
     lines = ((BLUE, "-"), (BLUE, "--"), (BLACK, ":"))
     for values, name, (colour, line) in zip(faithfulness.curves, names, lines, strict=True):
         ax.plot(100 * faithfulness.areas, values.mean(axis=0), color=colour, linestyle=line, label=name)
-    ax.set(xlabel="Removed (% of the image)", ylabel="Change of the answer (margin units)", xlim=(0, 100))
+    ax.set(xlabel="Removed (% of the image)", ylabel="Change of the prediction (margin units)", xlim=(0, 100))
     ax.set_title(" ".join([method_name(faithfulness.method), f"({faithfulness.fill})" if faithfulness.fill else ""]))
     ax.legend()
 
@@ -134,17 +133,15 @@ def _removal(scores: RemovalScores, ax: Axes, _: int) -> None:
     if not scores.scores:
         raise InputError("these scores hold no method; score some explanations first")
     fill, unit = scores.scores[0].fill, scores.scores[0].unit
-    own = {score.method: score.srg for score in scores.scores if (score.fill, score.unit) == (fill, unit)}
-    names = methods_in_order(own)
-    _plot_gaps([(method_name(name), own[name], GREY if is_control(name) else BLUE) for name in names], ax)
+    gains = {score.method: score.srg for score in scores.scores if (score.fill, score.unit) == (fill, unit)}
+    _plot_methods(gains, ax)
     ax.set(xlabel=f"Symmetric gain, {fill_name(fill, unit)} (margin units, 95 % interval)")
     ax.set_title(input_name(scores.input))
 
 
 def _truth(truth: Truth, ax: Axes, _: int) -> None:
-    own = {name: found.shapley for name, found in truth.methods.items() if found.shapley is not None}
-    rows = [(method_name(name), own[name], GREY if is_control(name) else BLUE) for name in methods_in_order(own)]
-    _plot_gaps(rows, ax)
+    scores = {name: method.shapley for name, method in truth.methods.items() if method.shapley is not None}
+    _plot_methods(scores, ax)
     ax.set(xlabel="Signed rank correlation with the markers' Shapley values (95 % interval)")
     ax.set_title(input_name(truth.input))
 
@@ -153,17 +150,23 @@ def _diagnosis(diagnosis: Diagnosis, ax: Axes, _: int) -> None:
     if not diagnosis.slices:
         raise InputError("this diagnosis tested no slice of the trials; diagnose a network on more trials")
     rows = []
-    for one in diagnosis.slices:
-        ends = {name: getattr(one.excess, name) for name in ("estimate", "low", "high")}
+    for part in diagnosis.slices:
+        ends = {name: getattr(part.excess, name) for name in ("estimate", "low", "high")}
         points = {name: None if end is None else 100 * end for name, end in ends.items()}
-        rows.append((wrap(one.name, 32), replace(one.excess, **points), BLUE if one.holds else GREY))
+        rows.append((wrap(part.name, 32), replace(part.excess, **points), BLUE if part.holds else GREY))
     _plot_gaps(rows, ax)
     ax.set(xlabel="Mean |error| less elsewhere (points of Γ, 95 % interval)")
     ax.set_title(f"{input_name(diagnosis.input)}: where the error is")
 
 
+def _plot_methods(values: Mapping[str, Difference], ax: Axes) -> None:
+    """Draw a value of each method with its interval, controls in grey."""
+    names = methods_in_order(values)
+    _plot_gaps([(method_name(name), values[name], GREY if is_control(name) else BLUE) for name in names], ax)
+
+
 def _plot_gaps(rows: Sequence[tuple[str, Difference, str]], ax: Axes) -> None:
-    """Draw estimates with their intervals, each with its name and colour, the first on top."""
+    """Draw estimates with their intervals, each with a name and colour, the first on top."""
     for place, (_, gap, colour) in enumerate(rows):
         if gap.low is not None and gap.high is not None:
             ax.plot([gap.low, gap.high], [place, place], color=colour)
@@ -184,17 +187,17 @@ def _margins(predictions: pa.Table, ax: Axes, index: int) -> None:
 
 
 def _tracking(tracking: Any, ax: Axes, index: int) -> None:
-    shown = _rows_of_trial(tracking.frame(), index)
-    frame, right, down = (column(shown, name) for name in ("frame", "dx_px", "dy_px"))
+    rows = _rows_of_trial(tracking.frame(), index)
+    frame, right, down = (column(rows, name) for name in ("frame", "dx_px", "dy_px"))
     frames, length = np.unique(frame), np.hypot(right, down)
-    known = [length[(frame == one) & np.isfinite(length)] for one in frames]
+    lengths = [length[(frame == number) & np.isfinite(length)] for number in frames]
     for values, name, colour in (
-        ([np.median(one) if len(one) else np.nan for one in known], "median marker", BLUE),
-        ([one.max() if len(one) else np.nan for one in known], "marker that moved most", VERMILLION),
+        ([np.median(moved) if len(moved) else np.nan for moved in lengths], "median marker", BLUE),
+        ([moved.max() if len(moved) else np.nan for moved in lengths], "marker that moved most", VERMILLION),
     ):
         ax.plot(frames, values, color=colour, label=name)
     ax.set(xlabel="Frame", ylabel="Displacement (px)")
-    ax.set_title(shown["trial"][0].as_py(), parse_math=False)
+    ax.set_title(rows["trial"][0].as_py(), parse_math=False)
     ax.legend()
 
 
@@ -233,22 +236,22 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Hold": lambda result, ax, _: plot_hold(result.steps, ax=ax).set_title(result.controller),
     "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
 }
-"""What draws a record, by the name of its class."""
+"""Functions that draw a record, by the name of its class."""
 
 
 def draw_proposal(proposal: SensorProposal) -> Figure:
-    """Draw the camera's frame with gel, crop and markers, and beside it the frame as networks and trackers read it."""
+    """Draw the camera's frame with gel, crop and markers, and beside it the frame that the profile makes of it."""
     profile, frame = proposal.profile, proposal.frame
     with drawing_style():
         figure = Figure(figsize=(9.6, 4.6), layout="constrained")
         camera, made = figure.subplots(1, 2, width_ratios=(frame.shape[1] / frame.shape[0], 1.0))
         camera.imshow(frame)
         for box, colour, words in (
-            (proposal.gel_px, BLUE, "gel found"),
-            (profile.crop_px or (0, 0, frame.shape[1], frame.shape[0]), VERMILLION, "kept (crop_px)"),
+            (proposal.gel_px, BLUE, "gel"),
+            (profile.crop_px or (0, 0, frame.shape[1], frame.shape[0]), VERMILLION, "crop_px"),
         ):
-            left, top, width, height = box
-            corner = (left - 0.5, top - 0.5)
+            x, y, width, height = box
+            corner = (x - 0.5, y - 0.5)
             camera.add_patch(Rectangle(corner, width, height, fill=False, color=colour, linewidth=1.6, label=words))
         if len(proposal.markers_px):
             camera.plot(
@@ -261,7 +264,7 @@ def draw_proposal(proposal: SensorProposal) -> Figure:
         )  # rings are white
         result = profile.apply(frame)
         made.imshow(result)
-        made.set(title=f"{profile.name}, as it is read", xlabel="x in pixels", ylabel="y in pixels")
+        made.set(title=f"{profile.name}, after the profile", xlabel="x in pixels", ylabel="y in pixels")
         if np.isfinite(proposal.spacing_px):
             made.text(
                 0.5, -0.22, f"markers {proposal.spacing_px:.1f} pixels apart", ha="center", transform=made.transAxes
@@ -272,6 +275,6 @@ def draw_proposal(proposal: SensorProposal) -> Figure:
 
 
 def write_proposal(proposal: SensorProposal, path: Path) -> None:
-    """Write the picture as PNG, whole or not at all."""
+    """Write the picture as PNG; it appears when complete."""
     with written_whole(path) as part:
         draw_proposal(proposal).savefig(part, dpi=120, format="png")

@@ -1,4 +1,4 @@
-"""Safety margins over time: as a network reads them, of a grip from stick to slip, of an episode of a grip."""
+"""Safety margins over time: predictions, a grip from stick to slip, an episode of a grip."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,37 +44,37 @@ _FORCES = (("normal_force_n", "normal", GREEN), ("tangential_force_n", "tangenti
 def draw_margins(rows: pa.Table, path: Path, *, title: str) -> int:
     """Save a page of predictions as .png, .pdf or .svg: a trial a row, at most `MOST_TRIALS`; gives how many.
 
-    `rows` are those of `sliplens.predict`. Where labels or forces are known they are drawn too.
+    `rows` are those of `sliplens.predict`. Labels and forces are drawn where they are in the table.
     """
     require_picture_path(path, example="margins.png")
     names = rows["trial"].unique().to_pylist()
     if not names:
-        raise InputError("there is no frame to draw; predict one or more")
-    shown = names[:MOST_TRIALS]
+        raise InputError("there is no frame to draw; predict at least one")
+    drawn = names[:MOST_TRIALS]
     forced = any(np.isfinite(column(rows, name)).any() for name, _, _ in _FORCES if name in rows.column_names)
     heights = [2.4, 1.2] if forced else [2.4]
     with drawing_style():
-        figure = Figure(figsize=(9.0, 0.5 + (sum(heights) + 0.5) * len(shown)), layout="constrained")
-        more = "" if len(names) == len(shown) else f", the first {len(shown)} of {len(names)} trials"
+        figure = Figure(figsize=(9.0, 0.5 + (sum(heights) + 0.5) * len(drawn)), layout="constrained")
+        more = "" if len(names) == len(drawn) else f", the first {len(drawn)} of {len(names)} trials"
         figure.suptitle(f"{title}{more}", x=0.01, ha="left", fontsize=12, fontweight="bold", parse_math=False)
-        axes = figure.subplots(len(heights) * len(shown), 1, squeeze=False, height_ratios=heights * len(shown))[:, 0]
-        for number, name in enumerate(shown):
-            own = rows.filter(pc.field("trial") == name)
+        axes = figure.subplots(len(heights) * len(drawn), 1, squeeze=False, height_ratios=heights * len(drawn))[:, 0]
+        for number, name in enumerate(drawn):
+            trial = rows.filter(pc.field("trial") == name)
             chart = axes[len(heights) * number]
-            plot_margins(own, ax=chart)
+            plot_margins(trial, ax=chart)
             if forced:
                 below = axes[len(heights) * number + 1]
                 below.sharex(chart)
-                _plot_forces(own, ax=below)
+                _plot_forces(trial, ax=below)
                 chart.set_xlabel("")
                 chart.tick_params(labelbottom=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     save_page(figure, path)
-    return len(shown)
+    return len(drawn)
 
 
 def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
-    """Draw the margin of one trial with its 90 % interval over time or frames, and the label where it is known.
+    """Draw the margin of one trial with its 90 % interval over time or frames, and the label where there is one.
 
     Frames whose margin is withheld are grey, and the legend says why.
     """
@@ -82,7 +82,7 @@ def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
     shade_withheld(across, rows["withheld"].to_pylist(), ax=ax)
     if "low_90" in rows.column_names:
         low, high = 100 * column(rows, "low_90"), 100 * column(rows, "high_90")
-        if np.isfinite(low).any():  # a network that was never calibrated tells none
+        if np.isfinite(low).any():  # a network that was never calibrated has none
             ax.fill_between(across, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
     # few frames have a dot each: one alone makes no line
     dot = "o" if len(across) <= 40 else ""
@@ -116,7 +116,7 @@ def _across(rows: pa.Table) -> tuple[Float[np.ndarray, " frames"], str]:
 
 
 def column(rows: pa.Table, name: str) -> Float[np.ndarray, " frames"]:
-    """Numbers of a column; NaN where one is not known."""
+    """Return the numbers of a column; NaN for null."""
     return rows[name].to_numpy().astype(np.float64)
 
 
@@ -126,8 +126,8 @@ _WIDTH_IN, _MARGIN_IN, _GAP_IN, _CHART_IN = 10.0, 0.75, 0.08, 2.2
 def draw_strip(strip: Strip) -> Figure:
     """Draw a trial from stick to slip.
 
-    Above, what the camera saw at a few moments with the map over it, on one scale for all: blue where a pixel raises
-    the read margin, orange where it lowers it. Below, the true and the read margin over time, with the 90 % interval.
+    Above, camera frames at a few moments under their maps, on one scale: blue where a pixel raises the predicted
+    margin, orange where it lowers it. Below, the true and the predicted margin over time, with the 90 % interval.
     """
     count = len(strip.shown)
     cell = (_WIDTH_IN - _MARGIN_IN - 1.0 - _GAP_IN * (count - 1)) / count
@@ -146,7 +146,7 @@ def draw_strip(strip: Strip) -> Figure:
             ax.set_axis_off()
             readings = strip.readings
             read, true = _percent(readings.prediction[frame]), _percent(readings.safety_margin[frame])
-            words = f"{number + 1}: {'withheld' if readings.withheld[frame] else f'{read} read'}\n{true} true"
+            words = f"{number + 1}: {'withheld' if readings.withheld[frame] else f'{read} predicted'}\n{true} true"
             ax.set_title(words, fontsize=9.5, loc="center", fontweight="normal")
         bar = place_axes(figure, _WIDTH_IN - 0.9, 1.05, 0.13, cell)
         figure.colorbar(ScalarMappable(Normalize(-limit, limit), SIGN_COLOURS), cax=bar)
@@ -158,7 +158,7 @@ def draw_strip(strip: Strip) -> Figure:
 
 
 def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
-    """Draw the true and the read margin over time, with the interval and the moments that have pictures."""
+    """Draw the true and the predicted margin over time, with the interval and the moments of the pictures."""
     readings = strip.readings
     touched = np.isfinite(readings.safety_margin)
     time_s = readings.time_s
@@ -166,9 +166,9 @@ def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
         np.where(touched, 100 * value, np.nan) for value in (readings.prediction, readings.low, readings.high)
     )
     shade_withheld(time_s, readings.withheld.tolist(), ax=ax)
-    if np.isfinite(low).any():  # a network that was never calibrated tells none
+    if np.isfinite(low).any():  # a network that was never calibrated has none
         ax.fill_between(time_s, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
-    ax.plot(time_s, read, color=BLUE, label="read from the image")
+    ax.plot(time_s, read, color=BLUE, label="predicted")
     ax.plot(time_s, 100 * readings.safety_margin, color=BLACK, linestyle="--", label="true")
     for number, frame in enumerate(strip.shown, start=1):
         ax.axvline(time_s[frame], color="#9CA3AF", linewidth=0.8, zorder=0)
@@ -195,23 +195,23 @@ def _percent(value: float) -> str:
 
 
 def plot_grip_force(trace: GripTrace, *, ax: Axes) -> Axes:
-    """Draw the grip force over the least force that holds, and when the markers told of a slip."""
+    """Draw the grip force over the least force that holds, and the slips that the markers showed."""
     ax.plot(trace.time_s, trace.force_n, color=BLUE, label="grip force")
     ax.plot(trace.time_s, trace.least_force_n, color=BLACK, linestyle="--", label="least that holds")
     ax.fill_between(trace.time_s, trace.least_force_n, trace.force_n, color=BLUE, alpha=0.12, linewidth=0)
     for number, time_s in enumerate(trace.time_s[trace.slip_seen]):
-        ax.axvline(time_s, color=VERMILLION, linewidth=1, linestyle=":", label="slip seen" if number == 0 else None)
-    # room for the legend above what is drawn
+        ax.axvline(time_s, color=VERMILLION, linewidth=1, linestyle=":", label="slip detected" if number == 0 else None)
+    # room for the legend above the curves
     ax.set(xlabel="Time (s)", ylabel="Force (N)", ylim=(0, 1.4 * float(trace.force_n.max()) or 1.0))
     ax.legend(loc="upper right", ncols=2)
     return ax
 
 
 def plot_hold(steps: HoldSteps, *, ax: Axes) -> Axes:
-    """Draw the grip force that a gripper was told and that it measured, and when it failed or a slip was told."""
-    ax.plot(steps.time_s, steps.command_n, color=BLACK, linestyle="--", label="told")
+    """Draw the commanded and the measured grip force, failures of the gripper and slips."""
+    ax.plot(steps.time_s, steps.command_n, color=BLACK, linestyle="--", label="commanded")
     ax.plot(steps.time_s, steps.force_n, color=BLUE, label="measured")
-    for marked, colour, label in ((steps.slip, VERMILLION, "slip seen"), (steps.failed, GREY, "gripper failed")):
+    for marked, colour, label in ((steps.slip, VERMILLION, "slip detected"), (steps.failed, GREY, "gripper failed")):
         ax.plot(steps.time_s[marked], steps.command_n[marked], color=colour, marker="x", linestyle="", label=label)
     ax.set(xlabel="Time (s)", ylabel="Grip force (N)", ylim=(0, 1.4 * float(steps.command_n.max(initial=0.0)) or 1.0))
     ax.legend(loc="upper right", ncols=2)
@@ -219,9 +219,9 @@ def plot_hold(steps: HoldSteps, *, ax: Axes) -> Axes:
 
 
 def plot_grip_margin(trace: GripTrace, *, ax: Axes) -> Axes:
-    """Draw the margin read, with its interval, and the true one."""
+    """Draw the predicted margin with its interval, and the true one."""
     ax.fill_between(trace.time_s, 100 * trace.low, 100 * trace.high, color=ORANGE, alpha=0.2, linewidth=0)
-    ax.plot(trace.time_s, 100 * trace.margin, color=ORANGE, linewidth=1, label="read, with 90 % interval")
+    ax.plot(trace.time_s, 100 * trace.margin, color=ORANGE, linewidth=1, label="predicted, with 90 % interval")
     ax.plot(trace.time_s, 100 * trace.true_margin, color=BLACK, linestyle="--", label="true")
     ax.set(xlabel="Time (s)", ylabel="Safety margin Γ (%)", ylim=(-3, 103))
     ax.legend(loc="lower right")
@@ -229,7 +229,7 @@ def plot_grip_margin(trace: GripTrace, *, ax: Axes) -> Axes:
 
 
 def plot_grip_slip(trace: GripTrace, *, ax: Axes) -> Axes:
-    """Draw how far the object has slid, in millimetres."""
+    """Draw the slip of the object, in millimetres."""
     ax.plot(trace.time_s, 1e3 * trace.slip_m, color=GREY)
     ax.set(xlabel="Time (s)", ylabel="Slip (mm)", ylim=(0, max(1.0, 1.05e3 * float(trace.slip_m.max()))))
     return ax

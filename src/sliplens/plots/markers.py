@@ -1,4 +1,4 @@
-"""Markers on pictures: arrows on the frame, the field between them, both beside saliency."""
+"""Figures of markers: arrows on a frame, the displacement field, and both beside saliency."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,10 +16,10 @@ from sliplens.markers import DisplacementField
 from sliplens.plots.saliency import overlay_saliency, plot_colour_bar, stretch_saliency
 from sliplens.plots.style import BLACK, GREY, drawing_style
 
-# light is far: read alike under every common colour blindness
+# light is far: equal under every common colour blindness
 FIELD_COLOURS = "cividis"
 SURE = 0.2
-"""Confidence below which a field is a guess, and is not shown."""
+"""Confidence below which a field is not drawn."""
 ARROWS = 5.0
 """Length of arrows over the displacement."""
 STILL_PX = 0.3
@@ -29,7 +29,7 @@ _PANEL_IN = 2.2
 
 @dataclass(frozen=True, kw_only=True)
 class MarkedFrame:
-    """A frame with its field and the saliency of a network's answer on it."""
+    """A frame with its displacement field and the saliency of a prediction."""
 
     title: str
     frame: UInt8[np.ndarray, "height width 3"]
@@ -45,9 +45,9 @@ def plot_arrows(
     *,
     ax: Axes,
 ) -> Axes:
-    """Draw a frame with an arrow from each marker's place at rest along its displacement, where that is known."""
-    known = np.all(np.isfinite(displacement_px), axis=1) & np.all(np.isfinite(rest_px), axis=1)
-    place, way = rest_px[known], displacement_px[known]
+    """Draw a frame with an arrow from each marker's place at rest along its displacement."""
+    followed = np.all(np.isfinite(displacement_px), axis=1) & np.all(np.isfinite(rest_px), axis=1)
+    place, way = rest_px[followed], displacement_px[followed]
     ax.imshow(frame)
     ax.quiver(
         *place.T, *way.T, angles="xy", scale_units="xy", scale=1 / ARROWS, color="white", width=0.008,
@@ -62,15 +62,15 @@ def plot_arrows(
 def plot_field(
     field: DisplacementField, *, size: tuple[int, int], ax: Axes, longest_px: float | None = None
 ) -> ScalarMappable:
-    """Draw the length of the displacement in colour and its direction as streamlines; what is a guess stays grey.
+    """Draw the length of the displacement in colour and its direction as streamlines; unsure parts stay grey.
 
     The lightest colour stands for `longest_px`, or for the field's own longest displacement.
     """
     sure = field.confidence > SURE
     length = np.linalg.norm(field.displacement_px, axis=-1)
     top = longest_px or max(float(np.nanmax(np.where(sure, length, 0))), STILL_PX)
-    (left, right), (top_edge, bottom) = _ends(field.x_px), _ends(field.y_px)
-    extent = (left, right, bottom, top_edge)
+    (first, last), (top_edge, bottom) = _ends(field.x_px), _ends(field.y_px)
+    extent = (first, last, bottom, top_edge)
     ax.set_facecolor("#D1D5DB")
     norm = Normalize(0, top)
     ax.imshow(np.where(sure, length, np.nan), cmap=FIELD_COLOURS, norm=norm, extent=extent, interpolation="nearest")
@@ -87,24 +87,26 @@ def plot_field(
 def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
     """Draw each frame, its field and the saliency on it side by side, a row a frame (thesis, Fig. 12)."""
     if not frames:
-        raise InputError("there is no frame to draw; name one or more")
-    fields = [one.field for one in frames]
-    longest = max(float(np.linalg.norm(one.displacement_px, axis=-1)[one.confidence > SURE].max()) for one in fields)
+        raise InputError("there is no frame to draw; give at least one")
+    fields = [marked.field for marked in frames]
+    longest = max(
+        float(np.linalg.norm(field.displacement_px, axis=-1)[field.confidence > SURE].max()) for field in fields
+    )
     with drawing_style():
         figure = Figure(figsize=(3 * _PANEL_IN + 1.4, _PANEL_IN * len(frames) + 1.3), layout="constrained")
         heights = [*[1.0] * len(frames), 0.07]
         grid = figure.add_gridspec(len(frames) + 1, 3, height_ratios=heights)
         axes = np.array([[figure.add_subplot(grid[row, column]) for column in range(3)] for row in range(len(frames))])
         mappable = None
-        for one, row in zip(frames, axes, strict=True):
-            row[0].imshow(one.frame)
-            mappable = plot_field(one.field, size=one.frame.shape[:2], ax=row[1], longest_px=longest)
-            row[2].imshow(overlay_saliency(one.frame, stretch_saliency(one.saliency)))
+        for marked, row in zip(frames, axes, strict=True):
+            row[0].imshow(marked.frame)
+            mappable = plot_field(marked.field, size=marked.frame.shape[:2], ax=row[1], longest_px=longest)
+            row[2].imshow(overlay_saliency(marked.frame, stretch_saliency(marked.saliency)))
             for place in row:
                 place.grid(visible=False)
                 place.set(xlabel="", ylabel="")
                 place.tick_params(labelleft=place is row[0], labelbottom=place in axes[-1])
-            row[0].set_ylabel(f"{one.title}\ny (px)", color=GREY)
+            row[0].set_ylabel(f"{marked.title}\ny (px)", color=GREY)
         for place in axes[-1]:
             place.set_xlabel("x (px)")
         for place, title in zip(axes[0], ("Camera", "Displacement field", "Saliency"), strict=True):
@@ -118,7 +120,7 @@ def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
 
 
 def _ends(places: Float[np.ndarray, " places"]) -> tuple[float, float]:
-    """Outer edges of the cells of an even grid."""
+    """Return the outer edges of the cells of an even grid."""
     half = (places[1] - places[0]) / 2
     return float(places[0] - half), float(places[-1] + half)
 

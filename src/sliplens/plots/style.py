@@ -1,4 +1,4 @@
-"""Names, colours and drawing style that all figures and tables share, and how pictures are laid out and kept."""
+"""Names, colours and style of all figures and tables, and layout and saving of pictures."""
 
 import base64
 import io
@@ -25,14 +25,14 @@ from sliplens.intervals import Difference
 from sliplens.progress import visible
 from sliplens.results.faithfulness import CHANCE, CONTROLS, NEW_WEIGHTS, is_control
 
-# Okabe and Ito's palette, told apart under every common colour blindness
+# Okabe and Ito's palette, distinct under every common colour blindness
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
     "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
 )  # fmt: skip
 GREY = "#6B7280"
 
 UNKNOWN = "\N{EN DASH}"
-"""Stands for a number that is not there."""
+"""Stands for a missing number."""
 INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images", "pair": "Image pairs"}
 INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE, "pair": GREEN}
 CONDITION_COLOURS = {"dry": ORANGE, "wet": BLUE}
@@ -99,7 +99,7 @@ FILL_NAMES = {
     "noisy-linear": "noisy linear",
     "true": "true scene",
 }
-"""What removed parts become, the most natural first."""
+"""Names of the fills of removed parts, the most natural first."""
 UNIT_NAMES = {"pixel": "pixels", "tile": "tiles", "marker": "markers"}
 
 _STYLE: Any = {
@@ -141,63 +141,63 @@ def drawing_style() -> AbstractContextManager[None]:
 
 
 def input_name(name: str) -> str:
-    """Name of an input as a reader sees it."""
+    """Return the display name of an input."""
     return INPUT_NAMES.get(name, f"{name.capitalize()} images")
 
 
 def short_input_name(name: str) -> str:
-    """Name of an input for the legend of a picture that is about images anyway."""
+    """Return the short display name of an input, for legends."""
     return input_name(name).removesuffix(" images")
 
 
 def method_name(name: str) -> str:
-    """Name of a method as a reader sees it."""
+    """Return the display name of a method."""
     of_method = name.removesuffix(NEW_WEIGHTS)
     return METHOD_NAMES.get(name, name) if of_method == name else f"{method_name(of_method)}, new weights (control)"
 
 
 def source_name(name: str) -> str:
-    """Name of the frames' origin as a reader sees it."""
+    """Return the display name of the frames' origin."""
     return SOURCE_NAMES.get(name, name)
 
 
-def in_order(names: Iterable[str], known: Iterable[str]) -> list[str]:
-    """Sort names: the known ones in their own order, then the others by the alphabet."""
-    rank = {name: index for index, name in enumerate(known)}
+def in_order(names: Iterable[str], order: Iterable[str]) -> list[str]:
+    """Sort names in an order, then the others by the alphabet."""
+    rank = {name: index for index, name in enumerate(order)}
     return sorted(names, key=lambda name: (rank.get(name, len(rank)), name))
 
 
 def inputs_in_order(names: Iterable[str]) -> list[str]:
-    """Raw before difference, as in the thesis, then what it had not."""
+    """Sort inputs: raw before difference, as in the thesis, then others."""
     return in_order(set(names), INPUT_NAMES)
 
 
 def methods_in_order(names: Iterable[str]) -> list[str]:
-    """Methods as in the thesis, the controls last."""
+    """Sort methods as in the thesis, the controls last."""
     order = [*METHOD_NAMES, *(name + NEW_WEIGHTS for name in METHOD_NAMES)]
     return sorted(in_order(set(names), order), key=is_control)
 
 
 def name_methods(text: str) -> str:
-    """Write the methods in a text by name; controls are left alone, for their keys are words of their own."""
+    """Replace the keys of methods in a text by display names, except of controls, whose keys are common words."""
     keys = sorted(METHOD_NAMES.keys() - {*CONTROLS, "oracle", "degraded-oracle"}, key=len, reverse=True)
     return re.sub(rf"(?<![\w-])(?:{'|'.join(keys)})(?![\w-])", lambda key: METHOD_NAMES[key[0]], text)
 
 
 def fill_name(fill: str, unit: str = "pixel") -> str:
-    """Name of what removed parts become, and of the parts where they are no pixels."""
+    """Return the display name of a fill, and of the removed parts where they are not pixels."""
     name = FILL_NAMES.get(fill, fill)
     # the true scene is drawn anew without one marker's motion: there is no other unit
     return name if unit == "pixel" or fill == "true" else f"{name} ({UNIT_NAMES.get(unit, unit)})"
 
 
 def listed(texts: Sequence[str]) -> str:
-    """Join texts as a sentence does."""
+    """Join texts with commas and "and"."""
     return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}"
 
 
 def conditions_in_order(names: Iterable[str]) -> list[str]:
-    """Dry before wet before any other."""
+    """Sort conditions: dry before wet before any other."""
     return in_order(set(names), ("dry", "wet"))
 
 
@@ -209,22 +209,22 @@ def tell_ends(gap: Difference, write: Callable[[float], str], *, title: str = ""
 
 
 def percent(value: float | None, *, digits: int = 0) -> str:
-    """Write a share as a percentage, or a dash where it is not known; what rounds to nothing is 0."""
+    """Write a share as a percentage, or a dash for None; without the sign of a negative zero."""
     return UNKNOWN if value is None else f"{decimals(100 * value, digits)}\N{NO-BREAK SPACE}%"
 
 
 def reading_words(prediction: float, withheld: str | None) -> str:
-    """Write what a network reads of a frame, or that it is withheld."""
-    return "withheld" if withheld else f"read {percent(prediction)}"
+    """Write the prediction of a frame, or that it is withheld."""
+    return "withheld" if withheld else f"predicted {percent(prediction)}"
 
 
 def signed(value: float, digits: int) -> str:
-    """Write a number with its sign; what rounds to nothing is +0."""
+    """Write a number with its sign; +0 for a negative zero."""
     return f"{round(value, digits) + 0.0:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
 
 
 def decimals(value: float | None, digits: int) -> str:
-    """Write a number, or a dash where it is not known."""
+    """Write a number, or a dash for None."""
     if value is None:
         return UNKNOWN
     return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "\N{MINUS SIGN}")
@@ -235,7 +235,7 @@ _METADATA: dict[str, dict[str, Any]] = {".png": {}, ".pdf": {"CreationDate": Non
 
 
 def require_picture_path(path: Path, *, example: str) -> None:
-    """Check that a file is named as a picture that can be saved."""
+    """Check that a file name is that of a picture that can be saved."""
     if path.suffix.lower() not in _METADATA:
         raise InputError(f"{path} does not end in {', '.join(_METADATA)}; name a picture, such as {example}")
 
@@ -243,14 +243,14 @@ def require_picture_path(path: Path, *, example: str) -> None:
 def save_page(figure: Figure, path: Path) -> None:
     """Save a page as .png, .pdf or .svg; it appears when complete."""
     suffix = path.suffix.lower()
-    _write_out(figure)
+    _escape_texts(figure)
     with written_whole(path) as part, drawing_style():
         # 150 dots an inch show frames of 224 pixels about pixel for pixel
         figure.savefig(part, format=suffix[1:], dpi=150, metadata=_METADATA[suffix])
 
 
-def _write_out(figure: Figure) -> None:
-    """Write out what cannot be seen in names of files: no font has it, and in an SVG it breaks the whole picture."""
+def _escape_texts(figure: Figure) -> None:
+    """Escape invisible characters of file names in texts: no font has them, and in an SVG they break the picture."""
 
     def whole(text: str) -> str:
         return "\n".join(map(visible, text.split("\n")))
@@ -266,7 +266,7 @@ def _write_out(figure: Figure) -> None:
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Give a file beside the target to write to; it takes the target's name when all went well, else it is gone."""
+    """Give a temporary file beside the target, renamed to it on success and removed on failure."""
     part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -275,43 +275,40 @@ def written_whole(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"cannot write {path} ({error.strerror}); choose another file") from None
     finally:
-        with suppress(OSError):  # it has its name by now, or could not be made
+        with suppress(OSError):  # renamed already, or never made
             part.unlink()
 
 
-def place_axes(figure: Figure, left: float, top: float, width: float, height: float) -> Axes:
-    """Add axes whose left upper corner and size are given in inches from the left upper corner of the page."""
+def place_axes(figure: Figure, x: float, top: float, width: float, height: float) -> Axes:
+    """Add axes with their left upper corner and size in inches, measured from that of the page."""
     across, down = figure.get_size_inches()
-    return figure.add_axes((left / across, 1 - (top + height) / down, width / across, height / down))
+    return figure.add_axes((x / across, 1 - (top + height) / down, width / across, height / down))
 
 
-def place_text(figure: Figure, left: float, top: float, text: str, **settings: Any) -> None:
-    """Write words there, their upper edge on that line unless told otherwise."""
+def place_text(figure: Figure, x: float, top: float, text: str, **settings: Any) -> None:
+    """Write text at a place in inches, by default the left upper corner of the text."""
     across, down = figure.get_size_inches()
-    figure.text(left / across, 1 - top / down, text, **{"va": "top", **settings})
+    figure.text(x / across, 1 - top / down, text, **{"va": "top", **settings})
 
 
 def shade_withheld(across: Float[np.ndarray, " frames"], reasons: Sequence[str | None], *, ax: Axes) -> None:
-    """Shade the frames whose margin is withheld, and name the reasons in the legend without their cures.
-
-    `across`: place of each frame on the axis.
-    """
+    """Shade the frames with a withheld margin, at their places `across`, with the reasons in the legend."""
     edges = np.concatenate([across[:1], (across[1:] + across[:-1]) / 2, across[-1:]])
-    named: set[str] = set()
+    labels: set[str] = set()
     for reason, frames in groupby(range(len(reasons)), key=lambda at: reasons[at]):
         if not reason:
             continue
         first, *others = frames
-        left, right = edges[first], edges[[first, *others][-1] + 1]
-        if left == right:  # the only frame there is
-            left, right = left - 0.5, right + 0.5
+        start, end = edges[first], edges[[first, *others][-1] + 1]
+        if start == end:  # a single frame
+            start, end = start - 0.5, end + 0.5
         label = f"withheld: {reason.partition(';')[0]}"
-        ax.axvspan(left, right, color=GREY, alpha=0.3, linewidth=0, label=None if label in named else label)
-        named.add(label)
+        ax.axvspan(start, end, color=GREY, alpha=0.3, linewidth=0, label=None if label in labels else label)
+        labels.add(label)
 
 
 def write_over(ax: Axes, words: str, **settings: Any) -> None:
-    """Write in the middle of axes, grey, why there is nothing in them."""
+    """Write in the middle of empty axes why they are empty."""
     ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", va="center", color=GREY, **settings)
 
 
@@ -322,7 +319,7 @@ _DOTS_PER_INCH = 144  # photographs of 224 pixels shown 1.5 inches wide, about p
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """An image as a data URI, its text for those who cannot see it, and its size in CSS pixels."""
+    """An image as a data URI, with its alternative text and its size in CSS pixels."""
 
     uri: str
     alt: str
@@ -331,12 +328,12 @@ class Picture:
 
 
 def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture:
-    """Hold a figure as SVG, or as PNG: smaller where it is made of photographs."""
+    """Convert a figure to SVG, or with `pixels` to PNG, which is smaller for photographs."""
     buffer = io.BytesIO()
-    _write_out(figure)
+    _escape_texts(figure)
     with drawing_style():
         if pixels:
-            # as bare pixels: a PNG made only to be read again takes as long as the drawing
+            # as bare pixels: encoding a PNG to decode it again takes as long as drawing
             figure.savefig(buffer, format="rgba", dpi=_DOTS_PER_INCH)
             width, height = (int(side * _DOTS_PER_INCH) for side in figure.get_size_inches())
             buffer = _fewer_colours(Image.frombytes("RGBA", (width, height), buffer.getvalue()))
@@ -349,11 +346,11 @@ def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture
 
 
 def _fewer_colours(image: Image.Image) -> io.BytesIO:
-    """Same picture in 256 colours, a fourth of the size: the PDF beside the page holds all of them."""
+    """Reduce a picture to 256 colours, a fourth of the size; the PDF beside the page has all of them."""
     smaller = io.BytesIO()
     # by octree: evenly spread colours, where the median cut would give most of them to the noise of a map
     reduced = image.convert("RGB").quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)
-    # each colour is the mean of its like: paper would be not quite white
+    # colours are means: paper would not be quite white
     reduced.putpalette([_WHITE if level > _NEARLY_WHITE else level for level in reduced.getpalette() or []])
     reduced.save(smaller, "png")
     return smaller
