@@ -1,4 +1,4 @@
-"""Tactile images: read, written, subtracted; 8-bit RGB in, PNG out."""
+"""Tactile images: reading, writing and differences; 8-bit RGB in, PNG out."""
 
 import io
 import re
@@ -42,15 +42,15 @@ _UPRIGHT = {
 }
 """Turns and mirror images that undo an orientation tag (EXIF 2.3, tag 274)."""
 _TAGGED = frozenset({"exif", "Raw profile type exif", "XML:com.adobe.xmp", "xmp"})
-"""Entries of a header in which Pillow finds the tag; without one it would decode a PNG to look behind its pixels."""
+"""Entries of a header in which Pillow finds the tag; without any it would decode a PNG to search behind its pixels."""
 MOST_PIXELS = 100_000_000
-"""Pixels of a frame; a larger one is a damaged header, and would ask for gigabytes."""
+"""Largest number of pixels: more mean a damaged header, and would need gigabytes."""
 _DAMAGE = (OSError, SyntaxError, ValueError, MemoryError, Image.DecompressionBombError)  # what Pillow raises
 
 
 @contextmanager
 def telling_damage(words: str, cure: str, *, kind: type[InputError] = ImageError) -> Iterator[None]:
-    """Tell in these words what Pillow raises of an image inside that is damaged, or expands too far."""
+    """Convert errors of Pillow on damaged or too large images to an `InputError` with a message and a cure."""
     try:
         yield
     except _DAMAGE as error:
@@ -58,17 +58,17 @@ def telling_damage(words: str, cure: str, *, kind: type[InputError] = ImageError
 
 
 _LEAST_COLOUR = 16
-"""Grey levels by which channels of a colour differ: those of a colour camera's noise on grey things differ by less."""
+"""Grey levels by which channels of a colour differ: more than by a camera's noise on grey objects."""
 
 
 def has_colour(image: UInt8[np.ndarray, "height width 3"]) -> bool:
-    """Whether a hundredth of an image or more has a colour; of a camera without colours the channels are equal."""
+    """Check whether at least a hundredth of an image has a colour; the channels of a grey camera are equal."""
     spread = image.max(axis=-1) - image.min(axis=-1)
     return bool(np.mean(spread >= _LEAST_COLOUR) >= 0.01)
 
 
 def require_image(path: Path) -> None:
-    """Check that a path is a file that can be opened, as `require_file` does, in the words of images."""
+    """Check that a path is a file that can be opened; raises `ImageError`."""
     try:
         require_file(path)
     except InputError as error:
@@ -79,9 +79,9 @@ def require_image(path: Path) -> None:
 def open_image(
     source: Path | io.BytesIO, *, formats: tuple[str, ...] = ("PNG", "TIFF", "JPEG", "BMP")
 ) -> Iterator[Image.Image]:
-    """Open an image, none of its pixels read; a `ValueError` where it claims more than any camera has."""
+    """Open an image without reading its pixels; raises `ValueError` where it claims more than any camera has."""
     with warnings.catch_warnings():
-        # Pillow's own limit lies near ours, and its warning is no sentence for people
+        # Pillow warns near the limit that is checked below
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         image = Image.open(source, formats=formats)
     with image:
@@ -91,20 +91,20 @@ def open_image(
 
 
 def _orientation(image: Image.Image) -> int:
-    """Orientation tag of an image that is not decoded yet; 1 of a TIFF, which Pillow turns itself."""
+    """Return the orientation tag of an image that is not decoded yet; 1 for a TIFF, which Pillow turns itself."""
     if image.format == "TIFF" or not _TAGGED & image.info.keys():
         return 1
     return image.getexif().get(ExifTags.Base.Orientation, 1)
 
 
 def upright_size(image: Image.Image) -> tuple[int, int]:
-    """Height and width of an image as its orientation tag turns it, in pixels, from its header."""
+    """Return height and width of an image after the turn of its orientation tag, in pixels, from its header."""
     height, width = image.size[::-1]
     return (width, height) if _orientation(image) >= 5 else (height, width)
 
 
 def upright_pixels(image: Image.Image) -> UInt8[np.ndarray, "height width *channels"]:
-    """Pixels of an image, turned and mirrored as its orientation tag says."""
+    """Decode an image, turned and mirrored by its orientation tag."""
     turn = _UPRIGHT.get(_orientation(image))
     return np.array(image if turn is None else image.transpose(turn))
 
@@ -112,7 +112,7 @@ def upright_pixels(image: Image.Image) -> UInt8[np.ndarray, "height width *chann
 def require_eight_bits(image: Image.Image, *, where: object) -> None:
     """Refuse an image with more than 8 bits a channel.
 
-    Pillow keeps the upper 8 bits of 16, and of a camera with 12 bits those hold four.
+    Pillow keeps the upper 8 bits of 16, which hold four of a camera with 12 bits.
     """
     bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))
     if image.mode.startswith("I;16") or any(";16" in str(tile.args) for tile in getattr(image, "tile", ())):
@@ -124,7 +124,7 @@ def require_eight_bits(image: Image.Image, *, where: object) -> None:
 def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
     """Read an 8-bit RGB image (PNG, TIFF, JPEG or BMP), of a size (height, width) in pixels unless that is None.
 
-    An image that a tag turns or mirrors (EXIF orientation) comes upright.
+    Images with an orientation tag (EXIF) are turned upright.
 
     Raises
     ------
@@ -164,30 +164,30 @@ def write_png(path: Path, pixels: UInt8[np.ndarray, "height width *channels"]) -
 
 
 def encode_png(pixels: UInt8[np.ndarray, "height width *channels"]) -> bytes:
-    """Bytes of an image as PNG; noisy tactile frames hardly shrink above the lowest level."""
+    """Encode an image as PNG, at the lowest level: noisy frames hardly shrink above it."""
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="PNG", compress_level=1)
     return buffer.getvalue()
 
 
 def encode_jpeg(pixels: UInt8[np.ndarray, "height width 3"], quality: int) -> bytes:
-    """Bytes of an image as JPEG, for people and other programs to look at: it changes pixels."""
+    """Encode an image as JPEG, for display: it changes pixels."""
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, format="JPEG", quality=quality)
     return buffer.getvalue()
 
 
 def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Pixels of an RGB PNG held in memory."""
-    told = telling_damage(f"{where} cannot be read as PNG", "make the data set again")
-    with told, open_image(io.BytesIO(data), formats=("PNG",)) as image:
+    """Decode an RGB PNG in memory."""
+    damage = telling_damage(f"{where} cannot be read as PNG", "make the data set again")
+    with damage, open_image(io.BytesIO(data), formats=("PNG",)) as image:
         if image.mode != "RGB":
             raise ImageError(f"{where} has {_OTHER_MODES.get(image.mode, image.mode)}; make the data set again")
         return np.array(image)
 
 
 def list_images(folder: Path) -> list[Path]:
-    """Image files of a folder in natural order (frame 2 before frame 10).
+    """List the image files of a folder in natural order (frame 2 before frame 10).
 
     Raises
     ------
@@ -195,27 +195,27 @@ def list_images(folder: Path) -> list[Path]:
         If the folder is missing, or holds no image.
     """
     require_folder(folder, what="the image folder")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
-    for path in found:
-        # without a frame that is a dead link, all that follow would be taken for earlier ones
+    images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    for path in images:
+        # without a frame that is a dead link, all later ones would move up
         require_image(path)
-    if not found:
+    if not images:
         raise InputError(f"{folder} holds no image (looked for {', '.join(sorted(IMAGE_SUFFIXES))}); check the path")
-    return sorted(found, key=lambda path: natural_key(path.name))
+    return sorted(images, key=lambda path: natural_key(path.name))
 
 
 def is_image(path: Path) -> bool:
-    """Whether it is a file that is named as an image."""
+    """Check whether a path is a file with the suffix of an image."""
     return path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()
 
 
 def natural_key(text: str) -> list[tuple[int, int | str]]:
-    """Sort key that reads runs of digits as numbers."""
+    """Return a sort key in which runs of digits count as numbers."""
     return [(0, int(part)) if part.isdecimal() else (1, part.lower()) for part in re.split(r"(\d+)", text)]
 
 
 def shrink(image: UInt8[np.ndarray, "height width 3"], factor: int) -> UInt8[np.ndarray, "rows columns 3"]:
-    """Means of square blocks, rounded; what fills no block at the right and below is left out."""
+    """Average square blocks and round; incomplete blocks at the right and below are cut off."""
     if factor == 1:
         return image
     height, width = (side // factor for side in image.shape[:2])
@@ -229,7 +229,7 @@ def shrink(image: UInt8[np.ndarray, "height width 3"], factor: int) -> UInt8[np.
 def absolute_difference(
     frames: UInt8[np.ndarray, "*batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
 ) -> UInt8[np.ndarray, "*batch height width 3"]:
-    """Absolute difference |T_n - T_0| of frames T_n against the reference frame T_0, in grey levels.
+    """Compute the absolute difference |T_n - T_0| of frames T_n and the reference frame T_0, in grey levels.
 
     Raises
     ------
@@ -258,9 +258,9 @@ def absolute_difference(
 def signed_difference(
     frames: UInt8[np.ndarray, "*batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
 ) -> UInt8[np.ndarray, "*batch height width 3"]:
-    """Signed difference T_n - T_0 of frames against the reference frame, in 8 bits: half the grey levels, plus 128.
+    """Compute the signed difference T_n - T_0 of frames and the reference frame, halved, plus 128, in 8 bits.
 
-    What brightens lies above 128, what darkens below; a step is two grey levels, less than the noise of a camera.
+    Values above 128 are brighter, values below darker; a step is two grey levels, less than the noise of a camera.
 
     Raises
     ------
@@ -286,13 +286,13 @@ _CURES = {
     "u": f"{_REDUCE}, and convert them with .astype(np.uint8)",
     "i": "if they are from 0 to 255, convert them with .astype(np.uint8)",
 }
-"""Ways to make 8-bit levels of an array, by NumPy's kind of its type."""
+"""Conversions to 8-bit levels, by NumPy's kind of a type."""
 
 
 def require_rgb(images: np.ndarray, *, what: str = "frames") -> None:
     """Refuse an array that holds no 8-bit RGB images, one or a batch with the colours on the last axis.
 
-    Levels of another type cannot be compared with 8-bit ones: 1.0 may be white or next to black.
+    Levels of other types are ambiguous: 1.0 may be white or almost black.
     """
     if not isinstance(images, np.ndarray):
         raise ImageError(f"the {what} are of type {type(images).__name__}; give a NumPy array of uint8")
@@ -307,7 +307,7 @@ def require_rgb(images: np.ndarray, *, what: str = "frames") -> None:
 
 
 def require_same_size(frames: np.ndarray, reference: np.ndarray) -> None:
-    """Refuse frames that cannot be compared with their reference frame: of another size or another type."""
+    """Refuse frames of another size or type than their reference frame."""
     require_rgb(frames)
     require_rgb(reference, what="levels of the reference")
     if frames.shape[-3:] != reference.shape:

@@ -11,15 +11,15 @@ from sliplens.cli.console import print_table, say, wrote
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK
 
-_TASK = "new makes a profile, list tells those that come with sliplens."
+_TASK = "new makes a profile, list shows those that come with sliplens."
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor(Command):
     """Make the profile of your sensor from a recording: `sliplens sensor new --from tip.mp4 -o tip.toml`.
 
-    Finds the gel's rectangle and the markers, proposes what to do with the frames, and draws a picture of it beside the
-    file. Look at it, change the file where it is wrong, and name it in --sensor of the other commands.
+    Finds the gel's rectangle and the markers, proposes crop and size of the frames, and draws a picture beside the
+    file. Check the picture, correct the file, and name it in --sensor of the other commands.
     """
 
     task: Annotated[Literal["new", "list"], tyro.conf.Positional, tyro.conf.arg(help=_TASK)]
@@ -30,21 +30,24 @@ class Sensor(Command):
     name: str | None = None
     """Name of the sensor; that of the file if not given."""
     network: str = DEFAULT_NETWORK
-    """Network that is to read the frames: they are brought to the size it was trained on."""
+    """Network for the frames, which are resized for it."""
     keep_size: bool = False
-    """Leave the gel in the camera's resolution, to train a network of its own; no network is named then."""
+    """Keep the camera's resolution, to train a new network; the profile then names no network."""
 
     def run(self) -> None:
-        """Propose, draw and write, or list."""
+        """Propose, draw and write a profile, or list profiles."""
         from sliplens.recordings.sensor import load_profile, shipped_profiles
 
         if self.task == "list":
             shipped = {name: load_profile(name) for name in shipped_profiles()}
-            rows = [(name, one.markers or "none", str(one.camera_size_px or "any")) for name, one in shipped.items()]
+            rows = [
+                (name, profile.markers or "none", str(profile.camera_size_px or "any"))
+                for name, profile in shipped.items()
+            ]
             print_table("Sensor profiles", ("name", "markers", "camera, width x height"), rows)
             return
         if self.source is None or self.output is None:
-            raise InputError("name a recording and the file to write: sliplens sensor new --from VIDEO -o FILE.toml")
+            raise InputError("give a recording and the file to write: sliplens sensor new --from VIDEO -o FILE.toml")
         from sliplens.files import require_new_file
         from sliplens.markers.gel import propose_profile
         from sliplens.models.checkpoint import read_manifest
@@ -60,6 +63,6 @@ class Sensor(Command):
         self.output.write_text(profile_text(proposal.profile, notes=proposal.notes), encoding="utf-8")
         for sentence in proposal.notes:
             say(f"  {sentence}")
-        wrote(self.output, "change in it what the picture shows to be wrong")
+        wrote(self.output, "correct it where the picture shows an error")
         write_proposal(proposal, self.output.with_suffix(".png"))
-        wrote(self.output.with_suffix(".png"), "what the profile does to a frame")
+        wrote(self.output.with_suffix(".png"), "a frame before and after the profile")

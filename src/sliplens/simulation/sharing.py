@@ -64,9 +64,9 @@ def compare_datasets(
     def shared(*facts: str) -> tuple[tuple[str, str], ...]:
         pairs = []
         for fact in facts:
-            left, right = ([trial[fact] for trial in side if fact in trial] for side in identities)
-            names = dict(right)
-            pairs += [(name, names[key]) for key, name in left if key in names]
+            ours, others = ([trial[fact] for trial in side if fact in trial] for side in identities)
+            names = dict(others)
+            pairs += [(name, names[key]) for key, name in ours if key in names]
         return tuple(dict.fromkeys(pairs))
 
     return SharedMaterial(
