@@ -10,7 +10,7 @@ import numpy as np
 from sliplens.errors import RecordingError
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.formats.tables import open_table, trial_name
+from sliplens.recordings.formats.tables import open_text_table, trial_name
 from sliplens.recordings.formats.video import count_stale, least_contact, read_video, small_copies
 from sliplens.recordings.labelling import Clip
 from sliplens.recordings.options import ReadOptions
@@ -26,7 +26,7 @@ def is_gelsight(path: Path) -> bool:
     for folder in (path, *path.absolute().parents[1:3]):
         with suppress(RecordingError):
             if (folder / LABELS_FILE).is_file() and {"file", "slip_label"} <= set(
-                open_table(folder / LABELS_FILE).header
+                open_text_table(folder / LABELS_FILE).header
             ):
                 return True
     return False

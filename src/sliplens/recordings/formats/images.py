@@ -29,7 +29,7 @@ from sliplens.recordings.formats.tables import (
     guess_time_column,
     guess_time_unit,
     guessed_encodings,
-    open_table,
+    open_text_table,
     place_on_clock,
     require_rising,
     require_unit,
@@ -99,7 +99,7 @@ def read_frame_times(
     table: Path, images: Sequence[Path]
 ) -> tuple[tuple[Path, ...], Float[np.ndarray, " frames"], list[str]]:
     """Sort images by a table with names of files and times; return them, their times, and notes."""
-    text = open_table(table)
+    text = open_text_table(table)
     name_column = next((name for name in text.header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
     if name_column is None:
         raise RecordingError(

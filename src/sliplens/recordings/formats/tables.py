@@ -72,7 +72,7 @@ class TextTable:
             yield line, fields
 
 
-def open_table(path: Path) -> TextTable:
+def open_text_table(path: Path) -> TextTable:
     """Find the separator and the header of a table, after a byte order mark, comments and empty lines."""
     encoding = _encoding(path)
     comment = ""
@@ -378,7 +378,7 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     What is not declared is guessed from the names of the columns (`time_s`, `t [ms]`, `stamp`; `fx`, `force_x [mN]`,
     `wrench.force.x`; `fn` and `ft`), the unit of the time also from its steps.
     """
-    table, time_column, force_columns = open_table(path), options.time_column, options.force_columns
+    table, time_column, force_columns = open_text_table(path), options.time_column, options.force_columns
     time_name = guess_time_column(table) if time_column is None else table.require(time_column, option="--time-column")
     if force_columns is None:
         names = guess_force_columns(table)
