@@ -31,8 +31,9 @@ _WEIGHTS: dict[str, tuple[tuple[float, ...], tuple[float, ...], float]] = {
     "": ((-0.5, -0.44, -2.48, 6.96, 1.45), (0.35, 4.25, -2.75, 3.25, 1.87), 0.11),
 }
 """By kind of sensor, at the knots: weights of a displacement and of its outward part, and the standard deviation of
-the shear as a share of the mean outward displacement. Fitted by ridge regression to the tangential force of simulated
-150 trials pulled in every direction; the deviation was measured on other days. The row without a name is of all simulated sensors together."""
+the shear as a share of the mean outward displacement. Fitted by ridge regression to the tangential force of 150
+simulated trials pulled in every direction; the deviation was measured on other days. The row without a name is of all
+simulated sensors together."""
 _KNOTS = np.array([0, 0.33, 0.66, 1.0, 1.4])  # distances from the centre over half of the shorter side
 _NOISE_PX = 0.027  # of the reduced picture
 
@@ -112,9 +113,9 @@ class ShearEstimator:
     """Estimates the shear of frames of one sensor against its untouched image.
 
     The displacement of patches of the picture is measured by normalised cross-correlation. A press moves the skin
-    outwards, a press off the centre or tilted also sideways; the weights by which the shear is read from the patches
-    cancel both. They depend on the distance from the centre of the picture alone, so that every direction is read
-    alike, and were fitted to simulated presses and pulls in every direction.
+    outwards, a press off the centre or tilted also sideways; the shear is a weighted sum over the patches that cancels
+    both. The weights depend on the distance from the centre of the picture alone, so that all directions are equal, and
+    were fitted to simulated presses and pulls in every direction.
 
     Parameters
     ----------
@@ -172,12 +173,12 @@ class ShearEstimator:
         return Shear(x_px=float(x_px), y_px=float(y_px), sigma_px=sigma_px)
 
     def moments(self, moved_px: Float[np.ndarray, "patches 2"]) -> Float[np.ndarray, "moments 2"]:
-        """Mean displacement of the patches near each knot, then mean of its outward part, of which shear is a sum."""
+        """Compute the terms of the shear: mean displacement of the patches near each knot, then of its outward part."""
         outward = (moved_px * self._outward).sum(axis=1, keepdims=True) * self._outward
         return np.concatenate([self._near.T @ moved_px, self._near.T @ outward])
 
     def _plane(self, image: UInt8[np.ndarray, "_ _ 3"]) -> Float32[np.ndarray, "rows columns"]:
-        """Green channel, reduced, without what is wider than a marker."""
+        """Reduce the green channel and remove structures wider than a marker."""
         plane = shrink(image, self._factor)[..., 1].astype(np.float32)
         side = 2 * _WIDE + 1
         sums = np.pad(np.pad(plane, _WIDE, mode="edge").cumsum(0, dtype=np.float64).cumsum(1), ((1, 0), (1, 0)))
@@ -186,14 +187,14 @@ class ShearEstimator:
 
     def measure_displacements(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[Float[np.ndarray, "patches 2"], float]:
         """Measure the displacement (x, y) of each patch in pixels, and the share of the patches that were matched."""
-        seen = _cut(np.pad(self._plane(frame), _WINDOW), *self._corners, _WINDOW)
+        windows = _cut(np.pad(self._plane(frame), _WINDOW), *self._corners, _WINDOW)
         places = _WINDOW - _PATCH + 1
         product, energy = (
             np.asarray(np.fft.irfft2(_transform(part) * other, s=(_WINDOW, _WINDOW)))[:, :places, :places]
-            for part, other in ((seen, self._patches), (seen**2, self._weight))
+            for part, other in ((windows, self._patches), (windows**2, self._weight))
         )
         scale = np.sqrt(np.maximum(energy, 1e-3)) * np.maximum(self._energy, 1e-3)[:, None, None]
-        match = (product / scale).reshape(len(seen), places**2)
+        match = (product / scale).reshape(len(windows), places**2)
         rows = np.arange(len(match))
         best = match.argmax(axis=1)
         row, column = np.divmod(best, places)
@@ -204,35 +205,35 @@ class ShearEstimator:
             at - (_WINDOW - _PATCH) // 2 + _parabola(*(match[rows, inside + step * side] for side in (-1, 0, 1)))
             for at, step in ((column, 1), (row, places))
         ]
-        found = np.where(matched[:, None], np.stack(moved, axis=1), np.nan).reshape(*self._grid, 2)
+        field = np.where(matched[:, None], np.stack(moved, axis=1), np.nan).reshape(*self._grid, 2)
         share = float(matched.mean()) if len(matched) else 0.0
-        return self._factor * _fill(found).reshape(-1, 2), share
+        return self._factor * _fill(field).reshape(-1, 2), share
 
 
 def _transform(patches: Float32[np.ndarray, "*patches side side"]) -> np.ndarray:
     return np.asarray(np.fft.rfft2(patches, s=(_WINDOW, _WINDOW)))
 
 
-def _cut(plane: Float32[np.ndarray, "height width"], top: np.ndarray, left: np.ndarray, side: int) -> np.ndarray:
-    """Squares of a plane, by their upper left corners."""
-    if not len(top):
+def _cut(plane: Float32[np.ndarray, "height width"], row: np.ndarray, column: np.ndarray, side: int) -> np.ndarray:
+    """Cut squares out of a plane, by their upper left corners."""
+    if not len(row):
         return np.zeros((0, side, side), dtype=np.float32)
-    return np.lib.stride_tricks.sliding_window_view(plane, (side, side))[top, left]
+    return np.lib.stride_tricks.sliding_window_view(plane, (side, side))[row, column]
 
 
 def _parabola(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Place of the top of the parabola through three values around the largest, from -0.5 to 0.5."""
+    """Find the top of the parabola through three values around the largest, from -0.5 to 0.5."""
     bend = np.minimum(before + after - 2 * at, -1e-9)
     return np.clip((before - after) / (2 * bend), -0.5, 0.5)
 
 
 def _fill(moved: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows columns 2"]:
-    """Replace what is not known (NaN) or far from the median of its neighbours by that; 0 where there is none."""
+    """Replace unknown values (NaN) and outliers by the median of their neighbours; 0 where there is none."""
     rows, columns = moved.shape[:2]
     for _ in range(2):
         padded = np.pad(moved, ((1, 1), (1, 1), (0, 0)), constant_values=np.nan)
         around = [padded[i : i + rows, j : j + columns] for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-        ordered = np.sort(np.stack(around), axis=0)  # what is not known comes last
+        ordered = np.sort(np.stack(around), axis=0)  # NaN comes last
         count = np.isfinite(ordered).sum(axis=0, keepdims=True)
         low, high = (np.take_along_axis(ordered, np.maximum(at, 0), axis=0)[0] for at in ((count - 1) // 2, count // 2))
         median = (low + high) / 2

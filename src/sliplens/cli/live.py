@@ -15,6 +15,7 @@ from sliplens.cli.console import print_table, say
 
 if TYPE_CHECKING:
     from sliplens.live import LiveReader
+    from sliplens.live.loop import ReaderSettings
     from sliplens.recordings import TrialFacts
 
 _SOURCE = "simulated, grip, number of a camera, address of a stream, or a video, bag, data set or growing folder."
@@ -75,7 +76,7 @@ class Live:
     day: int = 1
     """Day of the recording."""
     engine: Literal["auto", "torch", "openvino"] = "auto"
-    """What runs the network; auto is the fastest at hand."""
+    """Engine of the network; auto is the fastest at hand."""
     device: Device = "cpu"
 
     def run(self) -> None:
@@ -89,51 +90,67 @@ class Live:
         if self.list:
             self._list()
             return
-        wishes = {name: getattr(self, name) for name in ("speed", "trial", "pixel_format")}
-        options = LiveOptions(rate_hz=self.rate, size=parse_size(self.size), **wishes)
-        names = ("reference", "engine", "device", "seconds", "forces", "friction", "same_object", "sequence")
-        named = {name: getattr(self, name) for name in names} | {"smoothing_s": self.smoothing, "options": options}
-        profile = named["sensor"] = load_profile(self.sensor) if is_profile(self.sensor) else None
+        options = LiveOptions(
+            rate_hz=self.rate,
+            size=parse_size(self.size),
+            speed=self.speed,
+            trial=self.trial,
+            pixel_format=self.pixel_format,
+        )
+        profile = load_profile(self.sensor) if is_profile(self.sensor) else None
         grip = open_grip(self.source, options)
-        named |= {"source": self.source} if grip is None else {"source": grip, "options": None}
-        told = {name: getattr(self, name) for name in ("sensor", "object", "condition", "day")}
-        facts = TrialFacts(trial="live", **told)
+        source = self.source if grip is None else grip
+        settings: ReaderSettings = {
+            "reference": self.reference,
+            "options": options if grip is None else None,
+            "sensor": profile,
+            "friction": self.friction,
+            "same_object": self.same_object,
+            "sequence": self.sequence,
+            "engine": self.engine,
+            "device": self.device,
+            "smoothing_s": self.smoothing,
+            "seconds": self.seconds,
+            "forces": self.forces,
+        }
+        facts = TrialFacts(trial="live", sensor=self.sensor, object=self.object, condition=self.condition, day=self.day)
         with ExitStack() as stack:
-            network = self.network or usual_network(named["source"], profile)
-            reader = stack.enter_context(closing(LiveReader(network=network, **named)))
+            network = self.network or usual_network(source, profile)
+            reader = stack.enter_context(closing(LiveReader(source, network, **settings)))
             reader.send_to(*self.sink)
             if self.record is not None:
                 reader.record(self.record, facts=facts)
             stack.callback(lambda: [say(str(state), aside=True) for state in reader.outputs])
             stack.callback(lambda: reader.lesson and say(reader.lesson, aside=True))
-            with suppress(KeyboardInterrupt), reader, self._shown(reader, facts):  # the way to end it
-                self._watch(reader)
+            with suppress(KeyboardInterrupt), reader, self._serve_page(reader, facts):  # Ctrl-C ends it
+                self._print(reader)
 
     @contextmanager
-    def _shown(self, reader: "LiveReader", facts: "TrialFacts") -> Iterator[None]:
-        """Page of it, if it is wanted; alone it stays when the source has ended."""
+    def _serve_page(self, reader: "LiveReader", facts: "TrialFacts") -> Iterator[None]:
+        """Serve the page; without --seconds or --sink it stays when the source has ended."""
         if not self.page:
             yield
             return
         from sliplens.app import LivePage
 
-        shown = {"host": self.host, "port": self.port, "record_into": self.record or Path("recorded")}
-        with LivePage(reader, facts=facts, **shown) as page:
+        into = self.record or Path("recorded")
+        with LivePage(reader, host=self.host, port=self.port, record_into=into, facts=facts) as page:
             say(f"open {page.address}", aside=True)
             yield
             if self.seconds is None and not self.sink:
                 say(f"{reader.source.name} has ended; the page stays until Ctrl-C", aside=True)
                 Event().wait()
 
-    def _watch(self, reader: "LiveReader") -> None:
-        told_s, told = -1.0, set[str]()
+    def _print(self, reader: "LiveReader") -> None:
+        """Print a reading and new troubles every second."""
+        printed_s, printed = -1.0, set[str]()
         for reading in reader.readings():
-            if time.monotonic() - told_s >= 1:
-                told_s = time.monotonic()
+            if time.monotonic() - printed_s >= 1:
+                printed_s = time.monotonic()
                 for error in () if self.page else (sender.error for sender in reader.senders if sender.error):
                     raise error
-                for words in {*reader.doubts, *reader.troubles} - told:
-                    told.add(words)
+                for words in {*reader.doubts, *reader.troubles} - printed:
+                    printed.add(words)
                     say(words, aside=True)
                 if not self.sink:
                     say(str(reading))
@@ -141,7 +158,7 @@ class Live:
     def _list(self) -> None:
         from sliplens.live import SOURCES, list_cameras
 
-        rows = [(str(one.path), one.name, *mode.in_words()) for one in list_cameras() for mode in one.modes]
+        rows = [(str(camera.path), camera.name, *mode.in_words()) for camera in list_cameras() for mode in camera.modes]
         columns = ("device", "name", "format", "size", "frames/s")
         print_table("Cameras", columns, rows) if rows else say("no camera is there that can be read")
         for words in ("simulated gripper that holds (grip, or grip:egg)", *(kind.words for kind in SOURCES.values())):
