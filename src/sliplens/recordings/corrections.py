@@ -48,7 +48,7 @@ def read_corrections(path: Path | str) -> dict[str, Corrections]:
         if cells["trial"] in corrections:
             raise RecordingError(f"{where}: {cells['trial']} has a row already; write one row a trial")
         corrections[cells["trial"]] = _parse_row(cells, where)
-    return {trial: one for trial, one in corrections.items() if one != Corrections()}
+    return {trial: row for trial, row in corrections.items() if row != Corrections()}
 
 
 def _parse_row(cells: dict[str, str], where: str) -> Corrections:

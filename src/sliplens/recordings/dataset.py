@@ -247,11 +247,11 @@ def report_flags(labellings: Iterable[tuple[str, Labelling | None]]) -> None:
         add_note(message)
 
 
-def report_dataset(data: Dataset, *, kept: bool) -> None:
+def report_dataset(data: Dataset, *, existed: bool) -> None:
     """Report a data set that was written, or was there already, and the flags on its labels."""
     report_flags((info.trial, read_header(trial_path(data.folder, info.trial)).labelling) for info in data.trials)
     count = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
-    report_file(data.folder, count, kept=kept)
+    report_file(data.folder, count, kept=existed)
 
 
 def save_profile(folder: Path, profile: SensorProfile) -> None:
@@ -268,12 +268,12 @@ def copy_profiles(source: Path, folder: Path) -> None:
 
 
 def trial_path(folder: Path, trial: str) -> Path:
-    """File that holds a trial of a data set."""
+    """Return the file of a trial of a data set."""
     return folder / "trials" / f"{trial}.parquet"
 
 
 def trial_info(path: Path, *, split: str) -> TrialInfo:
-    """Row of the data set's table for a trial saved at `path`."""
+    """Make the row of the data set's table for the trial stored at `path`."""
     header = read_header(path)
     samples = forces_path(path.parent.parent, path.stem)
     values = {field.name: getattr(header, field.name) for field in fields(TrialInfo) if hasattr(header, field.name)}

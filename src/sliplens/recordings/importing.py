@@ -136,7 +136,7 @@ def import_recordings(
             add_note(f"already in {out}, and left as it is: {count}, such as {existing[0]}")
         jobs = {item: job for item, job in work.jobs.items() if job.capture.trial not in names}
         if before is not None and not jobs:
-            report_dataset(before, kept=True)
+            report_dataset(before, existed=True)
             return replace(before, left_out=tuple(left_out))
         captures = [job.capture for job in jobs.values()]
         _require_names(captures, left_out)
@@ -167,7 +167,7 @@ def import_recordings(
         for message in dealt.notes:
             add_note(message)
         data = load_dataset(out)
-        report_dataset(data, kept=output.complete)
+        report_dataset(data, existed=output.complete)
         return data
 
 

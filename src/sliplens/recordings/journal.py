@@ -1,6 +1,6 @@
-"""A trial while it is being recorded: one Arrow stream, appended frame by frame, and how it becomes a trial.
+"""Journal of a running recording: an Arrow stream, appended frame by frame, that becomes a trial.
 
-Each frame is handed to the system before the next is taken: a process that is killed loses the one it was writing.
+Each frame is passed to the system before the next is taken: a process that is killed loses the one it was writing.
 """
 
 import shutil
@@ -32,7 +32,7 @@ from sliplens.recordings.store import (
 from sliplens.recordings.trial import TrialFacts, labels_of_margins
 
 JOURNAL_FOLDER = "recording"
-"""Folder beside the trials of a data set that holds what is being recorded, or was when it was cut off."""
+"""Folder of a data set with the journals of recordings that run or were cut off."""
 LOCK_FILE = "lock"
 _HEADER, _REFERENCE = b"sliplens", b"reference"
 _SCHEMA = pa.schema(
@@ -48,22 +48,22 @@ _SCHEMA = pa.schema(
 
 @dataclass(frozen=True, kw_only=True)
 class JournalHeader:
-    """What is known of a trial before its first frame."""
+    """Facts of a trial before its first frame."""
 
     facts: TrialFacts
     source: str
-    """Camera, stream or file, for people."""
+    """Camera, stream or file."""
     simulated: bool
     size: tuple[int, int]
     """Height and width of the frames, in pixels."""
     forces: str | None = None
-    """What measures the forces, for people; None where nothing does."""
+    """Source of the forces; None where there is none."""
 
 
 class Journal:
-    """A trial being recorded; frames are appended one by one, their times rising.
+    """Journal of one trial; frames are appended one by one, with rising times.
 
-    `reference`: the sensor untouched; None where nobody knows it: the first frame will stand for it.
+    `reference` is the image of the untouched sensor; if None, the first frame stands for it.
     """
 
     def __init__(self, folder: Path, header: JournalHeader, *, reference: Frame | None) -> None:
@@ -77,37 +77,29 @@ class Journal:
     def append(
         self, image: Frame, *, time_s: float, safety_margin: float | None = None, forces: Forces | None = None
     ) -> None:
-        """Append a frame, whole when this returns; an `OSError` where there is no room."""
-        known = forces is not None
+        """Append a frame, completely when this returns; an `OSError` where there is no room."""
+        samples = ([], []) if forces is None else (forces.time_s.tolist(), forces.force_n.ravel().tolist())
         self._writer.write_batch(
             pa.record_batch(
-                [
-                    [time_s],
-                    [safety_margin],
-                    [forces.time_s.tolist() if known else []],
-                    [forces.force_n.ravel().tolist() if known else []],
-                    [encode_pixels(image)],
-                ],
-                schema=_SCHEMA,
+                [[time_s], [safety_margin], [samples[0]], [samples[1]], [encode_pixels(image)]], schema=_SCHEMA
             )
         )
         self._file.flush()
 
     def close(self) -> None:
-        """Give the file back; what is in it stays."""
+        """Close the file; its content stays."""
         with suppress(OSError):  # of a frame for which there was no room
             self._file.close()
 
 
 class JournalLock:
-    """Holds a data set while trials are recorded into it; the system lets go of it when the process ends, however.
+    """Lock of a data set into which trials are recorded; the system releases it when the process ends, even killed.
 
-    A data set that another one holds is a `RecordingError`.
+    A data set that is locked already is a `RecordingError`.
     """
 
     def __init__(self, data: Path) -> None:
         self.folder = data / JOURNAL_FOLDER
-
         self.folder.mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(self.folder / LOCK_FILE, blocking=False)
         try:
@@ -117,24 +109,24 @@ class JournalLock:
             raise RecordingError(message) from None
 
     def release(self) -> None:
-        """Let go; what is there stays for whoever opens the data set next."""
+        """Release the lock; the journals stay to be recovered."""
         self._lock.release()
 
     def discard(self) -> None:
-        """Remove the folder, everything in it being in trials, and let go."""
+        """Remove the journals, which are trials now, and release the lock."""
         shutil.rmtree(self.folder)
         self.release()
 
 
 def journals_of(data: Path) -> list[Path]:
-    """Journals that wait to become trials of a data set."""
+    """List the journals of a data set that are no trials yet."""
     return sorted((data / JOURNAL_FOLDER).glob("*.arrow"))
 
 
 def finish_journal(journal: Path, trial: Path) -> JournalHeader | None:
-    """Make a trial, and the file of its force samples, of a journal; None where it holds no whole frame.
+    """Make a trial, and the file of its force samples, of a journal; None where it holds no complete frame.
 
-    Labels are the margins that the source knew. Without any, `label_dataset` finds them from the forces.
+    Labels are the margins of the source. Without any, `label_dataset` makes them from the forces.
     """
     require_file(journal, missing="move it away")
     try:
@@ -173,7 +165,7 @@ def finish_journal(journal: Path, trial: Path) -> JournalHeader | None:
 
 
 def _read_head(file: pa.NativeFile) -> tuple[JournalHeader, bytes | None] | None:
-    """What is known of the trial, and the picture of the untouched sensor; None where it was cut off before that."""
+    """Read the facts of the trial and the image of the untouched sensor; None where the journal ends before them."""
     try:
         schema = pa.ipc.open_stream(file).schema
     except pa.ArrowInvalid:
@@ -190,7 +182,7 @@ def _read_head(file: pa.NativeFile) -> tuple[JournalHeader, bytes | None] | None
 
 
 def _rows(file: pa.NativeFile) -> Iterator[pa.RecordBatch]:
-    """Whole frames, from the first to where the journal was cut off."""
+    """Read the complete frames, from the first to the end of the journal."""
     reader = pa.ipc.open_stream(file)
     while True:
         try:
@@ -198,14 +190,14 @@ def _rows(file: pa.NativeFile) -> Iterator[pa.RecordBatch]:
         except (StopIteration, pa.ArrowInvalid, OSError):
             return
         row.validate(full=True)
-        known = not any(row.column(name).null_count for name in _SCHEMA.names if name != "safety_margin")
-        if len(row) != 1 or not known or len(row["force_n"][0]) != 3 * len(row["force_time_s"][0]):
+        gaps = any(row.column(name).null_count for name in _SCHEMA.names if name != "safety_margin")
+        if len(row) != 1 or gaps or len(row["force_n"][0]) != 3 * len(row["force_time_s"][0]):
             raise pa.ArrowInvalid("a row is no frame")
         yield row
 
 
 def _save_forces(numbers: pa.Table, header: JournalHeader, path: Path) -> None:
-    """Write the samples, those that come twice left out."""
+    """Write the samples, without repeated ones."""
     time_s = numbers.column("force_time_s").combine_chunks().flatten().to_numpy()
     force_n = numbers.column("force_n").combine_chunks().flatten().to_numpy().reshape(-1, 3)
     rising = time_s > np.maximum.accumulate(np.concatenate([[-np.inf], time_s]))[:-1]

@@ -1,4 +1,4 @@
-"""How the labels of a trial were made: kept with it, shown by the audit and the viewer."""
+"""Provenance of the labels of a trial, stored with it and shown by the audit and the viewer."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -18,7 +18,7 @@ Vector: TypeAlias = tuple[float, float, float]
 
 
 class Found(StrEnum):
-    """How a setting came about."""
+    """Origin of a setting."""
 
     DECLARED = "declared"
     INFERRED = "inferred"
@@ -27,7 +27,7 @@ class Found(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class ForceAxes:
-    """How to read a force sensor; an axis or a sign that is none is a `RecordingError`."""
+    """Axes, sign and tare of a force sensor; an unknown axis or sign is a `RecordingError`."""
 
     normal: str
     """x, y or z: the axis that presses."""
@@ -40,12 +40,12 @@ class ForceAxes:
     tare_sigma_n: Vector
     """Standard uncertainty of the tare."""
     still_until_s: float | None
-    """Time until which the sensor is surely untouched; None where it is never touched."""
+    """Time until which the sensor is certainly untouched; None where it is never touched."""
     normal_found: Found
     sign_found: Found
     tare_found: Found
     drift_n_s: Vector = (0.0, 0.0, 0.0)
-    """Rate at which the reading of the untouched sensor drifts; 0 where it cannot be told from none."""
+    """Rate at which the reading of the untouched sensor drifts; 0 where it is not significant."""
     drift_sigma_n_s: Vector = (0.0, 0.0, 0.0)
     """Standard uncertainty of that rate."""
     direction: Vector | None = None
@@ -88,18 +88,18 @@ class FrictionEstimate:
     high: float
     """Upper end of the coefficient's 68 % interval."""
     onset_s: float | None = None
-    """First gross slip, on the force sensor's clock; None where it is not known to slip."""
+    """First gross slip, on the force sensor's clock; None where no slip is known."""
     found: Found = Found.DECLARED
     method: str = "given by hand"
-    """Words for people."""
+    """Method of the estimate, in words."""
     onset_sigma_s: float | None = None
-    """Standard uncertainty of the onset; None where it is not known."""
+    """Standard uncertainty of the onset; None where it is unknown."""
     image_sigmas: float | None = None
     """Motion of the image at the onset beyond that before it, in standard deviations; None where not measured."""
     later_onsets_s: tuple[float, ...] = ()
-    """Gross slips of the contacts after it, at most one each."""
+    """Gross slips of later contacts, at most one each."""
     notes: tuple[str, ...] = ()
-    """Contradictions with the forces, a sentence each, which count as errors of the friction."""
+    """Contradictions with the forces, a sentence each; they count as errors of the friction."""
 
     def __post_init__(self) -> None:
         if not 0 < self.mu <= MOST_FRICTION:
@@ -122,7 +122,7 @@ class FrictionEstimate:
 class Lag:
     """Time by which the camera's stamps are later than the force sensor's, for the same event.
 
-    One that is no finite number, or whose uncertainty is negative, is a `RecordingError`.
+    A lag that is not finite, or has a negative uncertainty, is a `RecordingError`.
     """
 
     lag_s: float
@@ -132,7 +132,7 @@ class Lag:
     correlation: float | None = None
     """Correlation coefficient of image motion and force rate at this lag; None where it was given by hand."""
     doubt: str = ""
-    """Why the lag cannot be told from this trial; empty where it can."""
+    """Reason why this trial does not determine the lag; empty where it does."""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.lag_s) and self.sigma_s >= 0):
@@ -143,7 +143,7 @@ class Lag:
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceChoice:
-    """Which frame is the sensor untouched, and how sure that is."""
+    """Choice of the frame that shows the sensor untouched."""
 
     index: int | None = None
     """Number of the frame; None where the reference was recorded apart from the frames."""
@@ -158,7 +158,7 @@ class ReferenceChoice:
 
 @dataclass(frozen=True, kw_only=True)
 class Clip:
-    """Knowledge of a whole recording that tells nothing of a single frame."""
+    """Facts of a whole recording that label no single frame."""
 
     slips: bool
     grasp: str
@@ -168,7 +168,7 @@ class Clip:
 
 
 class Reason(StrEnum):
-    """Why a frame has no valid label; empty where it has one."""
+    """Reason why a frame has no valid label; empty where it has one."""
 
     NONE = ""
     DROP_OUT = "drop-out of the force"
@@ -188,19 +188,19 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class ForceFault:
-    """A stretch of samples that the force sensor got wrong."""
+    """Stretch of faulty samples of a force sensor."""
 
     kind: Reason
     start_s: float
     """On the force sensor's clock."""
     end_s: float
     largest_n: float | None = None
-    """Largest number that any axis reads in it, as recorded; None of missing samples."""
+    """Largest absolute value of any axis in it, as recorded; None for missing samples."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LabelBasis:
-    """Estimates and thresholds behind labels that were found from forces."""
+    """Estimates and thresholds behind automatic labels."""
 
     axes: ForceAxes
     friction: FrictionEstimate
@@ -209,7 +209,7 @@ class LabelBasis:
     slip_s: float | None
     """First gross slip, on the force sensor's clock; None if there is none."""
     lag: Lag | None
-    """None where it was neither estimated nor given."""
+    """None where it was neither estimated nor set."""
     lag_applied: bool
     contact_threshold_n: float
     window_s: float
@@ -217,33 +217,30 @@ class LabelBasis:
     gap_s: float
     """Time beyond which samples count as missing between two others."""
     force_range_n: float | None
-    """Largest force that each axis can measure; None where it is not known."""
+    """Largest force that each axis can measure; None where it is unknown."""
     faults: tuple[ForceFault, ...] = ()
     """Samples that were left out, in the order of time."""
     doubts: tuple[str, ...] = ()
-    """What else is not plausible, a sentence each."""
+    """Other implausible findings, a sentence each."""
 
     @property
     def flags(self) -> tuple[str, ...]:
-        """All that puts labels in doubt, a sentence each."""
-        return (*tell_faults(self.faults), *self.axes.notes, *self.friction.notes, *self.doubts)
+        """All doubts about the labels, a sentence each."""
+        return (*describe_faults(self.faults), *self.axes.notes, *self.friction.notes, *self.doubts)
 
 
-def tell_faults(faults: Sequence[ForceFault]) -> tuple[str, ...]:
-    """Tell of the faults of each kind in a sentence."""
-    told = []
+def describe_faults(faults: Sequence[ForceFault]) -> tuple[str, ...]:
+    """Describe the faults of each kind in a sentence."""
+    sentences = []
     for kind in dict.fromkeys(fault.kind for fault in faults):
-        some = [fault for fault in faults if fault.kind == kind]
-        where = (
-            f"at {some[0].start_s:.2f} s"
-            if len(some) == 1
-            else f"in {len(some)} places from {some[0].start_s:.2f} s on"
-        )
-        size = max((one.largest_n for one in some if one.largest_n), default=None)
+        same = [fault for fault in faults if fault.kind == kind]
+        first_s = f"{same[0].start_s:.2f} s"
+        where = f"at {first_s}" if len(same) == 1 else f"in {len(same)} places from {first_s} on"
+        size = max((fault.largest_n for fault in same if fault.largest_n), default=None)
         up_to = "" if size is None else f", up to {size:.3g} N"
-        length = sum(one.end_s - one.start_s for one in some)
-        told.append(f"{kind} {where}, {length:.2f} s in all{up_to}: frames there are not valid")
-    return tuple(told)
+        length = sum(fault.end_s - fault.start_s for fault in same)
+        sentences.append(f"{kind} {where}, {length:.2f} s in all{up_to}: frames there are not valid")
+    return tuple(sentences)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,14 +293,14 @@ class Corrections:
 
 @dataclass(frozen=True, kw_only=True)
 class Labelling:
-    """Where a trial and its labels come from."""
+    """Origin of a trial and of its labels."""
 
     source: str
     """File, folder or topic of the frames."""
     forces: str | None
     """Topic, file or columns of the forces; None where none were recorded."""
     notes: tuple[str, ...]
-    """Assumptions of the reader, a sentence each."""
+    """Assumptions made on import, a sentence each."""
     reference: ReferenceChoice
     clip: Clip | None = None
     basis: LabelBasis | None = None

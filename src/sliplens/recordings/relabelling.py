@@ -66,7 +66,7 @@ def label_dataset(
         labelling, out = labelling or LabelSettings(), Path(out)
         in_place = out.resolve() == data.folder.resolve()
         stored = {info.trial: read_header(trial_path(data.folder, info.trial)).labelling for info in data.trials}
-        before = {trial: known.corrections for trial, known in stored.items() if known and known.corrections}
+        before = {trial: origin.corrections for trial, origin in stored.items() if origin and origin.corrections}
         if corrections is None:
             corrections = before
         elif not isinstance(corrections, Mapping):
@@ -76,9 +76,9 @@ def label_dataset(
         work = _Relabelling(data=data, labelling=labelling, corrections=corrections)
         for number in range(len(data.trials)):  # mistakes are found before anything slow
             work.open(number)
-        for trial, known in stored.items():
-            excluded = known is not None and known.corrections is not None and known.corrections.exclude
-            if in_place and (known is None or (known.basis is None and not excluded)):
+        for trial, origin in stored.items():
+            excluded = origin is not None and origin.corrections is not None and origin.corrections.exclude
+            if in_place and (origin is None or (origin.basis is None and not excluded)):
                 raise InputError(
                     f"the labels of {trial} did not come from its forces and would be lost; "
                     "name a new folder with --output"
@@ -98,7 +98,7 @@ def label_dataset(
         if removed := sorted(before.keys() - corrections.keys()):
             add_note(f"corrections of {number_of(len(removed), 'trial')} removed, such as {removed[0]}")
         labelled = load_dataset(out)
-        report_dataset(labelled, kept=output.complete)
+        report_dataset(labelled, existed=output.complete)
     return labelled
 
 
@@ -129,11 +129,11 @@ class _Relabelling(TrialWork):
         except RecordingError as error:
             raise RecordingError(f"{info.trial}: {error}{cure}") from None
         # as it was imported, with the reference from before any correction
-        known = capture.labels.labelling if capture.labels else None
+        origin = capture.labels.labelling if capture.labels else None
         capture = replace(capture, labels=None)
-        if known is not None:
-            choice = known.first_reference or known.reference
-            capture = replace(capture, source=known.source, notes=known.notes, reference_choice=choice)
+        if origin is not None:
+            choice = origin.first_reference or origin.reference
+            capture = replace(capture, source=origin.source, notes=origin.notes, reference_choice=choice)
         if (first := read_first_reference(trial_path(folder, info.trial))) is not None:
             capture = replace(capture, reference=first)
         return TrialJob(capture=capture, settings=settings, corrections=corrections, cure=cure)

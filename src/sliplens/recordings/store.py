@@ -1,4 +1,4 @@
-"""One trial on disk: a Parquet file, a row a frame, with its header and reference frame beside the rows."""
+"""Trial on disk: a Parquet file with a row a frame, and a header and the reference frame in its metadata."""
 
 import os
 import re
@@ -38,37 +38,37 @@ SCHEMA_VERSION = 2
 CODEC = "rows+zstd"
 """Coding of the images, named in the metadata of a trial."""
 ROW_GROUP = 64
-"""Frames that are written, and can be read, together."""
+"""Frames that are written and read together."""
 _AGAIN = "make the data set again"
 reading = partial(telling_parquet, cure=_AGAIN, error=RecordingError)
-"""Tells of a file of a data set that is missing or damaged, whatever is read of it inside."""
+"""Context that turns errors of a missing or damaged file into a `RecordingError` with its cure."""
 
 
 def encode_pixels(pixels: Pixels) -> bytes:
-    """Bytes of an image; the size is kept elsewhere."""
+    """Encode an image; its size is stored elsewhere."""
     rows = pixels.copy()
     rows[1:] -= pixels[:-1]
-    # a copy of the right size: bytes that are cut down in place leave holes, and memory would grow with every frame
+    # a copy of the right size: bytes that shrink in place leave holes, and memory would grow with every frame
     return pa.compress(rows, codec="zstd").to_pybytes()
 
 
 def encode_frames(frames: Iterable[Pixels]) -> Iterator[list[bytes]]:
-    """Encode frames side by side while the next are made, and give them in chunks of a row group."""
-    images = in_turn(encode_pixels, frames)  # Zstandard lets go of the interpreter's lock
+    """Encode frames in threads while the next are made; yields them in chunks of a row group."""
+    images = in_turn(encode_pixels, frames)  # Zstandard releases the interpreter's lock
     yield from iter(lambda: list(islice(images, ROW_GROUP)), [])
 
 
-def in_turn(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
-    """Do a work in threads while the next items are made, and give what comes of each in their order.
+def in_turn(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
+    """Apply a function in threads while the next items are made; yields the results in the order of the items.
 
-    Two items a thread are held, however many there are.
+    At most two items a thread are in memory.
     """
-    share = os.environ.get("OMP_NUM_THREADS", "")  # of the processor, where several processes work
-    workers = int(share) if share.isdigit() and int(share) else os.cpu_count() or 1
+    cores = os.environ.get("OMP_NUM_THREADS", "")  # of this process, where several work
+    workers = int(cores) if cores.isdigit() and int(cores) else os.cpu_count() or 1
     waiting: deque[Future[_Result]] = deque()
     with ThreadPoolExecutor(workers) as pool:
         for item in items:
-            waiting.append(pool.submit(work, item))
+            waiting.append(pool.submit(function, item))
             if len(waiting) == 2 * workers:
                 yield waiting.popleft().result()
         while waiting:
@@ -76,7 +76,7 @@ def in_turn(work: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterato
 
 
 class Spool:
-    """Pieces put by in a file that has no name and is gone when it is closed, to be read again in any order."""
+    """Temporary file without a name, in which pieces are stored to be read again in any order."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -84,7 +84,7 @@ class Spool:
         self._ends = array("q", [0])
 
     def append(self, piece: bytes) -> None:
-        """Put a piece by."""
+        """Store a piece."""
         self._file.write(piece)
         self._ends.append(self._ends[-1] + len(piece))
 
@@ -97,7 +97,7 @@ class Spool:
         return self._file.read(end - begin)
 
     def chunks(self, size: int) -> Iterator[list[bytes]]:
-        """Pieces in their order, so many together."""
+        """Yield the pieces in their order, in lists of a size."""
         for first in range(0, len(self), size):
             yield [self[place] for place in range(first, min(first + size, len(self)))]
 
@@ -109,7 +109,7 @@ class Spool:
 
 
 def decode_pixels(data: bytes | pa.Buffer, *, size: Sequence[int], where: str) -> Pixels:
-    """Pixels of an image of known size (height, width, and channels if any)."""
+    """Decode the pixels of an image of known size (height, width, and channels if any)."""
     count = int(np.prod(size))
     try:
         raw = pa.decompress(data, decompressed_size=count, codec="zstd")
@@ -123,7 +123,7 @@ def decode_pixels(data: bytes | pa.Buffer, *, size: Sequence[int], where: str) -
 
 @dataclass(frozen=True, kw_only=True)
 class TruthHeader:
-    """Truth of a simulated trial that is not told frame by frame; see `GroundTruth`."""
+    """Part of the ground truth that has no value a frame; see `GroundTruth`."""
 
     recipe: str
     displacement: str
@@ -132,7 +132,7 @@ class TruthHeader:
 
 @dataclass(frozen=True, kw_only=True)
 class TrialHeader(TrialFacts):
-    """Facts of a stored trial that are read without its frames."""
+    """Facts of a stored trial that can be read without its frames."""
 
     frames: int
     height: int
@@ -145,9 +145,12 @@ class TrialHeader(TrialFacts):
 
 
 def require_stored(trial: TrialFacts) -> None:
-    """Check what a file says of a stored trial: its name names a file here, its frames are some a camera gives.
+    """Check name and frame size of a stored trial.
 
-    It is a `ValueError`, for the sentence of who reads the file.
+    Raises
+    ------
+    ValueError
+        If the name is no file name, or the size not that of a camera; the codec adds the file to the message.
     """
     if not _NAME.fullmatch(trial.trial):
         raise ValueError(f"a trial is named with letters, digits, dots, dashes and underscores, not {trial.trial!r}")
@@ -156,19 +159,20 @@ def require_stored(trial: TrialFacts) -> None:
         raise ValueError(f"no trial has {frames} frames of {height} x {width} pixels")
 
 
+_FACTS = tuple(field.name for field in fields(TrialFacts))
 _NAME = re.compile(r"\w(?:[\w.-]*\w)?")
 _HEADER, _FIRST_REFERENCE = b"sliplens", b"first_reference"
 
 
 def read_header(path: Path) -> TrialHeader:
-    """Read what a trial is and how its labels were made, without its frames."""
+    """Read the facts of a trial and the provenance of its labels, without its frames."""
     file, header = _open(path)
     file.close()
     return header
 
 
 def read_first_reference(path: Path) -> Frame | None:
-    """Image of the untouched sensor from before an edit named another; None where none did."""
+    """Read the image of the untouched sensor from before a correction named another; None where none did."""
     file, _ = _open(path)
     with file:
         image = file.schema_arrow.metadata.get(_FIRST_REFERENCE)
@@ -179,7 +183,7 @@ _KINDS = {
     **dict.fromkeys((*SIGNALS, "safety_margin_sigma", "force_time_s"), "numbers"),
     **{"image": "bytes", "contact_state": "texts", "valid": "true and false", "reason": "texts"},
 }
-"""What the columns of a trial hold; `OPTIONAL_LABELS` need not be there."""
+"""Kind of each column of a trial; `OPTIONAL_LABELS` may be missing."""
 
 
 def _open(path: Path) -> tuple[pq.ParquetFile, TrialHeader]:
@@ -206,7 +210,7 @@ _TRUTH_KINDS = {
 
 
 def save_recording(recording: Recording, path: Path) -> None:
-    """Write a trial as one Parquet file, its images lossless; whole or not at all."""
+    """Write a trial as one Parquet file with lossless images; complete or not at all."""
     write_trial(
         path,
         encode_frames(recording.frames),
@@ -231,22 +235,27 @@ def write_trial(
 ) -> None:
     """Write the Parquet file of a trial, its encoded images a row group at a time; it appears when complete.
 
-    `first_reference` is the image that stood in the place of the reference before an edit named another.
+    `first_reference` is the reference from before a correction named another.
     """
     columns: dict[str, Any] = {"time_s": time_s, "contact_state": labels.contact_state}
     columns |= {name: getattr(labels, name) for name in (*SIGNALS[1:], *OPTIONAL_LABELS)}
     columns = {name: values for name, values in columns.items() if values is not None}
-    kept = None
+    truth_header = None
     if truth is not None:
         rest = tuple((float(x), float(y)) for x, y in truth.marker_rest_px)
-        kept = TruthHeader(recipe=truth.recipe, displacement=truth.displacement, marker_rest_px=rest)
+        truth_header = TruthHeader(recipe=truth.recipe, displacement=truth.displacement, marker_rest_px=rest)
         columns |= {name: getattr(truth, name) for name in _TRUTH_SIGNALS}
         columns["marker_px"] = pa.FixedSizeListArray.from_arrays(truth.marker_px.ravel(), list_size=2 * len(rest))
         maps = [encoded for chunk in encode_frames(truth.contact_map) for encoded in chunk]
         columns["contact_map"] = pa.array(maps, type=pa.binary())
     height, width, _ = reference.shape
     header = TrialHeader(
-        **_facts(facts), frames=len(time_s), height=height, width=width, labelling=labels.labelling, truth=kept
+        **{name: getattr(facts, name) for name in _FACTS},
+        frames=len(time_s),
+        height=height,
+        width=width,
+        labelling=labels.labelling,
+        truth=truth_header,
     )
     metadata = {
         _HEADER: msgspec.json.encode(to_builtins(header)),
@@ -272,7 +281,7 @@ def write_trial(
 
 
 def _in_place(images: list[bytes]) -> pa.ChunkedArray:
-    """Images as Arrow sees them, none copied."""
+    """Wrap encoded images in Arrow without copying them."""
     ends = (pa.py_buffer(np.array([0, len(image)], dtype=np.int32)) for image in images)
     parts = [
         pa.Array.from_buffers(pa.binary(), 1, [None, end, pa.py_buffer(image)])
@@ -317,7 +326,7 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
     if "reason" in labels:
         labels["reason"] = tuple(labels["reason"])
     return Recording(
-        **_facts(header),
+        **{name: getattr(header, name) for name in _FACTS},
         **labels,
         labelling=header.labelling,
         reference=reference,
@@ -331,12 +340,8 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
 _MOST_BYTES = 2**35  # of the pixels of a trial that is read at once
 
 
-def _facts(trial: TrialFacts) -> dict[str, Any]:
-    return {field.name: getattr(trial, field.name) for field in fields(TrialFacts)}
-
-
 def stream_frames(path: Path, places: Collection[int] | None = None) -> Iterator[Frame]:
-    """Frames of a stored trial one at a time, those of some places or all, a row group of them in memory."""
+    """Yield the frames of a stored trial, all or those of some places, with one row group in memory."""
     file, header = _open(path)
     first = 0
     with file:
@@ -355,31 +360,31 @@ def stream_frames(path: Path, places: Collection[int] | None = None) -> Iterator
 
 
 def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
-    """Some frames of a stored trial, in the order asked for, a row group in memory at a time."""
+    """Read some frames of a stored trial, in the order of `places`, with one row group in memory at a time."""
     header, wanted = read_header(path), set(places)
-    strange = [place for place in places if not 0 <= place < header.frames]
-    if strange:
-        raise RecordingError(f"{path} has no frame {strange[0]}; name one from 0 to {header.frames - 1}")
-    found = np.empty((len(places), header.height, header.width, 3), dtype=np.uint8)
+    outside = [place for place in places if not 0 <= place < header.frames]
+    if outside:
+        raise RecordingError(f"{path} has no frame {outside[0]}; name one from 0 to {header.frames - 1}")
+    frames = np.empty((len(places), header.height, header.width, 3), dtype=np.uint8)
     for place, frame in zip(sorted(wanted), stream_frames(path, wanted), strict=True):
-        found[np.equal(places, place)] = frame
-    return found
+        frames[np.equal(places, place)] = frame
+    return frames
 
 
 def hash_frames(path: Path) -> str:
-    """Hash of what a stored trial shows, whatever its labels say: its reference, first and last frame, and how many."""
+    """Hash the images of a stored trial: its reference, its first and last frame, and the number of frames."""
     file, header = _open(path)
     with file, reading(path):
         last = file.num_row_groups - 1
         ends = [file.read_row_group(group, columns=["image"]).column("image")[at] for group, at in ((0, 0), (last, -1))]
-        shown = [file.schema_arrow.metadata[b"reference"], *(one.as_py() for one in ends)]
-    return hash_json([header.frames, *(sha256(one).hexdigest() for one in shown)])
+        images = [file.schema_arrow.metadata[b"reference"], *(end.as_py() for end in ends)]
+    return hash_json([header.frames, *(sha256(image).hexdigest() for image in images)])
 
 
 def _read_truth(table: pa.Table, header: TruthHeader, size: tuple[int, ...], path: Path) -> GroundTruth:
     rest = len(header.marker_rest_px)
-    if (held := table.schema.field("marker_px").type.list_size) != 2 * rest:
-        raise RecordingError(f"{path} has {held} numbers a frame for {rest} markers, 2 each are needed; {_AGAIN}")
+    if (numbers := table.schema.field("marker_px").type.list_size) != 2 * rest:
+        raise RecordingError(f"{path} has {numbers} numbers a frame for {rest} markers, 2 each are needed; {_AGAIN}")
     # a trial is read as one chunk or many, as Arrow likes
     flat = table.column("marker_px").combine_chunks().flatten()
     return GroundTruth(
@@ -408,12 +413,12 @@ _AXES = ("x_n", "y_n", "z_n")
 
 
 def forces_path(folder: Path, trial: str) -> Path:
-    """File that holds the force samples of a trial of a data set."""
+    """Return the file of the force samples of a trial."""
     return folder / "forces" / f"{trial}.parquet"
 
 
 def save_forces(forces: Forces, path: Path) -> None:
-    """Write samples as one Parquet file, a row a sample; whole or not at all."""
+    """Write samples as one Parquet file with a row a sample; complete or not at all."""
     columns = {"time_s": forces.time_s, **dict(zip(_AXES, forces.force_n.T, strict=True))}
     table = pa.table(columns).replace_schema_metadata({"source": forces.source})
     with whole_file(path) as part:

@@ -1,4 +1,4 @@
-"""One trial of a tactile sensor: frames, forces, labels, and who, when and what."""
+"""One trial of a tactile sensor: frames, forces, labels and facts."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -18,22 +18,22 @@ OUTSIDE, SLIPS, STICKS = 0, 1, 2
 
 @dataclass(frozen=True, kw_only=True)
 class TrialFacts:
-    """Who, when and what of a trial: what rules of splits ask for, and trials are grouped by."""
+    """Facts of a trial: name, sensor, day and object, by which trials are grouped."""
 
     trial: str
     """Name of the trial: letters, digits, dots, dashes and underscores."""
     sensor: str = ""
-    """Name of the sensor; empty where it is not told."""
+    """Name of the sensor; empty where it is unknown."""
     day: int = 1
     """Day of the recording, counted from 1."""
     condition: str = "dry"
     """dry or wet, or any other word for the state of the surface."""
     object: str = ""
-    """Name of what was held; empty where it is not told."""
+    """Name of the object in the grasp; empty where it is unknown."""
 
 
 class ContactState(StrEnum):
-    """Phase of a grasp, as in Fig. 4 of the thesis; unknown where nothing measured it."""
+    """Phase of a grasp, as in Fig. 4 of the thesis; unknown where it was not measured."""
 
     NO_CONTACT = "no contact"
     CONTACT = "contact"
@@ -43,7 +43,7 @@ class ContactState(StrEnum):
 
 
 def contact_states(margin: Float[np.ndarray, " frames"], *, without: ContactState) -> tuple[ContactState, ...]:
-    """States that safety margins tell, another one where there is no margin."""
+    """Derive contact states from safety margins; `without` is the state of frames without a margin."""
     states = (without, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
     kinds = np.select([np.isnan(margin), margin <= 0, margin >= 1], [0, 1, 2], default=3)
     return tuple(states[kind] for kind in kinds)
@@ -57,7 +57,7 @@ SIGNALS = ("time_s", *LABEL_SIGNALS)
 
 @dataclass(frozen=True, kw_only=True)
 class Labels:
-    """Forces and labels of a trial's frames, one value a frame; NaN where nothing is known.
+    """Forces and labels of the frames of a trial, one value a frame; NaN where unknown.
 
     Forces are in newtons, the normal force positive when pressing. Without contact the safety margin has no meaning
     and is NaN. Lengths that disagree are a `RecordingError`.
@@ -79,7 +79,7 @@ class Labels:
     force_time_s: Float[np.ndarray, " _"] | None = None
     """Times of the frames on the force sensor's clock, where forces were interpolated."""
     labelling: Labelling | None = None
-    """How the labels were made; None where that is not told."""
+    """Provenance of the labels; None where it is unknown."""
 
     def __post_init__(self) -> None:
         self._require_one_each(len(self.safety_margin), f"there are {len(self.safety_margin)} safety margins but")
@@ -103,18 +103,18 @@ class Labels:
         return present if self.valid is None else present & self.valid
 
     def count(self) -> dict[str, int]:
-        """Number of frames by the reason why they have no valid label; those that have one as 'valid'."""
+        """Count frames by the reason why they have no valid label; those with one as 'valid'."""
         reasons = self.reason or [""] * len(self.safety_margin)
         pairs = zip(self.labelled.tolist(), reasons, strict=True)
-        return dict(Counter("valid" if fine else reason or "no label" for fine, reason in pairs))
+        return dict(Counter("valid" if valid else reason or "no label" for valid, reason in pairs))
 
 
 OPTIONAL_LABELS = ("safety_margin_sigma", "valid", "reason", "force_time_s")
-"""What `Labels` may lack."""
+"""Fields of `Labels` that may be None."""
 
 
 def labels_of_margins(safety_margin: Float[np.ndarray, " frames"]) -> Labels:
-    """Labels where no force is known, but the margin in [0, 1], or not even that (NaN).
+    """Make labels without forces, from margins in [0, 1] or NaN where unknown.
 
     Full slip is where the margin is 0, contact where it is 1; the stick ratio is that of a sphere, as everywhere.
 
@@ -132,13 +132,13 @@ def labels_of_margins(safety_margin: Float[np.ndarray, " frames"]) -> Labels:
         safety_margin=safety_margin,
         stick_ratio=stick_ratio(safety_margin),
         contact_state=contact_states(safety_margin, without=ContactState.UNKNOWN),
-        reason=tuple("" if known else "not labelled" for known in np.isfinite(safety_margin)),
+        reason=tuple("" if finite else "not labelled" for finite in np.isfinite(safety_margin)),
     )
 
 
 @dataclass(frozen=True, kw_only=True)
 class GroundTruth:
-    """The truth behind a simulated trial; pixel coordinates are (x, y), pixel centres at whole numbers.
+    """Ground truth of a simulated trial; pixel coordinates are (x, y), pixel centres at whole numbers.
 
     Lengths that disagree, or a stick zone larger than the contact, are a `RecordingError`.
     """
@@ -146,19 +146,19 @@ class GroundTruth:
     recipe: str
     """Hash of the recipe that made the trial."""
     displacement: str
-    """Which model moved the markers; the stick zone of `calibrated` is nominal, that of `half-space` exact."""
+    """Model that moved the markers; the stick zone of `calibrated` is nominal, that of `half-space` exact."""
     # sizes that must agree are left open here and checked below, in the user's words
     marker_rest_px: Float32[np.ndarray, "_ 2"]
     """Markers of the untouched sensor."""
     marker_px: Float32[np.ndarray, "_ _ 2"]
-    """The same markers in every frame."""
+    """Markers in every frame, in the order of those at rest."""
     static_friction: Float[np.ndarray, " _"]
-    """mu_s, whether or not the contact slips; `Recording.friction_coefficient` is the one that holds."""
+    """mu_s, even in slip; `Recording.friction_coefficient` is the coefficient in force."""
     contact_radius_m: Float[np.ndarray, " _"]
     """0 without contact."""
     stick_radius_m: Float[np.ndarray, " _"]
     contact_map: UInt8[np.ndarray, "_ _ _"]
-    """Where the camera sees the skin touch the object: 0 nowhere, 1 slipping, 2 sticking."""
+    """Contact of the skin as the camera sees it: 0 none, 1 slipping, 2 sticking."""
 
     def __post_init__(self) -> None:
         count = len(self.marker_px)
@@ -196,7 +196,7 @@ class Recording(TrialFacts, Labels):
     time_s: Float[np.ndarray, " _"]
     """Times on the camera's clock, rising."""
     truth: GroundTruth | None = None
-    """Knowledge of a simulator beyond the labels; None for a real trial."""
+    """Ground truth of a simulator; None for a real trial."""
 
     def __post_init__(self) -> None:
         count = len(self.frames)
@@ -227,9 +227,9 @@ class Recording(TrialFacts, Labels):
 
 
 CLOCK_S = (-1e6, 1e10)
-"""Times that clocks tell: seconds from somewhere in the recording, or since 1970; others are in another unit."""
+"""Range of plausible times: seconds since the start of a recording or since 1970; others are in another unit."""
 MOST_FORCE_N = 1e4
-"""No fingertip survives more; a larger number is in another unit."""
+"""Largest force on a fingertip, in newtons; a larger number is in another unit."""
 _FORCES = (-MOST_FORCE_N, MOST_FORCE_N, "give it in newtons")
 _FRACTION = (0.0, 1.0, "give it as a fraction, not in percent")
 LABEL_BOUNDS = {
@@ -239,11 +239,11 @@ LABEL_BOUNDS = {
     **dict.fromkeys(("safety_margin", "stick_ratio"), _FRACTION),
     "safety_margin_sigma": (0.0, MOST_FORCE_N, "make the labels again"),
 }
-"""Between which numbers a label can lie at all, and the cure where it does not."""
+"""Range of each label, and the cure for values outside."""
 
 
 def require_possible(values: Float[np.ndarray, " frames"], *, name: str, where: str) -> None:
-    """Check that labels lie where they can at all; NaN (no label) passes."""
+    """Check that labels lie in their range; NaN (no label) passes."""
     low, high, cure = LABEL_BOUNDS[name]
     outside = (values < low) | (values > high)
     if outside.any():

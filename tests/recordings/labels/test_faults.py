@@ -73,7 +73,7 @@ def test_a_fault_is_marked_from_its_first_sample_to_its_last(trial: Trial, fault
     # a line through noise places a small jump to some samples
     assert found[0].start_s == pytest.approx(AT_S, abs=0.006)
     assert found[-1].end_s == pytest.approx(AT_S + length_s, abs=0.008)
-    assert len(screened.forces.time_s) == np.sum(screened.marks == 0)
+    assert len(screened.forces.time_s) == np.sum(screened.codes == 0)
 
 
 @pytest.mark.parametrize("fault", SPANS)

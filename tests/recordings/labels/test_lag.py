@@ -114,7 +114,7 @@ def test_an_object_that_drops_out_at_once_still_tells_the_lag():
 
 def test_of_too_few_frames_no_lag_is_told(trial: Trial, rng: np.random.Generator):
     lag = estimate_lag(trial.frame_time_s[:48], trial.motion[:48], trial.forces(), rng=rng)
-    assert lag == Lag(lag_s=0.0, sigma_s=0.0, doubt="48 frames are too few to tell a lag from, 49 are needed")
+    assert lag == Lag(lag_s=0.0, sigma_s=0.0, doubt="48 frames are too few to estimate a lag from, 49 are needed")
     assert not estimate_lag(trial.frame_time_s[:49], trial.motion[:49], trial.forces(), rng=rng).doubt.startswith("49")
 
 

@@ -71,7 +71,7 @@ def test_few_frames_are_labelled_without_a_lag(trial: Trial, rng: np.random.Gene
     few = slice(None, None, 4)
     time, motion = trial.frame_time_s[few], trial.motion[few]
     labels = label_trial(time, motion, trial.forces(noise_n=0.02, rng=rng), settings=LabelSettings(), rng=rng)
-    assert "too few to tell a lag" in there(labels.basis.lag).doubt
+    assert "too few to estimate a lag" in there(labels.basis.lag).doubt
     truth = 1 - ratio(time) / STATIC
     # windows are four times as long as at the full rate, so kinks err by four times as much
     np.testing.assert_allclose(labels.safety_margin[labels.valid], truth[labels.valid], atol=0.05)

@@ -11,18 +11,18 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import AXES, ForceAxes, Found, Vector
 
 _WINDOW_S = 0.03  # time over which the force is averaged to find the touch: a press takes longer, a spike is shorter
-_FIRST_S = 0.1  # how long the sensor must be untouched at the start for its tare to be read
+_FIRST_S = 0.1  # time at the start in which the sensor must be untouched, to measure its tare
 _TOUCH_SIGMAS = 6.0  # a departure from the tare by so many standard deviations of the averaged noise is a touch
 _TOUCH_SHARE = 0.05  # and by so much of the largest force: drift and vibration are no touch
 _GUARD_S = 0.15  # samples before the touch that are left out of the tare: a soft press begins before it is noticed
 # share of the contact, from its start, in which the object is pressed and held but not yet pulled far
 _PRESS_SHARE = 0.25
 _SPIKE_SIGMAS = 4.0  # a still sample further from the median is a spike
-_MOST = 0.9  # share of the still samples that cannot all be spikes
-_FEW_STILL = 10  # fewer still samples tell no tare
+_LEAST_TYPICAL = 0.9  # share of the still samples that are no spikes
+_FEW_STILL = 10  # fewer still samples give no tare
 _STRETCHES = 10  # parts of the still samples whose means are compared
 _DOUBTFUL = 0.6  # a second axis that departs by this share of the first makes the normal axis doubtful
-_FEW_RISING = 4  # fewer samples of a press tell no direction
+_FEW_RISING = 4  # fewer samples of a press give no direction
 _RISE = (0.15, 0.9)  # shares of the load in hold between which the direction of the press is measured
 _TILT_SIGMAS = 3.0  # a press that departs from an axis by so many standard uncertainties is tilted
 _LEAST_TILT_DEG = 0.5  # less moves a margin by 1 % or so
@@ -31,15 +31,15 @@ _SHEAR_FLAG_DEG = 10.0  # a press that is pulled, too, is no fault up to here
 # of the tilt: a force that is pulled from the touch on turns by more than its whole angle in the time after the press,
 # that of a tilted sensor not at all
 _MOST_BEND = 0.25
-# of a drift, of the untouched reading at the end or of its slope before the touch: a false one costs good labels
+# of a drift, by the untouched sensor at the end or by its slope before the touch: a false one costs good labels
 _DRIFT_SIGMAS, _SLOPE_SIGMAS = 4.0, 3.0
-# of the standard uncertainty of a drift that only the moment before the touch tells: all of it would cost 40 % of the
+# of the standard uncertainty of a drift that is measured before the touch alone: all of it would cost 40 % of the
 # labels of sound trials that are held to their end, 0.6 a quarter, none leaves a third of those of drifting ones wrong
-_UNSEEN_SHARE = 0.3
-_UNSEEN_LOAD = 0.1  # of the load: a drift that may be larger by the end is told
-_DRIFT_SHARE = 0.01  # of the load: less is no matter
+_UNCERTAIN_SHARE = 0.3
+_UNCERTAIN_LOAD = 0.1  # of the load: a drift that may be larger by the end is noted
+_DRIFT_SHARE = 0.01  # of the load: less does not matter
 _CALM_NOISES = 1.5
-_RELEASED_SHARE = 0.3  # of the load: what reads less at the end may be an untouched sensor that drifted
+_RELEASED_SHARE = 0.3  # of the load: a smaller force at the end may be the drift of an untouched sensor
 _MAD_TO_SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
 
 
@@ -57,7 +57,7 @@ def typical_step(time_s: Samples) -> float:
 def mean_force(
     time_s: Samples, force_n: Columns, at_s: Times, *, window_s: float, until_s: float = np.inf
 ) -> Float[np.ndarray, "times *axes"]:
-    """Mean over a window about given times of the force, interpolated linearly between its samples.
+    """Return the mean force over a window about given times, with the force interpolated linearly between samples.
 
     It is the exact mean of the broken line through the samples, so it holds for samples that are not evenly spaced,
     and a window of 0 is plain interpolation. Near the ends of the samples, and of `until_s`, the onset of slip
@@ -75,7 +75,7 @@ def mean_force(
 
 
 def half_window(time_s: Samples, at_s: Times, *, window_s: float, until_s: float) -> Times:
-    """Half the length of the windows that `mean_force` takes its means over."""
+    """Return half the length of the windows of `mean_force`."""
     room = np.minimum(at_s - time_s[0], time_s[-1] - at_s)
     return np.clip(np.minimum(room, np.abs(at_s - until_s)), 0, window_s / 2)
 
@@ -84,20 +84,20 @@ _MOST_WINDOWS = 4_000_000
 
 
 def middles(time_s: Samples, start_s: float, end_s: float, *, width_s: float) -> Times:
-    """Middles of windows one after another from a start, before an end.
+    """Return the middles of adjacent windows from a start to an end.
 
-    Where a gap would make them too many, only those that hold a sample: an array is as long as there are samples.
+    Where a gap would make them too many, windows without a sample are left out.
     """
     if (end_s - start_s) / width_s <= _MOST_WINDOWS:
         return np.arange(start_s + width_s / 2, end_s, width_s)
-    found = start_s + (np.unique(np.floor((time_s - start_s) / width_s)) + 0.5) * width_s
-    return found[found < end_s]
+    at_s = start_s + (np.unique(np.floor((time_s - start_s) / width_s)) + 0.5) * width_s
+    return at_s[at_s < end_s]
 
 
 def noise_sigma(values: Columns) -> Float[np.ndarray, "*axes"]:
-    """Standard deviation of the noise of each column, from second differences: what changes slowly leaves no trace.
+    """Estimate the standard deviation of the noise of each column from second differences, which slow changes cancel.
 
-    The median makes it blind to a few jumps. A column that hardly ever changes has a noise of 0.
+    The median ignores a few jumps. A column that hardly ever changes has a noise of 0.
     """
     if len(values) < 3:
         return np.zeros(values.shape[1:])
@@ -108,7 +108,7 @@ def noise_sigma(values: Columns) -> Float[np.ndarray, "*axes"]:
 def _integral(
     time_s: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"], at_s: Float[np.ndarray, " t"]
 ) -> Float[np.ndarray, "t columns"]:
-    """Integral of the broken line through the samples, from the first of them."""
+    """Integrate the broken line through the samples, from the first of them."""
     # about the mean: a large offset would cost digits
     steps = np.diff(time_s)[:, None] * (values[1:] + values[:-1]) / 2
     sums = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)))
@@ -127,15 +127,15 @@ def infer_axes(
     drift_n_s: float | None = None,
     moved_s: float = np.inf,
 ) -> ForceAxes:
-    """Infer what is not declared of how to read a force sensor.
+    """Infer the axes, sign and tare of a force sensor that are not declared.
 
     The tare is the mean of the samples before the touch, spikes left out. The normal axis is the one that departs
     furthest from it in the press, and its sign makes that positive. While nothing shears, the force of a press keeps
     its direction: where that is no axis, the sensor is tilted, and its normal is that direction, unless an axis was
-    declared. A force that turns within the press is sheared already, and tells the axis alone. A sensor that is pressed
+    declared. A force that turns within the press is sheared already, and gives the axis alone. A sensor that is pressed
     from the first sample on looks untouched: declare its tare. Where nothing is ever pressed, axis and sign cannot be
-    inferred: that is a `RecordingError`. `drift_n_s`: standard deviation of the rate at which the zero may drift, where
-    that is known. `moved_s`: time from which on the samples were moved, to take a step out, and so tell no drift.
+    inferred, which is a `RecordingError`. `drift_n_s` is the standard deviation of the rate at which the zero may
+    drift, if known; `moved_s` the time from which on samples were moved to remove a step, so that they show no drift.
     """
     noise = np.asarray(noise_sigma(forces.force_n))
     touch = _find_touch(forces, tare_n=tare_n) if touch_s is None else touch_s
@@ -153,7 +153,7 @@ def infer_axes(
     elif len(still) < _FEW_STILL:
         notes.append("no still samples before contact: the tare is taken as zero; declare it if the sensor has one")
     else:
-        (tare, tare_sigma), tare_found = _read_tare(still, noise=noise), Found.INFERRED
+        (tare, tare_sigma), tare_found = _measure_tare(still, noise=noise), Found.INFERRED
     drift, drift_sigma = np.zeros(3), np.zeros(3)
     if tare_found is not Found.ASSUMED and np.isfinite(touch):
         drift, drift_sigma = _find_drift(forces, tare, tare_sigma, noise=noise, until_s=until, moved_s=moved_s)
@@ -170,7 +170,7 @@ def infer_axes(
             f"the normal axis is doubtful: {axis} departs by {first:.2f} N in the press, another by {second:.2f} N; "
             "declare it"
         )
-    # an axis that is none is ForceAxes' to refuse
+    # ForceAxes refuses an unknown axis
     inferred_sign = 1 if axis not in AXES or main[AXES.index(axis)] >= 0 else -1
     tilt_deg = 0.0 if rise is None or axis not in AXES else rise.tilt_deg(axis, sign or inferred_sign)
     turned = rise is not None and not rise.bends and normal is None and sign in (None, inferred_sign) and tilt_deg > 0
@@ -178,15 +178,15 @@ def infer_axes(
         notes.append(_tilt_note(axis, tilt_deg, turned=turned, bends=rise.bends))
     if drift_n_s is not None:
         drift_sigma = np.full(3, drift_n_s)
-    elif np.any(drift_sigma * np.ptp(forces.time_s) > _UNSEEN_LOAD * np.linalg.norm(press)):
+    elif np.any(drift_sigma * np.ptp(forces.time_s) > _UNCERTAIN_LOAD * np.linalg.norm(press)):
         notes.append(
-            f"the zero may drift by {_written(drift_sigma * np.ptp(forces.time_s))} N (x, y, z) over the trial without "
-            "being seen, which makes late labels uncertain; let go before the recording ends, wait some seconds before "
+            f"the zero may drift by {_signed(drift_sigma * np.ptp(forces.time_s))} N (x, y, z) over the trial without "
+            "showing, which makes late labels uncertain; let go before the recording ends, wait some seconds before "
             "the touch, or give --drift-rate"
         )
     if drift.any():
         notes.append(
-            f"the zero of the force sensor drifts by {_written(drift * np.ptp(forces.time_s))} N (x, y, z) over the "
+            f"the zero of the force sensor drifts by {_signed(drift * np.ptp(forces.time_s))} N (x, y, z) over the "
             "trial, which counts as an error of its size; let it warm up"
         )
     return ForceAxes(
@@ -216,10 +216,10 @@ class _Rise:
     sigma: float
     """Standard uncertainty of the direction, in radians."""
     bends: bool
-    """Whether the direction changes on the way or soon after: something shears."""
+    """True where the direction changes on the way or soon after, because something shears."""
 
     def tilt_deg(self, axis: str, sign: int) -> float:
-        """Angle to an axis; 0 where it cannot be told from none."""
+        """Return the angle to an axis; 0 where it is not significant."""
         angle = float(np.rad2deg(np.arccos(np.clip(sign * self.direction[AXES.index(axis)], -1, 1))))
         return angle if angle > max(_LEAST_TILT_DEG, _TILT_SIGMAS * np.rad2deg(self.sigma)) else 0.0
 
@@ -227,10 +227,10 @@ class _Rise:
 def _measure_rise(
     forces: Forces, tare_n: Axes, tare_sigma_n: Axes, *, noise: Axes, touch_s: float, drift_n_s: Axes
 ) -> _Rise | None:
-    """Measure the direction of the force from the touch until it is held; None where no axis or no sample tells it."""
+    """Measure the direction of the force from the touch to the hold; None where axes or samples are missing."""
     time = forces.time_s
     contact = np.flatnonzero(time >= touch_s)
-    # two columns tell no direction: the tangential force may be a length
+    # two columns give no direction: the tangential force may be a length
     if len(contact) < _FEW_STILL or not np.ptp(forces.force_n, axis=0).all():
         return None
     force = forces.force_n - tare_n - drift_n_s * (time - (time[0] + touch_s) / 2)[:, None]
@@ -238,18 +238,18 @@ def _measure_rise(
     early = load[contact][time[contact] <= touch_s + _PRESS_SHARE * (time[-1] - touch_s)]
     level = float(np.median(early[early >= early.max() / 2]))
     low, high = (level * share for share in _RISE)
-    held = contact[np.argmax(load[contact] >= high)]
-    rising = np.arange(contact[0], held)
+    top = contact[np.argmax(load[contact] >= high)]
+    rising = np.arange(contact[0], top)
     rising = rising[load[rising] > low]
     if len(rising) < _FEW_RISING:
         return None
     # as long again, once it is pressed
-    holding = np.flatnonzero((time > time[held]) & (time <= 2 * time[held] - time[rising[0]]))
+    holding = np.flatnonzero((time > time[top]) & (time <= 2 * time[top] - time[rising[0]]))
     if len(holding) < _FEW_RISING:
         return None
 
     def direction(part: Int[np.ndarray, " part"]) -> tuple[Axes, float]:
-        """Slope of the force over its length, by least squares, and its standard uncertainty."""
+        """Fit the slope of the force over its length by least squares; returns its standard uncertainty, too."""
         weight = float(np.sum(load[part] ** 2))
         slope = load[part] @ force[part] / weight
         white = float(np.linalg.norm(noise)) / np.sqrt(weight)
@@ -275,16 +275,16 @@ def _tilt_note(axis: str, tilt_deg: float, *, turned: bool, bends: bool) -> str:
 def _find_drift(
     forces: Forces, tare_n: Axes, tare_sigma_n: Axes, *, noise: Axes, until_s: float, moved_s: float
 ) -> tuple[Axes, Axes]:
-    """Rate at which the zero drifts: to what is read at the end, if nothing touches there, else as before the touch.
+    """Measure the rate at which the zero drifts, and its standard uncertainty.
 
-    With its standard uncertainty: of a trial that is held to its end a moment before the touch is all that tells it.
+    The rate is that to the end of the trial if nothing touches there, else that of the samples before the touch.
     """
     time, force = forces.time_s, forces.force_n
     still, ends = time < until_s, time > time[-1] - _FIRST_S
     away = np.linalg.norm(force - tare_n, axis=1)
     offset = np.mean(force[ends], axis=0) - tare_n
     unsure = np.hypot(noise / np.sqrt(ends.sum()), tare_sigma_n)
-    # what wanders by more than its noise at the end is touched, or swings
+    # a sensor that wanders by more than its noise at the end is touched, or swings
     calm = np.all(np.std(force[ends], axis=0) < _CALM_NOISES * noise + 1e-9)
     if calm and time[-1] < moved_s and np.linalg.norm(offset) < _RELEASED_SHARE * np.quantile(away, 0.9):
         real = np.abs(offset) > np.maximum(_DRIFT_SIGMAS * unsure, _DRIFT_SHARE * np.quantile(away, 0.9))
@@ -299,25 +299,25 @@ def _find_drift(
     )
     white = noise / np.sqrt(still.sum()) / np.std(time[still])
     unsure = np.maximum(np.sqrt(covariance[0, 0]), white)
-    return np.where(np.abs(line[0]) > _SLOPE_SIGMAS * unsure + 1e-9, line[0], 0.0), _UNSEEN_SHARE * unsure
+    return np.where(np.abs(line[0]) > _SLOPE_SIGMAS * unsure + 1e-9, line[0], 0.0), _UNCERTAIN_SHARE * unsure
 
 
-def _written(values: Axes) -> str:
+def _signed(values: Axes) -> str:
     return ", ".join(f"{value:+.2g}" for value in values)
 
 
-def _read_tare(still: Float[np.ndarray, "samples 3"], *, noise: Axes) -> tuple[Axes, Axes]:
-    """Mean of the untouched samples, and its standard uncertainty."""
+def _measure_tare(still: Float[np.ndarray, "samples 3"], *, noise: Axes) -> tuple[Axes, Axes]:
+    """Return the mean of the untouched samples, and its standard uncertainty."""
     # a spike must not move it, and a plain median of Gaussian samples would be less certain by a quarter
     middle = np.median(still, axis=0)
-    kept = np.abs(still - middle) <= np.maximum(_SPIKE_SIGMAS * noise, 1e-9 + np.abs(middle) * 1e-9)
-    # where the sensor wanders by more than its noise, what lies further out is no spike
-    kept |= kept.mean(axis=0) < _MOST
-    white = np.std(still, axis=0, where=kept) / np.sqrt(kept.sum(axis=0))
+    typical = np.abs(still - middle) <= np.maximum(_SPIKE_SIGMAS * noise, 1e-9 + np.abs(middle) * 1e-9)
+    # where the sensor wanders by more than its noise, outer samples are no spikes
+    typical |= typical.mean(axis=0) < _LEAST_TYPICAL
+    white = np.std(still, axis=0, where=typical) / np.sqrt(typical.sum(axis=0))
     # noise with a memory leaves the means of stretches further apart than white noise would
     parts = np.array([part.mean(axis=0) for part in np.array_split(still, _STRETCHES)])
     sigma = np.maximum(white, np.std(parts, axis=0, ddof=1) / np.sqrt(_STRETCHES))
-    return np.mean(still, axis=0, where=kept), sigma
+    return np.mean(still, axis=0, where=typical), sigma
 
 
 def _vector(values: Axes) -> Vector:
@@ -326,11 +326,11 @@ def _vector(values: Axes) -> Vector:
 
 
 def _find_touch(forces: Forces, *, tare_n: Vector | None) -> float:
-    """When the sensor is first touched; infinite if it never is."""
+    """Find the time of the first touch; infinite if there is none."""
     time, start = forces.time_s, float(forces.time_s[0])
     first = forces.force_n[time <= start + _FIRST_S]
     rest = np.median(first, axis=0) if tare_n is None else np.array(tare_n)
-    # means taken one after the other tell their noise, whatever its memory
+    # adjacent means show their noise, even if it is correlated
     apart = middles(time, start, float(time[-1]), width_s=_WINDOW_S)
     sigma = float(np.linalg.norm(noise_sigma(mean_force(time, forces.force_n, apart, window_s=_WINDOW_S))))
     # the rest itself is known from a few windows only
@@ -342,7 +342,7 @@ def _find_touch(forces: Forces, *, tare_n: Vector | None) -> float:
     return float(time[np.argmax(touched)]) if touched.any() else float("inf")
 
 
-_FEW_MEANS = 20  # fewer means tell no spread
+_FEW_MEANS = 20  # fewer means give no spread
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -375,28 +375,27 @@ class ContactForces:
         return self._split(self.axes.noise_n)
 
     def tare_sigma_n(self, time_s: Times) -> tuple[Times, Times]:
-        """Standard uncertainty of the tare at given times, of the normal force and of a tangential component.
+        """Return the standard uncertainty of the tare at given times: of the normal force, of a tangential component.
 
-        A drift counts as an error of its size, and so does what may be one, from the middle of the untouched samples
-        on.
+        A drift, certain or possible, counts as an error of its size from the middle of the untouched samples on.
         """
         still = self._split(self.axes.tare_sigma_n)
-        aslant = self.axes.direction_sigma * np.abs(np.interp(time_s, self.time_s, self.normal_n))
+        tilt = self.axes.direction_sigma * np.abs(np.interp(time_s, self.time_s, self.normal_n))
         drift = self._split(np.hypot(self.axes.drift_n_s, self.axes.drift_sigma_n_s))
         begin = float(self.time_s[0])
         until = begin if self.axes.still_until_s is None else self.axes.still_until_s
         since = np.maximum(time_s - (begin + until) / 2, 0)
         # of a drift the length counts, for it is the same in all samples
-        tangential = np.hypot(np.hypot(still.tangential, np.sqrt(2) * drift.tangential * since), aslant)
+        tangential = np.hypot(np.hypot(still.tangential, np.sqrt(2) * drift.tangential * since), tilt)
         return np.hypot(still.normal, drift.normal * since), tangential
 
     def noise_of_means_n(self, window_s: float) -> NormalTangential:
-        """Standard deviation of the noise of means over a window; white or not, it is taken from means."""
+        """Return the standard deviation of the noise of means over a window, measured on means, white or not."""
         time = self.time_s
         ends = float(time[0]), float(time[-1] - window_s / 2)
         apart = middles(time, *ends, width_s=window_s) if window_s > 0 else time
         means = mean_force(time, self.recorded.force_n, apart, window_s=window_s)
-        # too few means tell no spread: the samples then have to
+        # of too few means the spread is unknown: that of the samples stands for it
         return self._split(noise_sigma(means)) if len(means) >= _FEW_MEANS else self.noise_n
 
     def _split(self, of_axes: Vector | Axes) -> NormalTangential:
@@ -408,7 +407,7 @@ class ContactForces:
 
 
 def turn_matrix(axes: ForceAxes) -> Float[np.ndarray, "3 3"]:
-    """Rotation that brings the direction of the press onto the normal axis, the shortest there is (Rodrigues)."""
+    """Return the shortest rotation that brings the direction of the press onto the normal axis (Rodrigues)."""
     onto = axes.sign * np.eye(3)[axes.normal_index]
     if axes.direction is None:
         return np.eye(3)
@@ -418,7 +417,7 @@ def turn_matrix(axes: ForceAxes) -> Float[np.ndarray, "3 3"]:
 
 
 def apply_axes(forces: Forces, axes: ForceAxes) -> ContactForces:
-    """Take the tare off and turn the forces into the axes of the contact."""
+    """Subtract the tare and turn the forces into the axes of the contact."""
     force = (forces.force_n - axes.tare_n) @ turn_matrix(axes).T
     return ContactForces(
         recorded=forces,
@@ -429,7 +428,7 @@ def apply_axes(forces: Forces, axes: ForceAxes) -> ContactForces:
 
 
 def magnitude(tangential_n: Float[np.ndarray, "samples 2"], *, sigma_n: float | Samples) -> Samples:
-    """Length of a tangential force with this noise left in each component, the noise's share of it taken off.
+    """Return the length of a tangential force, corrected for the noise of each component.
 
     References
     ----------

@@ -1,4 +1,4 @@
-"""Static friction of a trial: the ratio of tangential to normal force at which the contact slips as a whole."""
+"""Static friction of a trial: the ratio of tangential to normal force at the onset of gross slip."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +16,8 @@ _TRIES = 41  # breaks tried over that reach
 _FALLS_S = (0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056, 0.08)
 _LEAST_BEFORE, _LEAST_AFTER = 6, 3  # samples that the two sides of a break need
 _LEAST_LINE = 4  # samples that a line up to a break needs
-_PARAMETERS = 7  # what a fit takes from the noise: five numbers, and where the break and the end of the fall lie
-_MEMORY = 0.2  # residuals that correlate by more are drawn together
+_PARAMETERS = 7  # degrees of freedom of a fit: five coefficients, the time of the break, the end of the fall
+_MEMORY = 0.2  # residuals that correlate by more are resampled together
 _LONGEST_BLOCK = 0.1  # longest block, as a share of the samples
 
 
@@ -44,9 +44,8 @@ def fit_break(
 ) -> Break:
     """Fit a parabola that at a break goes over into a fall and then a line, by least squares.
 
-    Every break within reach and a few lengths of the fall are tried; the bootstrap draws blocks of the residuals anew
-    and fits the break anew with each. Samples too few for that tell the break as a line up to somewhere between two of
-    them.
+    Every break within reach and a few lengths of the fall are tried; the bootstrap resamples blocks of the residuals
+    and repeats the fit. With too few samples the break is a line up to somewhere between two of them.
     """
     tried = [
         (moment, fall)
@@ -65,7 +64,7 @@ def fit_break(
     (index,), (level,) = _best(bases, triangles, values[:, None])
     fitted = bases[index] @ (bases[index].T @ values)
     residuals = values - fitted
-    # a fit takes from the residuals what its parameters explain of the noise
+    # the parameters of a fit explain a part of the noise
     residuals = (residuals - residuals.mean()) * np.sqrt(len(values) / max(1, len(values) - _PARAMETERS))
     drawn = fitted[:, None] + residuals[_blocks(residuals, draws=draws, rng=rng)]
     chosen, levels = _best(bases, triangles, drawn)
@@ -73,8 +72,8 @@ def fit_break(
 
 
 def _bracket_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.random.Generator, draws: int) -> Break:
-    """Lengthen the line through the last samples before a break to anywhere before the next sample."""
-    # the break itself is rough: what lies half a step beyond may still be before it
+    """Extend the line through the last samples before a break to anywhere before the next sample."""
+    # the break itself is rough: a sample half a step beyond may still be before it
     near = np.flatnonzero(time_s <= about_s + typical_step(time_s) / 2)
     before = near[max(0, len(near) - _LEAST_BEFORE) : np.argmax(values[near]) + 1] if len(near) else near
     if len(before) < _LEAST_LINE or before[-1] + 1 == len(time_s):
@@ -97,7 +96,7 @@ def _best(
     triangles: Float[np.ndarray, "breaks parameters parameters"],
     values: Float[np.ndarray, "samples draws"],
 ) -> tuple[Int[np.ndarray, " draws"], Float[np.ndarray, " draws"]]:
-    """Which break explains each column best, and the level there."""
+    """Return the index of the break that fits each column best, and the level there."""
     draws = values.shape[1]
     explained, chosen, levels = np.full(draws, -np.inf), np.zeros(draws, dtype=int), np.zeros(draws)
     for index, (basis, triangle) in enumerate(zip(bases, triangles, strict=True)):
@@ -111,7 +110,7 @@ def _best(
 
 
 def _blocks(residuals: Samples, *, draws: int, rng: np.random.Generator) -> Int[np.ndarray, "samples draws"]:
-    """Indices that draw blocks of neighbours anew, a column a draw; white noise is drawn sample by sample."""
+    """Return indices that resample blocks of neighbours, a column a draw; white noise is resampled singly."""
     count = len(residuals)
     power = max(float(residuals @ residuals), 1e-300)
     longest = max(1, int(_LONGEST_BLOCK * count))
@@ -125,34 +124,34 @@ def _blocks(residuals: Samples, *, draws: int, rng: np.random.Generator) -> Int[
 
 # times over which the forces are averaged to find roughly where the ratio breaks off: the longer finds faint falls
 _WINDOWS_S = (0.03, 0.1)
-_DROP_SIGMAS = 5.0  # a fall of the averaged ratio by so many standard deviations of its noise is no chance
+_DROP_SIGMAS = 5.0  # a fall of the averaged ratio by so many standard deviations of its noise is significant
 _DROP_SHARE = 0.03  # and by so much of the ratio: less is a wobble of the hand that pulls
-_DROP_S = 0.25  # time in which the ratio must have fallen: slip is sudden, letting go is slow
+_DROP_S = 0.25  # time in which the ratio must have fallen: slip is sudden, a release is slow
 # where the normal force is this share of its largest: in a light touch the ratio is all noise
 _PRESSED_SHARE = 0.25
 _STEP_S = 0.06  # time over which the ratio before and after a fall is compared to place it
-_HELD_SHARE = 0.5  # a fall across which less than this share of the normal force stays is letting go, not slip
-_SUDDEN = 1.5  # a slip falls by so many times what the ratio falls in as long a time before or after it
+_NORMAL_SHARE = 0.5  # a fall across which less than this share of the normal force stays is a release, not slip
+_SUDDEN = 1.5  # the fall of a slip is so many times that in as long a time before or after it
 # kinetic friction, and the dip of a puller that springs back, is a larger share of static friction than this; a pull
-# that is let go falls to nothing
+# that is released falls to nothing
 _SLIDING_SHARE = 0.3
 _PULL_SHARE = 0.5  # share of the fall of the ratio that the pull falls by: a firmer press alone is no slip
 _APART_S = 0.1  # a load that is lost for less time is the same contact
-# what of the ratio is fitted before its break: the longer knows it better, unless the pull was no parabola so long
+# time before its break in which the ratio is fitted: the longer is more exact, unless the pull was no parabola so long
 _BEFORE_S = (0.6, 0.25, 0.1)
 _AFTER_S = 0.2  # and after it
 _LIKE_SHARE, _LIKE_SIGMAS = 0.02, 5.0  # a parabola that ends this far from the largest mean ratio there was none
 _BEFORE_STEPS, _AFTER_STEPS = 12, 6  # and of slow samples at least so many
 _BAND = (0.16, 0.84)  # quantiles that hold 68 %
-_SEEN_SIGMAS = 3.0  # an image that moves by so many standard deviations more than before sees the slip
-_QUIET_S = 0.5  # time before the onset that tells how much the image moves without slip
+_IMAGE_SIGMAS = 3.0  # an image that moves by so many standard deviations more than before shows the slip
+_QUIET_S = 0.5  # time before the onset in which the image moves without slip
 _LAW_SIGMAS = 3.0  # by more standard deviations a ratio contradicts the friction
-_LAW_SHARE = 0.01  # and by more of the friction: a break lies between samples, and its level is known no better
+_LAW_SHARE = 0.01  # and by more of the friction: a break lies between samples, and its level is no more exact
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImageMotion:
-    """How much each frame differs from the one before, at the frames' times on the force sensor's clock."""
+    """Difference of each frame from the one before, at the times of the frames on the clock of the force sensor."""
 
     time_s: Float[np.ndarray, " frames"]
     motion: Float[np.ndarray, " frames"]
@@ -160,10 +159,10 @@ class ImageMotion:
 
 
 def find_contacts(forces: ContactForces, *, contact_threshold_n: float) -> tuple[tuple[float, float], ...]:
-    """Find the spans of time, in seconds, in which the sensor is loaded: each from a touch until it is let go.
+    """Find the contacts: spans of time, in seconds, each from a touch to its release.
 
     A load below a quarter of the largest is no contact of its own, and one that is lost for less than a tenth of a
-    second goes on.
+    second continues.
     """
     time = forces.time_s
     normal = mean_force(time, forces.normal_n, time, window_s=_STEP_S)
@@ -191,20 +190,19 @@ def estimate_friction(
 
     A slip is a sudden fall of F_t / F_n while the normal force stays, from a height that the contact exceeds neither
     before nor after it. About the first slip the ratio is fitted by a line that breaks off: rising until the onset,
-    falling after it; mu_s is its value at the break. Where several falls of a contact compete, the first that the image
-    moves at wins, or else the first. Below `contact_threshold_n`, a normal force in newtons, the ratio means nothing.
+    falling after it; mu_s is its value at the break. Of several falls of a contact the first at which the image moves
+    counts, or else the first. Below `contact_threshold_n`, a normal force in newtons, the ratio is ignored.
     `friction_change` is the relative standard deviation by which friction may change within the trial.
 
-    Friction and slip are independent facts: where `slip_s` sets the onset, in seconds, the ratio breaks off there;
-    where `mu` gives the friction, the slips are found as well. A friction that contradicts the forces, because the
-    ratio exceeds it or slips elsewhere by more than 3 sigma, counts the difference as an error, and its notes give the
-    numbers.
+    Friction and slip are independent: where `slip_s` sets the onset, in seconds, the ratio breaks off there; where `mu`
+    sets the friction, the slips are found as well. If the friction contradicts the forces, because the ratio exceeds it
+    or slips elsewhere by more than 3 sigma, the difference counts as an error, and the notes give the numbers.
 
     Raises
     ------
     RecordingError
-        If nothing slips and no friction is given: it is larger than all that was measured, no more. If too few samples
-        lie about the slip that is to give the friction, or nothing presses before it.
+        If nothing slips and `mu` is None: the friction is larger than every ratio, and otherwise unknown. If too few
+        samples lie about the slip that is to give the friction, or nothing presses before it.
     """
     spans = find_contacts(forces, contact_threshold_n=contact_threshold_n)
     means = [_mean_ratio(forces, window_s=window_s, contact_threshold_n=contact_threshold_n) for window_s in _WINDOWS_S]
@@ -212,11 +210,11 @@ def estimate_friction(
     for start, end in spans:
         if slip_s is not None and start <= slip_s <= end:
             continue
-        falls = (_find_falls(one, start_s=start, end_s=end, friction_change=friction_change) for one in means)
+        falls = (_find_falls(mean, start_s=start, end_s=end, friction_change=friction_change) for mean in means)
         times = next(filter(None, falls), [])
-        # a slip that the image does not see is less likely than one that it does
-        seen = [time_s for time_s in times if (_image_sigmas(image, time_s) or 0) >= _SEEN_SIGMAS]
-        rough += (seen or times)[:1]
+        # a slip at which the image rests is less likely
+        visible = [time_s for time_s in times if (_image_sigmas(image, time_s) or 0) >= _IMAGE_SIGMAS]
+        rough += (visible or times)[:1]
     slips = []
     for time_s in sorted(rough if slip_s is None else [*rough, slip_s]):
         reach_s = 0.0 if time_s == slip_s else _REACH_S
@@ -228,8 +226,8 @@ def estimate_friction(
                 raise
             slips.append(_Slip(time_s=time_s))  # the friction is known without it
     # the window that shows most surely how far the ratio reaches
-    mean = max(means, key=lambda one: float(one.surely.max()))
-    highest = int(np.argmax(mean.surely))
+    mean = max(means, key=lambda mean: float(mean.least.max()))
+    highest = int(np.argmax(mean.least))
     if mu is not None:
         estimate = FrictionEstimate(mu=mu, low=mu, high=mu)
     elif not slips:
@@ -242,12 +240,12 @@ def estimate_friction(
         assert first.mu is not None  # a slip without a friction was refused above
         if first.low <= 0:
             raise RecordingError(
-                f"the slip at {first.time_s:.2f} s tells a friction of {first.mu:.2g} with a 68 % interval from "
+                f"the slip at {first.time_s:.2f} s gives a friction of {first.mu:.2g} with a 68 % interval from "
                 f"{first.low:.2g} to {first.high:.2g}, which is none; give the coefficient of friction with --mu"
             )
         if first.time_s != slip_s:
-            seen = (_image_sigmas(image, first.time_s) or 0) >= _SEEN_SIGMAS
-            method = "break of F_t / F_n" + (", seen in the image" if seen else "")
+            visible = (_image_sigmas(image, first.time_s) or 0) >= _IMAGE_SIGMAS
+            method = "break of F_t / F_n" + (", seen in the image" if visible else "")
         estimate = FrictionEstimate(mu=first.mu, low=first.low, high=first.high, found=Found.INFERRED, method=method)
     if slips:
         first, *later = slips
@@ -274,11 +272,11 @@ def _find_contradictions(
     slip_s: float | None,
     friction_change: float,
 ) -> tuple[list[str], float]:
-    """Compare a friction with the forces: what contradicts it, and by how much the friction is off for that."""
-    mu, given, ratio, time = friction.mu, friction.found is Found.DECLARED, means.ratio, means.time_s
-    written = f"{mu:.2f}" if given else f"{mu:.2f} ({friction.low:.2f} to {friction.high:.2f})"
+    """Compare a friction with the forces; returns the contradictions, and the error of the friction for them."""
+    mu, declared, ratio, time = friction.mu, friction.found is Found.DECLARED, means.ratio, means.time_s
+    written = f"{mu:.2f}" if declared else f"{mu:.2f} ({friction.low:.2f} to {friction.high:.2f})"
     notes, error = [], 0.0
-    if given and slips and slips[0].mu is not None:
+    if declared and slips and slips[0].mu is not None:
         first, apart = slips[0], abs(slips[0].mu - mu)
         if apart > max(_LAW_SIGMAS * (first.high - first.low) / 2, _LAW_SHARE * mu):
             notes.append(
@@ -287,14 +285,14 @@ def _find_contradictions(
                 "the friction; leave --mu out, or set the slip where F_t / F_n falls with --slip-s"
             )
             error = apart
-    highest = int(np.argmax(means.surely))
-    # a friction that comes from these forces has their tare in its own uncertainty
-    sigma, onset_s = float(means.tare_sigma[highest]) if given else friction.sigma, friction.onset_s
+    highest = int(np.argmax(means.least))
+    # the uncertainty of a friction that comes from these forces includes their tare
+    sigma, onset_s = float(means.tare_sigma[highest]) if declared else friction.sigma, friction.onset_s
     # on the way to the slip friction may still change, as in the labels' own uncertainty
     begin = float(time[np.argmax(means.pulled)])
     far = 1.0 if onset_s is None else abs(float(time[highest]) - onset_s) / max(onset_s - begin, 1e-9)
     sigma = np.hypot(sigma, friction_change * min(far, 1.0) * mu)
-    if not notes and means.surely[highest] > mu + max(_LAW_SIGMAS * sigma, _LAW_SHARE * mu):
+    if not notes and means.least[highest] > mu + max(_LAW_SIGMAS * sigma, _LAW_SHARE * mu):
         when = "before" if onset_s is None or time[highest] < onset_s else "after"
         where = "nothing slips" if onset_s is None else f"{when} the slip at {onset_s:.2f} s"
         notes.append(
@@ -316,7 +314,7 @@ def _find_contradictions(
 
 @dataclass(frozen=True, kw_only=True)
 class _Slip:
-    """Onset of a slip, and the friction that it shows; without one where the samples about it are too few."""
+    """Onset of a slip, and the friction at it; None where the samples about it are too few."""
 
     time_s: float
     mu: float | None = None
@@ -396,14 +394,14 @@ class _MeanRatio:
     ratio: Samples
     sigma: Samples
     """Standard deviation of the ratio's noise."""
-    surely: Samples
-    """Least ratio that noise leaves possible."""
+    least: Samples
+    """Ratio less 5 standard deviations of its noise."""
     tare_sigma: Samples
     """Standard deviation of the ratio for the uncertainty of the tare."""
     pressed: Bool[np.ndarray, " samples"]
-    """Whether the ratio means anything."""
+    """True where the normal force is large enough for a ratio."""
     pulled: Bool[np.ndarray, " samples"]
-    """Whether it is pressed, and the tangential force is no noise."""
+    """True where the tangential force is more than noise, too."""
 
 
 def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: float) -> _MeanRatio:
@@ -414,7 +412,7 @@ def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: 
     pressed = normal > max(contact_threshold_n, _PRESSED_SHARE * normal.max())
     # the window shrinks at the ends, where a single sample's noise is no fall
     pressed &= (time - time[0] >= window_s / 2) & (time[-1] - time >= window_s / 2)
-    # what is not touched cannot slip: a knock, where the contact was set by hand
+    # without a contact nothing slips: a knock, where the contact was set by hand
     pressed &= time >= (-np.inf if forces.axes.still_until_s is None else forces.axes.still_until_s)
     safe = np.where(pressed, normal, 1)
     ratio = np.where(pressed, tangential / safe, 0)
@@ -427,7 +425,7 @@ def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: 
         tangential_n=tangential,
         ratio=ratio,
         sigma=sigma,
-        surely=ratio - _DROP_SIGMAS * sigma,
+        least=ratio - _DROP_SIGMAS * sigma,
         tare_sigma=tare,
         pressed=pressed,
         pulled=pressed & (tangential > 3 * noise.tangential),
@@ -462,7 +460,7 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
     around = np.lib.stride_tricks.sliding_window_view(np.pad(steep, beside, mode="edge"), 2 * beside + 1)
     soon = np.lib.stride_tricks.sliding_window_view(np.pad(falling, (count, 0)), count + 1).any(axis=1)
     tops = np.flatnonzero(soon & (steep > 0) & (steep == around.max(axis=1)))
-    highest = float(means.surely[inside].max())
+    highest = float(means.least[inside].max())
     allowed = max(_DROP_SHARE, _LAW_SIGMAS * friction_change)
     falls = []
     for top in tops.tolist():
@@ -472,7 +470,7 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
         earlier, before, after, later = mean(ratio, places)
         normal, pull = (mean(values, places[1:3]) for values in (means.normal_n, means.tangential_n))
         slips = (
-            normal[1] > _HELD_SHARE * normal[0],
+            normal[1] > _NORMAL_SHARE * normal[0],
             before - after > _PULL_SHARE * least[top],
             after > _SLIDING_SHARE * before,
             before - after > _SUDDEN * max(earlier - before, after - later),
@@ -484,10 +482,10 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
 
 
 def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float | None:
-    """How far the image's largest motion at the onset stands out of that before it; None where it cannot be told."""
+    """Return the largest image motion at the onset in standard deviations of that before; None if not measured."""
     if image is None:
         return None
-    # a frame's motion happens between it and the one before; a lag may not be known to the frame
+    # the motion of a frame happens between it and the one before; a lag may be uncertain by a frame
     step = typical_step(image.time_s)
     after = image.time_s - onset_s
     quiet = image.motion[1:][(after[1:] < -3 * step) & (after[1:] > -_QUIET_S - 3 * step)]

@@ -1,4 +1,4 @@
-"""The lag between camera and force sensor, from what both feel: the image moves when the force changes."""
+"""Lag between camera and force sensor, by cross-correlation: the image moves when the force changes."""
 
 from collections.abc import Iterable
 from typing import TypeAlias
@@ -20,7 +20,7 @@ Soft: TypeAlias = Float32[np.ndarray, "rows columns 3"]
 
 
 def soften(frame: Frame) -> Soft:
-    """Means of square blocks of a frame, in grey levels; what fills no block at the right and below is left out."""
+    """Return the means of square blocks of a frame, in grey levels; incomplete blocks at the edges are left out."""
     height, width, _ = frame.shape
     side = max(1, min(height, width) // _MOTION_BLOCKS)
     rows, columns = height // side, width // side
@@ -38,12 +38,12 @@ LEAST_TOUCH = 7.0
 
 
 def picture_change(softened: Soft, untouched: Soft) -> float:
-    """How far a softened picture is from that of the untouched sensor where it is farthest (98 %), in grey levels."""
+    """Return the 98 % quantile of the difference of a softened frame from the untouched sensor, in grey levels."""
     return float(np.quantile(np.abs(softened - untouched).max(axis=-1), 0.98))
 
 
 def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
-    """Mean absolute difference of each softened frame from the one before it, in grey levels; 0 for the first."""
+    """Return the mean absolute difference of softened frames from their predecessors, in grey levels; 0 first."""
     motion: list[float] = []
     previous = None
     for soft in softened:
@@ -55,13 +55,13 @@ def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
 Intervals: TypeAlias = Float[np.ndarray, " intervals"]
 _STEPS_A_FRAME = 16  # lags tried in the time of a frame; between them the peak is a parabola's
 _LEAST_LAG_S = 5e-4  # a tenth of what a lag is known to: of a fast camera the lags would be too many
-_BLOCKS = 24  # stretches of a trial that are drawn anew: long enough to hold a slip whole, many enough to draw from
+_BLOCKS = 24  # stretches of a trial that are resampled: long enough to hold a slip, many enough to draw from
 _LEAST_INTERVALS = 2 * _BLOCKS
 _LEAST_CORRELATION = 0.3
 _OVERLAP = 0.7  # share of the frames that must have forces for a lag to be tried
-_LOAD_WINDOW_S = 0.03  # time over which the load is averaged to see it let go
+_LOAD_WINDOW_S = 0.03  # time over which the load is averaged to find its release
 _PART = (0.25, 0.75)  # shares of the load in hold between which a release is timed
-_SUDDEN_STEPS = 2.0  # a fall between these within so many frames tells the time however the gel yields
+_SUDDEN_STEPS = 2.0  # a fall between these within so many frames has a sharp time, however the gel yields
 
 
 def estimate_lag(
@@ -76,14 +76,14 @@ def estimate_lag(
     """Estimate the lag by cross-correlation of image motion and force rate, each frame keeping its own time.
 
     For every lag tried, the force is averaged about the lagged time of each frame; the length of its change from frame
-    to frame is what the image's motion is correlated with. The length does not know axes, signs or tare, so these may
+    to frame is correlated with the motion of the image. The length depends on neither axes, signs nor tare, which may
     all still be wrong. A contact yields the more the lighter it is loaded, so the image leads the force in a press and
     trails it in a release; a release weighs no more than makes the two cancel. The uncertainty is the spread of the
-    peak when stretches of the trial are drawn anew.
+    peak when stretches of the trial are resampled.
 
     `image_motion` is that of `measure_motion`, its first value not used; `longest_s` the longest lag tried, either way.
-    Frames that no lag brings to the forces, as of a camera that ran on, play no part. Of too few frames to correlate no
-    lag is told: it is 0, and its doubt says why. Forces without a frame are a `RecordingError`.
+    Frames that no lag brings to the forces, as of a camera that ran on, are ignored. With too few frames the lag is 0,
+    and its doubt says why. Forces without a frame are a `RecordingError`.
     """
     reached = (frame_time_s >= forces.time_s[0] - longest_s) & (frame_time_s <= forces.time_s[-1] + longest_s)
     if not reached.any():
@@ -94,7 +94,7 @@ def estimate_lag(
     frame_time_s, image_motion = frame_time_s[reached], image_motion[reached]
     intervals = len(frame_time_s) - 1
     if intervals < _LEAST_INTERVALS:
-        doubt = f"{intervals + 1} frames are too few to tell a lag from, {_LEAST_INTERVALS + 1} are needed"
+        doubt = f"{intervals + 1} frames are too few to estimate a lag from, {_LEAST_INTERVALS + 1} are needed"
         return Lag(lag_s=0.0, sigma_s=0.0, doubt=doubt)
     step = max(typical_step(frame_time_s) / _STEPS_A_FRAME, _LEAST_LAG_S)
     reach = int(np.ceil(longest_s / step))
@@ -103,7 +103,7 @@ def estimate_lag(
     covered = ~np.isnan(changes)
     usable = covered.mean(axis=1) >= _OVERLAP
     if not usable.any():
-        return Lag(lag_s=0.0, sigma_s=0.0, doubt="the forces cover too few of the frames to tell a lag from")
+        return Lag(lag_s=0.0, sigma_s=0.0, doubt="the forces cover too few of the frames to estimate a lag from")
     lags, changes, covered = lags[usable], np.nan_to_num(changes[usable]), covered[usable]
     weights = np.concatenate((np.ones((1, intervals)), _block_weights(intervals, draws=draws, rng=rng)))
     motion, release = image_motion[1:], _find_release(forces, sudden_s=_SUDDEN_STEPS * typical_step(frame_time_s))
@@ -119,10 +119,10 @@ def estimate_lag(
 
 
 def _balance(time_s: Intervals, changes: Intervals, release: tuple[float, float]) -> Intervals:
-    """Weights that give press and release the same pull on the lag.
+    """Return weights that give press and release the same influence on the lag.
 
-    Of two like peaks, the one of a rate r has a curvature as r^2 / T and errs as T, where T is how long it takes and
-    r T is the load of both: so each pulls as r^2.
+    A peak of rate r and duration T has a curvature of r^2 / T and an error of T, and r T is the load of both: so the
+    influence is r^2.
     """
     pressed_s, let_go_s = release
     press, fall = (float(changes[part].max(initial=0)) for part in (time_s <= pressed_s, time_s > let_go_s))
@@ -130,40 +130,40 @@ def _balance(time_s: Intervals, changes: Intervals, release: tuple[float, float]
 
 
 def _find_release(forces: Forces, *, sudden_s: float) -> tuple[float, float] | None:
-    """When a load that ends at nothing is pressed and begins to fall; None where it holds or falls suddenly."""
-    # the tare alone is asked for: neither axis nor sign matters to a length
-    loose = forces.force_n - infer_axes(forces, normal="x", sign=1).tare_n
+    """Return the times at which the load is pressed and begins to fall; None where it holds or falls suddenly."""
+    # the tare alone is needed: neither axis nor sign matters to a length
+    force = forces.force_n - infer_axes(forces, normal="x", sign=1).tare_n
     time = forces.time_s
-    load = np.linalg.norm(mean_force(time, loose, time, window_s=_LOAD_WINDOW_S), axis=1)
+    load = np.linalg.norm(mean_force(time, force, time, window_s=_LOAD_WINDOW_S), axis=1)
     hold = float(np.median(load[load >= load.max() / 2]))
     light, heavy = (time[load >= share * hold] for share in _PART)
     fall_s = float(light[-1] - heavy[-1])
     if light[-1] == time[-1] or fall_s <= sudden_s:
         return None
-    # the quarter of the load before is let go in about the time of the half between
+    # the quarter of the load before is released in about the time of the half between
     return float(heavy[0]), float(heavy[-1]) - fall_s
 
 
 def force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float[np.ndarray, " intervals"]:
-    """Length of the change of the force from frame to frame; NaN beyond the ends of the samples."""
-    # over a frame's time: as the images do, the change then tells of all that happened since the last frame
+    """Return the length of the change of the force from frame to frame; NaN beyond the ends of the samples."""
+    # averaged over a frame's time: like the image, the change then covers the whole time since the last frame
     force = mean_force(forces.time_s, forces.force_n, time_s, window_s=typical_step(time_s))
     inside = (time_s >= forces.time_s[0]) & (time_s <= forces.time_s[-1])
     force[~inside] = np.nan
     return np.linalg.norm(np.diff(force, axis=0), axis=1)
 
 
-_LOADED_SHARE = 0.15  # of the load of a trial: what departs further from rest is a contact
+_LOADED_SHARE = 0.15  # of the load of a trial: a larger force is a contact
 _APART_S = 0.3  # contacts that are closer are one, and the image may move as long about it
 _LEAST_FRAMES = 24  # of fewer, noise alone correlates by as much as a contact does
-_MOVES = (0.98, 0.5)  # quantile of what the image moves in the contacts, and a share of it that shows another contact
+_MOVES = (0.98, 0.5)  # quantile of the image motion in the contacts, and the share of it that shows another contact
 _LEAST_MOVES = 3  # frames
 
 
 def doubt_agreement(
     frame_time_s: Float[np.ndarray, " frames"], image_motion: Float[np.ndarray, " frames"], forces: Forces, lag: Lag
 ) -> tuple[str, ...]:
-    """Tell of contacts in which the image does not move as the force changes, a sentence each.
+    """Describe the contacts in which the image does not move as the force changes, a sentence each.
 
     A contact is a stretch in which the force departs from that of the untouched sensor; where it never does, the whole
     trial is compared. Of the correlations of the values and of their logarithms the larger counts: the first is that of
@@ -202,7 +202,7 @@ def doubt_agreement(
 
 
 def _find_loads(forces: Forces) -> list[tuple[float, float]]:
-    """Stretches, in seconds, in which the force departs from that of the untouched sensor."""
+    """Find the stretches, in seconds, in which the force departs from that of the untouched sensor."""
     axes = infer_axes(forces, normal="x", sign=1)
     if axes.still_until_s is None:
         return []
@@ -218,12 +218,12 @@ def _find_loads(forces: Forces) -> list[tuple[float, float]]:
 
 
 def _agreement(change_n: Intervals, motion: Intervals) -> float:
-    """Larger of the correlations of the values and of their logarithms; 0 where either never changes."""
+    """Return the larger of the correlations of the values and of their logarithms; 0 where either is constant."""
     values = np.array((np.maximum(change_n, 0), motion))
     if np.any(np.ptp(values, axis=1) < 1e-9):
         return 0.0
     logs = np.log(values + np.maximum(np.median(values, axis=1, keepdims=True), 1e-9))
-    return max(float(np.corrcoef(one)[0, 1]) for one in (values, logs))
+    return max(float(np.corrcoef(pair)[0, 1]) for pair in (values, logs))
 
 
 def _correlations(
@@ -233,7 +233,7 @@ def _correlations(
     changes: Float[np.ndarray, "lags intervals"],
     covered: Bool[np.ndarray, "lags intervals"],
 ) -> Float[np.ndarray, "draws lags"]:
-    """Weighted correlation of the motion with the force's changes, for every draw and lag."""
+    """Correlate the motion with the changes of the force, for every draw of weights and every lag."""
     mask = covered.astype(np.float64)
     # centred first: the sums below lose digits where a mean is large
     motion, changes = motion - motion.mean(), (changes - changes.mean()) * mask
@@ -245,7 +245,7 @@ def _correlations(
 
 
 def _peak(lags: Float[np.ndarray, " lags"], curve: Float[np.ndarray, " lags"]) -> float:
-    """Where a curve is highest, between the lags tried: the top of the parabola through a frame's worth of them."""
+    """Find the maximum of a curve between the lags tried: the top of the parabola through those of one frame."""
     top = int(np.argmax(curve))
     near = slice(max(0, top - _STEPS_A_FRAME // 4), top + _STEPS_A_FRAME // 4 + 1)
     if top in (0, len(lags) - 1):
@@ -257,7 +257,7 @@ def _peak(lags: Float[np.ndarray, " lags"], curve: Float[np.ndarray, " lags"]) -
 
 
 def _block_weights(intervals: int, *, draws: int, rng: np.random.Generator) -> Float[np.ndarray, "draws intervals"]:
-    """How often each interval is drawn when whole stretches are: what is near in time is not independent."""
+    """Count how often each interval is drawn when whole stretches are, as neighbours in time are not independent."""
     length = int(np.ceil(intervals / _BLOCKS))
     starts = rng.integers(0, intervals, (draws, _BLOCKS))
     # round the end: every interval is as likely as any other

@@ -1,4 +1,4 @@
-"""The label of every frame: its forces, its safety margin with uncertainty, its contact state, and its validity."""
+"""Labels of frames: forces, safety margin with uncertainty, contact state and validity."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from sliplens.errors import RecordingError
 from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labelling import Found, FrictionEstimate, LabelBasis, Lag, Reason, tell_faults
+from sliplens.recordings.labelling import Found, FrictionEstimate, LabelBasis, Lag, Reason, describe_faults
 from sliplens.recordings.labels.axes import (
     ContactForces,
     apply_axes,
@@ -21,7 +21,7 @@ from sliplens.recordings.labels.axes import (
     mean_force,
     typical_step,
 )
-from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, MARKED, Screened, faults_at, screen_trial
+from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, MARKED, Screened, screen_trial
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, find_contacts
 from sliplens.recordings.labels.lag import doubt_agreement
 from sliplens.recordings.options import LabelSettings
@@ -42,9 +42,9 @@ class FrameForces:
     """Standard uncertainty, from noise and tare."""
     tangential_sigma_n: Frames
     missing: Bool[np.ndarray, " frames"]
-    """Whether the neighbouring samples are too far apart, or there are none on one side."""
+    """True where the neighbouring samples are too far apart, or missing on one side."""
     out_of_range: Bool[np.ndarray, " frames"]
-    """Whether any sample that a frame's force rests on reaches the end of the sensor's range."""
+    """True where a sample in the window of a frame reaches the end of the sensor's range."""
 
 
 def interpolate_forces(
@@ -56,12 +56,12 @@ def interpolate_forces(
         mean_force(samples, values, time_s, window_s=window_s, until_s=until_s)
         for values in (forces.normal_n, forces.tangential_n)
     )
-    noise, one = forces.noise_of_means_n(window_s), forces.noise_n
+    noise, sample_noise = forces.noise_of_means_n(window_s), forces.noise_n
     # a shorter window averages less noise away, at worst none
     length = 2 * half_window(samples, np.clip(time_s, samples[0], samples[-1]), window_s=window_s, until_s=until_s)
     more = np.sqrt(window_s / np.maximum(length, 1e-9))
-    normal_noise = np.minimum(noise.normal * more, max(one.normal, noise.normal))
-    tangential_noise = np.minimum(noise.tangential * more, max(one.tangential, noise.tangential))
+    normal_noise = np.minimum(noise.normal * more, max(sample_noise.normal, noise.normal))
+    tangential_noise = np.minimum(noise.tangential * more, max(sample_noise.tangential, noise.tangential))
     normal_tare, tangential_tare = forces.tare_sigma_n(time_s)
     # the neighbours of a time on a sample are both that sample
     before = samples[np.maximum(np.searchsorted(samples, time_s, side="right") - 1, 0)]
@@ -82,19 +82,19 @@ def interpolate_forces(
 _CONTACT_SIGMAS = 8.0  # least normal force of a contact, in standard deviations of its noise
 _CONTACT_SHARE = 0.05  # and as a share of the trial's largest: of a lighter touch the margin would be all noise
 LARGEST_SIGMA = 0.2
-"""Largest standard uncertainty of a margin that is valid: beyond, it tells full stick hardly from slip."""
+"""Largest standard uncertainty of a valid margin: beyond, full stick and slip are hardly different."""
 _STUCK_SIGMAS = 2.0  # a margin nearer to 1 than so many standard deviations cannot be told from full stick
-# frames on either side from which it is read how fast the margin changes: fewer would show the noise's changes
+# frames on either side over which the rate of the margin is measured: fewer would show the noise
 _RATE_STEPS = 3.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundLabels(Labels):
-    """Labels that were found from forces, and all that they rest on.
+    """Labels from forces, with the estimates behind them.
 
-    After gross slip the margin is 0 and not valid, until the contact is let go and loaded anew: the friction that then
-    holds is another one. The friction coefficient is static until the slip, then F_t / F_n, so that in contact every
-    margin is 1 - F_t / (mu F_n).
+    After gross slip the margin is 0 and not valid until the contact is released and loaded again, for the friction then
+    is another. The friction coefficient is static until the slip, then F_t / F_n, so that in contact every margin is
+    1 - F_t / (mu F_n).
     """
 
     # required here: a keyword needs no default, though the base has one
@@ -106,7 +106,7 @@ class FoundLabels(Labels):
 
 
 def contact_threshold(forces: ContactForces, *, window_s: float) -> float:
-    """Least normal force that counts as contact: well above the noise, and a small share of the trial's largest."""
+    """Return the least normal force of a contact: well above the noise, and a small share of the largest force."""
     smooth = mean_force(forces.time_s, forces.normal_n, forces.time_s, window_s=window_s)
     return float(max(_CONTACT_SIGMAS * forces.noise_of_means_n(window_s).normal, _CONTACT_SHARE * smooth.max(), 1e-9))
 
@@ -126,9 +126,9 @@ def label_frames(
     The force of a frame is the mean over its time of the line through the samples; no window reaches over the onset of
     slip. Noise, tare, friction, lag and a change of the friction on the way to the slip all enter the uncertainty of
     the margin, as independent of each other. A lag that is known but not applied counts as an error of its size.
-    Where the friction tells no onset, gross slip begins with the first frame whose forces clearly lie outside the
-    friction cone. It lasts until the contact is let go and loaded anew. A lag that is to be applied, but not known or
-    doubtful, is a `RecordingError`.
+    Where the friction has no onset, gross slip begins with the first frame whose forces clearly lie outside the
+    friction cone. It lasts until the contact is released and loaded again. To apply a lag that is unknown or doubtful
+    is a `RecordingError`.
     """
     apply_lag = settings.apply_lag or settings.lag_ms is not None
     if apply_lag and (lag is None or lag.doubt):
@@ -157,7 +157,7 @@ def label_frames(
     drift = settings.friction_change * _remaining(time, contact, until_s=onset)
     sigma = np.sqrt(_variance(at, friction, threshold) + swing**2 + (used * drift) ** 2)
 
-    fault = np.zeros(len(time), dtype=np.int64) if screened is None else faults_at(screened, time, window_s=window)
+    fault = np.zeros(len(time), dtype=np.int64) if screened is None else screened.codes_at(time, window_s=window)
     for first, last in settings.bad_frames:
         fault[first : last + 1] = MARKED
     reliable = contact & ~at.missing & ~at.out_of_range & (fault == 0)
@@ -209,12 +209,12 @@ def label_frames(
 
 
 def _used(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Frames:
-    """Share of the friction that is used, F_t / (mu F_n); of a lighter touch than the threshold, as if it were that."""
+    """Return the used share of the friction, F_t / (mu F_n), with at least the threshold for F_n."""
     return at.tangential_n / (friction.mu * np.maximum(at.normal_n, threshold_n))
 
 
 def _variance(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Frames:
-    """Variance of the margin from that of the forces and of the friction."""
+    """Return the variance of the margin from that of the forces and of the friction."""
     normal, used = np.maximum(at.normal_n, threshold_n), _used(at, friction, threshold_n)
     return (
         (at.tangential_sigma_n / (friction.mu * normal)) ** 2
@@ -224,7 +224,7 @@ def _variance(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -
 
 
 def _remaining(time_s: Frames, contact: Bool[np.ndarray, " frames"], *, until_s: float) -> Frames:
-    """Distance in time from the slip, as a share of the way from touch to slip, at most 1."""
+    """Return the distance in time from the slip, as a share of the time from touch to slip, at most 1."""
     if not contact.any():
         return np.zeros(len(time_s))
     touch, end = time_s[np.argmax(contact)], min(until_s, time_s[-1])
@@ -234,7 +234,7 @@ def _remaining(time_s: Frames, contact: Bool[np.ndarray, " frames"], *, until_s:
 def _after_slips(
     time_s: Frames, onsets_s: Sequence[float], contacts: Sequence[tuple[float, float]]
 ) -> Bool[np.ndarray, " frames"]:
-    """Whether a contact has slipped before, and was not let go and loaded anew since."""
+    """Return True for frames of a contact that has slipped, until it is released and loaded again."""
     slipped = np.zeros(len(time_s), dtype=bool)
     for onset_s in onsets_s:
         anew_s = next((start_s for start_s, _ in contacts if start_s > onset_s), np.inf)
@@ -252,7 +252,7 @@ _Word = TypeVar("_Word", ContactState, Reason)
 
 
 def _first_of(words: Sequence[_Word], *flags: Bool[np.ndarray, " frames"]) -> tuple[_Word, ...]:
-    """Word of the first flag that holds for a frame; the last where none does."""
+    """Return the word of the first flag that is True for a frame; the last word where none is."""
     return tuple(words[index] for index in np.select(flags, list(range(len(flags))), default=len(flags)))
 
 
@@ -267,20 +267,20 @@ def label_trial(
 ) -> FoundLabels:
     """Label the frames of a trial: axes, lag, friction and margins, in that order.
 
-    The lag is estimated whether or not it is applied, and helps to tell at which fall of the force the image moves;
-    unless it was measured otherwise, or the settings give it.
+    The lag is estimated even if it is not applied, to compare the image with falls of the force, unless it is an
+    argument or set in `settings`.
 
     Raises
     ------
     RecordingError
-        If nothing touches, no tangential force was recorded, the trial never slips and no friction is given, a
-        doubtful lag is to be applied, or what is set by hand lies outside the trial.
+        If nothing touches, no tangential force was recorded, the trial never slips and its friction is unknown, a
+        doubtful lag is to be applied, or a setting lies outside the trial.
     """
     if lag is None and settings.lag_ms is not None:
         lag = Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0)
     require_inside(settings, frames=len(frame_time_s), time_s=forces.time_s)
-    by_hand = {"bad_frames": settings.bad_frames, "slip_s": settings.slip_s}
-    screened, lag = screen_trial(frame_time_s, image_motion, forces, lag=lag, **by_hand, rng=rng)
+    bad, slip_s = settings.bad_frames, settings.slip_s
+    screened, lag = screen_trial(frame_time_s, image_motion, forces, lag=lag, bad_frames=bad, slip_s=slip_s, rng=rng)
     try:
         return _label_screened(frame_time_s, image_motion, screened, lag=lag, settings=settings, rng=rng)
     except RecordingError as error:
@@ -288,11 +288,11 @@ def label_trial(
             raise
         steps = [fault.start_s for fault in screened.faults if fault.kind is Reason.STEP]
         slip = f"; if the contact slips at {steps[0]:.2f} s, give --slip-s {steps[0]:.2f}" if steps else ""
-        raise RecordingError(f"{error} (left out were: {'; '.join(tell_faults(screened.faults))}{slip})") from None
+        raise RecordingError(f"{error} (left out were: {'; '.join(describe_faults(screened.faults))}{slip})") from None
 
 
 def require_inside(settings: LabelSettings, *, frames: int, time_s: Frames) -> None:
-    """Check that what is set by hand lies within a trial of so many frames, with force samples at these times."""
+    """Check that the settings lie within a trial of so many frames, with force samples at these times."""
     for first, last in settings.bad_frames:
         if not 0 <= first <= last < frames:
             raise RecordingError(
@@ -304,10 +304,10 @@ def require_inside(settings: LabelSettings, *, frames: int, time_s: Frames) -> N
             f"the reference is frame {settings.reference_frame} of {frames}; name one from 0 on that is there"
         )
     begin, end = float(time_s[0]), float(time_s[-1])
-    for what, at_s in (("contact", settings.contact_s), ("slip", settings.slip_s)):
+    for event, at_s in (("contact", settings.contact_s), ("slip", settings.slip_s)):
         if at_s is not None and not begin <= at_s <= end:
             raise RecordingError(
-                f"the {what} is set to {at_s:.2f} s, and the forces are from {begin:.2f} to {end:.2f} s; set it within"
+                f"the {event} is set to {at_s:.2f} s, and the forces are from {begin:.2f} to {end:.2f} s; set it within"
             )
     if settings.contact_s is not None and settings.slip_s is not None and settings.slip_s <= settings.contact_s:
         raise RecordingError(
@@ -326,9 +326,14 @@ def _label_screened(
     rng: np.random.Generator,
 ) -> FoundLabels:
     forces = screened.forces
-    given = {"normal": settings.normal_axis, "sign": settings.normal_sign, "tare_n": settings.tare}
     axes = infer_axes(
-        forces, **given, touch_s=settings.contact_s, drift_n_s=settings.drift_rate, moved_s=screened.moved_s
+        forces,
+        normal=settings.normal_axis,
+        sign=settings.normal_sign,
+        tare_n=settings.tare,
+        touch_s=settings.contact_s,
+        drift_n_s=settings.drift_rate,
+        moved_s=screened.moved_s,
     )
     contact = apply_axes(forces, axes)
     if not np.ptp(contact.tangential_n, axis=0).any():
@@ -381,7 +386,7 @@ _USUAL_FRICTION = 1.5  # dry rubber on glass hardly exceeds it
 
 
 def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n: float) -> tuple[str, ...]:
-    """Tell what a fingertip cannot do: a friction that no skin has, a contact that pulls more than it presses."""
+    """Describe what no fingertip does: an implausible friction, a contact that pulls more than it presses."""
     doubts = []
     low, high = _PLAUSIBLE_FRICTION
     if not low <= friction.mu <= high:
@@ -414,7 +419,7 @@ _NEAR_LAG_S = 0.12  # clocks that run alike fit best within some frames; others,
 
 
 def _doubt_clocks(frame_time_s: Frames, forces: Forces, lag: Lag) -> tuple[str, ...]:
-    """Tell of frames and forces of different lengths, unless the image moves as the force changes: then one ran on."""
+    """Describe frames and forces of different lengths, unless the image moves as the force changes."""
     frames_s, forces_s = float(np.ptp(frame_time_s)), float(np.ptp(forces.time_s))
     fits = not lag.doubt and lag.correlation is not None and abs(lag.lag_s) <= _NEAR_LAG_S
     if fits or min(frames_s, forces_s) >= _LIKE_SPANS * max(frames_s, forces_s):

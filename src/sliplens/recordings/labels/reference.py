@@ -1,4 +1,4 @@
-"""The reference frame of a trial, the sensor untouched: named, or chosen; and how it drifts."""
+"""Reference frame of a trial, the sensor untouched: named or chosen, and its drift."""
 
 from collections.abc import Callable, Iterable, Sequence
 
@@ -11,8 +11,8 @@ from sliplens.recordings.labelling import ReferenceChoice
 from sliplens.recordings.labels.lag import measure_motion, soften
 from sliplens.recordings.options import REFERENCE_METHODS
 
-_STILL_TIMES = 1.5  # a frame that moves by so many times what the stillest quarter of its fellows do is not still
-_COMPARED = 200  # untouched frames that are compared at most: memory stays small where hours are untouched
+_STILL_TIMES = 1.5  # a still frame moves by at most so many times the motion of the stillest quarter
+_COMPARED = 200  # untouched frames that are compared at most, to bound the memory
 _ENDS = 10  # frames at either end of the untouched ones that are compared for drift
 # blocks over which the slow part of an image is taken: wider than a contact's rim, narrower than the light's fall
 _SMOOTH = 9
@@ -30,12 +30,12 @@ def choose_reference(
     These are the first stretch of untouched frames: a recording that begins pressed has them after its first contact.
 
     The energy of contact is the mean absolute difference from the median of the untouched frames, after the slow part
-    of the image is taken off: what a contact changes is markers and rims, while a lamp that warms up changes all of the
-    image alike and should not decide. The least energy is the default, for the first frame of a recording often holds
+    of the image is subtracted: a contact changes markers and rims, while a lamp that warms up changes all of the image
+    alike and should not decide. The least energy is the default, for the first frame of a recording often holds
     the hand that started it. Of a long stretch 200 frames are compared, evenly spread.
 
-    `read`: gives frames of rising numbers; `untouched`: frames without contact, as the forces say; `index`: the
-    reference by hand, which may touch. To have neither, or a number or method that is none, is a `RecordingError`.
+    `read` reads frames of rising numbers; `untouched` marks the frames without contact; `index` is the reference by
+    hand, which may touch. Without either, and for an unknown number or method, a `RecordingError` is raised.
     """
     if method not in REFERENCE_METHODS:
         raise RecordingError(f"the reference cannot be chosen by {method!r}; choose {' or '.join(REFERENCE_METHODS)}")
@@ -52,15 +52,14 @@ def choose_reference(
     first, last = places[:ends].tolist(), places[len(places) - ends :].tolist()
     # all of them, or so many evenly spread from the first to the last
     compared = before[np.linspace(0, len(before) - 1, min(len(before), _COMPARED)).round().astype(int)].tolist()
-    wanted = {*compared, *first, *last, *([] if chosen is None else [chosen])}
-    places_wanted = sorted(wanted)
-    soft = dict(zip(places_wanted, map(soften, read(places_wanted)), strict=True))
-    middle = np.median(np.stack([soft[place] for place in compared or sorted(wanted)]), axis=0)
+    needed: list[int] = sorted({*compared, *first, *last, *([] if chosen is None else [chosen])})
+    soft = dict(zip(needed, map(soften, read(needed)), strict=True))
+    middle = np.median(np.stack([soft[place] for place in compared or needed]), axis=0)
     if chosen is None:
         chosen, how = min(compared, key=lambda place: _energy(soft[place] - middle)), method
     drift = None
     if ends:
-        start, end = (np.median([soft[place] for place in some], axis=0) for some in (first, last))
+        start, end = (np.median([soft[place] for place in side], axis=0) for side in (first, last))
         drift = float(np.mean(np.abs(end - start)))
     return ReferenceChoice(
         index=chosen,
@@ -72,7 +71,7 @@ def choose_reference(
 
 
 def _first_still(motion: Float[np.ndarray, " frames"]) -> int:
-    """First frame that moves no more than its fellows, to and from it."""
+    """Return the first frame that moves no more than the others, to and from it."""
     if len(motion) < 3:
         return 0
     steps = motion[1:]
@@ -82,7 +81,7 @@ def _first_still(motion: Float[np.ndarray, " frames"]) -> int:
 
 
 def _energy(difference: Float[np.ndarray, "rows columns 3"]) -> float:
-    """Mean absolute value, the mean of a square about each block taken off."""
+    """Return the mean absolute value after subtracting the mean of a square about each block."""
     half = _SMOOTH // 2
     slow = difference.astype(np.float64)
     for axis in (0, 1):
