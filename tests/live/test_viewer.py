@@ -396,13 +396,6 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
     assert "table of forces" in text
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a"])
-def test_another_suffix_is_refused(small_dataset: Dataset, tmp_path: Path, name: str):
-    with pytest.raises(InputError, match=r"does not end in \.rrd; name a file of the Rerun viewer, such as trial\.rrd"):
-        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / name)
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_damaged_trial_leaves_no_file(trial: Recording, tmp_path: Path):
     data = save_dataset(tmp_path / "data", trial)
     path = trial_path(data.folder, trial.trial)
@@ -419,12 +412,6 @@ def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
     with pytest.raises(KeyboardInterrupt):
         write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd", on_progress=interrupt)
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_cannot_be_made_is_told(small_dataset: Dataset, tmp_path: Path):
-    (tmp_path / "taken").write_text("a file")
-    with pytest.raises(InputError, match=r"cannot write .*a\.rrd .*; choose another file"):
-        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "taken" / "a.rrd")
 
 
 def test_without_rerun_its_installation_is_told(

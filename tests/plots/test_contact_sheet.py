@@ -1,6 +1,5 @@
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -9,7 +8,6 @@ from drawn import misplaced, pictures, pulled_trial
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from PIL import Image
 from there import there
 
 from sliplens.errors import InputError
@@ -79,14 +77,6 @@ def test_full_stick_is_shown_where_the_sensor_is_pressed_hardest():
     )
 
 
-def test_full_slip_is_shown_rather_than_its_onset():
-    trial = pulled_trial()
-
-    last = there(choose_margins(trial)[-1])
-
-    assert trial.contact_state[last] == FULL_SLIP
-
-
 def test_frames_of_a_later_stick_are_left_alone():
     trial = pulled_trial()
     # after sliding the contact sticks again at exactly 40 %, and is pressed harder than ever
@@ -112,12 +102,6 @@ def test_no_frame_stands_in_two_columns():
     found = [index for index in choose_margins(trial) if index is not None]
 
     assert len(set(found)) == len(found)
-
-
-def test_untouched_frame_has_no_contact():
-    index = there(choose_untouched(pulled_trial()))
-
-    assert pulled_trial().contact_state[index] == NO_CONTACT
 
 
 def test_sheet_tells_each_margin_shown_and_each_that_is_missing():
@@ -272,43 +256,6 @@ def test_file_is_complete_and_alone(tmp_path, suffix):
 
     assert [found.name for found in path.parent.iterdir()] == [path.name]
     assert path.stat().st_size > 10_000
-
-
-def test_png_is_readable_and_wide_enough_to_read(tmp_path):
-    path = tmp_path / "preview.png"
-
-    write_contact_sheet([pulled_trial(), pulled_trial(pull=21)], path)
-
-    with Image.open(path) as image:
-        image.load()
-        assert image.width >= 1600
-
-
-@pytest.mark.parametrize("name", ["preview.jpg", "preview", "preview.png.txt"])
-def test_another_suffix_is_refused_and_nothing_written(tmp_path, name):
-    with pytest.raises(InputError, match=r"does not end in \.png, \.pdf, \.svg; name a picture"):
-        write_contact_sheet([pulled_trial()], tmp_path / name)
-
-    assert not list(tmp_path.iterdir())
-
-
-def test_interrupted_sheet_leaves_nothing_half_written(tmp_path, monkeypatch):
-    def stop(figure: Figure, path: Path, **settings: object) -> None:
-        path.write_bytes(b"half")
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Figure, "savefig", stop)
-    with pytest.raises(KeyboardInterrupt):
-        write_contact_sheet([pulled_trial()], tmp_path / "preview.png")
-
-    assert not list(tmp_path.iterdir())
-
-
-def test_unwritable_place_is_told(tmp_path):
-    (tmp_path / "file").write_text("no folder")
-
-    with pytest.raises(InputError, match=r"cannot write .* choose another file"):
-        write_contact_sheet([pulled_trial()], tmp_path / "file" / "preview.png")
 
 
 def test_no_trial_is_no_sheet():

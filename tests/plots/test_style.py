@@ -1,8 +1,14 @@
-"""How numbers and names are written."""
+"""Numbers and names as text, and files that appear when complete."""
 
+from pathlib import Path
+
+import matplotlib as mpl
 import pytest
+from matplotlib.figure import Figure
 
-from sliplens.plots.style import name_methods, percent
+from sliplens.errors import InputError
+from sliplens.plots.clip import require_clip_path
+from sliplens.plots.style import name_methods, percent, require_picture_path, save_page, written_whole
 
 
 @pytest.mark.parametrize(
@@ -18,3 +24,53 @@ def test_methods_in_a_text_are_named_and_other_words_stay():
     assert name_methods(text) == (
         "Poly-CAM as in the thesis and Poly-CAM of integrated-gradients-like input; insertion, black: Occlusion"
     )
+
+
+@pytest.mark.parametrize(
+    ("check", "name", "message"),
+    [
+        (
+            lambda path: require_picture_path(path, example="a.png"),
+            "page.doc",
+            r"does not end in \.png, .*; name",
+        ),
+        (lambda path: require_picture_path(path, example="a.png"), "page", "does not end in"),
+        (require_clip_path, "trial.mp4.mkv", r"trial\.mp4\.mkv does not end in \.mp4; name a clip"),
+    ],
+)
+def test_another_suffix_is_refused(check, name: str, message: str):
+    with pytest.raises(InputError, match=message):
+        check(Path(name))
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_what_fails_leaves_the_file_before_and_nothing_else(tmp_path: Path, error: type[BaseException]):
+    target = tmp_path / "page.png"
+    target.write_bytes(b"yesterday's")
+
+    def fail() -> None:
+        with written_whole(target) as part:
+            part.write_bytes(b"half")
+            raise error
+
+    with pytest.raises(error):
+        fail()
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("page.png", b"yesterday's")]
+
+
+def test_an_unwritable_place_is_named(tmp_path: Path):
+    (tmp_path / "file").write_text("no folder")
+    with (
+        pytest.raises(InputError, match=r"cannot write .*page\.png .*; choose another file"),
+        written_whole(tmp_path / "file" / "page.png"),
+    ):
+        pass
+
+
+def test_a_page_is_the_same_each_time_and_leaves_matplotlib_as_it_was(tmp_path: Path):
+    before, figure = dict(mpl.rcParams), Figure()
+    figure.subplots().plot([0, 1])
+    for name in ("a.svg", "b.svg"):
+        save_page(figure, tmp_path / name)
+    assert (tmp_path / "a.svg").read_bytes() == (tmp_path / "b.svg").read_bytes()
+    assert dict(mpl.rcParams) == before

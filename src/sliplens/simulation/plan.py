@@ -3,7 +3,7 @@
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, TypeAlias, TypedDict, Unpack, cast
+from typing import Any, TypedDict, Unpack, cast
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from sliplens.simulation.loading import MINIMUM_FRAMES
 from sliplens.simulation.nuisances import Day, Nuisances, Pulls, draw_camera, draw_day, mount_camera
 from sliplens.simulation.sensor import CHROMATOUCH, SENSORS, Sensor
 
-JsonObject: TypeAlias = dict[str, Any]
 # branches of the seed: draws of one never change those of another
 _DAYS, _UNITS, _TRIALS, _CAMERAS = range(4)
 
@@ -128,7 +127,7 @@ class SimulationRecipe:
         """Hash of the recipe and of the version of sliplens that follows it."""
         return hash_json({"recipe": self.to_dict(), "sliplens": __version__})
 
-    def to_dict(self) -> JsonObject:
+    def to_dict(self) -> dict[str, Any]:
         """Return the recipe as `run.json` holds it; None for `pulls` is left out, so that hashes stay."""
         fields = to_builtins(self)
         return fields if self.pulls else {name: value for name, value in fields.items() if name != "pulls"}
