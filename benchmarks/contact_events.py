@@ -9,8 +9,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float
-
 from labels import Seen, draw_frames
+
 from sliplens.mechanics import stick_ratio
 from sliplens.recordings.labels import LabelSettings, measure_motion, soften
 from sliplens.recordings.trial import ContactState, contact_states

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from labels import FORCE_HZ, LONGEST_LAG_S, Seen, film_trial, spoil
 
 from contact_events import EVENTS, Case, near_events, settings_of, tilt
-from labels import FORCE_HZ, LONGEST_LAG_S, Seen, film_trial, spoil
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels import LARGEST_SIGMA, FoundLabels, LabelSettings, label_trial

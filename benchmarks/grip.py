@@ -24,25 +24,14 @@ import numpy as np
 
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.friction import GRASP_SPREAD, Friction, SlipLearner
-from sliplens.grip import (
-    CONDITIONS,
-    OBJECTS,
-    GripLoop,
-    NoEyes,
-    Plant,
-    RenderedEyes,
-    Scripts,
-    TableEyes,
-    Tick,
-    draw_scripts,
-    load_readings,
-    make_controller,
-    run_episodes,
-    run_scripts,
-)
-from sliplens.grip.readings import ReadingTable
+from sliplens.grip.controllers import make_controller
+from sliplens.grip.episodes import EpisodeOptions, run_episodes, run_scripts
+from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor, Tick
+from sliplens.grip.plant import OBJECTS, Plant
+from sliplens.grip.readings import ReadingTable, load_readings
+from sliplens.grip.records import EpisodeTable
+from sliplens.grip.scripts import CONDITIONS, Scripts, draw_scripts
 from sliplens.models import load
-from sliplens.results.grip import EpisodeTable
 
 SEED = 500_000
 CHOSEN = 64
@@ -90,13 +79,13 @@ def hold(
 ) -> Outcome:
     """Run a controller over all episodes at once."""
     rng = np.random.default_rng(SEED)
-    learners = None if friction is None else [SlipLearner(one) for one in friction]
-    eyes = TableEyes(READINGS, fingertips=scripts.fingertips, rng=rng, error_scale=error_scale, learners=learners)
+    learners = [SlipLearner(mu) for mu in friction or ()]
+    sensor = TableSensor(READINGS, fingertips=scripts.fingertips, rng=rng, error_scale=error_scale, learners=learners)
     plant, hand = (
         Plant(OBJECTS["cup"], episodes=len(scripts)),
-        make_controller(controller, settings, told=bool(friction)),
+        make_controller(controller, settings, friction_known=bool(friction)),
     )
-    loop = GripLoop(plant, eyes if controller != "fixed" else NoEyes(), hand, latency_s=latency_s)
+    loop = GripLoop(plant, sensor if controller != "fixed" else None, hand, latency_s=latency_s)
     table = run_scripts(loop, scripts)
     return Outcome(
         dropped=table.dropped,
@@ -166,8 +155,8 @@ def accuracy(table: ReadingTable, scale: float, *, rng: np.random.Generator) -> 
 
 def rendered_rate(ticks: int = 120) -> float:
     """Ticks a second of plant, both fingertips drawn, read and followed."""
-    scripts, eyes = draw_scripts("cup", "dry", episodes=1, seed=SEED), RenderedEyes(RUN, seed=SEED)
-    loop = GripLoop(Plant(OBJECTS["cup"]), eyes, make_controller("margin"))
+    scripts, sensor = draw_scripts("cup", "dry", episodes=1, seed=SEED), RenderedSensor(RUN, seed=SEED)
+    loop = GripLoop(Plant(OBJECTS["cup"]), sensor, make_controller("margin"))
     for _ in range(20):
         loop.tick(scripts.world(loop.plant.state.time_s))
     begin = time.perf_counter()
@@ -190,16 +179,16 @@ def validate(count: int, conditions: Sequence[str], rng: np.random.Generator) ->
         scripts = replace(scripts, fingertips=np.array([float(pair)]))
         ticks: list[Tick] = []
         seen = GripLoop(
-            Plant(OBJECTS["cup"]), RenderedEyes(RUN, seed=READINGS.seed + 2 * pair), make_controller("margin")
+            Plant(OBJECTS["cup"]), RenderedSensor(RUN, seed=READINGS.seed + 2 * pair), make_controller("margin")
         )
         looked_up = GripLoop(
             Plant(OBJECTS["cup"]),
-            TableEyes(READINGS, fingertips=scripts.fingertips, rng=np.random.default_rng(pair)),
+            TableSensor(READINGS, fingertips=scripts.fingertips, rng=np.random.default_rng(pair)),
             make_controller("margin"),
         )
         pairs.append((run_scripts(seen, scripts, on_tick=ticks.append), run_scripts(looked_up, scripts)))
         held = [
-            (before.state, now.sight.margin[0])
+            (before.state, now.reading.margin[0])
             for before, now in itertools.pairwise(ticks)
             if before.state.time_s > 0.6 and not before.state.dropped[0]
         ]
@@ -243,8 +232,8 @@ def in_a_row(objects: int, conditions: Sequence[str], rng: np.random.Generator) 
         way: EpisodeTable.joined(
             [
                 run_episodes(
-                    "cup", "margin", condition=name, episodes=objects, grasps=GRASPS, network=RUN, readings=SELECTION,
-                    seed=SELECTION_SEED + number, **options,
+                    "cup", "margin", condition=name, episodes=objects, network=RUN, seed=SELECTION_SEED + number,
+                    options=EpisodeOptions(readings=SELECTION, grasps=GRASPS, **options),
                 ).episodes
                 for number, name in enumerate(conditions)
             ]
@@ -298,12 +287,12 @@ def in_order(count: int, conditions: Sequence[str], rng: np.random.Generator) ->
         scripts = draw_scripts("cup", conditions[number % len(conditions)], episodes=1, seed=SELECTION_SEED + number)
         for way, rows in found.items():
             ticks: list[Tick] = []
-            eyes = RenderedEyes(RUN, seed=_UNSEEN + 2 * number, sequence=way == "in order")
-            loop = GripLoop(Plant(OBJECTS["cup"]), eyes, make_controller("margin"))
+            sensor = RenderedSensor(RUN, seed=_UNSEEN + 2 * number, sequence=way == "in order")
+            loop = GripLoop(Plant(OBJECTS["cup"]), sensor, make_controller("margin"))
             table = run_scripts(loop, scripts, on_tick=ticks.append)
             errors = np.concatenate(
                 [
-                    now.sight.margin[0] - before.state.margin[0]
+                    now.reading.margin[0] - before.state.margin[0]
                     for before, now in itertools.pairwise(ticks)
                     if before.state.time_s > 0.6 and not before.state.dropped[0]
                 ]
@@ -369,7 +358,15 @@ def compare_all(options: argparse.Namespace, rng: np.random.Generator) -> dict[s
     scripts, labels = draw(conditions, episodes)
     found: dict[str, object] = {"episodes": episodes, "hz_rendered": round(rendered_rate(), 1)}
     begin, busy = time.perf_counter(), time.process_time()
-    run_episodes("cup", "margin", condition="dry", episodes=500, seed=SEED, readings=READINGS, network=RUN)
+    run_episodes(
+        "cup",
+        "margin",
+        condition="dry",
+        episodes=500,
+        seed=SEED,
+        network=RUN,
+        options=EpisodeOptions(readings=READINGS),
+    )
     found["episodes_per_s"] = round(500 / (time.perf_counter() - begin), 1)
     found["episodes_per_core_s"] = round(500 / (time.process_time() - busy), 1)
     fixed = [hold("fixed", {"force_n": force}, scripts) for force in FORCES_N]

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import torch
+from realism.refit import leave_one_out
 from torch.nn import functional
 
-from realism.refit import leave_one_out
 from sliplens.errors import SliplensError
 from sliplens.models.checkpoint import load
 from sliplens.study import frames_from_folder

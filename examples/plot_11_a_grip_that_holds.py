@@ -12,8 +12,9 @@ import numpy as np
 import sliplens as sl
 
 # %%
-# The same 200 episodes for each controller: the cup gets wet where it is held. Readings are looked up in what was
-# measured of the network; ``rendered=True`` closes the loop through pixels, and takes half a minute an episode.
+# The same 200 episodes for each controller: the cup gets wet where it is held. Predictions are looked up in the measured
+# errors of the network. ``options=EpisodeOptions(rendered=True)`` of ``sliplens.grip.episodes`` closes the loop through
+# pixels, and takes half a minute an episode.
 grips = {
     name: sl.run_episodes("cup", name, condition="patch", episodes=200, seed=5)
     for name in ("fixed", "margin", "oracle")

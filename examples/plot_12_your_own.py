@@ -58,9 +58,9 @@ plt.show()
 class Proportional:
     """Force in proportion to the missing margin."""
 
-    def command(self, seen: Observation) -> np.ndarray:
+    def command(self, observation: Observation) -> np.ndarray:
         """Grip force to press with, in newtons."""
-        margin = np.nanmin(np.where(np.isfinite(seen.margin), seen.margin, 1.0), axis=1)
+        margin = np.nanmin(np.where(np.isfinite(observation.margin), observation.margin, 1.0), axis=1)
         return 1.0 + 3.0 * (1.0 - margin)
 
 

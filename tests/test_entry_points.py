@@ -9,8 +9,9 @@ from sliplens.errors import InputError
 from sliplens.explainers.table import EXPLAINERS
 from sliplens.extras import Table
 from sliplens.faithfulness.fills import FILLS
-from sliplens.grip import CONDITIONS, CONTROLLERS
+from sliplens.grip.controllers import CONTROLLERS
 from sliplens.grip.gripper import ROS_MESSAGES
+from sliplens.grip.scripts import CONDITIONS
 from sliplens.live.sinks import SINKS
 from sliplens.live.sources import SOURCES
 from sliplens.markers import KINDS

@@ -77,7 +77,7 @@ def test_what_is_no_friction_is_refused(told: object):
 
 @pytest.mark.parametrize("slip", [(0.0, 0.1), (0.5, 0.0), (float("nan"), 0.1)])
 def test_what_is_no_slip_is_refused(slip: tuple[float, float]):
-    with pytest.raises(InputError, match="a slip is told by a positive ratio"):
+    with pytest.raises(InputError, match="a slip needs a positive ratio"):
         Friction.between(0.2, 1.0).update(*slip)
 
 

@@ -1,4 +1,4 @@
-"""What is known of the coefficient of friction: told exactly, within a range, or learnt from slips."""
+"""Knowledge of the coefficient of friction: exact, a range, or learnt from slips."""
 
 import math
 from collections import deque
@@ -12,26 +12,24 @@ from jaxtyping import Float
 from sliplens.errors import InputError
 from sliplens.files import hash_json
 
-__all__ = ["Friction", "FrictionLike", "SlipLearner", "as_friction"]
-
 LOWEST, HIGHEST = 0.05, 2.0
-"""Coefficients between which friction is looked for where only slips tell it: ice on steel to clean rubber on glass."""
+"""Range of an unknown coefficient of friction: ice on steel to clean rubber on glass."""
 GRASP_SPREAD = 0.06
-"""Standard deviation of an object's friction from one grasp to the next, as a share of it: the trials of a simulated
-day lie evenly within a tenth of its friction."""
+"""Standard deviation of an object's friction from grasp to grasp, as a share of it: the trials of a simulated day lie
+evenly within a tenth of its friction."""
 MOST_FRICTION = 20.0
-"""Larger than the coefficient of anything that slides: beyond, something sticks, or the number is none."""
+"""Largest coefficient: with more, something sticks, or the number is wrong."""
 LEARNT = "learnt from slips"
-"""Note of friction that slips told."""
+"""Note of friction learnt from slips."""
 _REACH = 4.0
-"""Standard deviations to either side within which friction of a mean and a spread is held possible."""
+"""Standard deviations to either side that a distribution of friction covers."""
 _NODES = 400
-"""Over two decades a step is then 1 %, finer than any slip tells."""
+"""Values over two decades, in steps of 1 %: finer than any slip shows."""
 _NEGLIGIBLE = 1e-6
 
 
 def require_friction(value: float) -> None:
-    """Check that a coefficient of friction can be one."""
+    """Refuse a number that cannot be a coefficient of friction."""
     if not 0 < value <= MOST_FRICTION:
         raise InputError(
             f"a coefficient of friction is a positive number up to {MOST_FRICTION:g}, got {value:g}; give F_t / F_n at "
@@ -41,31 +39,30 @@ def require_friction(value: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Friction:
-    """A coefficient of friction mu, as far as it is known: values and how likely each is.
+    """A coefficient of friction mu, with its uncertainty: possible values and their probabilities.
 
-    `Friction(0.62)` is known exactly, `Friction.between(0.5, 0.8)` lies anywhere in a range,
-    `Friction.about(0.58, 0.05)` has a mean and a standard deviation, and `Friction.from_slips([0.58])` was learnt from
-    slips seen before on the same object.
+    `Friction(0.62)` is exact, `Friction.between(0.5, 0.8)` lies anywhere in a range, `Friction.about(0.58, 0.05)` has a
+    mean and a standard deviation, and `Friction.from_slips([0.58])` is learnt from earlier slips of the same object.
 
     Parameters
     ----------
     values
-        Coefficient of static friction: one number, or several of which any may be right.
+        Coefficient of static friction: one number, or several possible ones.
     weights
-        How likely each value is, as a share: they are scaled to sum to 1, and are even if None.
+        Probability of each value, scaled to sum to 1; equal if None.
     note
-        Where it comes from, for tables and pages.
+        Origin, for tables and pages.
 
     Raises
     ------
     InputError
-        If a value is not positive and finite, or weights are negative, all zero or of another number.
+        If a value is not positive and finite, or weights are negative, all zero or not one a value.
 
     Examples
     --------
     >>> from sliplens.friction import Friction
     >>> str(Friction(0.62)), str(Friction.between(0.5, 0.8))
-    ('0.62, told exactly', '0.5 to 0.8, told as a range')
+    ('0.62, exact', '0.5 to 0.8, range')
     >>> learnt = Friction.from_slips([0.58], sigma=0.03)
     >>> round(learnt.mean, 2), round(learnt.sigma, 2)
     (0.58, 0.06)
@@ -73,7 +70,7 @@ class Friction:
 
     values: Float[np.ndarray, " values"] | float
     weights: Float[np.ndarray, " values"] | None = None
-    note: str = field(default="told exactly", kw_only=True)
+    note: str = field(default="exact", kw_only=True)
 
     def __post_init__(self) -> None:
         values = np.atleast_1d(np.asarray(self.values, dtype=np.float64))
@@ -87,18 +84,18 @@ class Friction:
 
     @classmethod
     def between(cls, low: float, high: float, *, values: int = 41) -> "Friction":
-        """Friction anywhere in a range, evenly; at so many values, each in the middle of its share of the range."""
+        """Friction evenly distributed in a range, at the middles of equal shares of it."""
         if not 0 < low < high <= MOST_FRICTION:
             raise InputError(
                 f"a range of friction runs from a positive low to a larger high, at most {MOST_FRICTION:g}, got "
                 f"{low:g}..{high:g}; give the smaller number first, such as 0.5..0.8"
             )
         middles = low + (high - low) * (np.arange(values) + 0.5) / values
-        return cls(middles, note=f"{low:g} to {high:g}, told as a range")
+        return cls(middles, note=f"{low:g} to {high:g}, range")
 
     @classmethod
     def about(cls, mean: float, sigma: float, *, values: int = 81) -> "Friction":
-        """Friction of a mean and a standard deviation, normal in the logarithm, where none becomes negative."""
+        """Friction with a mean and a standard deviation, normal in the logarithm and so never negative."""
         if not (0 < mean <= MOST_FRICTION and 0 < sigma < mean):
             raise InputError(
                 "mean and standard deviation of friction are positive, the mean the larger and at most "
@@ -107,8 +104,8 @@ class Friction:
         spread = math.sqrt(math.log1p((sigma / mean) ** 2))
         steps = np.linspace(-_REACH, _REACH, values)
         nodes = mean * np.exp(spread * steps - spread**2 / 2)
-        kept = nodes <= MOST_FRICTION
-        return cls(nodes[kept], np.exp(-0.5 * steps[kept] ** 2), note="told with its spread")
+        possible = nodes <= MOST_FRICTION
+        return cls(nodes[possible], np.exp(-0.5 * steps[possible] ** 2), note="mean and spread")
 
     @classmethod
     def from_slips(
@@ -127,27 +124,29 @@ class Friction:
         Parameters
         ----------
         ratios
-            F_t / F_n at which the object slipped, one a grasp: errors within a grasp are alike.
+            F_t / F_n at which the object slipped, one a grasp: errors within a grasp are correlated.
         sigma
-            Standard deviation of each such ratio, as it was read.
+            Standard deviation of each ratio.
         grasp_spread
             Standard deviation of friction from one grasp to the next, as a share of it.
         prior
-            What was known of the object before; evenly anything (in the logarithm) if None.
+            Friction of the object before the slips; any (evenly in the logarithm) if None.
         """
-        seen = np.asarray(ratios, dtype=np.float64)
-        known = _anything(seen) if prior is None else prior
-        for ratio in seen.tolist():
-            known = known.update(ratio, math.hypot(sigma, grasp_spread * ratio))
-        return known.next_grasp(grasp_spread)
+        ratios = np.asarray(ratios, dtype=np.float64)
+        friction = _unknown(ratios) if prior is None else prior
+        for ratio in ratios.tolist():
+            friction = friction.update(ratio, math.hypot(sigma, grasp_spread * ratio))
+        return friction.next_grasp(grasp_spread)
 
     def update(self, ratio: float, sigma: float) -> "Friction":
-        """Friction after a gross slip at F_t / F_n = `ratio`, read with the standard deviation `sigma` (Bayes' rule).
+        """Update by a gross slip at F_t / F_n = `ratio`, predicted with the standard deviation `sigma` (Bayes' rule).
 
-        What is known exactly stays; a slip far outside what was held possible leaves the value nearest to it.
+        Exact friction stays; a slip far outside the possible values leaves the nearest of them.
         """
         if not (math.isfinite(ratio) and ratio > 0 and math.isfinite(sigma) and sigma > 0):
-            raise InputError(f"a slip is told by a positive ratio F_t / F_n and its sigma, got {ratio:g} and {sigma:g}")
+            raise InputError(
+                f"a slip needs a positive ratio F_t / F_n and a positive sigma, got {ratio:g} and {sigma:g}"
+            )
         values, weights = self.nodes
         exponent = -0.5 * ((values - ratio) / sigma) ** 2
         with np.errstate(divide="ignore"):
@@ -156,27 +155,27 @@ class Friction:
         return Friction(values, posterior, note=LEARNT)._without_negligible()
 
     def next_grasp(self, spread: float = GRASP_SPREAD) -> "Friction":
-        """Friction of another grasp of the same object, which differs by a Gaussian share of deviation `spread`."""
+        """Friction of another grasp of the same object, whose share differs with the standard deviation `spread`."""
         if not 0 <= spread < 1:
             raise InputError(f"the spread from grasp to grasp is a share of the friction, from 0 to 1, got {spread:g}")
         if spread == 0:
             return self
         # in the logarithm, where no friction becomes negative
         values, weights = self.nodes
-        grid, _ = _anything(values, spread=spread).nodes
+        grid, _ = _unknown(values, spread=spread).nodes
         share = np.exp(-0.5 * (np.log(grid / values[:, None]) / spread) ** 2)
         moved = weights @ (share / np.maximum(share.sum(axis=1, keepdims=True), 1e-300))
         return Friction(grid, moved, note=self.note)._without_negligible()
 
     def _without_negligible(self) -> "Friction":
-        """The same without values that are a million times less likely than the likeliest."""
+        """Drop values that are a million times less likely than the likeliest."""
         values, weights = self.nodes
-        kept = weights > _NEGLIGIBLE * weights.max()
-        return Friction(values[kept], weights[kept], note=self.note)
+        likely = weights > _NEGLIGIBLE * weights.max()
+        return Friction(values[likely], weights[likely], note=self.note)
 
     @property
     def nodes(self) -> tuple[Float[np.ndarray, " values"], Float[np.ndarray, " values"]]:
-        """Values and their weights, which sum to 1."""
+        """Possible values, and their weights, which sum to 1."""
         assert isinstance(self.values, np.ndarray)
         assert self.weights is not None
         return self.values, self.weights
@@ -200,35 +199,34 @@ class Friction:
 
     @property
     def digest(self) -> str:
-        """Hash of all that is known, which `text` rounds: the same only for the same friction."""
+        """Hash of values and weights, which `text` rounds: equal only for equal friction."""
         return hash_json([part.tolist() for part in self.nodes])
 
     def __str__(self) -> str:
         if self.note.endswith("range"):
             return self.note
-        known = f"{self.mean:.3g} +- {self.sigma:.2g}" if len(self.nodes[0]) > 1 else f"{self.mean:.6g}"
-        return f"{known}, {self.note}"
+        number = f"{self.mean:.3g} +- {self.sigma:.2g}" if len(self.nodes[0]) > 1 else f"{self.mean:.6g}"
+        return f"{number}, {self.note}"
 
 
 class SlipLearner:
-    """Friction of what is held, as the first gross slip of each grasp teaches it.
+    """Friction of the object in the grip, learnt from the first gross slip of each grasp.
 
-    As a contact begins to slip, F_t / F_n is the static friction; what is read while it slides is less. So a slip is
-    told together with the time since it began, and the ratio that was read last before counts, if that is at most
-    0.3 s older: with no such reading a slip teaches nothing. Later slips of the same contact teach nothing either: what
-    a network reads wrong of a contact it reads wrong alike at each of them, so that they would make it surer and no
-    better.
+    As a contact begins to slip, F_t / F_n is the static friction; while it slides, the ratio is less. So the last ratio
+    before the beginning of the slip counts, if it is at most 0.3 s older; otherwise nothing is learnt. Later slips of
+    the same contact teach nothing either: a network's error is the same at each of them, so that they would reduce the
+    uncertainty and not the error.
 
-    Nobody sees whether the next grasp is of the same object. So what a slip taught ends with its grasp, unless it was
-    said that the object stays the same: then it counts in the next ones, a little less surely. Where nothing was told,
-    it counts from the next grasp on, so that a controller's constants do not change while it answers the slip.
+    The next grasp may be of another object. So the learnt friction ends with its grasp, unless `same_object` is set:
+    then it counts in the next grasps, with a slightly larger uncertainty. Without friction beforehand it counts from
+    the next grasp on, so that a controller's constants do not change during its reaction to the slip.
 
     Parameters
     ----------
     friction
-        What is known beforehand; what is known exactly stays so. None where nothing is.
+        Friction beforehand; exact friction stays. None if it is unknown.
     same_object
-        Whether all grasps are of one object.
+        If True, all grasps are of one object.
 
     Examples
     --------
@@ -245,28 +243,28 @@ class SlipLearner:
     """
 
     def __init__(self, friction: Friction | None = None, *, same_object: bool = False) -> None:
-        self.friction = self._told = friction
-        """What is known of the friction of this grasp; None where nothing is."""
+        self.friction = self._first = friction
+        """Friction of this grasp; None if it is unknown."""
         self.learnt: Friction | None = None
-        """What slips taught of the object that slipped last, for a grasp to come; None before any."""
+        """Friction of the next grasp of the last object that slipped; None before a slip."""
         self.slips = 0
-        """How many slips that was learnt from."""
+        """Number of slips that it was learnt from."""
         self.same_object = same_object
-        self._read: deque[tuple[float, float, float]] = deque(maxlen=_KEPT)
+        self._ratios: deque[tuple[float, float, float]] = deque(maxlen=_MOST_RATIOS)
         self._slipped = False
 
     def note(self, ratio: float, *, sigma: float, time_s: float) -> None:
-        """Keep a ratio F_t / F_n that was read, and its standard deviation."""
-        self._read.append((time_s, ratio, sigma))
+        """Take a predicted ratio F_t / F_n, and its standard deviation."""
+        self._ratios.append((time_s, ratio, sigma))
 
     def update(self, time_s: float, *, slipping_s: float | None, touches: bool = True) -> None:
-        """Learn from whether the contact slips now, and since how many seconds; None where it holds."""
+        """Learn from a slip that began some seconds ago; None where the contact holds."""
         if slipping_s is not None and not self._slipped:
             began_s = time_s - slipping_s
-            before = [(ratio, sigma) for then_s, ratio, sigma in self._read if 0 <= began_s - then_s <= _FRESH_S]
-            known = _anything() if self.friction is None else self.friction
-            if before and before[-1][0] > 0 and len(known.nodes[0]) > 1:
-                slipped, self._slipped = known.update(*before[-1]), True
+            before = [(ratio, sigma) for then_s, ratio, sigma in self._ratios if 0 <= began_s - then_s <= _FRESH_S]
+            prior = _unknown() if self.friction is None else self.friction
+            if before and before[-1][0] > 0 and len(prior.nodes[0]) > 1:
+                slipped, self._slipped = prior.update(*before[-1]), True
                 self.learnt, self.slips = slipped.next_grasp(), self.slips + 1 if self.same_object else 1
                 if self.friction is not None:
                     self.friction = slipped
@@ -274,62 +272,65 @@ class SlipLearner:
             self.release()
 
     def release(self) -> None:
-        """Let the object go: the next contact is another grasp."""
-        self._read.clear()
+        """End the grasp: the next contact is another one."""
+        self._ratios.clear()
         if self._slipped:
-            self.friction = self.learnt if self.same_object else self._told
+            self.friction = self.learnt if self.same_object else self._first
             self._slipped = False
 
 
-_KEPT = 120
-"""Readings that are kept: longer than any slip takes to be told."""
+_MOST_RATIOS = 120
+"""Number of ratios in memory, for more time than the detection of a slip takes."""
 _FRESH_S = 0.3
-"""Time before a slip within which a ratio is that of its beginning. Frames may be withheld while the pull grows, and
-an older ratio would teach too little friction."""
+"""Largest age of a ratio at the beginning of a slip. Frames may be withheld while the pull grows, and an older ratio
+would give too little friction."""
 
 
 FrictionLike: TypeAlias = Friction | float | tuple[float, float] | str
-"""Friction as a caller may give it: `Friction`, one number, (low, high), or as text 0.62, 0.5..0.8 or 0.58+-0.05."""
+"""Friction as a parameter: `Friction`, one number, (low, high), or as text 0.62, 0.5..0.8 or 0.58+-0.05."""
 
 
-def as_friction(told: FrictionLike) -> Friction:
-    """Coefficient of friction from what a caller gave.
+def as_friction(friction: FrictionLike) -> Friction:
+    """Convert a number, range or text to a coefficient of friction.
 
     Raises
     ------
     InputError
-        If it is none.
+        If it is not valid.
 
     Examples
     --------
     >>> from sliplens.friction import as_friction
     >>> str(as_friction("0.5..0.8")), str(as_friction("0.58+-0.05"))
-    ('0.5 to 0.8, told as a range', '0.58 +- 0.05, told with its spread')
+    ('0.5 to 0.8, range', '0.58 +- 0.05, mean and spread')
     """
-    if isinstance(told, Friction):
-        return told
-    about = isinstance(told, str) and "+-" in told
-    parts = (
-        told.split("+-" if about else "..") if isinstance(told, str) else told if isinstance(told, tuple) else (told,)
-    )
+    if isinstance(friction, Friction):
+        return friction
+    about = isinstance(friction, str) and "+-" in friction
+    parts = friction if isinstance(friction, tuple) else (friction,)
+    if isinstance(friction, str):
+        parts = friction.split("+-" if about else "..")
     try:
         numbers = [float(part) for part in parts]
     except (TypeError, ValueError):
         numbers = []
     if len(numbers) not in {1, 2}:
         raise InputError(
-            f"{told!r} is no friction; give a number such as 0.62, a range such as 0.5..0.8, or mean and spread such "
-            "as 0.58+-0.05"
+            f"{friction!r} is no friction; give a number such as 0.62, a range such as 0.5..0.8, or mean and spread "
+            "such as 0.58+-0.05"
         )
     if len(numbers) == 1:
         return Friction(numbers[0])
     return Friction.about(*numbers) if about else Friction.between(*numbers)
 
 
-def _anything(near: Float[np.ndarray, " values"] | None = None, *, spread: float = GRASP_SPREAD) -> Friction:
-    """Friction of which nothing is known, evenly in the logarithm; also what lies within a spread of some values."""
+def _unknown(near: Float[np.ndarray, " values"] | None = None, *, spread: float = GRASP_SPREAD) -> Friction:
+    """Return unknown friction, evenly in the logarithm, over a range that covers some values and their spread."""
     low, high = LOWEST, HIGHEST
     if near is not None and len(near) and np.all((near > 0) & np.isfinite(near)):
         low = min(low, float(near.min()) * math.exp(-_REACH * spread))
         high = min(MOST_FRICTION, max(high, float(near.max()) * math.exp(_REACH * spread)))
-    return Friction(np.geomspace(low, high, _NODES), note="not told")
+    return Friction(np.geomspace(low, high, _NODES), note="unknown")
+
+
+__all__ = ["Friction", "FrictionLike", "SlipLearner", "as_friction"]

@@ -11,7 +11,7 @@ import sys
 import sliplens as sl
 from sliplens.app import LivePage
 from sliplens.errors import InputError
-from sliplens.grip import GripSource
+from sliplens.grip.source import GripSource
 from sliplens.live import LiveSource, SimulatedSource
 
 

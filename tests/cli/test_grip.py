@@ -7,8 +7,8 @@ from command_line import refused, run
 
 import sliplens as sl
 from sliplens.codec import load_result
+from sliplens.grip.records import Grip
 from sliplens.report.grip import table_episodes
-from sliplens.results.grip import Grip
 
 
 def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -22,7 +22,7 @@ def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, cap
     assert set(grip.episodes.mass_kg) == {0.05}
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "What the margin holds" in page
-    assert "What became of 4 episodes" in page
+    assert "4 episodes: cup" in page
     assert (tmp_path / "figures" / "grip-episode.pdf").is_file()
     assert len(sl.plot(grip).axes[0].lines) >= 2
     assert run(*words) == 0
@@ -35,7 +35,7 @@ def test_grasps_of_the_same_objects_have_a_row_each(tmp_path: Path, capsys: pyte
     assert "Grasp after grasp" in capsys.readouterr().out
     table = table_episodes(load_result(tmp_path / "grip", Grip, command="sliplens grip"))
     assert [[cell.text for cell in row[:2]] for row in table.rows] == [["1", "4"], ["2", "4"]]
-    assert "What a slip taught of the friction counts in the grasps that follow." in table.caption
+    assert "Friction learnt from a slip counts in the grasps that follow." in table.caption
 
 
 @pytest.mark.parametrize(

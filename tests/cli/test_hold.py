@@ -7,8 +7,8 @@ import pytest
 from command_line import refused, run
 
 from sliplens.codec import load_result
+from sliplens.grip.records import Hold
 from sliplens.recordings import Dataset
-from sliplens.results.grip import Hold
 
 
 def test_a_line_of_json_a_command_and_a_table_of_all(small_dataset: Dataset, tmp_path: Path, capsys):

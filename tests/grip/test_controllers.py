@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.grip import CONTROLLERS, Observation, make_controller
-from sliplens.grip.controllers import MarginLaw
+from sliplens.grip.controllers import CONTROLLERS, MarginLaw, Observation, make_controller
 from sliplens.grip.plant import PERIOD_S
 
 LATE_S = 2.0

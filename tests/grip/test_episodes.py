@@ -1,6 +1,6 @@
 """Episodes: the same draws for all, readings as they were measured, loops that close, folders that go on."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,28 +14,16 @@ from sliplens.codec import load_result
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.friction import GRASP_SPREAD, Friction, SlipLearner
-from sliplens.grip import (
-    CONDITIONS,
-    Fingertip,
-    GripLoop,
-    NoEyes,
-    Plant,
-    ReadingTable,
-    RenderedEyes,
-    TableEyes,
-    draw_scripts,
-    load_readings,
-    make_controller,
-    pick_object,
-    run_episodes,
-)
 from sliplens.grip import episodes as episodes_module
-from sliplens.grip.controllers import Controller, MarginLaw
-from sliplens.grip.fingertip import MarkerField, draw_film
-from sliplens.grip.readings import FORCES_N, FRICTIONS, MARGINS
-from sliplens.grip.scripts import EPISODE_S, hand_motion
+from sliplens.grip.controllers import Controller, MarginLaw, make_controller
+from sliplens.grip.episodes import EpisodeOptions, run_episodes
+from sliplens.grip.fingertip import Fingertip, MarkerField, draw_film
+from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor
+from sliplens.grip.plant import Plant, pick_object
+from sliplens.grip.readings import FORCES_N, FRICTIONS, MARGINS, ReadingTable, load_readings
+from sliplens.grip.records import Grip
+from sliplens.grip.scripts import CONDITIONS, EPISODE_S, draw_scripts, hand_motion
 from sliplens.models import Network
-from sliplens.results.grip import Grip
 
 
 @cache
@@ -56,8 +44,11 @@ def table(network) -> ReadingTable:
 
 
 def few(controller: str | Controller, condition: str = "dry", **options: Any) -> Grip:
-    asked: dict[str, Any] = {"episodes": 40, "seed": 7, "network": shipped(), **options}
-    return run_episodes("cup", controller, condition=condition, **asked)
+    names = {item.name for item in fields(EpisodeOptions)}
+    call: dict[str, Any] = {"episodes": 40, "seed": 7, "network": shipped()}
+    call |= {name: value for name, value in options.items() if name not in names}
+    chosen = EpisodeOptions(**{name: value for name, value in options.items() if name in names})
+    return run_episodes("cup", controller, condition=condition, options=chosen, **call)
 
 
 def test_the_same_seed_gives_the_same_episodes_and_another_gives_others(monkeypatch):
@@ -114,9 +105,9 @@ def test_what_the_network_reads_of_a_fingertip_is_what_its_table_has(network, ta
 
 def test_a_network_without_errors_reads_the_truth(table):
     plant = Plant(pick_object("cup"), episodes=20)
-    eyes = TableEyes(table, fingertips=np.arange(20.0), rng=np.random.default_rng(0), error_scale=0.0)
+    eyes = TableSensor(table, fingertips=np.arange(20.0), rng=np.random.default_rng(0), error_scale=0.0)
     plant.state = replace(plant.state, force_n=np.full(20, 1.0), shear_n=np.full((20, 2), 0.3))
-    sight = eyes.look(plant.state, np.full(20, np.nan))
+    sight = eyes.measure(plant.state, np.full(20, np.nan))
     assert sight.margin == pytest.approx(0.7)
     assert sight.low == pytest.approx(0.7)
 
@@ -157,10 +148,13 @@ def test_the_loop_detects_slip_as_a_real_hold_does_and_only_where_an_object_slid
         script = {"mass_kg": weight_n / 9.81 / 1.1, "friction": friction, "friction_gap": 0.0, "pull_n": 0.0}
         script |= {"patch_factor": factor, "patch_at_s": 2.5}
         scripts = draw_scripts("cup", "dry", episodes=6, seed=1, script=script)
-        eyes = TableEyes(table, fingertips=np.arange(6.0), rng=np.random.default_rng(0))
+        eyes = TableSensor(table, fingertips=np.arange(6.0), rng=np.random.default_rng(0))
         loop = GripLoop(Plant(pick_object("cup"), episodes=6), eyes, make_controller("fixed", {"force_n": 1.5}))
         ticks = [loop.tick(scripts.world(loop.plant.state.time_s)) for _ in range(180)]
-        slip, time_s = np.array([tick.seen.slip for tick in ticks]), np.array([tick.state.time_s for tick in ticks])
+        slip, time_s = (
+            np.array([tick.observation.slip for tick in ticks]),
+            np.array([tick.state.time_s for tick in ticks]),
+        )
         # as an object leaves the table, and as the hand stops at 2 s, it swings: the load falls, as in a slip
         assert not slip[(time_s > 2.2) & (time_s < 2.5)].any()
         assert slip[time_s > 2.5].any(axis=0).all() == (factor < 1)
@@ -169,15 +163,15 @@ def test_the_loop_detects_slip_as_a_real_hold_does_and_only_where_an_object_slid
 def test_the_loop_closes_through_pixels(network):
     """A little of an episode: what is read follows what the plant does."""
     scripts = draw_scripts("cup", "dry", episodes=1, seed=0, script={"mass_kg": 0.08, "friction": 0.6})
-    eyes = RenderedEyes(network, seed=11, engine="torch")
+    eyes = RenderedSensor(network, seed=11, engine="torch")
     loop = GripLoop(Plant(pick_object("cup")), eyes, make_controller("fixed", {"force_n": 1.2}))
     ticks = [loop.tick(scripts.world(loop.plant.state.time_s)) for _ in range(3)]
-    frames = ticks[-1].sight.frames
+    frames = ticks[-1].reading.frames
     assert frames is not None
     assert np.abs(frames.astype(int) - eyes.references).max() > 30  # touched
     plant = loop.plant
     near, far = (replace(plant.state, force_n=np.array([1.2]), shear_n=np.full((1, 2), s)) for s in (0.05, 0.65))
-    reads = [eyes.look(replace(one, friction=np.full((1, 2), 0.6)), np.full(1, np.nan)) for one in (near, far)]
+    reads = [eyes.measure(replace(one, friction=np.full((1, 2), 0.6)), np.full(1, np.nan)) for one in (near, far)]
     assert np.all(reads[0].margin > reads[1].margin + 0.3)
     assert np.all(reads[1].low <= reads[1].margin)
 
@@ -193,7 +187,7 @@ def test_a_reading_comes_as_late_as_is_said():
     for latency, ticks in ((0.0, 0), (0.02, 2), (0.1, 6)):
         times.clear()
         scripts = draw_scripts("cup", "dry", episodes=1, seed=0)
-        loop = GripLoop(Plant(pick_object("cup")), NoEyes(), Note(), latency_s=latency)
+        loop = GripLoop(Plant(pick_object("cup")), None, Note(), latency_s=latency)
         after = [loop.tick(scripts.world(loop.plant.state.time_s)).state.force_n[0] for _ in range(12)]
         forces = [0.0, *map(float, after)]
         assert [force for _, force in times][ticks:] == forces[: 12 - ticks]
@@ -254,8 +248,6 @@ def test_an_interrupted_run_goes_on_to_the_same_record(tmp_path: Path, monkeypat
         ({"episodes": 0}, "0 episodes cannot be run"),
         ({"script": {"weight": 1.0}}, "an episode has no weight; choose of"),
         ({"script": {"mass_kg": 0.0}}, "mass_kg must be above 0, got 0"),
-        ({"latency_s": -1.0}, "latency and error scale must not be negative"),
-        ({"method": "guess", "rendered": True}, "there is no method named 'guess'"),
     ],
 )
 def test_what_cannot_be_run_is_told_in_a_sentence(options, told):
@@ -282,14 +274,14 @@ def pulled(friction: float, ratio: float) -> Plant:
 @pytest.mark.parametrize(("scale", "read"), [(0.0, 0.24), (1.0, 0.18)])
 def test_a_friction_that_is_told_makes_the_margin_of_the_ratio(table, scale, read):
     known, options = [Friction(0.3), Friction(0.6), Friction.between(0.3, 0.9)], {"fingertips": np.arange(3.0)}
-    eyes = TableEyes(
+    eyes = TableSensor(
         told_table(table),
         rng=np.random.default_rng(0),
         error_scale=scale,
         learners=[SlipLearner(one) for one in known],
         **options,
     )
-    sight = eyes.look(pulled(0.3, 0.24).state, np.full(3, np.nan))
+    sight = eyes.measure(pulled(0.3, 0.24).state, np.full(3, np.nan))
     for row, friction in enumerate(known):
         values, weights = friction.nodes
         # the table is even in the logarithm of the friction between its nodes, and 0.3 is one
@@ -300,16 +292,16 @@ def test_a_friction_that_is_told_makes_the_margin_of_the_ratio(table, scale, rea
 
 
 def test_a_slip_narrows_what_was_told_of_friction(table):
-    eyes = TableEyes(
+    eyes = TableSensor(
         told_table(table),
         fingertips=np.zeros(3),
         rng=np.random.default_rng(0),
         learners=[SlipLearner(Friction.between(0.1, 0.9)) for _ in range(3)],
     )
     plant, none = pulled(0.3, 0.29), np.full(3, np.nan)
-    before = eyes.look(plant.state, none)
+    before = eyes.measure(plant.state, none)
     plant.state = replace(plant.state, time_s=0.1)
-    after = eyes.look(plant.state, np.array([0.05, np.nan, np.nan]))
+    after = eyes.measure(plant.state, np.array([0.05, np.nan, np.nan]))
     # it slipped at what was read: there is no margin left, as far as that can be told
     assert after.margin[0].mean() < 0.1 < before.margin[0].mean()
     assert after.margin[1:] == pytest.approx(before.margin[1:])
@@ -317,10 +309,10 @@ def test_a_slip_narrows_what_was_told_of_friction(table):
 
 def test_friction_told_shapes_what_is_read_through_pixels(ratio_run: Path):
     network, known = sl.load(ratio_run), Friction(0.4)
-    eyes = RenderedEyes(network, seed=11, engine="torch", learner=SlipLearner(known))
+    eyes = RenderedSensor(network, seed=11, engine="torch", learner=SlipLearner(known))
     plant = Plant(pick_object("cup"))
     plant.state = replace(plant.state, force_n=np.ones(1), shear_n=np.full((1, 2), 0.2))
-    sight = eyes.look(plant.state, np.full(1, np.nan))
+    sight = eyes.measure(plant.state, np.full(1, np.nan))
     assert sight.frames is not None
     inputs = torch.cat([network.encode(f[None], r) for f, r in zip(sight.frames, eyes.references, strict=True)])
     assert sight.margin[0] == pytest.approx(network.estimate(inputs, friction=known).margin, abs=1e-4)
@@ -363,12 +355,12 @@ def test_what_slips_taught_counts_in_the_grasps_that_follow_only_of_the_same_obj
 
 
 def test_frames_of_a_grip_are_read_in_order_through_pixels(network: Network):
-    eyes = [RenderedEyes(network, seed=11, engine="torch", sequence=way) for way in (False, True)]
+    eyes = [RenderedSensor(network, seed=11, engine="torch", sequence=way) for way in (False, True)]
     followers, differ = [network.follow() for _ in range(2)], list[float]()
     plant = Plant(pick_object("cup"))
     for step in range(3):
         state = replace(plant.state, time_s=0.1 * step, force_n=np.ones(1), shear_n=np.full((1, 2), 0.1 + 0.1 * step))
-        one, several = (eye.look(state, np.full(1, np.nan)) for eye in eyes)
+        one, several = (eye.measure(state, np.full(1, np.nan)) for eye in eyes)
         assert one.frames is not None
         assert several.frames is not None
         np.testing.assert_array_equal(one.frames, several.frames)
@@ -384,6 +376,8 @@ def test_frames_of_a_grip_are_read_in_order_through_pixels(network: Network):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
+        ({"latency_s": -1.0}, "latency and error scale must not be negative"),
+        ({"method": "guess", "rendered": True}, "there is no method named 'guess'"),
         ({"grasps": 0}, "0 grasps of an object cannot be run"),
         ({"sequence": True}, "looked up have no order"),
         ({"sequence": True, "rendered": True, "friction": 0.6}, "leave out one of them"),

@@ -102,9 +102,9 @@ def test_a_late_answer_never_counts_as_that_of_another_line(numbered):
     with pytest.raises(GripperError, match="did not answer"):
         gripper.set_force(2.0)
     late.set()
-    gripper._timeout_s = 2.0
+    gripper.timeout_s = 2.0
     for force_n in (3.0, 4.0):
-        assert gripper._ask(f"F {force_n:.3f}").force_n == force_n
+        assert gripper.ask(f"F {force_n:.3f}").force_n == force_n
     gripper.close()
     fake.close()
 
@@ -278,7 +278,7 @@ class FakeRosGripper:
         self.address, self.heard = f"zenoh:hand@{address}", []
         self.state: bytes | None = self.joints(effort=[1.0, 2.0], position=[0.5, 0.04])
         self._session, self._stop = session, threading.Event()
-        self._names = {f"hand/{one.topic}": one.kind for row in ROS_MESSAGES.values() for one in (row.force, row.width)}
+        self._names = {f"hand/{one.topic}": one.kind for row in ROS_MESSAGES.values() for one in row}
         self._ears = session.declare_subscriber("hand/**", self._hear)
         self._thread = threading.Thread(target=self._tell, daemon=True)
         self._thread.start()
@@ -342,24 +342,24 @@ def test_a_gripper_of_ros_that_misbehaves_is_told_in_a_sentence_and_held(hand):
     gripper = open_gripper(hand.address, timeout_s=2.0)
     assert isinstance(gripper, RosGripper)
     for state, told in (
-        (b"\x00\x01", "tells no force and width"),
-        (b"", "tells no force and width"),
-        (hand.joints(position=[0.04, 0.04]), "tells no force and width"),
-        (hand.joints(effort=[math.nan, 1.0], position=[0.04, 0.04]), "tells nan N"),
+        (b"\x00\x01", "has no force and width"),
+        (b"", "has no force and width"),
+        (hand.joints(position=[0.04, 0.04]), "has no force and width"),
+        (hand.joints(effort=[math.nan, 1.0], position=[0.04, 0.04]), "has nan N"),
     ):
         hand.state = state
-        wait_until(lambda state=state: gripper._told == state)
+        wait_until(lambda state=state: gripper._message == state)
         with pytest.raises(GripperError, match=told):
             gripper.read_state()
-    gripper._timeout_s, hand.state = SOON_S, None
-    wait_until(lambda: time.monotonic() - gripper._told_s > SOON_S)
-    with pytest.raises(GripperError, match="tells nothing of itself on /hand/joint_states"):
+    gripper.timeout_s, hand.state = SOON_S, None
+    wait_until(lambda: time.monotonic() - gripper._message_s > SOON_S)
+    with pytest.raises(GripperError, match="sends no state on /hand/joint_states"):
         gripper.set_force(1.0)
     with GuardedGripper(gripper, ceiling_n=4.0, watchdog_s=SOON_S) as guarded:
         guarded.set_force(1e9)  # told to a gripper that has fallen silent, and again until it speaks
         assert guarded.holding
         wait_until(lambda: len(hand.heard) > 3)
-        gripper._timeout_s, hand.state = 2.0, hand.joints(effort=[4.0, 0.0], position=[0.04, 0.0])
+        gripper.timeout_s, hand.state = 2.0, hand.joints(effort=[4.0, 0.0], position=[0.04, 0.0])
         wait_until(lambda: guarded.failure is None)
     assert {told for _, _, told in hand.heard} == {1.0, 4.0}
 
@@ -376,7 +376,7 @@ def test_no_force_is_told_to_ros_as_almost_none_for_0_may_mean_without_a_limit(h
 def test_a_gripper_of_ros_that_was_never_heard_is_told(hand, monkeypatch):
     monkeypatch.setattr("sliplens.grip.gripper._FIRST_STATE_S", 0.05)
     hand.state = None
-    with pytest.raises(GripperError, match="tells nothing of itself"):
+    with pytest.raises(GripperError, match="sends no state"):
         open_gripper(hand.address)
     with pytest.raises(InputError, match="no kind of gripper messages named 'morse'; choose one of gripper-command"):
         open_gripper(hand.address, messages="morse")

@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from sliplens.errors import ContactError
-from sliplens.grip import OBJECTS, GripperModel, Plant, World, least_force
-from sliplens.grip.plant import GRAVITY_M_S2, PERIOD_S
+from sliplens.grip.plant import (
+    GRAVITY_M_S2,
+    OBJECTS,
+    PERIOD_S,
+    GripperModel,
+    Plant,
+    World,
+    least_force,
+)
 
 CUP = OBJECTS["cup"]
 

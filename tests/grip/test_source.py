@@ -8,7 +8,7 @@ import pytest
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.grip.controllers import MarginLaw
-from sliplens.grip.source import GripSource, Held, open_grip, usual_network
+from sliplens.grip.source import GripSource, GripStatus, open_grip, usual_network
 from sliplens.live.contract import LiveOptions, Pace
 from sliplens.live.reading import Reading, SlipState
 from sliplens.recordings.sensor import SensorProfile
@@ -25,11 +25,13 @@ def source(monkeypatch: pytest.MonkeyPatch) -> GripSource:
     return source
 
 
-def run(source: GripSource, frames, seconds: float, *, tells: bool = True, slip: SlipState | None = None) -> list[Held]:
+def run(
+    source: GripSource, frames, seconds: float, *, tells: bool = True, slip: SlipState | None = None
+) -> list[GripStatus]:
     """Go on for a time; what is told is the true margin, as far as the fingertip is pressed."""
     course = []
     for frame in islice(frames, round(seconds * RATE_HZ)):
-        held = source.held(frame.number)
+        held = source.status(frame.number)
         assert held is not None
         course.append(held)
         if tells:
@@ -57,7 +59,7 @@ def test_it_lifts_holds_at_the_margin_aimed_at_and_answers_more_weight(source: G
 def test_it_is_careful_where_it_hears_nothing(source: GripSource):
     course = run(source, source.frames(), 5.0, tells=False)
     assert course[-1].force_n == pytest.approx(MarginLaw.safe_n, rel=0.02)
-    assert course[-1].why.startswith("no margin is read")
+    assert course[-1].why.startswith("no margin:")
 
 
 def test_a_reading_that_stays_the_same_grows_old(source: GripSource):
@@ -65,7 +67,7 @@ def test_a_reading_that_stays_the_same_grows_old(source: GripSource):
     run(source, frames, 4.0)
     course = run(source, frames, 20.0, tells=False)
     assert course[-1].force_n == pytest.approx(MarginLaw.safe_n, rel=0.02)
-    assert course[-1].why.startswith("no margin is read")
+    assert course[-1].why.startswith("no margin:")
 
 
 def test_a_slip_that_the_markers_tell_is_answered_once(source: GripSource):

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sliplens.grip.controllers import Controller, Holder, MarginGrip, MarginLaw
+from sliplens.grip.controllers import Controller, MarginGrip, MarginLaw
 from sliplens.grip.gripper import GuardedGripper, LineGripper
+from sliplens.grip.holder import Holder
 from sliplens.grip.plant import PERIOD_S
 from sliplens.live.reading import Reading
 
@@ -101,21 +102,22 @@ def hold(lie: str, controller: str | Controller = "margin") -> LyingHold:
         for step in range(round(OVER_S / PERIOD_S)):
             now_s = step * PERIOD_S
             gripper.lies = LIES_S <= now_s < ENDS_S
+            line.timeout_s = 0.02 if gripper.lies else 2.0  # a busy machine is no lie
             gripper.force_n += (gripper.command_n - gripper.force_n) * (1 - np.exp(-PERIOD_S / 0.05))
             pull_n = 0.0 if now_s < 1 else 0.6 if now_s < LIES_S + 0.3 else 0.8
             margin = max(0.0, 1 - pull_n / (FRICTION * max(gripper.force_n, 1e-9)))
             read = 0.5 + 0.5 * margin  # as a network reads that sees no friction
-            holder.hear(Reading(number=step, time_s=now_s, captured_s=now_s, margin=read), taken_s=now_s)
+            holder.update_reading(Reading(number=step, time_s=now_s, captured_s=now_s, margin=read), taken_s=now_s)
             try:
                 force_n, trouble = guard.read_state().force_n, None
             except Exception as error:  # as `hold_grip` takes it
                 force_n, trouble = np.nan, str(error)
-            answer = holder.answer(now_s, force_n)
+            answer = holder.grip_force(now_s, force_n)
             guard.set_force(answer.command_n)
             for words in (guard.failure, trouble, answer.trouble):
                 if words is not None:
                     troubles[words] = None
-            law = holder._controller
+            law = holder.controller
             acted = float(law.acted[0]) if isinstance(law, MarginGrip) else read
             rows.append((now_s, answer.command_n, acted, gripper.force_n))
     time_s, command_n, acted, force_n = np.array(rows).T

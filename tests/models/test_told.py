@@ -93,7 +93,7 @@ def test_a_network_of_two_answers_takes_friction(networks: dict[str, Network], i
     assert interval is not None
     assert np.all(ratio_interval[0] <= ratio_interval[1])
     assert np.all((interval[0] >= 0) & (interval[1] <= 1))
-    assert str(exact.friction) == "0.6, told exactly"
+    assert str(exact.friction) == "0.6, exact"
     again = trained.estimate(images, friction="0.6")
     np.testing.assert_array_equal(exact.margin, again.margin)
     assert np.all((exact.margin >= 0) & (exact.margin <= 1))

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from limit import margin_bound
+
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, Nuisances, SimulationRecipe, plan_trials
 from sliplens.simulation.intervention import (

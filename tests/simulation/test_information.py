@@ -5,8 +5,8 @@ from typing import cast
 
 import numpy as np
 import pytest
-
 from limit import margin_bound, sequence_bound
+
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, Nuisances
 from sliplens.simulation.geometry import FlatPad

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from realism.scene import nominal_unit
+
 from sliplens.errors import InputError
 from sliplens.files import output_folder
 from sliplens.recordings import Dataset, Recording, load_dataset

@@ -6,7 +6,6 @@ markers 0.5 px, colours 12 grey levels.
 
 import numpy as np
 import pytest
-
 from realism.markers import fit_crescents, read_table, rms, track
 from realism.measures import colour_errors, correlations, top_over_bottom
 from realism.scene import SEEN, read_real, simulate

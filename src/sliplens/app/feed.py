@@ -22,7 +22,7 @@ from sliplens.explainers.attribution import CLOSE, Attribution
 from sliplens.explainers.occlusion import marker_regions, to_network_px
 from sliplens.explainers.table import RECOMMENDED_METHOD, explain
 from sliplens.files import to_builtins
-from sliplens.grip.source import GripSource, Held
+from sliplens.grip.source import GripSource, GripStatus
 from sliplens.images import encode_jpeg
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
@@ -140,7 +140,7 @@ class Update:
     """Time of the message, as `time.monotonic` counts."""
     reading: Reading | None
     words: ReadingWords | None
-    grip: Held | None
+    grip: GripStatus | None
     """State of a simulated gripper."""
     points: tuple[Point, ...]
     """Readings since the message before."""
@@ -196,7 +196,7 @@ class Feed:
         """Clients that may connect, by the name in the address of their socket."""
         self.reading: Reading | None = None
         """Newest reading."""
-        self.grip: Held | None = None
+        self.grip: GripStatus | None = None
         """State of a simulated gripper at that reading."""
         self.picture: Picture | None = None
         """Newest picture."""
@@ -271,7 +271,7 @@ class Feed:
 
     def _take(self, reading: Reading, frame: LiveFrame | None) -> None:
         now_s, source = time.monotonic(), self.reader.source
-        self.grip = grip = source.held(reading.number) if isinstance(source, GripSource) else None
+        self.grip = grip = source.status(reading.number) if isinstance(source, GripSource) else None
         point = Point(
             at_s=now_s,
             margin=reading.margin,

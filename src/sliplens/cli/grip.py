@@ -13,23 +13,23 @@ from sliplens.files import DEFAULT_NETWORK
 
 @dataclass(frozen=True, kw_only=True)
 class Grip(Command):
-    """Grip, lift and hold a simulated object with the safety margin in the loop, and tell what became of it.
+    """Grip, lift and hold a simulated object with the safety margin in the loop.
 
-    One episode is closed through pixels: both fingertips are filmed, read by the network, and the force answers. It is
-    written as a data set with both fingertips, a clip, and a page with force, margin, slip and map. Of more episodes
-    the readings are looked up in the network's measured errors, dozens a second. Interrupted, it goes on.
+    One episode is closed through pixels: both fingertips are drawn and predicted by the network, which sets the force.
+    It is written as a data set with both fingertips, a clip, and a page with force, margin, slip and map. For more
+    episodes, predictions are looked up in the network's measured errors, dozens a second. An interrupted run goes on.
     """
 
     output: Output
     """Folder to make; the page is report.html in it."""
     object: Literal["cup", "egg", "berries"] = "cup"
-    """What is held."""
+    """Object to grip."""
     controller: str = "margin"
     """fixed, assumed-friction, margin, proportional, reflex or oracle, or one of an installed package."""
     condition: str = "dry"
-    """What happens: dry, wet, drifting, unknown, patch (a wet patch at 2.5 s), jolt, poured or lamp (one goes out)."""
+    """Events: dry, wet, drifting, unknown, patch (a wet patch at 2.5 s), jolt, poured or lamp (one goes out)."""
     episodes: int = 1
-    """How many, each drawn anew."""
+    """Number of episodes."""
     rendered: bool | None = None
     """Close the loop through pixels; if not given, for a single episode."""
     network: str = DEFAULT_NETWORK
@@ -41,9 +41,9 @@ class Grip(Command):
     friction: float | None = None
     """Coefficient of friction at the beginning; drawn if not given."""
     told_friction: Annotated[str | None, tyro.conf.arg(metavar="MU|LOW..HIGH|MU+-SD|each")] = None
-    """What a network that tells F_t / F_n is told of it: 0.62, 0.3..0.9, or each for that of each episode."""
+    """Friction that predictions of F_t / F_n use: 0.62, 0.3..0.9, or each for that of each episode."""
     grasps: int = 1
-    """How many times each object is gripped, one grasp after another."""
+    """Number of grasps of each object, one after another."""
     same_object: SameObject = False
     sequence: InOrder = False
     pull: float | None = None
@@ -62,7 +62,7 @@ class Grip(Command):
     def run(self) -> None:
         """Run the episodes, and draw the page."""
         from sliplens.cli.report import Report
-        from sliplens.grip import run_episodes
+        from sliplens.grip.episodes import EpisodeOptions, run_episodes
 
         rendered = self.episodes == 1 if self.rendered is None else self.rendered
         script = {
@@ -76,12 +76,17 @@ class Grip(Command):
         }
         grip = self.call(
             run_episodes,
-            rendered=rendered,
+            options=EpisodeOptions(
+                rendered=rendered,
+                friction=self.told_friction,
+                grasps=self.grasps,
+                same_object=self.same_object,
+                sequence=self.sequence,
+                latency_s=self.latency,
+                method=self.method if rendered and self.method != "none" else None,
+            ),
             script={name: value for name, value in script.items() if value is not None},
             settings=dict(map(constant, self.set)),
-            friction=self.told_friction,
-            latency_s=self.latency,
-            method=self.method if rendered and self.method != "none" else None,
             out=self.output / "grip",
         )
         table = grip.episodes
@@ -95,15 +100,15 @@ class Grip(Command):
         ]
         print_table(f"{self.controller} on a {self.object}, {self.condition}", ("", ""), rows)
         if self.grasps > 1:
-            by_grasp = [table.where(table.grasp == one) for one in range(1, self.grasps + 1)]
             rows = [
                 (
-                    f"{number}",
-                    f"{int(one.dropped.sum())} of {len(one)}",
-                    f"{100 * one.force_excess.mean():.0f} %",
-                    f"{int((one.known_friction > 0).sum())} of {len(one)}",
+                    f"{grasp}",
+                    f"{int(part.dropped.sum())} of {len(part)}",
+                    f"{100 * part.force_excess.mean():.0f} %",
+                    f"{int((part.known_friction > 0).sum())} of {len(part)}",
                 )
-                for number, one in enumerate(by_grasp, start=1)
+                for grasp in range(1, self.grasps + 1)
+                for part in [table.where(table.grasp == grasp)]
             ]
             columns = ("grasp", "dropped", "over the least that holds", "friction known")
             print_table("Grasp after grasp", columns, rows)
@@ -111,7 +116,7 @@ class Grip(Command):
 
 
 def constant(text: str) -> tuple[str, float]:
-    """Name and value of a constant."""
+    """Parse the name and value of a constant."""
     name, _, value = text.partition("=")
     try:
         return name, float(value)

@@ -26,28 +26,28 @@ _SOURCES = "One source or two, a fingertip each: grip (simulated), number of a c
 
 @dataclass(frozen=True, kw_only=True)
 class Hold(Command):
-    """Hold with a real gripper: its force answers what its fingertips read, and nothing is loosened blindly.
+    """Hold with a real gripper: its force follows the margins of its fingertips, and is never loosened blindly.
 
-    Ends with Ctrl-C, after --seconds or with the source; the gripper keeps the force that it was told last.
+    Ends with Ctrl-C, after --seconds or with the source; the gripper keeps the last commanded force.
     """
 
     sources: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE [SOURCE]", help=_SOURCES)]
     gripper: str | None = None
     """tcp://HOST:PORT or /dev/ttyUSB0 (lines of ASCII), zenoh:KEY (ROS 2), or simulated (that of the source grip)."""
     dry_run: bool = False
-    """Send nothing: show what would be sent, as if it were obeyed at once."""
+    """Send nothing: show the commands, as if the gripper obeyed at once."""
     controller: str = "margin"
     """margin, proportional, reflex or fixed, or one of an installed package."""
     set: tuple[str, ...] = ()
     """Constants of the controller to change, such as --set target=0.4 least_n=1."""
     ceiling: float = 4.0
-    """Grip force that is never passed, in newtons."""
+    """Largest grip force, in newtons."""
     watchdog: float = 0.2
-    """Time without a command after which the gripper is told the last force again, in seconds."""
+    """Time without a command after which the last force is repeated, in seconds."""
     messages: str = "gripper-command"
-    """What a gripper of ROS 2 takes: gripper-command, numbers or controllers."""
+    """Messages of a gripper of ROS 2: gripper-command, numbers or controllers."""
     joint: str | None = None
-    """Joint of a gripper of ROS 2 that tells width and force; the first if not given."""
+    """Joint of a gripper of ROS 2 that measures width and force; the first if not given."""
     network: str | None = None
     """Folder or name of a trained network. If not given, that of the profile; chromatouch-pair for what is
     simulated, else none."""
@@ -61,11 +61,11 @@ class Hold(Command):
     seconds: float | None = None
     """Time after which it ends."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None
-    """Folder to keep what was told, measured and read in; its steps.parquet has a row a command."""
+    """Folder to save commands, measurements and margins in; its steps.parquet has a row a command."""
     json: bool = False
-    """Print a line of JSON a command, with all that was read; else a line a second is printed."""
+    """Print a line of JSON a command, with the readings; else a line a second."""
     engine: Literal["auto", "torch", "openvino"] = "auto"
-    """What runs the network; auto is the fastest at hand."""
+    """Engine that runs the network; auto is the fastest that is installed."""
     device: Device = "cpu"
 
     def run(self) -> None:
@@ -76,7 +76,7 @@ class Hold(Command):
 
         gripper = "dry-run" if self.dry_run else self.gripper
         if gripper is None:
-            raise InputError("no gripper is named; name one with --gripper, or see what is sent with --dry-run")
+            raise InputError("no gripper is named; name one with --gripper, or see the commands with --dry-run")
         settings = dict(map(constant, self.set))
         make_controller(self.controller, settings)  # refused before a network is made ready
         with ExitStack() as stack:
@@ -129,15 +129,15 @@ class _Steps:
     """Prints each command as a line of JSON, or one a second, and each trouble and doubt once."""
 
     def __init__(self, readers: "Sequence[LiveReader]", *, json: bool) -> None:
-        self._readers, self._json, self._told_s, self._told = readers, json, -1.0, set[str]()
+        self._readers, self._json, self._printed_s, self._printed = readers, json, -1.0, set[str]()
 
     def __call__(self, step: "HoldStep") -> None:
         for words in (step.trouble, *(doubt for reader in self._readers for doubt in reader.doubts)):
-            if words is not None and words not in self._told:
-                self._told.add(words)
+            if words is not None and words not in self._printed:
+                self._printed.add(words)
                 say(words, aside=True)
         if self._json:
             print(msgspec.json.encode(to_builtins(step)).decode(), flush=True)
-        elif time.monotonic() - self._told_s >= 1:
-            self._told_s = time.monotonic()
+        elif time.monotonic() - self._printed_s >= 1:
+            self._printed_s = time.monotonic()
             say(str(step))

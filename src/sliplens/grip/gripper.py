@@ -1,8 +1,7 @@
-"""Out to a real gripper: lines over serial or TCP, topics of ROS 2, and a guard that nothing gets past.
+"""Drivers of real grippers, by lines over serial or TCP or topics of ROS 2, and a guard in front of them.
 
-A guard stands between whatever controls and the gripper. It cuts every force at a ceiling, and when commands stop
-coming it holds: the last force is told again, and nothing is opened. A dry run notes what would be sent and sends
-nothing.
+The guard cuts every force at a ceiling. When no commands come it holds: it repeats the last force, and never opens. A
+dry run records commands and sends nothing.
 """
 
 import math
@@ -26,21 +25,21 @@ from sliplens.extras import Table
 from sliplens.live.sinks import ZENOH_ADDRESS, ZenohRos, parse_zenoh
 
 _ANSWER_BYTES = 200
-"""Longer lines are no answers."""
+"""Longest answer; longer lines are none."""
 _SILENCE_S = 2.0
-"""Time after which a serial gripper without numbers is taken to answer no more what it was asked."""
+"""Time after which a serial gripper without numbers sends no more late answers."""
 
 
 class GripperError(SliplensError):
-    """A gripper that does not answer, or answers something else than its protocol has."""
+    """A gripper does not answer, or not by its protocol."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GripperState:
-    """What a gripper tells of itself."""
+    """Measured force and width of a gripper."""
 
     force_n: float
-    """Grip force measured, in newtons."""
+    """Grip force, in newtons."""
     width_m: float
     """Opening between the fingers."""
 
@@ -58,24 +57,24 @@ class Gripper(Protocol):
         ...
 
     def read_state(self) -> GripperState:
-        """Measured force and width."""
+        """Measure force and width."""
         ...
 
     def close(self) -> None:
-        """Let go of the connection, not of the object."""
+        """Close the connection; the grip stays."""
         ...
 
 
 class LineGripper:
-    """A gripper spoken to in lines of ASCII, over a serial port or TCP.
+    """A gripper with a protocol of ASCII lines, over a serial port or TCP.
 
-    `F 1.250` sets the force in newtons, `W 0.0400` the width in metres, `S` asks; each is answered by one line,
-    `OK force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`, and so is a connection
-    that breaks; it is opened again with the next line.
+    `F 1.250` sets the force in newtons, `W 0.0400` the width in metres, `S` asks; the answer to each is one line, `OK
+    force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`, and so is a connection that
+    breaks; the next line opens it again.
 
     The first line of a connection is `S #n`, n = 1 at first. A gripper that ends its answer with `#n` gets a number
     with every line and repeats it: an answer with another number is late, and thrown away. Any other gripper gets plain
-    lines. Their late answers cannot be matched to a line, so the connection is closed where one does not come in time,
+    lines. Its late answers cannot be matched to a line, so the connection is closed where one does not come in time,
     and a serial line is then left alone for `silence_s`.
 
     Parameters
@@ -83,38 +82,39 @@ class LineGripper:
     connect
         Opens the socket, or file of a serial device, that carries the lines; see `open_gripper`.
     timeout_s
-        Time, in seconds, within which an answer has to come.
+        Longest time until an answer, in seconds.
     silence_s
-        Time, in seconds, after which an answer of a gripper without numbers that is late no longer comes on a new
-        connection; 0 where the old connection takes it along, as TCP does.
+        Time, in seconds, after which a late answer of a gripper without numbers does not come any more on a new
+        connection; 0 where the answer ends with the old connection, as in TCP.
     """
 
     def __init__(
         self, connect: Callable[[], socket.socket | FileIO], *, timeout_s: float = 0.1, silence_s: float = 0.0
     ) -> None:
-        self._connect, self._timeout_s, self._silence_s = connect, timeout_s, silence_s
+        self._connect, self.timeout_s, self._silence_s = connect, timeout_s, silence_s
         self._wire, self._broken, self._silent_until_s = connect(), False, -math.inf
         self._numbered: bool | None = None
-        """Whether the gripper repeats numbers; None before it was asked."""
+        """True where the gripper repeats numbers; None before the first line."""
         self._number, self._rest = 0, b""
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
-        self._ask(f"F {force_n:.3f}")
+        self.ask(f"F {force_n:.3f}")
 
     def set_width(self, width_m: float) -> None:
         """Open to so many metres."""
-        self._ask(f"W {width_m:.4f}")
+        self.ask(f"W {width_m:.4f}")
 
     def read_state(self) -> GripperState:
-        """Measured force and width."""
-        return self._ask("S")
+        """Measure force and width."""
+        return self.ask("S")
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
         self._wire.close()
 
-    def _ask(self, line: str) -> GripperState:
+    def ask(self, line: str) -> GripperState:
+        """Send a line, and return its answer."""
         if self._broken:
             if (wait_s := self._silent_until_s - time.monotonic()) > 0:
                 raise GripperError(f"the gripper answers late and without numbers; it is left alone for {wait_s:.1f} s")
@@ -128,9 +128,9 @@ class LineGripper:
             # late answers come with their number, if they are no endless line
             if not self._numbered or len(self._rest) >= _ANSWER_BYTES:
                 self._break(silence_s=self._silence_s)
-            heard = f", it sent {error}" if str(error) else ""
+            sent = f", it sent {error}" if str(error) else ""
             raise GripperError(
-                f"the gripper did not answer {line!r} in time{heard}; check its cable and power"
+                f"the gripper did not answer {line!r} in time{sent}; check its cable and power"
             ) from None
         except (OSError, ValueError) as error:
             self._break()
@@ -138,7 +138,7 @@ class LineGripper:
         if self._numbered:
             answer = answer[:-1]
         if answer[0] == "ERR":
-            raise GripperError(f"the gripper refused {line!r}: {' '.join(answer[1:]) or 'no reason told'}")
+            raise GripperError(f"the gripper refused {line!r}: {' '.join(answer[1:]) or 'no reason given'}")
         try:
             force_n, width_m = map(float, answer[1:])
         except ValueError:
@@ -150,34 +150,33 @@ class LineGripper:
         return GripperState(force_n=force_n, width_m=width_m)
 
     def _exchange(self, line: str, *, numbered: bool) -> list[str]:
-        """Send a line; give the words of its answer. What was sent for no line, or for one before, is passed over."""
-        ends_s = time.monotonic() + self._timeout_s
-        heard = ""
+        """Send a line, and return the words of its answer; lines that answer none, or an earlier one, are dropped."""
+        ends_s, text = time.monotonic() + self.timeout_s, ""
         if numbered:
             self._number += 1
             line = f"{line} #{self._number}"
         else:
             while self._rest or self._ready(0.0):
-                self._line(ends_s)
+                self._read_line(ends_s)
         os.write(self._wire.fileno(), f"{line}\n".encode("ascii"))
         while True:
             try:
-                words = (heard := self._line(ends_s)).split()
+                words = (text := self._read_line(ends_s)).split()
             except TimeoutError:
-                raise TimeoutError(repr(heard) if heard else "") from None
-            # an answer with another number is one to an earlier line
+                raise TimeoutError(repr(text) if text else "") from None
+            # an answer with another number belongs to an earlier line
             other = words[-1:] != [f"#{self._number}"]
             late = other and (self._numbered or (numbered and "".join(words[-1:]).startswith("#")))
             if words[:1] in (["OK"], ["ERR"]) and not late:
                 return words
 
     def _break(self, *, silence_s: float = 0.0) -> None:
-        """Close the connection, and with it all answers that are still to come."""
+        """Close the connection, and with it drop all answers that are still to come."""
         self._broken, self._silent_until_s = True, time.monotonic() + silence_s
         self._wire.close()
 
-    def _line(self, ends_s: float) -> str:
-        """Next whole line; `TimeoutError` where none comes, or one without an end."""
+    def _read_line(self, ends_s: float) -> str:
+        """Read the next whole line; `TimeoutError` where none comes, or one without an end."""
         while b"\n" not in self._rest:
             if len(self._rest) >= _ANSWER_BYTES or not self._ready(ends_s - time.monotonic()):
                 raise TimeoutError
@@ -189,36 +188,28 @@ class LineGripper:
         return line.decode("ascii", errors="replace").strip()
 
     def _ready(self, wait_s: float) -> bool:
-        """Whether there is something to read within so many seconds."""
+        """Wait at most so many seconds for bytes; True where some are there."""
         return bool(select.select([self._wire.fileno()], [], [], max(0.0, wait_s))[0])
 
 
 @dataclass(frozen=True, kw_only=True)
 class RosCommand:
-    """What tells a gripper of ROS 2 a force or a width."""
+    """Message by which a gripper of ROS 2 takes a force or a width."""
 
     topic: str
-    """Below the key of the gripper."""
+    """Topic, below the key of the gripper."""
     kind: str
-    """Type of its messages."""
+    """Type of the message."""
     fields: Callable[[float], dict[str, Any]]
-    """Fields of the message of a force in newtons, or of a width in metres."""
+    """Returns the fields of the message for a force in newtons, or a width in metres."""
     definition: str | None = None
-    """What the `.msg` file of a type has that ROS itself does not bring."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class RosMessages:
-    """Messages that a gripper of ROS 2 takes."""
-
-    force: RosCommand
-    width: RosCommand
+    """Text of the `.msg` file of a type that ROS itself does not bring."""
 
 
 _LEAST_EFFORT_N = 0.01
-"""Told in place of no force: to some drivers an effort of 0 is one without a limit."""
+"""Effort in place of 0, which some drivers take for no limit."""
 _MOVING_EFFORT_N = 2.0
-"""Told with a width: it moves open fingers, and crushes little that is between them."""
+"""Effort sent with a width: it moves open fingers, and crushes little between them."""
 
 
 def _number(topic: str) -> RosCommand:
@@ -226,42 +217,42 @@ def _number(topic: str) -> RosCommand:
 
 
 def _controller(topic: str) -> RosCommand:
-    # as the forward controllers of ros2_control take it: one number a joint
+    # forward controllers of ros2_control take a number a joint
     kind, layout = "std_msgs/msg/Float64MultiArray", SimpleNamespace(dim=[], data_offset=0)
     return RosCommand(topic=topic, kind=kind, fields=lambda value: {"layout": layout, "data": np.array([value])})
 
 
-def _command(fields: Callable[[float], dict[str, Any]]) -> RosCommand:
-    kind, definition = "control_msgs/msg/GripperCommand", "float64 position\nfloat64 max_effort"
-    return RosCommand(topic="command", kind=kind, fields=fields, definition=definition)
-
-
+_COMMAND = partial(
+    RosCommand,
+    topic="command",
+    kind="control_msgs/msg/GripperCommand",
+    definition="float64 position\nfloat64 max_effort",
+)
 ROS_MESSAGES = Table(
     "kind of gripper messages",
     "sliplens.gripper_messages",
     {
         # closed as far as the effort brings it
-        "gripper-command": RosMessages(
-            force=_command(lambda force_n: {"position": 0.0, "max_effort": max(force_n, _LEAST_EFFORT_N)}),
-            width=_command(lambda width_m: {"position": width_m, "max_effort": _MOVING_EFFORT_N}),
+        "gripper-command": (
+            _COMMAND(fields=lambda force_n: {"position": 0.0, "max_effort": max(force_n, _LEAST_EFFORT_N)}),
+            _COMMAND(fields=lambda width_m: {"position": width_m, "max_effort": _MOVING_EFFORT_N}),
         ),
-        "numbers": RosMessages(force=_number("force"), width=_number("width")),
-        "controllers": RosMessages(
-            force=_controller("effort_controller/commands"), width=_controller("position_controller/commands")
-        ),
+        "numbers": (_number("force"), _number("width")),
+        "controllers": (_controller("effort_controller/commands"), _controller("position_controller/commands")),
     },
 )
-"""Messages of grippers of ROS 2 by name; an installed package adds its own by `sliplens.gripper_messages`."""
+"""Messages of grippers of ROS 2 by name, for a force and for a width; an installed package adds its own by the entry
+point `sliplens.gripper_messages`."""
 _STATE_TOPIC, _STATE_KIND = "joint_states", "sensor_msgs/msg/JointState"
 _FIRST_STATE_S = 3.0
 
 
 class RosGripper:
-    """A gripper of ROS 2, told by topics over Zenoh; its state is `sensor_msgs/msg/JointState` on `joint_states`.
+    """A gripper of ROS 2, by topics over Zenoh; its state is `sensor_msgs/msg/JointState` on `joint_states`.
 
     The joint's position is the width in metres and its effort the force in newtons. Topics confirm nothing: a gripper
-    that has told no state for `timeout_s` is a `GripperError` after each command, though the command was sent, and so
-    is a state that cannot be read.
+    without a state for `timeout_s` is a `GripperError` after each command, though the command was sent, and so is a
+    state that cannot be decoded.
 
     Parameters
     ----------
@@ -274,7 +265,7 @@ class RosGripper:
     joint
         Joint of the gripper among those in its state; the first if None.
     timeout_s
-        Age, in seconds, from which a state says nothing of now.
+        Largest age of a state, in seconds.
     """
 
     def __init__(
@@ -286,76 +277,75 @@ class RosGripper:
         joint: str | None = None,
         timeout_s: float = 0.1,
     ) -> None:
-        row, key = ROS_MESSAGES.pick(messages), key.strip("/")
+        commands, key = ROS_MESSAGES.pick(messages), key.strip("/")
         self._ros = ZenohRos(address, purpose="a gripper of ROS 2")
-        self._topic, self._joint, self._timeout_s = f"{key}/{_STATE_TOPIC}", joint, timeout_s
-        self._told, self._told_s, self._new = b"", -math.inf, threading.Condition()
+        self._topic, self._joint, self.timeout_s = f"{key}/{_STATE_TOPIC}", joint, timeout_s
+        self._message, self._message_s, self._new = b"", -math.inf, threading.Condition()
+        self._senders: list[Callable[[float], None]] = []
         try:
-            self._senders = [(one, self._publisher(key, one)) for one in (row.force, row.width)]
-            self._ros.subscribe(self._topic, _STATE_KIND, self._hear)
+            for command in commands:
+                if command.definition is not None:
+                    self._ros.define(command.kind, command.definition)
+                send = self._ros.publisher(f"{key}/{command.topic}", command.kind)
+                self._senders.append(partial(self._send, command, send))
+            self._ros.subscribe(self._topic, _STATE_KIND, self._receive)
             self._await_state(_FIRST_STATE_S)
         except SliplensError:
             self.close()
             raise
-        except Exception as error:  # whatever Zenoh or a package's messages say
+        except Exception as error:  # whatever Zenoh or a package's messages raise
             self.close()
             raise InputError(
-                f"no gripper can be told at {key!r} ({error}); check the key and the kind of messages"
+                f"no gripper can be commanded at {key!r} ({error}); check the key and the kind of messages"
             ) from None
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
-        self._tell(0, force_n)
+        self._senders[0](force_n)
 
     def set_width(self, width_m: float) -> None:
         """Open to so many metres."""
-        self._tell(1, width_m)
+        self._senders[1](width_m)
 
     def read_state(self) -> GripperState:
-        """Measured force and width, as they were told last."""
-        told = self._await_state(self._timeout_s)
+        """Return force and width from the newest state."""
+        message = self._await_state(self.timeout_s)
         try:
-            state = self._ros.decode(told, _STATE_KIND)
+            state = self._ros.decode(message, _STATE_KIND)
             at = 0 if self._joint is None else list(state.name).index(self._joint)
             force_n, width_m = float(state.effort[at]), float(state.position[at])
-        except Exception as error:  # whatever a decoder does at bytes of anybody
+        except Exception as error:  # whatever a decoder does at foreign bytes
             raise GripperError(
-                f"/{self._topic} tells no force and width of {self._joint or 'a joint'} "
+                f"/{self._topic} has no force and width of {self._joint or 'a joint'} "
                 f"({str(error) or type(error).__name__}); it has to be {_STATE_KIND} with position and effort"
             ) from None
         if not (math.isfinite(force_n) and math.isfinite(width_m)):
-            raise GripperError(f"/{self._topic} tells {force_n:g} N and {width_m:g} m; check the gripper's sensors")
+            raise GripperError(f"/{self._topic} has {force_n:g} N and {width_m:g} m; check the gripper's sensors")
         return GripperState(force_n=force_n, width_m=width_m)
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
         self._ros.close()
 
-    def _publisher(self, key: str, command: RosCommand) -> Callable[[dict[str, Any], int], None]:
-        if command.definition is not None:
-            self._ros.define(command.kind, command.definition)
-        return self._ros.publisher(f"{key}/{command.topic}", command.kind)
-
-    def _tell(self, which: int, value: float) -> None:
-        command, send = self._senders[which]
+    def _send(self, command: RosCommand, send: Callable[[dict[str, Any], int], None], value: float) -> None:
         try:
             send(command.fields(value), time.time_ns())
         except OSError as error:
             raise GripperError(f"the gripper cannot be reached ({error}); check its bridge") from None
         self.read_state()
 
-    def _hear(self, message: bytes) -> None:
+    def _receive(self, message: bytes) -> None:
         with self._new:
-            self._told, self._told_s = message, time.monotonic()
+            self._message, self._message_s = message, time.monotonic()
             self._new.notify_all()
 
     def _await_state(self, wait_s: float) -> bytes:
         with self._new:
-            if not self._new.wait_for(lambda: time.monotonic() - self._told_s <= self._timeout_s, wait_s):
+            if not self._new.wait_for(lambda: time.monotonic() - self._message_s <= self.timeout_s, wait_s):
                 raise GripperError(
-                    f"the gripper tells nothing of itself on /{self._topic}; check its power, its driver and its bridge"
+                    f"the gripper sends no state on /{self._topic}; check its power, its driver and its bridge"
                 )
-            return self._told
+            return self._message
 
 
 def open_gripper(
@@ -369,16 +359,16 @@ def open_gripper(
         `tcp://host:port`, or a serial device such as `/dev/ttyUSB0`, whose speed was set before (`stty`); for ROS 2
         `zenoh:KEY`, or `zenoh:KEY@tcp/HOST:PORT`, by `zenoh-bridge-ros2dds` or `rmw_zenohd`.
     timeout_s
-        Time, in seconds, within which an answer has to come.
+        Longest time until an answer, in seconds.
     messages, joint
-        Of a gripper of ROS 2, as `RosGripper` takes them.
+        Of a gripper of ROS 2, as in `RosGripper`.
 
     Raises
     ------
     InputError
-        If the address is none, or packages are missing.
+        If the address is not valid, or packages are missing.
     GripperError
-        If nobody is there.
+        If no gripper answers.
     """
     if address.startswith("zenoh:"):
         key, where = parse_zenoh(address.removeprefix("zenoh:"), purpose="zenoh")
@@ -399,12 +389,12 @@ def open_gripper(
 
 
 def _open_serial(path: Path) -> FileIO:
-    """Open a serial device whose bytes come as they are."""
+    """Open a serial device that passes bytes on unchanged."""
     if not path.exists():
         raise InputError(f"there is no serial device {path}; name one, or tcp://HOST:PORT, or zenoh:KEY for ROS 2")
     try:
         import termios  # noqa: PLC0415 (not on every system)
-        import tty  # noqa: PLC0415 (the same)
+        import tty  # noqa: PLC0415 (not on every system)
     except ImportError:
         raise InputError("serial devices are opened on Linux and macOS alone; use tcp://HOST:PORT") from None
     try:
@@ -417,24 +407,24 @@ def _open_serial(path: Path) -> FileIO:
 
 
 class DryRun:
-    """A gripper that is told everything and does nothing: what would have been sent is kept in `sent`."""
+    """A gripper that does nothing and records all commands in `sent`."""
 
     def __init__(self) -> None:
         self.sent: list[str] = []
         self._force_n, self._width_m = 0.0, 0.0
 
     def set_force(self, force_n: float) -> None:
-        """Note a force in newtons."""
+        """Record a force in newtons."""
         self.sent.append(f"F {force_n:.3f}")
         self._force_n = force_n
 
     def set_width(self, width_m: float) -> None:
-        """Note a width in metres."""
+        """Record a width in metres."""
         self.sent.append(f"W {width_m:.4f}")
         self._width_m = width_m
 
     def read_state(self) -> GripperState:
-        """Force and width that were told last."""
+        """Return the last force and width."""
         return GripperState(force_n=self._force_n, width_m=self._width_m)
 
     def close(self) -> None:
@@ -442,20 +432,20 @@ class DryRun:
 
 
 class GuardedGripper:
-    """A gripper behind a guard: a ceiling that no force passes, and a watchdog that holds.
+    """A gripper behind a guard: a ceiling that no force exceeds, and a watchdog that holds.
 
-    When no command comes for `watchdog_s`, or the gripper fails at one in whatever way, the guard holds what was
-    gripped: it tells the last force again and again until commands return, and never opens. A force that is no number
-    holds, too; a width is refused while holding, for opening drops what is held.
+    When no command comes for `watchdog_s`, or the gripper fails at one in whatever way, the guard holds the object: it
+    repeats the last force until commands return, and never opens. A force of NaN holds, too; a width is refused while
+    holding, for opening drops the object.
 
     Parameters
     ----------
     gripper
-        What is guarded.
+        Gripper to guard.
     ceiling_n
-        Grip force, in newtons, that is never passed.
+        Largest grip force, in newtons.
     watchdog_s
-        Time without a command, in seconds, after which it holds.
+        Time without a command, in seconds, after which the guard holds.
     """
 
     def __init__(self, gripper: Gripper, *, ceiling_n: float = 4.0, watchdog_s: float = 0.2) -> None:
@@ -465,25 +455,25 @@ class GuardedGripper:
         self._gripper, self._ceiling, self._limit = gripper, ceiling_n, watchdog_s
         self._lock, self._stop = threading.Lock(), threading.Event()
         self._force: float | None = None
-        self._heard = time.monotonic()
+        self._command_s = time.monotonic()
         self.failure: str | None = None
-        """What the gripper last failed at; None while it takes its commands."""
+        """Last fault of the gripper; None while it takes its commands."""
         self._watch = threading.Thread(target=self._guard, name="sliplens gripper watchdog", daemon=True)
         self._watch.start()
 
     @property
     def holding(self) -> bool:
-        """Whether the guard holds, for commands stay away or the gripper fails; an open gripper holds nothing."""
-        late = time.monotonic() - self._heard > self._limit
+        """True while commands stay away or the gripper fails; an open gripper holds nothing."""
+        late = time.monotonic() - self._command_s > self._limit
         return self._force is not None and (late or self.failure is not None)
 
     def set_force(self, force_n: float) -> None:
-        """Press with so many newtons, at most the ceiling, at least none; what is no number holds."""
+        """Press with so many newtons, between 0 and the ceiling; NaN holds."""
         with self._lock:
-            self._heard = time.monotonic()
+            self._command_s = time.monotonic()
             if not math.isnan(force_n):
                 self._force = min(max(force_n, 0.0), self._ceiling)
-            self._tell()
+            self._send()
 
     def set_width(self, width_m: float) -> None:
         """Open to so many metres; refused while holding."""
@@ -492,22 +482,22 @@ class GuardedGripper:
         with self._lock:
             if self.holding:
                 raise GripperError("the guard holds the object and opens nothing; send a force first")
-            self._heard = time.monotonic()
+            self._command_s = time.monotonic()
             self._gripper.set_width(width_m)
             self._force = None  # not before: a gripper that fails at it still has to hold
 
     def read_state(self) -> GripperState:
-        """Measured force and width."""
+        """Measure force and width."""
         with self._lock:
             return self._gripper.read_state()
 
     def stop(self) -> None:
-        """Stop guarding; the gripper keeps the last force it was told."""
+        """Stop guarding; the gripper keeps the last force."""
         self._stop.set()
         self._watch.join()
 
     def close(self) -> None:
-        """Stop guarding, and let go of the connection."""
+        """Stop guarding, and close the connection."""
         self.stop()
         self._gripper.close()
 
@@ -517,23 +507,23 @@ class GuardedGripper:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _tell(self) -> None:
+    def _send(self) -> None:
         if self._force is None:
             return
         try:
             self._gripper.set_force(self._force)
             self.failure = None
-        except Exception as error:  # whatever it was: a watchdog that dies of it would hold nothing
+        except Exception as error:  # whatever it was: without the watchdog nothing holds
             self.failure = str(error) or type(error).__name__
 
     def _guard(self) -> None:
         while not self._stop.wait(self._limit / 4):
             with self._lock:
                 if self.holding:
-                    self._tell()
+                    self._send()
 
 
 __all__ = [
     "ROS_MESSAGES", "DryRun", "Gripper", "GripperError", "GripperState", "GuardedGripper", "LineGripper", "RosCommand",
-    "RosGripper", "RosMessages", "open_gripper",
+    "RosGripper", "open_gripper",
 ]  # fmt: skip

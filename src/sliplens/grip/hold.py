@@ -1,4 +1,4 @@
-"""Hold with a gripper by what one or two running fingertips read."""
+"""Hold with a gripper by the margins of one or two running fingertips."""
 
 import math
 import time
@@ -15,32 +15,23 @@ import numpy as np
 from sliplens.codec import save_result
 from sliplens.errors import InputError
 from sliplens.files import output_folder
-from sliplens.grip.controllers import (
-    STALE_S,
-    Answer,
-    AssumedFriction,
-    Controller,
-    Holder,
-    MarginGrip,
-    Oracle,
-    make_controller,
-)
+from sliplens.grip.controllers import AssumedFriction, Controller, MarginGrip, Oracle, make_controller
 from sliplens.grip.gripper import DryRun, Gripper, GripperError, GripperState, GuardedGripper, open_gripper
+from sliplens.grip.holder import STALE_S, Holder
 from sliplens.grip.plant import PERIOD_S
+from sliplens.grip.records import Hold, HoldSteps
 from sliplens.grip.source import GripSource, open_grip, usual_network
 from sliplens.live.contract import LiveOptions, LiveSource, Pace
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading, describe_reading
 from sliplens.models.checkpoint import Network
-from sliplens.results.grip import Hold, HoldSteps
 
 GRIPPERS = {
     "simulated": "the gripper of the source `grip`",
-    "dry-run": "none: what would be sent is noted",
+    "dry-run": "none: commands are recorded and not sent",
 }
-"""Names of grippers that are no address, and what they are."""
-
-_TRIES = 30  # at the first force, for half a second: a driver may not have heard of it yet
+"""Names of grippers that are no address, and their meaning."""
+_TRIES = 30  # for the first force, half a second: a driver may start late
 _STUCK_S, _STUCK_M = 2.0, 1e-4
 """Time in which a gripper without any force has to close by a tenth of a millimetre; the simulated one opens for 1.5 s
 first."""
@@ -48,23 +39,23 @@ first."""
 
 @dataclass(frozen=True, kw_only=True)
 class HoldStep:
-    """One command to a gripper, and what it answers."""
+    """One command to a gripper, and the readings behind it."""
 
     time_s: float
-    """Since the hold began."""
+    """Time since the hold began."""
     command_n: float
-    """Grip force that was told."""
+    """Commanded grip force."""
     force_n: float
-    """Grip force that the gripper measured before; NaN where it told none."""
+    """Grip force that the gripper measured before; NaN without a measurement."""
     margin: float
-    """Safety margin read, the mean of the fingertips that read; NaN where none does."""
+    """Predicted safety margin, mean of the fingertips that have one; NaN without a margin."""
     low: float
     """Lower end of its interval, in margin units."""
     slip: bool
-    """Whether the markers told a slip."""
+    """True where the markers showed a slip."""
     why: str
     trouble: str | None
-    """What the gripper failed at; None while it takes its commands and its force follows them."""
+    """Fault of the gripper; None while it takes commands and its force follows them."""
     readings: tuple[Reading | None, ...]
     """Newest reading of each fingertip; None before the first."""
 
@@ -75,8 +66,8 @@ class HoldStep:
             for number, reading in enumerate(self.readings, start=1)
             if reading is not None
         ]
-        told = f"{self.time_s:8.2f} s  {self.command_n:5.2f} N told, {self.force_n:5.2f} N measured  {self.why}"
-        return "; ".join([told, *words])
+        forces = f"{self.time_s:8.2f} s  {self.command_n:5.2f} N commanded, {self.force_n:5.2f} N measured"
+        return "; ".join([f"{forces}  {self.why}", *words])
 
 
 def hold_grip(
@@ -93,53 +84,53 @@ def hold_grip(
     out: Path | str | None = None,
     overwrite: bool = False,
 ) -> Hold:
-    """Hold with a gripper: 60 times a second a controller answers what the fingertips read with a grip force.
+    """Hold with a gripper: 60 times a second a controller sets the grip force by the fingertips' margins.
 
-    Each reading is paired with the grip force that was measured when its frame was taken. While no margin is read, and
-    when the reading stops, nothing is loosened; at the end, by Ctrl-C too, the gripper keeps the force that it was told
-    last. No force passes the ceiling, and a watchdog tells the last one again when no command comes (`GuardedGripper`).
+    Each reading is paired with the grip force at the time of its frame. Without a margin, and when the readings stop,
+    the grip is never loosened; at the end, by Ctrl-C too, the gripper keeps the last commanded force. No force exceeds
+    the ceiling, and a watchdog repeats the last command when no other comes (`GuardedGripper`).
 
     Parameters
     ----------
     source
-        Reader that was entered, or two for both fingertips of the gripper; or a source that `LiveReader` takes, or
-        `grip` for a simulated gripper (`GripSource`), read by `network` until the hold ends.
+        Entered reader, or two for both fingertips of the gripper; or a source that `LiveReader` takes, or `grip` for a
+        simulated gripper (`GripSource`), predicted by `network` until the hold ends.
     gripper
-        Gripper, or an address as `open_gripper` takes it, whose connection is closed at the end; `simulated` for the
-        gripper of the source `grip`; `dry-run` to note what would be sent, as if it were obeyed at once.
+        Gripper, or an address as in `open_gripper`, whose connection is closed at the end; `simulated` for the gripper
+        of the source `grip`; `dry-run` to record commands as if the gripper obeyed at once.
     network
-        Network that reads a source; for `grip` and `simulated` that of the package if None.
+        Network for a source; for `grip` and `simulated` that of the package if None.
     controller
-        Row of `CONTROLLERS`, or anything with `command(observation)`.
+        Row of `CONTROLLERS`, or an object with `command(observation)`.
     settings
         Constants of a row to change, in its units (newtons, seconds, shares).
     ceiling_n
-        Grip force that is never passed.
+        Largest grip force.
     watchdog_s
-        Time without a command after which the last force is told again, in seconds.
+        Time without a command after which the last force is repeated, in seconds.
     seconds
-        Time after which it ends; with the source if None.
+        Duration; with the source if None.
     on_step
-        Called after each command; what takes long delays the next, and what it raises ends the hold and is raised
-        again once the result is kept.
+        Called after each command; a slow call delays the next command, and an exception ends the hold and is raised
+        again once the result is saved.
     out
-        Folder to keep the result in; in memory alone if None.
+        Folder to save the result in; none if None.
     overwrite
-        Whether to replace a folder that is there.
+        If True, replace a folder that exists.
 
     Raises
     ------
     InputError
         If there is no such source, network, controller or gripper, or they do not go together.
     GripperError
-        If nobody answers at the gripper's address.
+        If no gripper answers at the address.
 
     Examples
     --------
     >>> import sliplens as sl
     >>> with sl.LiveReader("simulated", "chromatouch-pair", engine="torch") as reader:
     ...     hold = sl.hold_grip(reader, "dry-run", ceiling_n=3.0, seconds=0.2)
-    >>> bool((hold.steps.command_n >= 2).all())  # lifted with 2 N, whatever is read
+    >>> bool((hold.steps.command_n >= 2).all())  # lifted with 2 N, whatever the margin
     True
     >>> hold.why
     'the time is over; nothing was sent'
@@ -147,27 +138,32 @@ def hold_grip(
     if seconds is not None and not seconds > 0:
         raise InputError(f"seconds must be positive, got {seconds:g}")
     if settings and not isinstance(controller, str):
-        raise InputError("settings change a controller that is named; give your own as it is to be")
+        raise InputError("settings change a controller of the table; set those of your own where you make it")
     with ExitStack() as stack:
         address = gripper if isinstance(gripper, str) else type(gripper).__name__
         if isinstance(gripper, str) and gripper not in GRIPPERS:
             gripper = stack.enter_context(closing(open_gripper(gripper)))
-        readers = _readers(source, network, stack)
+        readers = _enter_readers(source, network, stack)
         _require_fit(make_controller(controller, settings) if isinstance(controller, str) else controller, readers)
-        if isinstance(gripper, str):
-            gripper = DryRun() if gripper == "dry-run" else _simulated(readers[0])
+        if gripper == "simulated":
+            simulated = readers[0].source
+            if not isinstance(simulated, GripSource):
+                raise InputError(f"`simulated` is {GRIPPERS['simulated']}; {simulated.name} has none")
+            gripper = simulated
+        elif isinstance(gripper, str):
+            gripper = DryRun()
         name = controller if isinstance(controller, str) else type(controller).__name__
         recipe = {"gripper": address, "controller": name, "begun_s": time.time()}  # no two holds are the same
-        kept = None
+        output = None
         if out is not None:
-            kept = output_folder(Path(out), stage="hold", config=recipe, overwrite=overwrite, resumable=False)
-        output = None if kept is None else stack.enter_context(kept)
+            folder = output_folder(Path(out), stage="hold", config=recipe, overwrite=overwrite, resumable=False)
+            output = stack.enter_context(folder)
         guard = GuardedGripper(gripper, ceiling_n=ceiling_n, watchdog_s=watchdog_s)
         stack.callback(guard.stop)
-        holding = _Holding(guard, readers, controller, settings, ceiling_n)
+        loop = HoldLoop(guard, readers, controller, settings=settings, ceiling_n=ceiling_n)
         for finger, reader in enumerate(readers):
-            stack.callback(reader.subscribe(partial(holding.hear, finger)))
-        ended, why, error = holding.run(seconds, on_step)
+            stack.callback(reader.subscribe(partial(loop.update_reading, finger)))
+        ended, why, error = loop.run(seconds, on_step)
         hold = Hold(
             sources=tuple(reader.source.name for reader in readers),
             gripper=address,
@@ -176,9 +172,9 @@ def hold_grip(
             ceiling_n=ceiling_n,
             watchdog_s=watchdog_s,
             ended=ended,
-            why=f"{why}; {'nothing was sent' if address == 'dry-run' else holding.kept}",
-            troubles=tuple(holding.troubles),
-            steps=holding.steps(),
+            why=f"{why}; {'nothing was sent' if address == 'dry-run' else loop.last_force}",
+            troubles=tuple(loop.troubles),
+            steps=loop.table(),
         )
         if output is not None:
             save_result(hold, output.folder)
@@ -187,42 +183,59 @@ def hold_grip(
     return hold
 
 
-class _Holding:
-    """The loop of a hold: measure, answer, tell."""
+class HoldLoop:
+    """Loop of a hold: measure, decide, command.
+
+    Parameters
+    ----------
+    guard
+        Gripper behind its guard.
+    readers
+        Reader of each fingertip, to know when they end.
+    controller, settings, ceiling_n
+        As in `hold_grip`.
+
+    Raises
+    ------
+    GripperError
+        If the gripper measures no force to begin with: commands without it could open what is held.
+    """
 
     def __init__(
         self,
         guard: GuardedGripper,
         readers: Sequence[LiveReader],
         controller: str | Controller,
-        settings: Mapping[str, float] | None,
+        *,
+        settings: Mapping[str, float] | None = None,
         ceiling_n: float,
     ) -> None:
         self._guard, self._readers = guard, readers
         self._readings: list[Reading | None] = [None] * len(readers)
-        self._rows: list[tuple[float, Answer, float, bool]] = []
+        self._steps: list[HoldStep] = []
         self.troubles: dict[str, None] = {}
-        """What the gripper failed at, in the order in which it first did."""
+        """Faults of the gripper, in the order in which they first came."""
         force_n = self._first_force()
-        self._closes: tuple[float, float, float] | None = None
-        """Time at which the fingers last moved without any force, and their opening then; None once they pressed."""
+        self._closing: tuple[float, float, float] | None = None
+        """Time of the last motion of the fingers without any force, and the range of their opening since; None once
+        they pressed."""
         self._holder = Holder(
             controller,
             settings=settings,
             ceiling_n=ceiling_n,
-            command_n=min(force_n, ceiling_n) if force_n > 0 else 0.0,  # what is held already is not let go
+            command_n=min(force_n, ceiling_n) if force_n > 0 else 0.0,  # what is held already stays held
             fingers=len(readers),
         )
 
-    def hear(self, finger: int, reading: Reading, _: LiveFrame | None) -> None:
-        """Take a reading, in the thread that reads."""
+    def update_reading(self, finger: int, reading: Reading, _: LiveFrame | None) -> None:
+        """Take a reading, in the thread of its reader."""
         self._readings[finger] = reading
-        self._holder.hear(reading, taken_s=reading.captured_s, finger=finger)
+        self._holder.update_reading(reading, taken_s=reading.captured_s, finger=finger)
 
     def run(
         self, seconds: float | None, on_step: Callable[[HoldStep], None] | None
     ) -> tuple[Literal["time", "source", "failed", "interrupted"], str, Exception | None]:
-        """Hold until it ends; tells how, and what `on_step` raised."""
+        """Hold until the end; returns its kind, its reason, and the exception to raise."""
         begun_s = time.monotonic()
         pace, number = Pace(Event()), 0
         try:
@@ -235,70 +248,65 @@ class _Holding:
                 if seconds is not None and time.monotonic() - begun_s >= seconds:
                     break
                 try:
-                    step = self._step(begun_s)
+                    step = self.step(begun_s)
                 except GripperError as error:
                     return "failed", str(error), error
                 if on_step is not None:
                     try:
                         on_step(step)
-                    except Exception as error:  # whoever is told no more: what was held is kept none the less
-                        return "failed", f"who is told of each step failed ({error or type(error).__name__})", error
+                    except Exception as error:  # whatever a callback raises: the result is saved first
+                        return "failed", f"on_step failed ({error or type(error).__name__})", error
         except KeyboardInterrupt:
             return "interrupted", "interrupted", None
         return "time", "the time is over", None
 
     @property
-    def kept(self) -> str:
-        """What the gripper goes on doing."""
-        if not self._rows:
-            return "the gripper was told nothing"
-        return f"the gripper keeps the {self._rows[-1][1].command_n:.2f} N that it was told last"
+    def last_force(self) -> str:
+        """State in which the gripper goes on, in words."""
+        if not self._steps:
+            return "the gripper got no command"
+        return f"the gripper keeps the last command of {self._steps[-1].command_n:.2f} N"
 
-    def steps(self) -> HoldSteps:
-        """All commands so far."""
-        times, answers, forces, failed = zip(*self._rows, strict=True) if self._rows else ((),) * 4
-        return HoldSteps(
-            time_s=np.array(times, dtype=np.float64),
-            command_n=np.array([one.command_n for one in answers], dtype=np.float64),
-            force_n=np.array(forces, dtype=np.float64),
-            margin=np.array([one.margin for one in answers], dtype=np.float64),
-            low=np.array([one.low for one in answers], dtype=np.float64),
-            slip=np.array([one.slip for one in answers], dtype=bool),
-            failed=np.array(failed, dtype=bool),
-            why=np.array([one.why for one in answers], dtype=str),
-        )
+    def table(self) -> HoldSteps:
+        """Return all commands so far."""
+        columns = {"failed": np.array([step.trouble is not None for step in self._steps], dtype=bool)}
+        for name, kind in (("slip", bool), ("why", str), *((name, np.float64) for name in _NUMBERS)):
+            columns[name] = np.array([getattr(step, name) for step in self._steps], dtype=kind)
+        return HoldSteps(**columns)
 
-    def _step(self, begun_s: float) -> HoldStep:
+    def step(self, begun_s: float) -> HoldStep:
+        """Measure the force, and command the next one."""
         state, trouble = self._measure()
-        now_s, force_n = time.monotonic(), state.force_n
-        answer = self._holder.answer(now_s, force_n)
+        now_s = time.monotonic()
+        decision = self._holder.grip_force(now_s, state.force_n)
         self._require_force(state, now_s)
         try:
-            self._guard.set_force(answer.command_n)
-        finally:  # interrupted, it was told none the less
-            trouble = self._guard.failure or trouble or answer.trouble
+            self._guard.set_force(decision.command_n)
+        finally:  # an interrupted command was sent, too
+            trouble = self._guard.failure or trouble or decision.trouble
             if trouble is not None:
                 self.troubles[trouble] = None
-            self._rows.append((now_s - begun_s, answer, force_n, trouble is not None))
-        return HoldStep(
-            time_s=now_s - begun_s,
-            command_n=answer.command_n,
-            force_n=force_n,
-            margin=answer.margin,
-            low=answer.low,
-            slip=answer.slip,
-            why=answer.why,
-            trouble=trouble,
-            readings=tuple(
-                replace(one, margin=None, low=None, high=None, withheld="the newest margin is too old")
-                if one is not None and one.margin is not None and now_s - one.captured_s > STALE_S
-                else one
-                for one in self._readings
-            ),
-        )
+            step = HoldStep(
+                time_s=now_s - begun_s,
+                command_n=decision.command_n,
+                force_n=state.force_n,
+                margin=decision.margin,
+                low=decision.low,
+                slip=decision.slip,
+                why=decision.why,
+                trouble=trouble,
+                readings=tuple(
+                    replace(reading, margin=None, low=None, high=None, withheld="the newest margin is too old")
+                    if reading is not None and reading.margin is not None and now_s - reading.captured_s > STALE_S
+                    else reading
+                    for reading in self._readings
+                ),
+            )
+            self._steps.append(replace(step, readings=()))
+        return step
 
     def _first_force(self) -> float:
-        """Grip force before anything is told: who does not know it would let go of what is held."""
+        """Measure the grip force before any command."""
         trouble = None
         for _ in range(_TRIES):
             state, trouble = self._measure()
@@ -306,43 +314,47 @@ class _Holding:
                 return state.force_n
             time.sleep(PERIOD_S)
         raise GripperError(
-            f"the gripper tells no force to begin with ({trouble or 'no number'}); check its connection: it was told "
-            "nothing"
+            f"the gripper measures no force to begin with ({trouble or 'not a number'}), and got no command; check its "
+            "connection"
         )
 
     def _measure(self) -> tuple[GripperState, str | None]:
-        """State of the gripper; NaN and what it failed at where it gives none."""
+        """Return the state of the gripper, NaN where it gives none, and its fault."""
         try:
             return self._guard.read_state(), None
-        except Exception as error:  # whatever a driver raises: what is held is held on
+        except Exception as error:  # whatever a driver raises: the hold goes on
             return GripperState(force_n=math.nan, width_m=math.nan), str(error) or type(error).__name__
 
     def _require_force(self, state: GripperState, now_s: float) -> None:
-        """Refuse a gripper that has measured no force from the start, though its fingers have stopped."""
+        """Refuse a gripper that measures no force from the start although its fingers have stopped."""
         if math.isnan(state.width_m):
             return
-        if self._holder.touched or not self._rows:
-            self._closes = None
+        if self._holder.touched or not self._steps:
+            self._closing = None
             return
-        since_s, low_m, high_m = self._closes or (now_s, state.width_m, state.width_m)
+        since_s, low_m, high_m = self._closing or (now_s, state.width_m, state.width_m)
         if not low_m - _STUCK_M <= state.width_m <= high_m + _STUCK_M:
             since_s = now_s
-        # widths that were measured before are noise, not a motion
-        self._closes = since_s, min(low_m, state.width_m), max(high_m, state.width_m)
-        if now_s - since_s > _STUCK_S and self._rows[-1][1].command_n > 0:
+        # a width that was measured before is noise, not motion
+        self._closing = since_s, min(low_m, state.width_m), max(high_m, state.width_m)
+        command_n = self._steps[-1].command_n
+        if now_s - since_s > _STUCK_S and command_n > 0:
             raise GripperError(
                 f"the gripper measures {state.force_n:.2f} N and its fingers do not move, {_STUCK_S:g} s after "
-                f"{self._rows[-1][1].command_n:.2f} N was commanded; without a force sensor, or with forces of the "
-                "other sign, it cannot be held by the margin: check its driver"
+                f"{command_n:.2f} N was commanded; without a force sensor, or with forces of the other sign, it cannot "
+                "be held by the margin: check its driver"
             )
 
 
-def _readers(
+_NUMBERS = ("time_s", "command_n", "force_n", "margin", "low")
+
+
+def _enter_readers(
     source: LiveReader | LiveSource | Path | str | Sequence[LiveReader],
     network: Network | Path | str | None,
     stack: ExitStack,
 ) -> list[LiveReader]:
-    """Readers of the fingertips; one that is made here reads until the stack is left."""
+    """Return the readers of the fingertips; a new one reads until the stack is closed."""
     if isinstance(source, LiveSource | Path | str):
         if isinstance(source, str):
             source = open_grip(source, LiveOptions()) or source
@@ -358,22 +370,16 @@ def _readers(
 
 
 def _require_fit(controller: Controller, readers: Sequence[LiveReader]) -> None:
-    """Refuse a controller that needs what these readers do not tell."""
+    """Refuse a controller that needs more than these readers provide."""
     if isinstance(controller, AssumedFriction):
         raise InputError("this controller needs a force sensor at the wrist; choose margin, reflex or fixed")
     for reader in readers:
         name = reader.source.name
         if isinstance(controller, Oracle):
             if not reader.source.simulated:
-                raise InputError(f"this controller needs the true margin, which {name} does not tell; choose margin")
+                raise InputError(f"this controller needs the true margin, which {name} does not have; choose margin")
         elif isinstance(controller, MarginGrip) and reader.network is None:
             raise InputError(f"this controller needs margins, and no network reads {name}; name one with --network")
 
 
-def _simulated(reader: LiveReader) -> GripSource:
-    if not isinstance(reader.source, GripSource):
-        raise InputError(f"`simulated` is {GRIPPERS['simulated']}; {reader.source.name} has none")
-    return reader.source
-
-
-__all__ = ["GRIPPERS", "HoldStep", "hold_grip"]
+__all__ = ["GRIPPERS", "HoldLoop", "HoldStep", "hold_grip"]

@@ -1,4 +1,4 @@
-"""A parallel gripper that lifts an object with two soft fingertips: forces, friction and motion, many at once.
+"""Parallel gripper that lifts an object with two soft fingertips: forces, friction and motion, many at once.
 
 Symbols: grip force F, the same on both fingers; tangential force f of a finger on the object, positive upwards; static
 friction mu_s and kinetic mu_k; mass m. Heights run upwards, pulls downwards. Arrays hold one value an episode, or one
@@ -25,13 +25,13 @@ Fingers: TypeAlias = Float[np.ndarray, "episodes 2"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeldObject:
-    """What is gripped."""
+class GrippedObject:
+    """Mass, stiffness and strength of an object."""
 
     mass_kg: tuple[float, float]
-    """Least and largest mass it may have."""
+    """Smallest and largest mass."""
     stiffness_n_m: float
-    """Of its sides under the fingertips: a soft object takes force slowly."""
+    """Stiffness of its sides under the fingertips: force grows slowly on a soft object."""
     crush_n: float
     """Grip force that breaks it."""
     grip_length_m: float
@@ -40,15 +40,15 @@ class HeldObject:
 
 OBJECTS = {
     # a paper cup with water, a raw egg, a berry box; typical values (assumed)
-    "cup": HeldObject(mass_kg=(0.02, 0.11), stiffness_n_m=3_000.0, crush_n=6.0, grip_length_m=0.03),
-    "egg": HeldObject(mass_kg=(0.045, 0.07), stiffness_n_m=50_000.0, crush_n=25.0, grip_length_m=0.02),
-    "berries": HeldObject(mass_kg=(0.03, 0.12), stiffness_n_m=1_500.0, crush_n=3.5, grip_length_m=0.03),
+    "cup": GrippedObject(mass_kg=(0.02, 0.11), stiffness_n_m=3_000.0, crush_n=6.0, grip_length_m=0.03),
+    "egg": GrippedObject(mass_kg=(0.045, 0.07), stiffness_n_m=50_000.0, crush_n=25.0, grip_length_m=0.02),
+    "berries": GrippedObject(mass_kg=(0.03, 0.12), stiffness_n_m=1_500.0, crush_n=3.5, grip_length_m=0.03),
 }
 """Objects by name."""
 
 
-def pick_object(name: str) -> HeldObject:
-    """Object of a name that a user gave."""
+def pick_object(name: str) -> GrippedObject:
+    """Return the row of `OBJECTS` of a name that a user gave."""
     if name not in OBJECTS:
         raise InputError(f"there is no object named {name!r}; choose one of {', '.join(OBJECTS)}")
     return OBJECTS[name]
@@ -56,35 +56,35 @@ def pick_object(name: str) -> HeldObject:
 
 @dataclass(frozen=True, kw_only=True)
 class GripperModel:
-    """Fingers and force actuator of a gripper; a value that cannot be is a `ContactError`."""
+    """Fingers and force actuator of a gripper; a value that is not positive is a `ContactError`."""
 
     finger_stiffness_n_m: float = 4_000.0
-    """Of one fingertip, pressed."""
+    """Stiffness of one fingertip against the press."""
     shear_stiffness_n_m: float = 1_500.0
-    """Of one fingertip, pulled along; physics of the thesis's sensor (assumed)."""
+    """Stiffness of one fingertip against the pull; physics of the thesis's sensor (assumed)."""
     shear_damping_n_s_m: float = 3.0
     lag_s: float = 0.05
     """Time constant of the force actuator."""
     closing_speed_m_s: float = 0.02
-    """How fast the fingers close: with the stiffness it limits how fast the force changes."""
+    """Speed of the closing fingers; with the stiffness it limits the rate of the force."""
     resolution_n: float = 0.02
-    """Step of the forces it can be told."""
+    """Step of the commanded forces."""
     ceiling_n: float = 4.0
-    """Force it never passes, whatever it is told."""
+    """Largest force, whatever the command."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not value > 0:
                 raise ContactError(f"{name} of the gripper must be positive, got {value:.3g}")
 
-    def force_rate(self, held: HeldObject) -> float:
-        """Newtons a second at which the force can change: fingers and object are springs in a row."""
-        return self.closing_speed_m_s / (2 / self.finger_stiffness_n_m + 1 / held.stiffness_n_m)
+    def force_rate(self, gripped: GrippedObject) -> float:
+        """Compute the largest rate of the force, in newtons a second: fingers and object are springs in a row."""
+        return self.closing_speed_m_s / (2 / self.finger_stiffness_n_m + 1 / gripped.stiffness_n_m)
 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """What acts on the gripped objects during one step."""
+    """Loads on the gripped objects, and the motion of the hand, during one step."""
 
     mass_kg: Episodes
     friction: Fingers
@@ -101,7 +101,7 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class PlantState:
-    """Where everything is after a step."""
+    """Positions, forces and friction after a step."""
 
     time_s: float
     force_n: Episodes
@@ -109,14 +109,14 @@ class PlantState:
     height_m: Episodes
     speed_m_s: Episodes
     anchor_m: Fingers
-    """Where on the object, against the hand, each fingertip's skin would be at rest."""
+    """Position on the object, against the hand, at which each fingertip's skin is at rest."""
     shear_n: Fingers
     """Tangential force of each finger on the object, positive upwards."""
     sliding: Bool[np.ndarray, "episodes 2"]
     slip_m: Fingers
-    """Way that each fingertip has slid on the object."""
+    """Distance that each fingertip has slid on the object."""
     friction: Fingers
-    """Static friction that held in the last step."""
+    """Static friction in the last step."""
     kinetic_ratio: Episodes
     held_s: Episodes
     """Time since the fingers touched."""
@@ -131,17 +131,17 @@ class PlantState:
 
     @property
     def holding_friction(self) -> Fingers:
-        """Coefficient that holds: kinetic where the finger slides."""
+        """Coefficient of friction in effect: kinetic where the finger slides."""
         return self.friction * np.where(self.sliding, self.kinetic_ratio[:, None], 1.0)
 
     @property
     def slipped_m(self) -> Episodes:
-        """Way slid by the finger that slid farther."""
+        """Slip of the finger that slid farther."""
         return self.slip_m.max(axis=1)
 
     @property
     def load_n(self) -> Episodes:
-        """Force that both fingers carry together, as a force sensor at the wrist tells it."""
+        """Force that both fingers carry together, as a force sensor at the wrist measures it."""
         return self.shear_n.sum(axis=1)
 
 
@@ -155,10 +155,10 @@ class Plant:
 
     Parameters
     ----------
-    held
-        What is gripped.
+    gripped
+        Object.
     episodes
-        How many at once.
+        Number of grippers.
     model
         Fingers and actuator.
     substeps
@@ -167,9 +167,9 @@ class Plant:
     """
 
     def __init__(
-        self, held: HeldObject, *, episodes: int = 1, model: GripperModel | None = None, substeps: int = 16
+        self, gripped: GrippedObject, *, episodes: int = 1, model: GripperModel | None = None, substeps: int = 16
     ) -> None:
-        self.held, self.model, self.substeps = held, GripperModel() if model is None else model, substeps
+        self.gripped, self.model, self.substeps = gripped, GripperModel() if model is None else model, substeps
         nothing, fingers = np.zeros(episodes), np.zeros((episodes, 2))
         no = np.zeros(episodes, dtype=bool)
         self.state = PlantState(
@@ -179,24 +179,23 @@ class Plant:
         )  # fmt: skip
 
     def step(self, command_n: Episodes, world: World, *, duration_s: float = PERIOD_S) -> PlantState:
-        """Go on by one period under a grip force that is told and what acts on the objects.
+        """Step by one period under a commanded grip force and loads on the objects.
 
-        A command is cut to what the gripper can do: whatever it is (NaN holds), the force stays between 0 and the
-        ceiling. Dropped objects stay as they are.
+        The force stays between 0 and the ceiling, whatever the command; NaN holds. Dropped objects stay unchanged.
         """
         old, model = self.state, self.model
         stiffness, damping = model.shear_stiffness_n_m, model.shear_damping_n_s_m
-        told = np.where(np.isnan(command_n), old.force_n, command_n)
-        told = np.clip(np.round(told / model.resolution_n) * model.resolution_n, 0, model.ceiling_n)
+        command_n = np.where(np.isnan(command_n), old.force_n, command_n)
+        command_n = np.clip(np.round(command_n / model.resolution_n) * model.resolution_n, 0, model.ceiling_n)
         dt = duration_s / self.substeps
-        share, most = 1 - math.exp(-dt / model.lag_s), model.force_rate(self.held) * dt
+        share, most = 1 - math.exp(-dt / model.lag_s), model.force_rate(self.gripped) * dt
         static, kinetic = world.friction, world.friction * world.kinetic_ratio[:, None]
         weight, inverse = world.mass_kg * GRAVITY_M_S2 + world.pull_n, dt / world.mass_kg
         force, height, speed = old.force_n, old.height_m, old.speed_m_s
         anchor, sliding, slip, crushed = old.anchor_m, old.sliding, old.slip_m, old.crushed
         shear = old.shear_n
         for number in range(self.substeps):
-            force = force + np.clip(share * (told - force), -most, most)
+            force = force + np.clip(share * (command_n - force), -most, most)
             hand = world.hand_m + world.hand_speed_m_s * (number * dt)
             apart = (hand - height)[:, None]
             trial = stiffness * (apart - anchor) + damping * (world.hand_speed_m_s - speed)[:, None]
@@ -209,30 +208,31 @@ class Plant:
             # the table holds what would fall through it
             standing = height <= 0
             speed, height = np.where(standing, np.maximum(speed, 0), speed), np.maximum(height, 0)
-            crushed = crushed | (force > self.held.crush_n)
+            crushed = crushed | (force > self.gripped.crush_n)
         new = PlantState(
             time_s=old.time_s + duration_s, force_n=force, height_m=height, speed_m_s=speed, anchor_m=anchor,
             shear_n=shear, sliding=sliding, slip_m=slip, friction=static, kinetic_ratio=world.kinetic_ratio,
             held_s=np.where(force > 0, old.held_s + duration_s, 0.0),
-            dropped=old.dropped | (slip.max(axis=1) > self.held.grip_length_m), crushed=crushed,
+            dropped=old.dropped | (slip.max(axis=1) > self.gripped.grip_length_m), crushed=crushed,
         )  # fmt: skip
-        self.state = _keep_dropped(old, new) if old.dropped.any() else new
-        return self.state
+        if old.dropped.any():
+            fallen = {
+                name: np.where(old.dropped if before.ndim == 1 else old.dropped[:, None], before, getattr(new, name))
+                for name, before in vars(old).items()
+                if name != "time_s"
+            }
+            new = replace(new, **fallen)
+        self.state = new
+        return new
 
 
 def least_force(world: World, *, hand_acceleration_m_s2: float = 0.0) -> Episodes:
-    """Least grip force that holds, in newtons: (m (g + a) + pull) over the sum of both mu_s."""
+    """Compute the least grip force that holds, in newtons: (m (g + a) + pull) over the sum of both mu_s."""
     load = world.mass_kg * (GRAVITY_M_S2 + hand_acceleration_m_s2) + world.pull_n
     return np.maximum(load, 0) / world.friction.sum(axis=1)
 
 
-def _keep_dropped(old: PlantState, new: PlantState) -> PlantState:
-    """The new state, but for objects that were dropped before."""
-    gone = old.dropped
-
-    def pick(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        return np.where(gone if before.ndim == 1 else gone[:, None], before, after)
-
-    return replace(
-        new, **{name: pick(getattr(old, name), value) for name, value in vars(new).items() if name != "time_s"}
-    )
+__all__ = [
+    "GRAVITY_M_S2", "OBJECTS", "PERIOD_S", "GrippedObject", "GripperModel", "Plant", "PlantState", "World",
+    "least_force", "pick_object",
+]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What happens in an episode: mass, friction, pulls, jolts, a wet patch, water, a lamp that goes out."""
+"""Events of an episode: mass, friction, pulls, jolts, a wet patch, water, a lamp that goes out."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
@@ -11,12 +11,12 @@ from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.extras import Table
 from sliplens.friction import GRASP_SPREAD
-from sliplens.grip.plant import GRAVITY_M_S2, HeldObject, World, pick_object
+from sliplens.grip.plant import GRAVITY_M_S2, GrippedObject, World, pick_object
 
 EPISODE_S = 6.0
 """Length of an episode in seconds."""
 LIFT_S = 0.5
-"""When the hand begins to rise."""
+"""Time at which the hand begins to rise."""
 _RISE_S, _RISE_M = 1.5, 0.2
 _NEVER = 1e9
 _JOLT_S = 0.08
@@ -30,16 +30,16 @@ Values: TypeAlias = Float[np.ndarray, " episodes"]
 
 @dataclass(frozen=True, kw_only=True)
 class Scripts(Columns):
-    """What happens in each of some episodes, a row an episode; what never happens has a time beyond the end.
+    """Events of some episodes, a row an episode; an event that never happens has a time beyond the end.
 
     Masses are in kilograms, times in seconds, forces in newtons, factors are ratios.
     """
 
     mass_kg: Values
     friction: Values
-    """Static, mean of both fingers, as the episode begins."""
+    """Static friction, mean of both fingers, at the beginning."""
     friction_gap: Values
-    """Difference between the fingers, as a share of it."""
+    """Difference of the friction between the fingers, as a share of it."""
     kinetic_ratio: Values
     drift: Values
     """Relative change of the friction over three seconds from 2 s on."""
@@ -56,12 +56,12 @@ class Scripts(Columns):
     """Poured in within 2 s."""
     water_at_s: Values
     lamp_at_s: Values
-    """When the lamp of one fingertip goes out, whose readings are withheld from then on."""
+    """Time at which the lamp of one fingertip goes out; its margins are withheld from then on."""
     fingertips: Values
-    """Which pair of fingertips holds, counted from 0."""
+    """Pair of fingertips, counted from 0."""
 
     def world(self, time_s: float) -> World:
-        """What acts on the objects from this time on for one period."""
+        """Return the loads on the objects from this time on for one period."""
         fade = np.clip((time_s - 2.0) / _FADE_S, 0, 1) * self.drift
         friction = self.friction * (1 + fade) * np.where(time_s >= self.patch_at_s, self.patch_factor, 1.0)
         gap = self.friction_gap[:, None] * np.array([-0.5, 0.5])
@@ -81,8 +81,10 @@ class Scripts(Columns):
 
 
 def hand_motion(time_s: float) -> tuple[float, float, float]:
-    """Height in metres, speed and acceleration of the hand, in metres a second (squared): a lift of least jerk.
+    """Compute height in metres, speed and acceleration of the hand: a lift of least jerk.
 
+    References
+    ----------
     Flash and Hogan, *J. Neurosci.* 5 (1985) 1688, eq. 2.
     """
     part = min(max((time_s - LIFT_S) / _RISE_S, 0.0), 1.0)
@@ -91,20 +93,20 @@ def hand_motion(time_s: float) -> tuple[float, float, float]:
     return height, speed, _RISE_M / _RISE_S**2 * 60 * part * (1 - part) * (1 - 2 * part)
 
 
-Draw: TypeAlias = Callable[[Scripts, HeldObject, np.random.Generator], Scripts]
-"""Changes ordinary dry episodes of an object into those of a condition."""
+Draw: TypeAlias = Callable[[Scripts, GrippedObject, np.random.Generator], Scripts]
+"""Function that changes dry episodes of an object into those of a condition."""
 
 
-def _wet(scripts: Scripts, _: HeldObject, rng: np.random.Generator) -> Scripts:
+def _wet(scripts: Scripts, _: GrippedObject, rng: np.random.Generator) -> Scripts:
     count = len(scripts)
     return replace(scripts, friction=rng.uniform(0.15, 0.7, count), drift=rng.uniform(-0.15, 0.15, count))
 
 
-def _unknown(scripts: Scripts, _: HeldObject, rng: np.random.Generator) -> Scripts:
+def _unknown(scripts: Scripts, _: GrippedObject, rng: np.random.Generator) -> Scripts:
     return replace(scripts, friction=np.exp(rng.uniform(np.log(0.15), np.log(1.2), len(scripts))))
 
 
-def _jolt(scripts: Scripts, _: HeldObject, rng: np.random.Generator) -> Scripts:
+def _jolt(scripts: Scripts, _: GrippedObject, rng: np.random.Generator) -> Scripts:
     count, weight = len(scripts), scripts.mass_kg * GRAVITY_M_S2
     return replace(scripts, jolt_n=weight * rng.uniform(0.5, 1.5, count), jolt_at_s=rng.uniform(3, 5, count))
 
@@ -121,21 +123,21 @@ CONDITIONS: Table[Draw] = Table(
             scripts, patch_factor=rng.uniform(0.4, 0.75, len(scripts)), patch_at_s=np.full(len(scripts), 2.5)
         ),
         "jolt": _jolt,
-        "poured": lambda scripts, held, rng: replace(
+        "poured": lambda scripts, gripped, rng: replace(
             scripts,
-            mass_kg=np.full(len(scripts), held.mass_kg[0]),
-            water_kg=rng.uniform(0, 1, len(scripts)) * (held.mass_kg[1] - held.mass_kg[0]),
+            mass_kg=np.full(len(scripts), gripped.mass_kg[0]),
+            water_kg=rng.uniform(0, 1, len(scripts)) * (gripped.mass_kg[1] - gripped.mass_kg[0]),
             water_at_s=rng.uniform(2, 3, len(scripts)),
         ),
         "lamp": lambda scripts, _, rng: replace(scripts, lamp_at_s=rng.uniform(2, 4, len(scripts))),
     },
 )
-"""Conditions by name: dry objects of another friction each; wet ones; a friction that falls; one of which nothing is
-known; a wet patch at 2.5 s; a jolt; water poured in; a fingertip's lamp that goes out."""
+"""Conditions by name: dry objects of different friction; wet ones; falling friction; friction from a wide range; a wet
+patch at 2.5 s; a jolt; water poured in; a fingertip's lamp that goes out."""
 
 
 def draw_scripts(
-    held: HeldObject | str,
+    gripped: GrippedObject | str,
     condition: str,
     *,
     episodes: int,
@@ -143,18 +145,18 @@ def draw_scripts(
     fingertips: int = 64,
     script: Mapping[str, float] | None = None,
 ) -> Scripts:
-    """Draw what happens in some episodes, the same for the same seed.
+    """Draw the events of some episodes; the same seed gives the same events.
 
     Parameters
     ----------
-    held
+    gripped
         Object, or row of `OBJECTS`.
     condition
         Row of `CONDITIONS`.
     episodes, seed
-        How many, and the seed they are drawn from.
+        Number of episodes, and the seed they are drawn from.
     fingertips
-        How many pairs of fingertips to choose from.
+        Number of pairs of fingertips to choose from.
     script
         Columns of `Scripts`, in their units (kilograms, seconds, newtons, ratios), that are the same in all episodes
         rather than drawn, such as `mass_kg`.
@@ -166,21 +168,21 @@ def draw_scripts(
 
     Examples
     --------
-    >>> from sliplens.grip import draw_scripts
+    >>> from sliplens.grip.scripts import draw_scripts
     >>> scripts = draw_scripts("cup", "patch", episodes=2, seed=0, script={"mass_kg": 0.06})
     >>> scripts.mass_kg, scripts.patch_at_s
     (array([0.06, 0.06]), array([2.5, 2.5]))
     """
-    if isinstance(held, str):
-        held = pick_object(held)
+    if isinstance(gripped, str):
+        gripped = pick_object(gripped)
     if episodes < 1:
         raise InputError(f"{episodes} episodes cannot be run; ask for 1 or more")
-    rng, own = np.random.default_rng(seed).spawn(2)
+    rng, condition_rng = np.random.default_rng(seed).spawn(2)
 
     def uniform(low: float, high: float) -> Values:
         return rng.uniform(low, high, episodes)
 
-    mass = uniform(*held.mass_kg)
+    mass = uniform(*gripped.mass_kg)
     nothing, never = np.zeros(episodes), np.full(episodes, _NEVER)
     scripts = Scripts(
         mass_kg=mass, friction=uniform(0.5, 1.2), friction_gap=uniform(-0.1, 0.1), kinetic_ratio=uniform(0.7, 0.9),
@@ -189,7 +191,7 @@ def draw_scripts(
         water_kg=nothing, water_at_s=never, lamp_at_s=never,
         fingertips=rng.integers(fingertips, size=episodes).astype(np.float64),
     )  # fmt: skip
-    scripts = CONDITIONS.pick(condition)(scripts, held, own)
+    scripts = CONDITIONS.pick(condition)(scripts, gripped, condition_rng)
     names, fixed = {field.name for field in fields(Scripts)}, script or {}
     for name, value in fixed.items():
         if name not in names:
@@ -201,10 +203,10 @@ def draw_scripts(
 
 
 def next_grasp(scripts: Scripts, *, rng: np.random.Generator) -> Scripts:
-    """Another grasp of the same objects, to which the same happens.
+    """Draw another grasp of the same objects with the same events.
 
-    Friction differs from the object's by the share by which grasps do (`GRASP_SPREAD`), and other fingertips of those
-    that there are hold it: what a network reads wrong of one touch is not what it reads wrong of the next.
+    The friction differs from the object's by a random share (`GRASP_SPREAD`), and other fingertips hold it: the errors
+    of a network differ from touch to touch.
     """
     share = 1 + GRASP_SPREAD * rng.standard_normal(len(scripts))
     pairs = rng.integers(int(scripts.fingertips.max(initial=0)) + 1, size=len(scripts))
@@ -212,3 +214,6 @@ def next_grasp(scripts: Scripts, *, rng: np.random.Generator) -> Scripts:
 
 
 _BOUNDS = {"mass_kg": 0, "friction": 0, "kinetic_ratio": 0, "patch_factor": 0, "drift": -1, "water_kg": -1e-9}
+
+
+__all__ = ["CONDITIONS", "EPISODE_S", "LIFT_S", "Scripts", "draw_scripts", "hand_motion", "next_grasp"]

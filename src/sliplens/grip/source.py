@@ -1,4 +1,4 @@
-"""A gripper that runs: simulated, seen through one fingertip, and held by what is read of its frames."""
+"""Simulated gripper as a live source: drawn through one fingertip, and held by the predictions for its frames."""
 
 import time
 from collections.abc import Iterator
@@ -10,9 +10,9 @@ import numpy as np
 
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK
-from sliplens.grip.controllers import Holder
 from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.gripper import GripperError, GripperState
+from sliplens.grip.holder import Holder
 from sliplens.grip.plant import PERIOD_S, GripperModel, Plant, PlantState, World, least_force, pick_object
 from sliplens.grip.scripts import LIFT_S, hand_motion
 from sliplens.live.contract import LiveOptions, LiveSource, Pace
@@ -21,42 +21,42 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.sensor import SensorProfile
 
 OPEN_S = 1.5
-"""Time that the fingers stay open before they close, so that the sensor is seen untouched, and after a drop."""
+"""Time for which the fingers stay open at first, to show the untouched sensor, and after a drop."""
 _CEILING_N = 2.8
-"""Force that the gripper never passes: beyond, the network of the package sees frames that it does not know, its margin
-is withheld, and a grip that is never loosened blindly would stay there."""
+"""Largest force of the gripper: beyond it, frames are unknown to the network of the package, its margins withheld, and
+a grip that is never loosened blindly would stay there."""
 _MEMORY = 120
 _POURS_KG_S, _PULLS_N_S = 0.03, 2.0
-"""How fast a person pours and pulls."""
+"""Rates at which a person pours and pulls."""
 _FAINTEST_N = 0.02
 _WIDTHS_M = (0.09, 0.07)
-"""Opening of the fingers, and what is between them when they touch (assumed)."""
+"""Opening of the fingers without and with an object between them (assumed)."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Held:
-    """What the gripper did when a frame was taken."""
+class GripStatus:
+    """State of the gripper at a frame."""
 
     force_n: float
     """Grip force of each finger."""
     least_force_n: float
     """Least grip force that holds."""
     slip_m: float
-    """Way that the object has slid."""
+    """Distance that the object has slid."""
     phase: str
     """open, closing, lifting, holding, dropped or crushed."""
     controller: str
     why: str
-    """What the controller answered last, and to what."""
+    """Last action of the controller, and its reason."""
 
 
 class GripSource(LiveSource):
-    """Simulated gripper that lifts an object and holds it; water can be poured in, and it can be pulled at and wetted.
+    """Simulated gripper that lifts an object and holds it while water is poured in, it is pulled or wetted.
 
-    Its frames are those of one fingertip. Who reads them says what was read (`hear`, as `LiveReader` does), and the
-    controller answers that: the loop is closed through pixels, by the network at hand, with its true latency and what
-    its health withholds. A gripper that hears nothing goes to its safe force. What has fallen is gripped anew. Told
-    forces from outside (`set_force`), it is a `Gripper` without a controller of its own.
+    Its frames are those of one fingertip. `hear` takes the reading of each frame, as `LiveReader` passes it on, and the
+    controller acts on it: the loop is closed through pixels, with the network's true latency and withheld margins.
+    Without readings the gripper goes to its safe force. A dropped object is gripped again. With forces from outside
+    (`set_force`), it is a `Gripper` without a controller.
 
     Parameters
     ----------
@@ -69,15 +69,15 @@ class GripSource(LiveSource):
     rate_hz
         Frames a second.
     seed
-        Of the fingertip, its day and its touch.
+        Seed of the fingertip, its day and its touch.
 
     Examples
     --------
-    >>> from sliplens.grip import GripSource
+    >>> from sliplens.grip.source import GripSource
     >>> with GripSource("cup", rate_hz=200.0) as source:
     ...     source.act(water_kg=0.05, wet=True)
     ...     frame = next(source.frames())
-    >>> frame.size, source.held(frame.number).phase
+    >>> frame.size, source.status(frame.number).phase
     ((224, 224), 'open')
     """
 
@@ -100,16 +100,17 @@ class GripSource(LiveSource):
         self._lock, self._closed = Lock(), Event()
         self.water_kg, self.pull_n, self.wet = 0.0, 0.0, False
         self.controller = controller
-        """Row of `CONTROLLERS` that grips."""
+        """Row of `CONTROLLERS` in use."""
         self._outside_n: float | None = None
-        self._told: dict[int, tuple[PlantState, Held]] = {}
+        self._frames: dict[int, tuple[float, GripStatus]] = {}
+        """Time of the grip, and the status, at each of the last frames."""
         self._begin(0.0)
 
     def _begin(self, time_s: float) -> None:
-        """Open the fingers, and close them anew after a moment."""
+        """Open the fingers, to close them again after `OPEN_S`."""
         self._plant = Plant(self._object, model=GripperModel(ceiling_n=_CEILING_N))
         self._grips_s = time_s + OPEN_S
-        self._told.clear()
+        self._frames.clear()
         self._ended_s: float | None = None
         self._poured_kg = self._pulled_n = 0.0
         self._holder, self._why = Holder(self.controller, ceiling_n=_CEILING_N), ""
@@ -135,56 +136,47 @@ class GripSource(LiveSource):
                 self.controller = controller
 
     def grip_again(self) -> None:
-        """Put the object down, and grip it anew."""
+        """Put the object down, and grip it again."""
         with self._lock:
             self._ended_s = -np.inf
 
     def hear(self, reading: Reading) -> None:
-        """Take what was read of a frame."""
+        """Take the reading of a frame."""
         with self._lock:
-            known = self._told.get(reading.number)
-            if known is not None:
-                self._holder.hear(reading, taken_s=known[0].time_s)
+            if reading.number in self._frames:
+                self._holder.update_reading(reading, taken_s=self._frames[reading.number][0])
 
     def set_force(self, force_n: float) -> None:
-        """Press with so many newtons from now on: who tells forces is the controller."""
+        """Press with so many newtons from now on, in place of the controller's force."""
         with self._lock:
-            self._outside_n, self._why = force_n, "presses as it is told from outside"
+            self._outside_n, self._why = force_n, "follows commands from outside"
 
     def set_width(self, width_m: float) -> None:
-        """Refused: it opens by itself."""
-        raise GripperError(f"the simulated gripper cannot be opened to {width_m:g} m; tell it forces")
+        """Refuse to open: the source opens by itself."""
+        raise GripperError(f"the simulated gripper cannot be opened to {width_m:g} m; command forces")
 
     def read_state(self) -> GripperState:
-        """Grip force, and a width that is assumed."""
+        """Return the grip force, and an assumed width."""
         with self._lock:
             force_n = float(self._plant.state.force_n[0])
         return GripperState(force_n=force_n, width_m=_WIDTHS_M[force_n > 0])
 
-    def held(self, number: int) -> Held | None:
-        """What the gripper did at a frame; None where that was long ago."""
-        known = self._told.get(number)
-        return None if known is None else known[1]
+    def status(self, number: int) -> GripStatus | None:
+        """Return the state of the gripper at a frame; None for a frame long ago."""
+        return self._frames[number][1] if number in self._frames else None
 
     def frames(self) -> Iterator[LiveFrame]:
-        """Frames of the first fingertip, as the gripper goes on."""
+        """Draw frames of the fingertip while the gripper goes on."""
         pace, number, rate_hz = Pace(self._closed), 0, self.rate_hz or 30.0
         while pace.wait(number / rate_hz):
             captured_s, time_s = time.monotonic(), number / rate_hz
             with self._lock:
                 state = self._advance(time_s)
-                self._told[number] = state, self._describe(state, time_s)
-                self._told.pop(number - _MEMORY, None)
+                self._frames[number] = state.time_s, self._describe(state, time_s)
+                self._frames.pop(number - _MEMORY, None)
             force_n, margin = float(state.force_n[0]), float(state.margin[0, 0])
-            image = self._tip.draw(
-                force_n,
-                friction=float(state.holding_friction[0, 0]),
-                margin=float(np.nan_to_num(margin, nan=1.0)),
-                held_s=float(state.held_s[0]),
-                pulled_back=bool(state.shear_n[0, 0] < 0),
-            )
             yield LiveFrame(
-                image=image,
+                image=self._tip.draw_state(state),
                 number=number,
                 time_s=time_s,
                 captured_s=captured_s,
@@ -203,50 +195,46 @@ class GripSource(LiveSource):
         self._closed.set()
 
     def _advance(self, time_s: float) -> PlantState:
-        """Go on until a time; what has ended begins anew after a moment."""
-        plant = self._plant
-        if self._ended_s is None and (plant.state.dropped[0] or plant.state.crushed[0]):
+        """Step until a time; begin again some time after a drop."""
+        state = self._plant.state
+        if self._ended_s is None and (state.dropped[0] or state.crushed[0]):
             self._ended_s = time_s
         if self._ended_s is not None and time_s - self._ended_s >= OPEN_S:
             self._begin(time_s)
-            plant = self._plant
+        plant = self._plant
         while self._grips_s + plant.state.time_s + PERIOD_S <= time_s:
-            self._poured_kg = _towards(self._poured_kg, self.water_kg, _POURS_KG_S * PERIOD_S)
-            self._pulled_n = _towards(self._pulled_n, self.pull_n, _PULLS_N_S * PERIOD_S)
-            world = self._world()
-            plant.step(np.array([self._answer(plant.state)]), world)
+            pour, pull = _POURS_KG_S * PERIOD_S, _PULLS_N_S * PERIOD_S
+            self._poured_kg += float(np.clip(self.water_kg - self._poured_kg, -pour, pour))
+            self._pulled_n += float(np.clip(self.pull_n - self._pulled_n, -pull, pull))
+            command_n, state = self._outside_n, plant.state
+            if command_n is None:
+                command = self._holder.grip_force(state.time_s, float(state.force_n[0]), load_n=float(state.load_n[0]))
+                command_n, self._why = command.command_n, command.why
+            plant.step(np.array([command_n]), self._world())
         return plant.state
 
     def _world(self) -> World:
         height, speed, _ = hand_motion(self._plant.state.time_s)
-        one = np.ones(1)
         return World(
-            mass_kg=(self._object.mass_kg[0] + self._poured_kg) * one,
+            mass_kg=np.array([self._object.mass_kg[0] + self._poured_kg]),
             friction=np.full((1, 2), self._friction * (0.5 if self.wet else 1.0)),
-            kinetic_ratio=0.8 * one,
-            pull_n=self._pulled_n * one,
-            hand_m=height * one,
-            hand_speed_m_s=speed * one,
+            kinetic_ratio=np.array([0.8]),
+            pull_n=np.array([self._pulled_n]),
+            hand_m=np.array([height]),
+            hand_speed_m_s=np.array([speed]),
         )
 
-    def _answer(self, now: PlantState) -> float:
-        """Grip force that the controller tells, in newtons."""
-        if self._outside_n is not None:
-            return self._outside_n
-        answer = self._holder.answer(now.time_s, float(now.force_n[0]), load_n=float(now.load_n[0]))
-        self._why = answer.why
-        return answer.command_n
-
-    def _describe(self, state: PlantState, time_s: float) -> Held:
-        world = self._world()
-        least = least_force(world, hand_acceleration_m_s2=hand_motion(state.time_s)[2])
-        lifting = state.time_s < LIFT_S + 1.5
-        phase = "closing" if state.time_s < LIFT_S else "lifting" if lifting else "holding"
+    def _describe(self, state: PlantState, time_s: float) -> GripStatus:
+        least = least_force(self._world(), hand_acceleration_m_s2=hand_motion(state.time_s)[2])
         if time_s < self._grips_s:
             phase = "open"
         elif state.dropped[0] or state.crushed[0]:
             phase = "dropped" if state.dropped[0] else "crushed"
-        return Held(
+        elif state.time_s < LIFT_S:
+            phase = "closing"
+        else:
+            phase = "lifting" if state.time_s < LIFT_S + 1.5 else "holding"
+        return GripStatus(
             force_n=float(state.force_n[0]),
             least_force_n=float(least[0]) if state.time_s > LIFT_S else 0.0,
             slip_m=float(state.slipped_m[0]),
@@ -256,25 +244,21 @@ class GripSource(LiveSource):
         )
 
 
-def _towards(value: float, wanted: float, step: float) -> float:
-    return value + min(max(wanted - value, -step), step)
-
-
 def open_grip(name: str, options: LiveOptions) -> GripSource | None:
-    """Gripper of a name such as `grip` or `grip:egg`; None where it is that of another source."""
-    kind, _, held = name.partition(":")
+    """Create the simulated gripper of a name such as `grip` or `grip:egg`; None for the name of another source."""
+    kind, _, gripped = name.partition(":")
     if kind != "grip":
         return None
     options.require_only("rate_hz", what="the simulated gripper")
-    return GripSource(held or "cup", rate_hz=options.rate_hz or 30.0)
+    return GripSource(gripped or "cup", rate_hz=options.rate_hz or 30.0)
 
 
 def usual_network(source: LiveSource | Path | str, profile: SensorProfile | None) -> str | None:
-    """Network for a source where none is named: the profile's, else the package's for the sensor it was trained on."""
+    """Return the default network of a source: the profile's, else the package's for the sensor it was trained on."""
     if profile is not None:
         return profile.network
-    own = isinstance(source, GripSource) or source in {"simulated", "simulated:chromatouch"}
-    return DEFAULT_NETWORK if own else None
+    simulated = isinstance(source, GripSource) or source in {"simulated", "simulated:chromatouch"}
+    return DEFAULT_NETWORK if simulated else None
 
 
-__all__ = ["GripSource", "Held", "open_grip", "usual_network"]
+__all__ = ["GripSource", "GripStatus", "open_grip", "usual_network"]

@@ -232,8 +232,8 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Predictions": lambda result, ax, index: _margins(result.frame(), ax, index),
     "ScoredFrames": lambda result, ax, index: _margins(result.table(), ax, index),
     "Tracking": _tracking,
-    "Grip": lambda result, ax, _: plot_grip_force(result.trace, ax=ax).set_title(result.setup.controller),
-    "Hold": lambda result, ax, _: plot_hold(result.steps, ax=ax).set_title(result.controller),
+    "Grip": lambda result, ax, _: plot_grip_force(result.trace.table(), ax=ax).set_title(result.setup.controller),
+    "Hold": lambda result, ax, _: plot_hold(result.steps.table(), ax=ax).set_title(result.controller),
     "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
 }
 """Functions that draw a record, by the name of its class."""

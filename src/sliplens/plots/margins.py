@@ -34,7 +34,6 @@ from sliplens.plots.style import (
     shade_withheld,
 )
 from sliplens.results.explanation import Strip
-from sliplens.results.grip import GripTrace, HoldSteps
 
 MOST_TRIALS = 6
 """Trials on one page."""
@@ -194,50 +193,43 @@ def _percent(value: float) -> str:
     return f"{100 * value:.0f} %" if np.isfinite(value) else "-"
 
 
-def plot_grip_force(trace: GripTrace, *, ax: Axes) -> Axes:
-    """Draw the grip force over the least force that holds, and the slips that the markers showed."""
-    ax.plot(trace.time_s, trace.force_n, color=BLUE, label="grip force")
-    ax.plot(trace.time_s, trace.least_force_n, color=BLACK, linestyle="--", label="least that holds")
-    ax.fill_between(trace.time_s, trace.least_force_n, trace.force_n, color=BLUE, alpha=0.12, linewidth=0)
-    for number, time_s in enumerate(trace.time_s[trace.slip_seen]):
-        ax.axvline(time_s, color=VERMILLION, linewidth=1, linestyle=":", label="slip detected" if number == 0 else None)
-    # room for the legend above the curves
-    ax.set(xlabel="Time (s)", ylabel="Force (N)", ylim=(0, 1.4 * float(trace.force_n.max()) or 1.0))
+def plot_grip_force(trace: pa.Table, *, ax: Axes) -> Axes:
+    """Draw the grip force over the least force that holds, and detected slips."""
+    time_s, force_n, least_n = (column(trace, name) for name in ("time_s", "force_n", "least_force_n"))
+    ax.plot(time_s, force_n, color=BLUE, label="grip force")
+    ax.plot(time_s, least_n, color=BLACK, linestyle="--", label="least that holds")
+    ax.fill_between(time_s, least_n, force_n, color=BLUE, alpha=0.12, linewidth=0)
+    for number, slip_s in enumerate(time_s[column(trace, "slip_seen") > 0]):
+        ax.axvline(slip_s, color=VERMILLION, linewidth=1, linestyle=":", label="slip detected" if number == 0 else None)
+    # room for the legend above the lines
+    ax.set(xlabel="Time (s)", ylabel="Force (N)", ylim=(0, 1.4 * float(force_n.max()) or 1.0))
     ax.legend(loc="upper right", ncols=2)
     return ax
 
 
-def plot_hold(steps: HoldSteps, *, ax: Axes) -> Axes:
-    """Draw the commanded and the measured grip force, failures of the gripper and slips."""
-    ax.plot(steps.time_s, steps.command_n, color=BLACK, linestyle="--", label="commanded")
-    ax.plot(steps.time_s, steps.force_n, color=BLUE, label="measured")
-    for marked, colour, label in ((steps.slip, VERMILLION, "slip detected"), (steps.failed, GREY, "gripper failed")):
-        ax.plot(steps.time_s[marked], steps.command_n[marked], color=colour, marker="x", linestyle="", label=label)
-    ax.set(xlabel="Time (s)", ylabel="Grip force (N)", ylim=(0, 1.4 * float(steps.command_n.max(initial=0.0)) or 1.0))
+def plot_hold(steps: pa.Table, *, ax: Axes) -> Axes:
+    """Draw the commanded and the measured grip force, slips, and faults of the gripper."""
+    time_s, command_n = column(steps, "time_s"), column(steps, "command_n")
+    ax.plot(time_s, command_n, color=BLACK, linestyle="--", label="commanded")
+    ax.plot(time_s, column(steps, "force_n"), color=BLUE, label="measured")
+    for name, colour, label in (("slip", VERMILLION, "slip detected"), ("failed", GREY, "gripper failed")):
+        marked = column(steps, name) > 0
+        ax.plot(time_s[marked], command_n[marked], color=colour, marker="x", linestyle="", label=label)
+    ax.set(xlabel="Time (s)", ylabel="Grip force (N)", ylim=(0, 1.4 * float(command_n.max(initial=0.0)) or 1.0))
     ax.legend(loc="upper right", ncols=2)
     return ax
 
 
-def plot_grip_margin(trace: GripTrace, *, ax: Axes) -> Axes:
-    """Draw the predicted margin with its interval, and the true one."""
-    ax.fill_between(trace.time_s, 100 * trace.low, 100 * trace.high, color=ORANGE, alpha=0.2, linewidth=0)
-    ax.plot(trace.time_s, 100 * trace.margin, color=ORANGE, linewidth=1, label="predicted, with 90 % interval")
-    ax.plot(trace.time_s, 100 * trace.true_margin, color=BLACK, linestyle="--", label="true")
-    ax.set(xlabel="Time (s)", ylabel="Safety margin Γ (%)", ylim=(-3, 103))
-    ax.legend(loc="lower right")
-    return ax
-
-
-def plot_grip_slip(trace: GripTrace, *, ax: Axes) -> Axes:
-    """Draw the slip of the object, in millimetres."""
-    ax.plot(trace.time_s, 1e3 * trace.slip_m, color=GREY)
-    ax.set(xlabel="Time (s)", ylabel="Slip (mm)", ylim=(0, max(1.0, 1.05e3 * float(trace.slip_m.max()))))
-    return ax
-
-
-def plot_grip(trace: GripTrace, *, axes: Sequence[Axes]) -> None:
+def plot_grip(trace: pa.Table, *, axes: Sequence[Axes]) -> None:
     """Draw force, margin and slip on three axes."""
-    for draw, title, ax in zip(
-        (plot_grip_force, plot_grip_margin, plot_grip_slip), ("Force", "Margin", "Slip"), axes, strict=True
-    ):
-        draw(trace, ax=ax).set_title(title)
+    force, margin, slip = axes
+    plot_grip_force(trace, ax=force).set_title("Force")
+    time_s, slip_m = column(trace, "time_s"), column(trace, "slip_m")
+    predicted, low, high, true = (100 * column(trace, name) for name in ("margin", "low", "high", "true_margin"))
+    margin.fill_between(time_s, low, high, color=ORANGE, alpha=0.2, linewidth=0)
+    margin.plot(time_s, predicted, color=ORANGE, linewidth=1, label="predicted, with 90 % interval")
+    margin.plot(time_s, true, color=BLACK, linestyle="--", label="true")
+    margin.set(xlabel="Time (s)", ylabel="Safety margin Γ (%)", ylim=(-3, 103), title="Margin")
+    margin.legend(loc="lower right")
+    slip.plot(time_s, 1e3 * slip_m, color=GREY)
+    slip.set(xlabel="Time (s)", ylabel="Slip (mm)", ylim=(0, max(1.0, 1.05e3 * float(slip_m.max()))), title="Slip")

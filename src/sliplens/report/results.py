@@ -7,11 +7,11 @@ from typing import Any
 from sliplens.codec import load_record, load_result
 from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, Provenance, require_folder
+from sliplens.grip.records import Grip
 from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import Diagnosis, Evaluation, Simulation, Training, describe_simulation
 from sliplens.results.explanation import Explanation, Strip, load_explanation
 from sliplens.results.faithfulness import DeletionScores
-from sliplens.results.grip import Grip
 from sliplens.results.study import CONFIG_FILE, RECORDS, TABLES, Choice, Study, StudyConfig
 
 _OF_A_COMMAND: dict[str, type] = {

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.stats import binomtest
 
+from sliplens.grip.records import Grip
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.plots.style import (
     FILL_NAMES,
@@ -43,7 +44,6 @@ from sliplens.report.comparisons import (
 from sliplens.report.results import Results
 from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import CHANCE, DeletionScores, Lead, RemovalScores
-from sliplens.results.grip import Grip
 from sliplens.results.study import Localisation, Truth
 
 Tone = Literal["good", "plain", "caution"]

@@ -19,7 +19,6 @@ from sliplens.results.evaluation import (
 )
 from sliplens.results.explanation import ExplainedFrame, Explanation, load_explanation
 from sliplens.results.faithfulness import DeletionCurve, DeletionScores, Remedies, RemovalCurve, RemovalScores
-from sliplens.results.grip import EpisodeTable, Grip, GripTrace, Hold, HoldSteps
 from sliplens.results.study import Choice, MapQuality, Randomisation, Setting, States, Study, StudyConfig, Timing, Truth
 
 __all__ = [
@@ -31,14 +30,9 @@ __all__ = [
     "DeletionCurve",
     "DeletionScores",
     "Diagnosis",
-    "EpisodeTable",
     "Evaluation",
     "ExplainedFrame",
     "Explanation",
-    "Grip",
-    "GripTrace",
-    "Hold",
-    "HoldSteps",
     "LeadTimes",
     "LearningCurve",
     "MapQuality",

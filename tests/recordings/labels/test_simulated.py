@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from labels import Score, film_trial, score_trial, summarise
+
 from sliplens.simulation import SimulationRecipe, plan_trials
 
 

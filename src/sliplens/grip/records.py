@@ -1,4 +1,4 @@
-"""Grips: what became of each episode, one of them tick by tick, and what a real gripper was told."""
+"""Records of simulated episodes and of holds with a gripper; reports load them without torch."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -17,34 +17,34 @@ class EpisodeTable(Columns):
 
     condition: Shaped[np.ndarray, " episodes"]
     grasp: Int64[np.ndarray, " episodes"]
-    """Which grasp of its object it is, counted from 1."""
+    """Number of the grasp of its object, counted from 1."""
     known_friction: Annotated[Float64[np.ndarray, " episodes"], AMOUNT, UNKNOWN]
-    """Coefficient of friction that was told, or learnt in the grasps before, its mean; NaN where nothing was."""
+    """Mean of the friction that the controller's margins used, given or learnt in earlier grasps; NaN without one."""
     mass_kg: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
     friction: Annotated[Float64[np.ndarray, " episodes"], FRICTION]
-    """Least static friction of the episode, mean of both fingers."""
+    """Lowest static friction of the episode, mean of both fingers."""
     dropped: Bool[np.ndarray, " episodes"]
     crushed: Bool[np.ndarray, " episodes"]
     slip_m: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
-    """Way slid by the finger that slid farther."""
+    """Slip of the finger that slid farther."""
     mean_force_n: Annotated[Float64[np.ndarray, " episodes"], AMOUNT, UNKNOWN]
     """Grip force, mean from the lift until the end or the drop."""
     peak_force_n: Annotated[Float64[np.ndarray, " episodes"], FORCE]
     least_force_n: Annotated[Float64[np.ndarray, " episodes"], AMOUNT, UNKNOWN]
-    """Least force that would have held, mean over the same time."""
+    """Least force that holds, mean over the same time."""
     peak_least_force_n: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
-    """The highest that was needed at any moment."""
+    """Largest value of the least force."""
     force_excess: Annotated[Float64[np.ndarray, " episodes"], EXCESS, UNKNOWN]
     """Mean force over the mean least force, less 1: a ratio."""
     peak_excess: Annotated[Float64[np.ndarray, " episodes"], EXCESS, UNKNOWN]
-    """The same of the peaks."""
+    """Peak force over the peak of the least force, less 1."""
     under_20_s: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
     """Time with a true margin under 20 %."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GripTrace(Columns):
-    """One episode, a row a tick; margins are means of both fingers that read, NaN where none does."""
+    """One episode, a row a tick; margins are means of the fingers that have one, NaN where none has."""
 
     time_s: Annotated[Float64[np.ndarray, " ticks"], AMOUNT]
     command_n: Annotated[Float64[np.ndarray, " ticks"], FORCE]
@@ -54,39 +54,39 @@ class GripTrace(Columns):
     load_n: Annotated[Float64[np.ndarray, " ticks"], FORCE]
     """Tangential force of both fingers."""
     true_margin: Annotated[Float64[np.ndarray, " ticks"], MARGIN, UNKNOWN]
-    """Of the finger with less."""
+    """Smaller of both fingers."""
     margin: Annotated[Float64[np.ndarray, " ticks"], ANSWER, UNKNOWN]
-    """Read."""
+    """Prediction."""
     low: Annotated[Float64[np.ndarray, " ticks"], MARGIN, UNKNOWN]
     high: Annotated[Float64[np.ndarray, " ticks"], MARGIN, UNKNOWN]
     slip_m: Annotated[Float64[np.ndarray, " ticks"], AMOUNT]
     slip_seen: Bool[np.ndarray, " ticks"]
-    """Whether the markers told of a slip."""
+    """True where the markers showed a slip."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class GripSetup:
-    """What is held, by what, and with which readings."""
+    """Object, controller and network of some episodes, and how they were run."""
 
     object: str
     condition: str
     controller: str
     settings: dict[str, float]
-    """Constants of the controller that were changed; all of one that is none of the table."""
+    """Changed constants of the controller; all constants of one that is not in `CONTROLLERS`."""
     network: str
     """First 12 hex digits of the hash of its weights."""
     friction: str | None
-    """What was told of the friction, in words; None where nothing was."""
+    """Friction that predictions used, in words; None without one."""
     grasps: int
-    """How many times each object was gripped."""
+    """Number of grasps of each object."""
     same_object: bool
-    """Whether what a slip taught counted in the grasps that followed."""
+    """True where friction learnt from a slip counted in the grasps that followed."""
     sequence: bool
-    """Whether frames were read in order."""
+    """True where frames were predicted in order."""
     latency_s: float
-    """From an image to the command that answers it."""
+    """Time from an image to the command by it."""
     rendered: bool
-    """Whether the fingertips were filmed and read, rather than looked up in the network's measured errors."""
+    """True where the fingertips were drawn; False where the network's measured errors were looked up."""
     seed: int
 
 
@@ -96,12 +96,12 @@ class Grip:
 
     setup: GripSetup
     seconds: float
-    """Time the episodes took to run."""
+    """Time that running the episodes took."""
     episodes: EpisodeTable
     trace: GripTrace
-    """The first episode."""
+    """First episode."""
     moments_s: tuple[float, ...]
-    """Times of the pictures; none where nothing was rendered."""
+    """Times of the pictures; empty where nothing was rendered."""
     pictures: UInt8[np.ndarray, "moments height width 3"]
     maps: Annotated[Float32[np.ndarray, "moments side side"], ANSWER]
     """Relevance of the first finger's frames, in margin units, signed."""
@@ -114,44 +114,48 @@ class Grip:
 
 @dataclass(frozen=True, kw_only=True)
 class HoldSteps(Columns):
-    """Commands to a gripper, a row each; NaN where nothing was measured or read."""
+    """Commands to a gripper, a row each; NaN where nothing was measured or predicted."""
 
     time_s: Annotated[Float64[np.ndarray, " steps"], AMOUNT]
     command_n: Annotated[Float64[np.ndarray, " steps"], AMOUNT]
-    """Grip force that was told."""
+    """Commanded grip force."""
     force_n: Annotated[Float64[np.ndarray, " steps"], ANSWER, UNKNOWN]
     """Grip force that the gripper measured before."""
     margin: Annotated[Float64[np.ndarray, " steps"], MARGIN, UNKNOWN]
-    """Read, the mean of the fingertips that read."""
+    """Predicted margin, mean of the fingertips that have one."""
     low: Annotated[Float64[np.ndarray, " steps"], MARGIN, UNKNOWN]
     slip: Bool[np.ndarray, " steps"]
-    """Whether the markers told of a slip."""
+    """True where the markers showed a slip."""
     failed: Bool[np.ndarray, " steps"]
-    """Whether the gripper failed to take the command, or to tell its force."""
+    """True where the gripper failed to take the command, or to measure its force."""
     why: Shaped[np.ndarray, " steps"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hold:
-    """What a gripper was told while something was held, and how that ended."""
+    """Commands to a gripper while it held something, and how the hold ended."""
 
     sources: tuple[str, ...]
-    """What was read: a fingertip each."""
+    """Live source of each fingertip."""
     gripper: str
     """Its address, or the name of its class."""
     controller: str
     settings: dict[str, float]
-    """Constants of the controller that were changed."""
+    """Changed constants of the controller."""
     ceiling_n: float
     watchdog_s: float
     ended: Literal["time", "source", "failed", "interrupted"]
-    """The time was over, a source ended, that or who was told of each step failed, or a person interrupted it."""
+    """`time`: the time was over; `source`: a source ended; `failed`: a source or callback failed; `interrupted`: by a
+    person."""
     why: str
-    """The same in a sentence, with what the gripper goes on doing."""
+    """End of the hold in a sentence, with the state of the gripper after it."""
     troubles: tuple[str, ...]
-    """What the gripper failed at, each once."""
+    """Faults of the gripper, each once."""
     steps: HoldSteps
 
     def frame(self) -> pa.Table:
-        """Table with a row a command."""
+        """Return a table with a row a command."""
         return self.steps.table()
+
+
+__all__ = ["EpisodeTable", "Grip", "GripSetup", "GripTrace", "Hold", "HoldSteps"]
