@@ -1,4 +1,4 @@
-"""Gross slip as the markers alone tell it: no network, nothing learnt, thresholds from the sensor's own stillness."""
+"""Gross slip from the motion of the markers alone: no network, thresholds from the noise of the still sensor."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -17,9 +17,9 @@ Fields: TypeAlias = np.ndarray
 """Fields by row, coordinate and marker: not checked in tests, for these helpers run some 20 times a frame."""
 
 _FEWEST = 6
-"""Markers of the contact without which no motion of it can be told."""
+"""Least number of markers that shows the motion of a contact."""
 _FEWEST_FRAMES = 3
-"""Of the window, however slow the camera is."""
+"""Least number of frames in the window, however slow the camera is."""
 _LEAST_NOISE_PX = 0.02
 """Of compressed video, whose frames repeat, the noise cannot be seen."""
 _REPRESSED = 1 / 0.75
@@ -38,7 +38,7 @@ _RAYLEIGH_95 = 2.45
 
 @dataclass(frozen=True, kw_only=True)
 class SlipLimits:
-    """From when on a motion counts; `recoil` and `evidence` in standard deviations of what the still sensor showed.
+    """Limits from which a motion counts; `recoil` and `evidence` in standard deviations of the still sensor's noise.
 
     The defaults were chosen on simulated trials of other seeds than `benchmarks/slip.py` tests on.
     """
@@ -48,17 +48,17 @@ class SlipLimits:
     still_frames: int = 12
     """Frames that this takes at least."""
     window_s: float = 0.1
-    """Longest time over which a motion is looked at, in seconds."""
+    """Longest time over which a motion is measured, in seconds."""
     pattern_s: float = 0.4
     """Time over which the pattern of the shear is averaged, in seconds."""
     recoil: float = 4.0
     """Motion of the skin against that pattern."""
     evidence: float = 0.5
-    """The same, of what no rigid motion explains (Dong's residual)."""
+    """Part of that motion that no rigid motion explains (Dong's residual)."""
     fall: float = 0.045
     """Least share of the shear that is lost within the window: a pull that is let go slowly is no slip."""
     hold_s: float = 0.25
-    """Time for which a slip that was seen is told, in seconds."""
+    """Time for which a detected slip is reported, in seconds."""
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -71,11 +71,11 @@ class ContactStates:
     """State of some contacts at one frame, an entry each."""
 
     ready: Bool[np.ndarray, " contacts"]
-    """Whether the noise of the markers was measured, and enough of them are seen."""
+    """True where the noise of the markers was measured, and enough of them are visible."""
     contact: Bool[np.ndarray, " contacts"]
     slip: Bool[np.ndarray, " contacts"]
     unknown: Bool[np.ndarray, " contacts"]
-    """Whether neither slip nor sticking can be told."""
+    """True where neither slip nor sticking is certain."""
     shear_px: Float[np.ndarray, " contacts"]
     """Mean motion of the contact's middle since it was pressed, in pixels."""
     slipping_s: Float[np.ndarray, " contacts"]
@@ -102,7 +102,7 @@ class _Frame:
     time_s: float
     spread: Float[np.ndarray, " contacts"]
     moved: Float[np.ndarray, "contacts 2 markers"]
-    seen: Bool[np.ndarray, "contacts markers"]
+    visible: Bool[np.ndarray, "contacts markers"]
 
 
 class SlipBatch:
@@ -113,7 +113,7 @@ class SlipBatch:
     rest_px
         Places (x, y) of the markers in the untouched sensors; at least 6 each.
     limits
-        From when on a motion counts.
+        Limits from which a motion counts.
 
     Raises
     ------
@@ -133,21 +133,21 @@ class SlipBatch:
         """Times and motions (NaN where a marker is not seen) of the frames in which noise is measured."""
         self._still_s, self._still_frames = np.full(contacts, np.inf), np.zeros(contacts, dtype=int)
         """Time of the first of these frames that counts for each contact, and their number."""
-        self._seen = np.ones((contacts, markers), dtype=bool)
-        self._fit = _affine_weights(self._rest, self._seen)
+        self._visible = np.ones((contacts, markers), dtype=bool)
+        self._fit = _affine_weights(self._rest, self._visible)
         self._noise_px = np.full(contacts, np.nan)
         """Standard deviation of a coordinate of a marker of the still sensor."""
         self._together_px = np.full(contacts, np.nan)
-        """The same, were all their motion that of the markers as a whole: more where a camera trembles."""
+        """Standard deviation if all motion were that of the markers as a whole: more where a camera trembles."""
         self._frames: deque[_Frame] = deque()
         self._window = np.zeros(contacts, dtype=int)
-        """How many of the last frames are looked at."""
+        """Number of frames in the window of each contact."""
         self._hold = np.full(self._rest.shape, np.nan)
         """Motion of the markers up to the end of the press; NaN without a contact."""
         self._pattern = np.full(self._rest.shape, np.nan)
         """Mean motion since then, of the frames that left the window."""
         self._inner = np.zeros((contacts, markers), dtype=bool)
-        self._pressed, self._hold_s, self._seen_s = np.zeros((3, contacts))
+        self._pressed, self._hold_s, self._recoil_s = np.zeros((3, contacts))
         self._slip_s, self._least_px = np.full(contacts, np.nan), np.full(contacts, np.inf)
         self._recoils_at: dict[int, _Recoil] = {}
         """Recoils that are not judged yet, by contact."""
@@ -157,21 +157,21 @@ class SlipBatch:
     def update(self, positions_px: Float[np.ndarray, "contacts markers 2"], time_s: float, /) -> ContactStates:
         """Take the markers of a frame, in the order of `rest_px`, NaN where one is not seen; times must rise."""
         moved = np.ascontiguousarray(positions_px.swapaxes(1, 2)) - self._rest
-        seen = np.isfinite(moved[:, 0])
-        moved, count = np.where(seen[:, None], moved, 0), np.count_nonzero(seen, axis=1)
+        visible = np.isfinite(moved[:, 0])
+        moved, count = np.where(visible[:, None], moved, 0), np.count_nonzero(visible, axis=1)
         learns = np.isnan(self._noise_px)
         if learns.any():
             still = learns & (count >= _FEWEST)
-            self._learn_noise(still, np.where((still[:, None] & seen)[:, None], moved, np.nan), time_s)
+            self._learn_noise(still, np.where((still[:, None] & visible)[:, None], moved, np.nan), time_s)
         ready = ~learns & (count >= _FEWEST)
-        if not np.array_equal(seen, self._seen):
-            self._seen, self._fit = seen, _affine_weights(self._rest, seen)
+        if not np.array_equal(visible, self._visible):
+            self._visible, self._fit = visible, _affine_weights(self._rest, visible)
         spread = np.einsum("ckm,ckm->c", self._fit[:, 1:], moved)
         stand_out = moved[:, 0] ** 2 + moved[:, 1] ** 2 > ((2 * _RAYLEIGH_95 * self._noise_px) ** 2)[:, None]
         # out of the noise, and a contact that was there has not been let go
         contact = ready & (np.count_nonzero(stand_out, axis=1) > 0.1 * count) & (spread > _LET_GO * self._pressed)
         self._end(np.flatnonzero(~contact & (self._pressed > 0)))
-        shear_px = np.linalg.norm(self._shear(moved, seen), axis=1)
+        shear_px = np.linalg.norm(self._shear(moved, visible), axis=1)
         # what is stuck, and the shear, count from a press that grew by much, and more than it was pulled: a pull, too,
         # spreads the markers a little
         grown_px = (spread - self._pressed) / 2 * self._reach_px
@@ -181,7 +181,7 @@ class SlipBatch:
             self._begin(begins, moved[begins], spread[begins], time_s)
             shear_px[begins] = 0.0
         self._window = np.where(contact, self._window + 1, 0)
-        self._frames.append(_Frame(time_s=time_s, spread=spread, moved=moved, seen=seen))
+        self._frames.append(_Frame(time_s=time_s, spread=spread, moved=moved, visible=visible))
         self._shorten_windows(time_s)
         return self._states(self._recoils(), shear_px, ready, contact, time_s)
 
@@ -195,13 +195,13 @@ class SlipBatch:
     ) -> ContactStates:
         springs = np.isfinite(began_s)
         self._slip_s = np.where(springs & np.isnan(self._slip_s), began_s, self._slip_s)
-        self._seen_s = np.where(springs, time_s, self._seen_s)
+        self._recoil_s = np.where(springs, time_s, self._recoil_s)
         self._least_px = np.fmin(np.where(springs, np.inf, self._least_px), shear_px)
-        slip = np.isfinite(self._slip_s) & (time_s - self._seen_s <= self.limits.hold_s)
+        slip = np.isfinite(self._slip_s) & (time_s - self._recoil_s <= self.limits.hold_s)
         # pulled on, and it follows: it sticks again
         sticks = ~slip & (shear_px > self._least_px + self.limits.recoil * self._middle_noise_px())
         self._slip_s = np.where(sticks, np.nan, self._slip_s)
-        # after a slip, and until the press is over, nobody knows
+        # after a slip, and until the press is over, neither is certain
         unknown = np.isfinite(self._slip_s) | (time_s - self._hold_s < self.limits.window_s)
         return ContactStates(
             ready=ready,
@@ -214,7 +214,7 @@ class SlipBatch:
         )
 
     def _confirm(self, springs: Bool[np.ndarray, " contacts"], time_s: float) -> Float[np.ndarray, " contacts"]:
-        """Time since the slips that are confirmed now: some time after the recoil the load is still there.
+        """Compute the time since the slips that are confirmed now: the load is still there some time after the recoil.
 
         A contact that slides carries what kinetic friction holds, and one that is tightened takes the load up again; a
         pull that was let go is gone.
@@ -223,7 +223,7 @@ class SlipBatch:
         for row in np.flatnonzero(springs).tolist():
             if row not in self._recoils_at and self._slip_s[row] != self._judged_s[row]:
                 first = self._frames[-int(self._window[row])]
-                middle = self._inner[row] & first.seen[row]
+                middle = self._inner[row] & first.visible[row]
                 self._recoils_at[row] = _Recoil(
                     time_s=float(self._slip_s[row]),
                     spread=float(first.spread[row]),
@@ -237,7 +237,7 @@ class SlipBatch:
             elif time_s - recoil.time_s >= _CONFIRMED_S:
                 del self._recoils_at[row]
                 self._judged_s[row] = recoil.time_s
-                middle = recoil.inner & newest.seen[row]
+                middle = recoil.inner & newest.visible[row]
                 shear_px = (newest.moved[row] - recoil.hold)[:, middle].mean(axis=1) if middle.any() else np.zeros(2)
                 carried = float(shear_px @ recoil.shear_px) / max(float(recoil.shear_px @ recoil.shear_px), 1e-9)
                 tightened = newest.spread[row] > _TIGHTENED * recoil.spread
@@ -256,9 +256,9 @@ class SlipBatch:
             at = np.flatnonzero(enough & (self._still_s == first_s))
             fields = np.stack([field[at] for then_s, field in self._still if then_s >= first_s], axis=1)
             steps = np.diff(fields, axis=1)
-            known = np.isfinite(steps)
-            median, count = np.median if known.all() else np.nanmedian, known.sum(axis=3)
-            mean = np.where(count, np.where(known, steps, 0).sum(axis=3) / np.maximum(count, 1), np.nan)
+            valid = np.isfinite(steps)
+            median, count = np.median if valid.all() else np.nanmedian, valid.sum(axis=3)
+            mean = np.where(count, np.where(valid, steps, 0).sum(axis=3) / np.maximum(count, 1), np.nan)
             mean *= np.sqrt(np.isfinite(moved[at, 0]).sum(axis=1))[:, None, None]
             # of differences, and their median: creep and a touch that begins count little
             single, together = (
@@ -273,43 +273,43 @@ class SlipBatch:
         self, rows: Int[np.ndarray, " begins"], moved: Fields, spread: Float[np.ndarray, " begins"], time_s: float
     ) -> None:
         """Begin some contacts, or begin them anew."""
-        seen = self._seen[rows]
-        self._hold[rows] = np.where(seen[:, None], moved, np.nan)
+        visible = self._visible[rows]
+        self._hold[rows] = np.where(visible[:, None], moved, np.nan)
         self._pressed[rows], self._hold_s[rows] = spread, time_s
         self._pattern[rows], self._window[rows] = np.nan, 0
         mean_px = (self._fit[rows, :1] * moved).sum(axis=2)
         rank = rank_from_centre(self._rest[rows].swapaxes(1, 2), mean_px=mean_px, divergence=spread)
-        inner = (rank < INNER_SHARE) & seen
-        self._inner[rows] = np.where((inner.sum(axis=1) >= 2)[:, None], inner, seen)
+        inner = (rank < INNER_SHARE) & visible
+        self._inner[rows] = np.where((inner.sum(axis=1) >= 2)[:, None], inner, visible)
 
     def _end(self, rows: Int[np.ndarray, " ended"]) -> None:
         self._hold[rows] = self._pattern[rows] = self._slip_s[rows] = np.nan
-        self._pressed[rows] = self._hold_s[rows] = self._seen_s[rows] = 0.0
+        self._pressed[rows] = self._hold_s[rows] = self._recoil_s[rows] = 0.0
         self._inner[rows], self._least_px[rows] = False, np.inf
 
     def trial(self, row: int, since: Field) -> FieldTrial:
-        """Two frames of a contact for the estimators: as it was pressed, and some motion since."""
+        """Make two frames of a contact for the estimators: as it was pressed, and some motion since."""
         hold = self._hold[row].T
         return FieldTrial(rest_px=self._rest[row].T, displacement_px=np.stack([hold, hold + since]), hold=0)
 
     def step_px(self, row: int) -> float:
-        """Length that 95 % of the differences between two places of a still marker do not reach."""
+        """Compute the length below which 95 % of the differences between two places of a still marker lie."""
         return _RAYLEIGH_95 * float(np.sqrt(2) * self._noise_px[row])
 
     def since_press(self, row: int) -> Field:
-        """Motion of a contact's markers since it was pressed, in the newest frame."""
+        """Return the motion of a contact's markers since it was pressed, in the newest frame."""
         frame = self._frames[-1]
-        return np.where(frame.seen[row], frame.moved[row] - self._hold[row], np.nan).T
+        return np.where(frame.visible[row], frame.moved[row] - self._hold[row], np.nan).T
 
     def _middle_noise_px(self) -> Float[np.ndarray, " contacts"]:
-        """Noise of a difference of two means over the contact's middle."""
+        """Compute the noise of a difference of two means over the contact's middle."""
         return self._noise_px * np.sqrt(2 / np.maximum(self._inner.sum(axis=1), 1))
 
     def _shear(
-        self, moved: Float[np.ndarray, "contacts 2 markers"], seen: Bool[np.ndarray, "contacts markers"]
+        self, moved: Float[np.ndarray, "contacts 2 markers"], visible: Bool[np.ndarray, "contacts markers"]
     ) -> Float[np.ndarray, "contacts 2"]:
-        """Mean motion of the contact's middle since it was pressed; NaN without a contact."""
-        middle = self._inner & seen & np.isfinite(self._hold[:, 0])
+        """Compute the mean motion of the contact's middle since it was pressed; NaN without a contact."""
+        middle = self._inner & visible & np.isfinite(self._hold[:, 0])
         count = np.count_nonzero(middle, axis=1)[:, None]
         total = np.where(middle[:, None], moved - self._hold, 0).sum(axis=2)
         return np.where(count > 0, total / np.maximum(count, 1), np.nan)
@@ -324,7 +324,7 @@ class SlipBatch:
             for at in np.unique(first[late]).tolist():
                 rows = np.flatnonzero(late & (first == at))
                 share = -np.expm1(-(times[at + 1] - times[at]) / limits.pattern_s)
-                field = np.where(frames[at].seen[rows][:, None], frames[at].moved[rows] - self._hold[rows], np.nan)
+                field = np.where(frames[at].visible[rows][:, None], frames[at].moved[rows] - self._hold[rows], np.nan)
                 pattern = self._pattern[rows]
                 blended = pattern + share * (field - pattern)
                 # a marker that was not seen keeps what it had
@@ -336,7 +336,7 @@ class SlipBatch:
             frames.popleft()
 
     def _recoils(self) -> Float[np.ndarray, " contacts"]:
-        """Time at which the skin began to spring back; NaN where it did not, or where that tells no slip."""
+        """Find the times at which the skin began to spring back by a slip; NaN where it did not."""
         began_s = np.full(len(self._rest), np.nan)
         searched = (self._window > 1) & np.isfinite(self._pattern[:, 0]).any(axis=1)
         for count in np.unique(self._window[searched]).tolist():
@@ -346,33 +346,33 @@ class SlipBatch:
         return began_s
 
     def _recoils_of(self, rows: Int[np.ndarray, " rows"], frames: Sequence[_Frame]) -> Float[np.ndarray, " rows"]:
-        """The same of contacts whose windows are these frames."""
+        """Find these times for contacts whose windows are some frames."""
         began_s, limits = np.full(len(rows), np.nan), self.limits
         picks = slice(None) if len(rows) == len(self._rest) else rows
         rest, pattern, hold = (values[picks] for values in (self._rest, self._pattern, self._hold))
-        known = np.isfinite(pattern[:, 0]) & np.isfinite(hold[:, 0])
+        valid = np.isfinite(pattern[:, 0]) & np.isfinite(hold[:, 0])
         for frame in frames:
-            known &= frame.seen[picks]
-        if not known.all():
-            rest, pattern, hold = (np.where(known[:, None], values, 0) for values in (rest, pattern, hold))
-        count = np.maximum(known.sum(axis=1), 1)[:, None, None]
-        arm = (rest - rest.sum(axis=2, keepdims=True) / count) * known[:, None]
+            valid &= frame.visible[picks]
+        if not valid.all():
+            rest, pattern, hold = (np.where(valid[:, None], values, 0) for values in (rest, pattern, hold))
+        count = np.maximum(valid.sum(axis=1), 1)[:, None, None]
+        arm = (rest - rest.sum(axis=2, keepdims=True) / count) * valid[:, None]
         # a grip that is tightened or loosened moves the markers as its press did, or from the middle
         press = _unit(hold)
         pattern = _without(pattern, press, _unit(_without(arm, press)))
         length = np.sqrt(np.einsum("rkm,rkm->r", pattern, pattern))
         # of little shear the pattern is noise
-        enough = (length >= 2 * limits.recoil * self._together_px[rows]) & (known.sum(axis=1) >= _FEWEST)
+        enough = (length >= 2 * limits.recoil * self._together_px[rows]) & (valid.sum(axis=1) >= _FEWEST)
         if not enough.any():
             return began_s
         if not enough.all():
-            rows, known, pattern, arm, length = (values[enough] for values in (rows, known, pattern, arm, length))
+            rows, valid, pattern, arm, length = (values[enough] for values in (rows, valid, pattern, arm, length))
         pattern /= length[:, None, None]
         old = np.arange(1, len(frames))
         spread = np.sqrt(1 / old + 1 / (len(frames) - old))
 
         def drops(ways: Fields, of: slice | np.ndarray) -> Float[np.ndarray, "rows cuts"]:
-            """Fall of the mean motion along a way from the frames before each cut to those after it."""
+            """Compute the fall of the mean motion along a field from before each cut to after it."""
             picks = slice(None) if len(ways) == len(self._rest) else rows[of]  # a view of all costs no copy
             heights = np.stack([np.einsum("rkm,rkm->r", frame.moved[picks], ways) for frame in frames], axis=-1)
             total = np.cumsum(heights, axis=-1)
@@ -386,16 +386,16 @@ class SlipBatch:
         springs = (drop >= limits.fall * length) & (whole >= limits.recoil)
         if not springs.any():
             return began_s
-        shifts = [_unit(known[springs, None] * np.array(way)) for way in ([[1.0], [0.0]], [[0.0], [1.0]])]
+        shifts = [_unit(valid[springs, None] * np.array(way)) for way in ([[1.0], [0.0]], [[0.0], [1.0]])]
         turn = _unit(arm[springs][:, ::-1] * np.array([[-1.0], [1.0]]))
         bent = _without(pattern[springs], *shifts, turn)
-        left = np.sqrt(np.einsum("rkm,rkm->r", bent, bent))
+        residual = np.sqrt(np.einsum("rkm,rkm->r", bent, bent))
         bending = np.take_along_axis(drops(_unit(bent), springs), cut[springs, None], axis=-1)[:, 0]
         bending = bending / wide[springs] / self._noise_px[rows[springs]]
         # a large motion must show more than noise that happens to bend
         bends = springs.copy()
-        bends[springs] = bending >= np.maximum(limits.evidence, _BENT_SHARE * left * whole[springs])
-        bends[bends] = ~self._handled(rows[bends], frames, cut[bends] + 1, known[bends], drop[bends])
+        bends[springs] = bending >= np.maximum(limits.evidence, _BENT_SHARE * residual * whole[springs])
+        bends[bends] = ~self._handled(rows[bends], frames, cut[bends] + 1, valid[bends], drop[bends])
         began_s[enough] = np.where(bends, np.array([frame.time_s for frame in frames])[cut], np.nan)
         return began_s
 
@@ -404,7 +404,7 @@ class SlipBatch:
         rows: Int[np.ndarray, " rows"],
         frames: Sequence[_Frame],
         cut: Int[np.ndarray, " rows"],
-        known: Bool[np.ndarray, "rows markers"],
+        valid: Bool[np.ndarray, "rows markers"],
         drop: Float[np.ndarray, " rows"],
     ) -> Bool[np.ndarray, " rows"]:
         """True where a contact was let go, pressed or pulled further from a frame of the window on."""
@@ -412,29 +412,29 @@ class SlipBatch:
         shares = [old / cut, ~old / (len(frames) - cut)]  # weights of the means before the cut and from it on
         spread = np.stack([frame.spread[rows] for frame in frames])
         pressed = np.abs((spread * (shares[0] - shares[1])).sum(axis=0))
-        inner = known & self._inner[rows]
-        markers = np.expand_dims(np.where(inner.any(axis=1, keepdims=True), inner, known), 1)
+        inner = valid & self._inner[rows]
+        markers = np.expand_dims(np.where(inner.any(axis=1, keepdims=True), inner, valid), 1)
         count = np.count_nonzero(markers, axis=2)
         hold = np.where(markers, self._hold[rows], 0)
         middle = np.stack([(np.where(markers, frame.moved[rows], 0) - hold).sum(axis=2) / count for frame in frames])
         before, after = (np.linalg.norm((middle * share[..., None]).sum(axis=0), axis=1) for share in shares)
         pulled = after > before + self.limits.recoil * self._middle_noise_px()[rows]
-        return pulled | (pressed / 2 * self._reach_px[rows] > drop / np.sqrt(known.sum(axis=1)))
+        return pulled | (pressed / 2 * self._reach_px[rows] > drop / np.sqrt(valid.sum(axis=1)))
 
 
 class SlipDetector:
-    """Says of each frame whether the contact slips as a whole, from the motion of its markers.
+    """Detector of a slip of the contact as a whole, from the motion of its markers.
 
     When a contact slips, friction falls from its static to its kinetic value and the stretched skin springs back
-    against the pull within some hundredths of a second. So a slip is told where the markers move back along the pattern
-    in which they were sheared before, and where what is left of that motion besides the best rigid one still follows
-    the pattern: a camera that moves takes all markers along. The pattern is the mean shear of the last moments;
-    projected on it, dozens of markers of a tenth of a pixel's noise tell a recoil of a few hundredths. Old and new
-    frames are told apart where they differ most, in units of what the sensor showed in its first still moments. What
-    the press moves is projected out of all that: a gripper tightens and loosens all the time.
+    against the pull within some hundredths of a second. A slip is detected where the markers move back along the
+    pattern in which they were sheared before, and where the residual of the best rigid motion still follows the
+    pattern: a camera that moves takes all markers along. The pattern is the mean shear of the last moments; projected
+    on it, dozens of markers of a tenth of a pixel's noise show a recoil of a few hundredths. The window is cut where
+    the frames before and after differ most, in units of the noise of the first still moments. The motion of the press
+    is projected out of all that: a gripper tightens and loosens all the time.
 
-    What it cannot tell: a contact that slides on evenly looks as one that holds, and one whose friction does not fall
-    has no recoil; after a slip it says "cannot tell" until the shear grows again. A load that is taken away as fast as
+    Its limits: a contact that slides on evenly looks like one that holds, and one whose friction does not fall has no
+    recoil; after a slip the state is "cannot tell" until the shear grows again. A load that is taken away as fast as
     skin springs back passes for a slip.
 
     Parameters
@@ -442,7 +442,7 @@ class SlipDetector:
     rest_px
         Places (x, y) of the markers in the untouched sensor; at least 6.
     limits
-        From when on a motion counts.
+        Limits from which a motion counts.
 
     Raises
     ------
@@ -493,20 +493,22 @@ def _from_middle(places_px: Fields) -> Fields:
     return places_px - places_px.mean(axis=2, keepdims=True)
 
 
-def _affine_weights(rest_px: Fields, seen: Bool[np.ndarray, "rows markers"]) -> Fields:
-    """Weights of each marker's motion in the mean and in the divergence (x and y) of its field, as `affine_parts`."""
-    terms = np.concatenate([np.ones((len(seen), 1, seen.shape[1])), _from_middle(rest_px)], axis=1) * seen[:, None]
+def _affine_weights(rest_px: Fields, visible: Bool[np.ndarray, "rows markers"]) -> Fields:
+    """Compute the weights of each marker in the mean and the divergence (x and y) of its field, as `affine_parts`."""
+    terms = (
+        np.concatenate([np.ones((len(visible), 1, visible.shape[1])), _from_middle(rest_px)], axis=1) * visible[:, None]
+    )
     return np.linalg.solve(terms @ terms.swapaxes(1, 2) + 1e-9 * np.eye(3), terms)
 
 
 def _unit(fields: Fields) -> Fields:
-    """Fields of length 1 that are 0 where they were 0."""
+    """Scale fields to length 1; those of 0 stay 0."""
     length = np.sqrt(np.einsum("rkm,rkm->r", fields, fields))
     return fields / np.maximum(length, 1e-9)[:, None, None]
 
 
 def _without(fields: Fields, *ways: Fields) -> Fields:
-    """Fields less their parts along some ways, which are orthogonal to each other and of length 1."""
+    """Subtract from fields their parts along some others, which are orthogonal to each other and of length 1."""
     for way in ways:
         fields = fields - np.einsum("rkm,rkm->r", fields, way)[:, None, None] * way
     return fields
