@@ -147,7 +147,7 @@ def test_frames_are_read_as_the_head_was_taught(run: Network):
     margin, ratio = (there(one.probabilities).astype("f4") for one in (estimate, there(estimate.ratio)))
     elapsed_s = np.array([1.0, *np.full(11, 0.1)])
     with torch.no_grad():
-        told = torch.from_numpy(head.tell(head.summarize(margin, ratio), elapsed_s))
+        told = torch.from_numpy(head.make_inputs(head.summarize(margin, ratio), elapsed_s))
         logits = head(told[None], torch.from_numpy(margin)[None])
     read = run.follow().update(estimate, np.arange(12) / 10, np.ones(12, dtype=bool))
     # floats have 24 bits, and sums of up to 80 of them are added in another order

@@ -9,7 +9,7 @@ from scipy import stats
 from sliplens.errors import InputError
 from sliplens.friction import Friction
 from sliplens.models import Network
-from sliplens.models.calibration import told_probabilities
+from sliplens.models.calibration import condition_on_friction
 
 EDGES, RATIO_EDGES = np.linspace(-0.1, 1.1, 61), np.linspace(-0.1, 1.5, 81)
 MARGINS = np.clip((EDGES[1:] + EDGES[:-1]) / 2, 0, 1)
@@ -23,7 +23,7 @@ def ratio_about(mean: float, sigma: float) -> np.ndarray:
 
 
 def told(margin: np.ndarray, ratio: np.ndarray, friction: Friction) -> np.ndarray:
-    return told_probabilities(
+    return condition_on_friction(
         margin, ratio, edges=EDGES, ratio_edges=RATIO_EDGES, friction=friction, trained_friction=TRAINED
     )
 

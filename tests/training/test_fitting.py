@@ -6,15 +6,16 @@ import pytest
 import torch
 
 from sliplens.errors import InputError, ModelError
-from sliplens.models import load_checkpoint, save_checkpoint
+from sliplens.models import Network, load_checkpoint, save_checkpoint
 from sliplens.models.encodings import ENCODINGS
+from sliplens.progress import OnProgress, reporting
 from sliplens.recordings import Dataset
 from sliplens.results.evaluation import Training
-from sliplens.training import TrainConfig, evaluate_frames, fit, fitting, get_recipe
+from sliplens.training import TrainingConfig, evaluate_frames, fit, fitting, get_recipe
 from sliplens.training.data import EpochShuffle, FrameSet, load_frames
-from sliplens.training.fitting import require_same_kind
+from sliplens.training.fitting import DataOrigin, require_same_kind
 
-CONFIG = TrainConfig(image_size=32, epochs=3, batch_size=11, seed=3)
+CONFIG = TrainingConfig(image_size=32, epochs=3, batch_size=11, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -27,9 +28,20 @@ def frames(small_dataset: Dataset) -> tuple[FrameSet, FrameSet]:
     return train, validation
 
 
-def run(folder: Path, frames: tuple[FrameSet, FrameSet], config: TrainConfig = CONFIG, **more: object) -> Training:
+ORIGIN = DataOrigin(frame_size=(48, 48), sensor="test", data_hash="none", trained_on=("abc",))
+
+
+def run(
+    folder: Path,
+    frames: tuple[FrameSet, FrameSet],
+    config: TrainingConfig = CONFIG,
+    *,
+    start: Network | None = None,
+    on_progress: OnProgress | None = None,
+) -> Training:
     folder.mkdir(exist_ok=True)
-    return fit(config, *frames, folder, frame_size=(48, 48), sensor="test", data_hash="none", **more)  # pyright: ignore[reportArgumentType]
+    with reporting(on_progress):
+        return fit(config, *frames, folder, origin=ORIGIN, start=start)
 
 
 @pytest.fixture(scope="module")
@@ -164,13 +176,13 @@ def test_a_training_may_start_from_another_network(
     start = load_checkpoint(trained_run)
     before = {name: value.clone() for name, value in start.model.state_dict().items()}
     # so low a rate leaves the weights as they were, whatever else is done to them
-    run(tmp_path / "still", frames, replace(CONFIG, epochs=1, learning_rate=1e-12), start=start, trained_on=["abc"])
+    run(tmp_path / "still", frames, replace(CONFIG, epochs=1, learning_rate=1e-12), start=start)
     after = load_checkpoint(tmp_path / "still")
     weights = dict(after.model.named_parameters())
     for name, value in start.model.named_parameters():
         torch.testing.assert_close(weights[name], value, rtol=0, atol=1e-9)
     assert after.manifest.started_from == start.manifest.weights_sha256
-    assert after.manifest.trained_on == ("abc", *start.manifest.trained_on)
+    assert after.manifest.trained_on == ("abc", *start.manifest.trained_on) == ("abc", "abc")
     assert start.manifest.started_from == ""
     for name, value in start.model.state_dict().items():
         assert torch.equal(value, before[name])
@@ -286,7 +298,7 @@ def test_without_forces_there_is_no_second_answer(tmp_path: Path, frames: tuple[
     train, validation = (
         replace(one, traction_ratio=torch.full_like(one.traction_ratio, float("nan"))) for one in frames
     )
-    with pytest.raises(InputError, match="no training frame tells its forces"):
+    with pytest.raises(InputError, match="no training frame has forces"):
         run(tmp_path / "run", (train, validation), replace(CONFIG, head="margin-and-ratio"))
 
 

@@ -9,10 +9,10 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from there import there
 
 from sliplens.errors import InputError
-from sliplens.training import TrainConfig
+from sliplens.training import TrainingConfig
 from sliplens.training.config import LOGGERS, open_logger
 
-RECIPE = {**asdict(TrainConfig()), "input": "difference", "condition": None}
+RECIPE = {**asdict(TrainingConfig()), "input": "difference", "condition": None}
 
 
 def needs(name: str) -> None:

@@ -15,7 +15,7 @@ from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.sequence import GAP_S
 from sliplens.recordings import Dataset
 from sliplens.training import evaluate, train
-from sliplens.training import sequence as sequences
+from sliplens.training.sequence import TrialOutputs
 
 
 @pytest.fixture(scope="module")
@@ -72,10 +72,8 @@ def test_neither_rate_nor_number_of_frames_tells_how_long_a_trial_is(rng: np.ran
     rates = {}
     for duration_s in (1.5, 7.5):
         time_s = np.linspace(0, duration_s, 76)
-        trial = sequences.AnsweredTrial(
-            margin=np.zeros((76, 1), "f4"), ratio=np.zeros((76, 1), "f4"), label=time_s, time_s=time_s
-        )
-        some = [trial.some(rng) for _ in range(400)]
+        trial = TrialOutputs(margin=np.zeros((76, 1), "f4"), ratio=np.zeros((76, 1), "f4"), label=time_s, time_s=time_s)
+        some = [trial.sample(rng) for _ in range(400)]
         assert all(one.time_s[0] <= duration_s / 2 + 0.1 for one in some)
         assert all(np.array_equal(one.label, one.time_s) for one in some)
         rates[duration_s] = np.concatenate([np.diff(one.time_s)[:1] for one in some])
@@ -88,8 +86,8 @@ def test_no_step_is_taught_that_is_never_read(rng: np.random.Generator):
     """Every second frame, 0.7 s apart, would be further than memory reaches when a trial is read."""
     time_s = 0.35 * np.arange(20)
     empty = np.zeros((20, 1), "f4")
-    trial = sequences.AnsweredTrial(margin=empty, ratio=empty, label=time_s, time_s=time_s)
-    steps = [np.diff(trial.some(rng).time_s) for _ in range(50)]
+    trial = TrialOutputs(margin=empty, ratio=empty, label=time_s, time_s=time_s)
+    steps = [np.diff(trial.sample(rng).time_s) for _ in range(50)]
     assert np.concatenate(steps).max() <= GAP_S
     assert np.allclose(np.concatenate(steps), 0.35)
 
@@ -141,7 +139,7 @@ def test_what_cannot_be_taught_is_refused(small_dataset: Dataset, start: Path, d
         teach(replace(small_dataset), start, devices=2)
     with pytest.raises(InputError, match="whose image_size is 32; leave out --image-size"):
         teach(small_dataset, start, image_size=96)
-    with pytest.raises(InputError, match="takes no such thing; leave out --untouched-share"):
+    with pytest.raises(InputError, match="takes no such option; leave out --untouched-share"):
         teach(small_dataset, start, untouched_share=0.2)
     with pytest.raises(InputError, match="--logger tensorboard"):
         teach(small_dataset, start, logger="tensorboard")

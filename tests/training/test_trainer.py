@@ -1,7 +1,7 @@
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.training import TrainConfig, make_trainer
+from sliplens.training import TrainingConfig, make_trainer
 from sliplens.training.module import share_of_batch
 
 VARIABLES = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "WORLD_SIZE", "TORCHELASTIC_RUN_ID")
@@ -42,21 +42,21 @@ def test_a_process_knows_its_number_before_it_trains(
 ):
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    trainer = make_trainer(TrainConfig(), accelerator="cpu", devices=2, num_nodes=2)
+    trainer = make_trainer(TrainingConfig(), accelerator="cpu", devices=2, num_nodes=2)
     assert (trainer.global_rank, trainer.world_size) == (rank, 4)
 
 
 def test_a_cluster_that_lightning_cannot_read_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SLURM_NTASKS", "4")
     with pytest.raises(InputError, match=r"this machine cannot train on 4 x cpu .*ntasks-per-node"):
-        make_trainer(TrainConfig(), accelerator="cpu", devices=4)
+        make_trainer(TrainingConfig(), accelerator="cpu", devices=4)
 
 
 def test_processes_that_nobody_asked_for_are_refused(monkeypatch: pytest.MonkeyPatch):
     for name, value in {"TORCHELASTIC_RUN_ID": "a", "RANK": "1", "LOCAL_RANK": "1", "WORLD_SIZE": "2"}.items():
         monkeypatch.setenv(name, value)
     with pytest.raises(InputError, match=r"does not match the world size \(2\)\); change --devices, --num-nodes"):
-        make_trainer(TrainConfig(), accelerator="cpu")
+        make_trainer(TrainingConfig(), accelerator="cpu")
 
 
 @pytest.mark.parametrize("processes", [1, 2, 3, 4, 6, 12])
@@ -80,4 +80,4 @@ def test_a_batch_that_cannot_be_shared_is_refused(batch_size: int, message: str)
 @pytest.mark.parametrize("flags", [{"devices": 0}, {"devices": 1, "num_nodes": 0}])
 def test_no_hardware_is_refused(flags: dict[str, int]):
     with pytest.raises(InputError, match="this machine cannot train on"):
-        make_trainer(TrainConfig(), accelerator="cpu", **flags)
+        make_trainer(TrainingConfig(), accelerator="cpu", **flags)

@@ -80,7 +80,7 @@ def test_a_network_that_is_adapted_stays_of_its_kind(small_dataset: Dataset):
     for name in ("input", "backbone", "head", "image_size"):
         assert getattr(run.manifest, name) == getattr(start.manifest, name)
     assert any("6 labelled trials" in sentence for sentence in notes.sentences)
-    with pytest.raises(InputError, match="teaches a network that is there; name it with --start-from"):
+    with pytest.raises(InputError, match="teaches an existing network; name it with --start-from"):
         sl.train(small_dataset, recipe="adapt")
 
 

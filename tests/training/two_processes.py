@@ -14,12 +14,14 @@ from sliplens.errors import ModelError
 from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import load_dataset
 from sliplens.results.evaluation import Training
-from sliplens.training import TrainConfig, fit, make_trainer
+from sliplens.training import TrainingConfig, fit, make_trainer
 from sliplens.training.data import FrameSet, load_frames
+from sliplens.training.fitting import DataOrigin
 
-CONFIG = TrainConfig(
+CONFIG = TrainingConfig(
     head="point", image_size=32, epochs=3, batch_size=12, augmentation="none", untouched_share=0.0, seed=5
 )
+ORIGIN = DataOrigin(frame_size=(48, 48), sensor="test", data_hash="none")
 BAD_ROW = 7
 
 
@@ -46,12 +48,12 @@ def load(folder: Path) -> tuple[FrameSet, FrameSet]:
     return train, replace(validation, **kept)
 
 
-def train(folder: Path, frames: tuple[FrameSet, FrameSet], config: TrainConfig, *, devices: int) -> Training:
+def train(folder: Path, frames: tuple[FrameSet, FrameSet], config: TrainingConfig, *, devices: int) -> Training:
     """Fit the plain network."""
     folder.mkdir(exist_ok=True, parents=True)
     trainer = make_trainer(config, accelerator="cpu", devices=devices)
     with patch("sliplens.training.fitting.build_model", lambda *_, **__: Plain()):
-        return fit(config, *frames, folder, frame_size=(48, 48), sensor="test", data_hash="none", trainer=trainer)
+        return fit(config, *frames, folder, origin=ORIGIN, trainer=trainer)
 
 
 def main() -> None:

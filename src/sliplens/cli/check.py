@@ -74,9 +74,9 @@ class Check:
 
     def _ask(self, data: "Dataset", network: Path) -> None:
         from sliplens.models.checkpoint import load
-        from sliplens.training.evaluation import find_known
+        from sliplens.training.evaluation import find_training_trials
 
         trials = data.select(split=self.split)
-        known = Counter(trial.split for trial in find_known(trials, load(network)))
+        known = Counter(trial.split for trial in find_training_trials(trials, load(network)))
         for split, count in Counter(trial.split for trial in trials).items():
             say(f"{network} was trained on {known[split]} of the {count} {split} trials of {self.data}")

@@ -1,4 +1,4 @@
-"""How sure a network may be: a temperature, intervals that hold as often as they say, and a friction that is told."""
+"""Calibration: temperature, conformal intervals, and the margin under a known friction."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,7 +30,7 @@ class Calibration:
     """
 
     temperature: float
-    """What logits are divided by; 1 for a network that answers with one number."""
+    """Divisor of the logits; 1 for a network with one number as its output."""
     offsets: dict[str, float]
     """Widening of each level's interval, in margin units; negative where quantiles were too far apart."""
     frames: int
@@ -51,15 +51,15 @@ class Calibration:
 
 @dataclass(frozen=True, kw_only=True)
 class Traction:
-    """What the second answer of a network, the traction ratio F_t / F_n, is and how it turns into a margin."""
+    """Calibration of the second output, the traction ratio F_t / F_n, and facts to turn it into a margin."""
 
     calibration: Calibration
     """Of the ratio; its errors are ratios, not margins."""
     told: Calibration
-    """Of the margin where each validation trial's friction is told; the temperature is that of the first answer."""
+    """Calibration of the margin under each validation trial's known friction; the temperature is that of the margin."""
     friction: tuple[float, ...]
     """Evenly spaced quantiles of the coefficient of friction over the training frames, from the least to the largest:
-    what the network expects where it is told none."""
+    the prior of the network where no friction is known."""
 
     def __post_init__(self) -> None:
         if not self.friction or min(self.friction) <= 0 or list(self.friction) != sorted(self.friction):
@@ -71,31 +71,29 @@ def spread(
     probabilities: Float[np.ndarray, "frames bins"],
     edges: Float[np.ndarray, " edges"],
 ) -> Float[np.ndarray, " frames"]:
-    """Standard deviation of each distribution around a value, such as its mean."""
+    """Compute the standard deviation of each distribution around a value, such as its mean."""
     squares = (bin_centres(edges) - values[:, None]) ** 2
     return np.sqrt((probabilities * squares).sum(axis=1))
 
 
 def fit_temperature(logits: Float[Tensor, "frames bins"], targets: Float[Tensor, "frames bins"]) -> float:
-    """Temperature of least cross-entropy, by golden-section search on its logarithm; the loss is convex in 1/T."""
+    """Find the temperature of least cross-entropy; the loss is convex in 1/T."""
 
     def loss(log_temperature: float) -> float:
         return float(torch.nn.functional.cross_entropy(logits / float(np.exp(log_temperature)), targets))
 
+    # golden-section search
     ratio, low, high = (np.sqrt(5) - 1) / 2, _COLDEST, _HOTTEST
     while high - low > 1e-4:
-        left, right = high - ratio * (high - low), low + ratio * (high - low)
-        low, high = (low, right) if loss(left) < loss(right) else (left, high)
+        lower, upper = high - ratio * (high - low), low + ratio * (high - low)
+        low, high = (low, upper) if loss(lower) < loss(upper) else (lower, high)
     return float(np.exp((low + high) / 2))
 
 
 def quantiles(
     probabilities: Float[np.ndarray, "frames bins"], edges: Float[np.ndarray, " edges"], share: float
 ) -> Float[np.ndarray, " frames"]:
-    """Margin below which a share of each distribution lies; within a bin the distribution is even.
-
-    `probabilities`: each row sums to 1; `share`: between 0 and 1.
-    """
+    """Return the margin below which a share, from 0 to 1, of each distribution lies; a bin is even inside."""
     below = np.concatenate([np.zeros((len(probabilities), 1)), np.cumsum(probabilities, axis=1)], axis=1)
     below /= below[:, -1:]
     at = np.clip((below <= share).sum(axis=1) - 1, 0, probabilities.shape[1] - 1)
@@ -111,7 +109,7 @@ def raw_interval(
     edges: Float[np.ndarray, " edges"] | None,
     level: float,
 ) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
-    """Interval of a level before it is widened: quantiles of each distribution, or the number itself, twice."""
+    """Return the interval of a level before it is widened: quantiles of each distribution, or the number twice."""
     if probabilities is None or edges is None:
         return margin, margin
     return quantiles(probabilities, edges, (1 - level) / 2), quantiles(probabilities, edges, (1 + level) / 2)
@@ -124,9 +122,9 @@ def conformal_offset(
     *,
     level: float,
 ) -> float:
-    """By how much intervals must widen to hold for a share of the frames, a frame more counted as missed.
+    """Compute by how much intervals must widen to hold for a share of the frames, one more counted as missed.
 
-    `low`, `high`: intervals of validation frames; equal for one number.
+    `low`, `high`: intervals of validation frames; equal for a single number.
 
     Romano et al. (2019), eq. 6 and 7.
     """
@@ -141,19 +139,29 @@ def calibrate_histogram(
     temperature: Tensor,
     labels: Float[Tensor, " frames"],
     *,
-    kept: Calibration | None = None,
+    calibration: Calibration | None = None,
 ) -> tuple[Calibration, Float[np.ndarray, "frames bins"]]:
-    """Fit and set the temperature of a histogram, unless it is kept; its calibration, and its probabilities then.
+    """Fit the temperature of a histogram in place; return its calibration and its probabilities.
 
-    `logits`, `labels`: of validation frames; `temperature` is changed in place.
+    Parameters
+    ----------
+    logits, labels
+        Outputs and labels of validation frames.
+    edges
+        Edges of the bins.
+    temperature
+        Temperature of the histogram, changed in place.
+    calibration
+        Earlier calibration that is to stay, with its temperature; fitted if None.
     """
-    if kept is None:
+    if calibration is None:
         temperature.fill_(fit_temperature(logits, histogram_targets(labels, edges.cpu())))
     probabilities = torch.softmax(logits / temperature.cpu(), dim=-1).double().numpy()
     numbers = edges.double().cpu().numpy()
     values = probabilities @ bin_centres(numbers)
-    kept = kept or conformal_calibration(values, probabilities, numbers, labels, temperature=float(temperature))
-    return kept, probabilities
+    if calibration is None:
+        calibration = conformal_calibration(values, probabilities, numbers, labels, temperature=float(temperature))
+    return calibration, probabilities
 
 
 def conformal_calibration(
@@ -164,7 +172,7 @@ def conformal_calibration(
     *,
     temperature: float,
 ) -> Calibration:
-    """Intervals that hold as often as they say on validation frames with these labels."""
+    """Calibrate intervals on validation frames, so that each level holds for its share of them."""
     truth = labels.double().numpy()
     ends = {level: raw_interval(values, probabilities, edges, level) for level in LEVELS}
     return Calibration(
@@ -176,13 +184,13 @@ def conformal_calibration(
 
 
 _DOUBT = 0.1
-"""How likely it is beforehand, against 1, that the two answers or what is told do not fit together: then the ratio and
-the friction that is told decide alone. Chosen on simulated days of selection; from 0.03 to 0.3 little changes."""
+"""Prior odds that the two outputs and the friction contradict each other: then the ratio and the friction decide alone.
+Chosen on simulated days of selection; from 0.03 to 0.3 little changes."""
 _RARE = 0.05
-"""Least density of a friction in the training, over an even one: what was never met is rare, not impossible."""
+"""Least density of a friction in the training, over an even one: an unseen friction is rare, not impossible."""
 
 
-def told_probabilities(
+def condition_on_friction(
     margin: Float[np.ndarray, "frames bins"],
     ratio: Float[np.ndarray, "frames ratio_bins"],
     *,
@@ -191,17 +199,17 @@ def told_probabilities(
     friction: Friction,
     trained_friction: Float[np.ndarray, " quantiles"],
 ) -> Float[np.ndarray, "frames bins"]:
-    """Distribution over the margin where the friction is told, on the bins of the margin that was not told any.
+    """Compute the distribution over the margin under a known friction, on the bins of the margin.
 
-    Of a frame x, a network answers with p(Gamma | x) and p(rho | x), rho = F_t / F_n, both as if friction were drawn as
-    in its training, from pi. Friction and margin tell the ratio, rho = mu (1 - Gamma), so that friction drawn from q
-    instead gives
+    For a frame x, a network predicts p(Gamma | x) and p(rho | x), rho = F_t / F_n, both with friction drawn as in its
+    training, from pi. Friction and margin give the ratio, rho = mu (1 - Gamma), so that friction drawn from q instead
+    gives
 
         p(Gamma | x, q) ~ p(Gamma | x) * integral over mu of q(mu) / pi(mu) * p(rho = mu (1 - Gamma) | x) * (1 - Gamma),
 
-    the Jacobian last. Told what the training had (q = pi) this is nearly p(Gamma | x); told all, what the ratio and
-    friction leave of it. Beside it stands the closed form alone, Gamma = 1 - rho / mu cut to [0, 1], for what does not
-    fit together: a ratio beyond what the friction that is told can hold is a margin of 0.
+    the Jacobian last. With the friction of the training (q = pi) this is nearly p(Gamma | x). Beside it stands the
+    closed form alone, Gamma = 1 - rho / mu cut to [0, 1], for outputs that contradict the friction: a ratio above the
+    friction is a margin of 0.
 
     Parameters
     ----------
@@ -210,7 +218,7 @@ def told_probabilities(
     edges, ratio_edges
         Edges of their bins, each of one width.
     friction
-        What is told.
+        Known friction.
     trained_friction
         Evenly spaced quantiles of the friction coefficients in the training, from the least to the largest.
     """
@@ -223,22 +231,22 @@ def told_probabilities(
 def _kernels(
     friction: Friction, edges: tuple[float, ...], ratio_edges: tuple[float, ...], trained_friction: tuple[float, ...]
 ) -> tuple[Float[np.ndarray, "ratio_bins bins"], Float[np.ndarray, "ratio_bins bins"]]:
-    """What a ratio in each bin says of each margin where the margin's own answer counts too, and where it does not."""
+    """Compute the likelihood of each margin by ratio bin, with the network's own margin and without it."""
     centres, ratio_centres = bin_centres(np.array(edges)), bin_centres(np.array(ratio_edges))
     # labels at 0 and 1 reach into bins beyond them, which mean the ends
-    left = 1 - np.clip(centres, 0, 1)
+    used = 1 - np.clip(centres, 0, 1)
     values, weights = friction.nodes
-    fits = _between(values[:, None] * left, ratio_centres, weights / _density(values, np.array(trained_friction))).T
+    fits = _between(values[:, None] * used, ratio_centres, weights / _density(values, np.array(trained_friction))).T
     alone = _between(np.clip(1 - ratio_centres / values[:, None], 0, 1), centres, weights)
     # a full stick leaves nothing to compare: half a bin keeps its Jacobian from being none
-    fits *= np.maximum(left, (edges[1] - edges[0]) / 2) / (ratio_edges[1] - ratio_edges[0])
+    fits *= np.maximum(used, (edges[1] - edges[0]) / 2) / (ratio_edges[1] - ratio_edges[0])
     return fits, alone
 
 
 def _between(
     values: Float[np.ndarray, "draws values"], centres: Float[np.ndarray, " bins"], weights: Float[np.ndarray, " draws"]
 ) -> Float[np.ndarray, "values bins"]:
-    """Shares of the two bins whose middles a value lies between, of the last one beyond the ends; summed over draws."""
+    """Share each value out to the two bins around it, beyond the ends to the last bin; sum over draws."""
     at = (np.clip(values, centres[0], centres[-1]) - centres[0]) / (centres[1] - centres[0])
     below = np.minimum(at.astype(int), len(centres) - 2)
     rows, table = len(centres) * np.arange(values.shape[1]), np.zeros(values.shape[1] * len(centres))
@@ -250,8 +258,8 @@ def _between(
 def _density(
     values: Float[np.ndarray, " values"], quantiles: Float[np.ndarray, " quantiles"]
 ) -> Float[np.ndarray, " values"]:
-    """Density of friction in the training, even between its quantiles."""
-    # frictions that many trials share have a width of their own, else the density would be infinite
+    """Compute the density of friction in the training, even between its quantiles."""
+    # frictions that many trials share get a width, else the density would be infinite
     widths = np.maximum(np.diff(quantiles), 1e-2)
     share = 1 / (len(quantiles) - 1)
     at = np.searchsorted(quantiles, values, side="right") - 1

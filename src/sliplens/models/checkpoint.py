@@ -29,7 +29,7 @@ from sliplens.models.backbones import (
     build_model,
     ratio_edges,
 )
-from sliplens.models.calibration import Calibration, Traction, raw_interval, spread, told_probabilities
+from sliplens.models.calibration import Calibration, Traction, condition_on_friction, raw_interval, spread
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty
 from sliplens.models.sequence import Follower, SequenceHead, SequenceManifest
@@ -463,14 +463,14 @@ class Estimate:
         trained_friction: Float[np.ndarray, " quantiles"],
         calibration: Calibration | None = None,
     ) -> "Estimate":
-        """The same frames once friction is told (`told_probabilities`); margins then lie within [0, 1].
+        """The same frames once friction is told (`condition_on_friction`); margins then lie within [0, 1].
 
         `calibration`: of the intervals of such margins; there are none if None.
         """
         assert self.probabilities is not None
         assert self.edges is not None
         assert self.ratio is not None
-        probabilities = told_probabilities(
+        probabilities = condition_on_friction(
             self.probabilities,
             self.ratio.probabilities,
             edges=self.edges,

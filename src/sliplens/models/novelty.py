@@ -1,4 +1,4 @@
-"""How far a network knows its input: the distance of its features from the training's, and the spread of its answer."""
+"""Novelty: strangeness of an input, by its features' distance from the training's and the spread of the prediction."""
 
 from collections.abc import Iterable
 from contextlib import suppress
@@ -14,16 +14,16 @@ from sliplens.models.backbones import Answers, bin_edges, watch_features
 from sliplens.models.calibration import spread
 
 _STRIDE = 8
-"""Of the features: early enough to cost a third of a pass, and to see light, focus and print."""
+"""Stride of the features: early enough to cost a third of a pass, and to respond to light, focus and print."""
 _MOST_DIRECTIONS = 12
 _LEAST_FRAMES = 40
 _SHARES = (1.0, 0.8, 0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005)
-"""Of the validation frames, for each of which the strangeness is kept that only so many reach."""
+"""Shares of the validation frames, for each of which `Novelty` keeps the strangeness that so many reach."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Novelty:
-    """Where the features of healthy frames lie: their mean, the directions in which they vary, and what is left.
+    """Distribution of the features of healthy frames: mean, principal directions, and the remaining variance.
 
     Features are the mean over the image of each channel of an early layer. The distance is that of Mahalanobis under
     probabilistic principal components, over the square root of the number of features: about 1 for frames like those
@@ -34,7 +34,7 @@ class Novelty:
     """
 
     layer: str
-    """Module whose output is looked at, by its path in the network."""
+    """Path in the network of the module whose output is used."""
     mean: tuple[float, ...]
     scale: tuple[float, ...]
     """Standard deviation of each feature."""
@@ -48,11 +48,11 @@ class Novelty:
     frames: int
     """Validation frames."""
     spread_limit: float | None = None
-    """What they stay below of the standard deviation of the answer, in margin units; None of a network that answers
-    with one number."""
+    """Standard deviation of the prediction that the same frames stay below, in margin units; None for a network with
+    one number as its output."""
     strangeness: tuple[float, ...] = ()
-    """What 100, 80, 50, 30, 20, 10, 5, 2, 1 and 0.5 % of the validation frames reach of `measure_strangeness`; empty
-    where that was never measured (`benchmarks/health.py --fit`)."""
+    """Values of `measure_strangeness` that 100, 80, 50, 30, 20, 10, 5, 2, 1 and 0.5 % of the validation frames reach;
+    empty if never measured (`benchmarks/health.py --fit`)."""
 
     def __post_init__(self) -> None:
         width = len(self.mean)
@@ -64,18 +64,18 @@ class Novelty:
             raise ValueError(f"strangeness has no or {len(_SHARES)} levels, and its limit is positive")
 
     def distance(self, features: Float[np.ndarray, "frames features"]) -> Float[np.ndarray, " frames"]:
-        """Distance of features, as `read_features` gives them."""
+        """Compute the distance of features from those of healthy frames."""
         unit = (features - np.array(self.mean)) / np.array(self.scale)
         directions = np.array(self.directions)
         along = unit @ directions.T
-        left = np.maximum((unit**2).sum(axis=1) - (along**2).sum(axis=1), 0)
-        squared = (along**2 / np.array(self.variances)).sum(axis=1) + left / self.rest
+        rest = np.maximum((unit**2).sum(axis=1) - (along**2).sum(axis=1), 0)
+        squared = (along**2 / np.array(self.variances)).sum(axis=1) + rest / self.rest
         return np.sqrt(squared / features.shape[1])
 
     def measure_strangeness(
         self, features: Float[np.ndarray, "frames features"], sigma: Float[np.ndarray, " frames"] | None
     ) -> Float[np.ndarray, " frames"]:
-        """The larger of distance and spread, each over its limit."""
+        """Return the larger of distance and spread, each over its limit."""
         distance = self.distance(features) / self.limit
         if sigma is None or self.spread_limit is None:
             return distance
@@ -84,12 +84,12 @@ class Novelty:
     def known(
         self, features: Float[np.ndarray, "frames features"], sigma: Float[np.ndarray, " frames"] | None
     ) -> Float[np.ndarray, " frames"]:
-        """Share of the validation frames that were as strange or stranger, from 0 to 1.
+        """Return the share of the validation frames that were as strange or stranger, from 0 to 1.
 
         Frames like those of the validation are below a share p with probability p, as p values are. Beyond the
-        strangest half percent the logarithm goes on as steeply as before it: what is farther off is known less.
+        strangest half percent the logarithm continues with the same slope.
 
-        `sigma`: standard deviation of each answer, in margin units; None where it is one number.
+        `sigma`: standard deviation of each prediction, in margin units; None for a single number.
         """
         levels, shares = np.array(self.strangeness), np.log(_SHARES)
         strange = self.measure_strangeness(features, sigma)
@@ -99,92 +99,92 @@ class Novelty:
 
 
 class _Enough(Exception):  # noqa: N818 (no error: it ends a pass early)
-    """The layer that was waited for has answered."""
+    """End a pass after the layer of interest."""
 
 
 @torch.no_grad()
 def read_features(
     model: nn.Module, layer: str, images: Float[Tensor, "batch colours height width"]
 ) -> Float[np.ndarray, "batch features"]:
-    """Mean over the image of each channel of a layer; what comes after it is not run."""
+    """Compute the mean over the image of each channel of a layer; later layers are not run."""
 
     def stop() -> None:
         raise _Enough
 
-    with watch_features(model, layer, stop) as kept, suppress(_Enough):
+    with watch_features(model, layer, stop) as features, suppress(_Enough):
         model(images.to(next(model.parameters()).device))
-    return kept[0].double().cpu().numpy()
+    return features[0].double().cpu().numpy()
 
 
 @torch.no_grad()
 def find_layer(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> str | None:
-    """Last module of those that answer with an eighth of the image's side; None where none does."""
-    found: list[str] = []
+    """Find the last module whose output has an eighth of the image's side; None if there is none."""
+    layers: list[str] = []
     names = {module: name for name, module in model.named_modules() if name}
     side = images.shape[-1] / _STRIDE
 
-    def look(module: nn.Module, _: object, output: object) -> None:
+    def record(module: nn.Module, _: object, output: object) -> None:
         if isinstance(output, Tensor) and output.ndim == 4 and 0.75 * side <= output.shape[-1] <= 1.25 * side:
-            found.append(names[module])
+            layers.append(names[module])
 
-    handles = [module.register_forward_hook(look) for module in names]
+    handles = [module.register_forward_hook(record) for module in names]
     try:
         model(images.to(next(model.parameters()).device))
     finally:
         for handle in handles:
             handle.remove()
-    # of modules within each other the outermost, which answers last
-    return found[-1] if found else None
+    # of nested modules the outermost, which returns last
+    return layers[-1] if layers else None
 
 
 def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[Tensor]) -> Novelty | None:
-    """Fit the features of training frames; what is usual is told by validation frames, of other trials.
+    """Fit the features of training frames, and set the limits by validation frames of other trials.
 
     `model` is in evaluation mode; `train`, `validation`: batches of encoded frames, (batch, 3, size, size). None where
-    the network has no layer to look at, or there are too few frames.
+    the network has no suitable layer, or there are too few frames.
     """
     batches, others = list(train), list(validation)
     layer = find_layer(model, batches[0][:1]) if batches else None
     if layer is None:
         return None
-    features, held = (
+    features, validation_features = (
         np.concatenate([read_features(model, layer, batch) for batch in part] or [np.zeros((0, 1))])
         for part in (batches, others)
     )
-    if min(len(features), len(held)) < _LEAST_FRAMES:
+    if min(len(features), len(validation_features)) < _LEAST_FRAMES:
         return None
     if not np.isfinite(features).all():
-        raise ModelError(f"the layer {layer} of {type(model).__name__} answers with numbers that are not finite")
+        raise ModelError(f"the layer {layer} of {type(model).__name__} returns NaN or infinity; train it again")
     mean, scale = features.mean(axis=0), features.std(axis=0)
-    scale = np.maximum(scale, 1e-6 + 1e-3 * float(scale.max()))  # channels that never answer
+    scale = np.maximum(scale, 1e-6 + 1e-3 * float(scale.max()))  # channels that are constant
     unit = (features - mean) / scale
     _, spread, directions = np.linalg.svd(unit, full_matrices=False)
     variances = spread**2 / len(unit)
-    kept = min(_MOST_DIRECTIONS, len(variances) - 1)
+    count = min(_MOST_DIRECTIONS, len(variances) - 1)
     begun = Novelty(
         layer=layer,
         mean=_rounded(mean),
         scale=_rounded(scale),
-        directions=tuple(_rounded(row) for row in directions[:kept]),
-        variances=_rounded(variances[:kept]),
-        rest=float(variances[kept:].sum() / max(1, unit.shape[1] - kept)) + 1e-6,
+        directions=tuple(_rounded(row) for row in directions[:count]),
+        variances=_rounded(variances[:count]),
+        rest=float(variances[count:].sum() / max(1, unit.shape[1] - count)) + 1e-6,
         limit=np.inf,
-        frames=len(held),
+        frames=len(validation_features),
     )
     sigma = _spread(model, others)
     usual = 1 - _SHARES[-1]
     limited = replace(
         begun,
-        limit=float(np.quantile(begun.distance(held), usual)),
+        limit=float(np.quantile(begun.distance(validation_features), usual)),
         spread_limit=None if sigma is None else float(np.quantile(sigma, usual)),
     )
-    reached = np.quantile(limited.measure_strangeness(held, sigma), 1 - np.array(_SHARES))
+    reached = np.quantile(limited.measure_strangeness(validation_features, sigma), 1 - np.array(_SHARES))
     return replace(limited, strangeness=_rounded(reached))
 
 
 @torch.no_grad()
 def _spread(model: nn.Module, batches: Iterable[Tensor]) -> Float[np.ndarray, " frames"] | None:
-    """Standard deviation of the answers, in margin units; None for a network that answers with one number."""
+    """Compute the standard deviation of the predictions, in margin units; None for a single number."""
     edges, device = bin_edges(model), next(model.parameters()).device
     if edges is None:
         return None
@@ -194,5 +194,5 @@ def _spread(model: nn.Module, batches: Iterable[Tensor]) -> Float[np.ndarray, " 
 
 
 def _rounded(values: np.ndarray) -> tuple[float, ...]:
-    """Five digits: a manifest is read by people."""
+    """Round to five digits, since people read manifests."""
     return tuple(float(f"{value:.5g}") for value in values)

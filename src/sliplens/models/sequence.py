@@ -1,4 +1,4 @@
-"""Several frames: what the frames before one tell of its margin, read one after another."""
+"""Sequence head: correct the margin of a frame by the frames of its contact before it."""
 
 from dataclasses import dataclass, replace
 from math import erf, isnan, sqrt
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from sliplens.models.checkpoint import Estimate
 
 WIDTH = 32
-"""Numbers that the head remembers of a contact."""
+"""Size of the memory of the head."""
 STEP_S, LONGEST_S = 0.1, 1.0
-"""Time after which memory takes a step, and the longest that is told apart; a contact begins with the longest."""
+"""Time after which memory takes a step, and the upper limit of the time input; a contact begins with the limit."""
 GAP_S = 0.6
-"""Longest time from a step of memory to a frame that is read by it. Training takes steps of 0.1 to 0.4 s, and the
-frame that makes one may come a frame later, which for the shipped head is 0.17 s at most. Days of selection are read
-better with steps of up to 0.6 s than frame by frame, or as well; wet ones worse with 1 to 1.5 s (R2 0.70 for 0.77)."""
+"""Longest time from a step of memory to a frame that it corrects. Training takes steps of 0.1 to 0.4 s, and the frame
+that makes one may come a frame later, which for the shipped head is 0.17 s at most. On days of selection, steps of up
+to 0.6 s are as good as single frames or better; on wet days, 1 to 1.5 s are worse (R2 0.70 for 0.77)."""
 _LEAST_PEAK = 0.02
 """Traction ratio below which nothing is pulled."""
 _RATIO, _PEAK = 1, 5
-"""Which numbers of `SequenceHead.tell` are the ratio and the largest so far."""
+"""Columns of `SequenceHead.make_inputs`: the ratio, and the largest ratio so far."""
 ROUNDING_S = 1e-6
-"""By which times that are multiples of a step may miss it."""
+"""Tolerance of times that are multiples of a step."""
 _NEAR_ZERO = 0.1
 """Margins up to which a contact may slide already, in margin units."""
 _LEAST = 1e-6
@@ -39,7 +39,7 @@ _LEAST = 1e-6
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceManifest:
-    """How sure the margins read from several frames are."""
+    """Calibration of the margins predicted from several frames."""
 
     calibration: Calibration
     mse_one: float
@@ -48,19 +48,19 @@ class SequenceManifest:
 
 
 class SequenceHead(nn.Module):
-    """Recurrent head over what a network answers frame by frame; it corrects the distribution over the margin.
+    """Recurrent head over the outputs of a network for each frame; it corrects the distribution over the margin.
 
-    It is causal: an answer depends on the frames so far. It sees no image, only what `tell` gives. At first its
-    correction is none, and the answer that of one frame. `Follower` takes its steps one at a time.
+    It is causal: a prediction depends on the frames so far. Its input is that of `make_inputs`, not the image. An
+    untrained head corrects nothing. `Follower` takes its steps one at a time.
 
     Cho et al., *Learning Phrase Representations using RNN Encoder-Decoder* (2014), for the gated recurrent unit.
 
     Parameters
     ----------
     edges, ratio_edges
-        Of the bins of both distributions, as the network has them.
+        Edges of the bins of both distributions of the network.
     dropout
-        Share of what is remembered that is hidden from the answer in training.
+        Share of the memory that is dropped in training.
     """
 
     edges: Tensor
@@ -84,10 +84,9 @@ class SequenceHead(nn.Module):
     def summarize(
         self, margin: Float32[np.ndarray, "frames bins"], ratio: Float32[np.ndarray, "frames ratio_bins"]
     ) -> Float32[np.ndarray, "frames 5"]:
-        """What each frame tells by itself, of its probabilities.
+        """Compute mean and spread of the margin and of F_t / F_n, and the probability of a margin near 0.
 
-        Mean and spread of the margin and of F_t / F_n, and how likely the margin is near 0. So few numbers because
-        whole distributions let the head learn its training trials by heart.
+        So few numbers because with whole distributions the head overfits its training trials.
         """
         values, spread = _moments(margin, self.centres)
         pulled, pulled_spread = _moments(ratio, self._ratio_centres)
@@ -95,60 +94,66 @@ class SequenceHead(nn.Module):
         return np.stack([values, pulled, 4 * spread, 8 * pulled_spread, near_zero], axis=1)
 
     @staticmethod
-    def tell(
+    def make_inputs(
         summary: Float32[np.ndarray, "frames 5"], elapsed_s: Float[np.ndarray, " frames"], *, peak: float = _LEAST_PEAK
     ) -> Float32[np.ndarray, "frames 8"]:
-        """What the head is told of each frame, one after another.
+        """Make the inputs of the head for consecutive frames.
 
-        Beside what `summarize` gives: that ratio over the largest so far (friction falls as a contact begins to slide),
-        the largest itself, and the time since memory took its last step.
+        They are the numbers of `summarize`, that ratio over the largest so far (friction falls as a contact begins to
+        slide), the largest ratio, and the time since the last step of memory.
 
-        `elapsed_s`: that time; `peak`: largest F_t / F_n of the frames before these.
+        Parameters
+        ----------
+        summary
+            Numbers of `summarize`.
+        elapsed_s
+            Time since the last step of memory, in seconds.
+        peak
+            Largest F_t / F_n of the frames before these.
         """
-        told = np.empty((len(summary), 8), dtype=np.float32)
-        told[:, :4], told[:, 6] = summary[:, :4], summary[:, 4]
-        np.maximum(np.maximum.accumulate(told[:, _RATIO]), peak, out=told[:, _PEAK])
-        told[:, 4] = told[:, _RATIO] / told[:, _PEAK]
-        told[:, 7] = np.log(np.minimum(np.maximum(elapsed_s, STEP_S), LONGEST_S))
-        return told
+        inputs = np.empty((len(summary), 8), dtype=np.float32)
+        inputs[:, :4], inputs[:, 6] = summary[:, :4], summary[:, 4]
+        np.maximum(np.maximum.accumulate(inputs[:, _RATIO]), peak, out=inputs[:, _PEAK])
+        inputs[:, 4] = inputs[:, _RATIO] / inputs[:, _PEAK]
+        inputs[:, 7] = np.log(np.minimum(np.maximum(elapsed_s, STEP_S), LONGEST_S))
+        return inputs
 
     def forward(
-        self, told: Float[Tensor, "batch frames 8"], margin: Float[Tensor, "batch frames bins"]
+        self, inputs: Float[Tensor, "batch frames 8"], margin: Float[Tensor, "batch frames bins"]
     ) -> Float[Tensor, "batch frames bins"]:
-        """Logits over the margin in whole contacts, of what `tell` gives and the probabilities of each frame."""
-        seen = functional.gelu(self.seen(told))
-        remembered, _ = self.memory(self.dropout(seen))
-        correction = self.correction(torch.cat([self.dropout(remembered), seen], dim=-1))
+        """Compute logits over the margin in whole contacts, from `make_inputs` and the probabilities of each frame."""
+        hidden = functional.gelu(self.seen(inputs))
+        memory, _ = self.memory(self.dropout(hidden))
+        correction = self.correction(torch.cat([self.dropout(memory), hidden], dim=-1))
         return margin.clamp_min(_LEAST).log() + correction
 
 
 def _moments(
     probabilities: Float[np.ndarray, "frames bins"], centres: Float[np.ndarray, " bins"]
 ) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]]:
-    """Mean and standard deviation of each distribution, the same to the bit however many there are.
+    """Compute mean and standard deviation of each distribution, to the same bits for any number of rows.
 
-    Hence no product of matrices, which adds in another order for many rows than for one.
+    Hence no product of matrices, which adds in another order for many rows than for a single row.
     """
     mean = (probabilities * centres).sum(axis=-1)
     return mean, np.sqrt((probabilities * (centres - mean[:, None]) ** 2).sum(axis=-1))
 
 
 def require_frequent(time_s: Float[np.ndarray, " frames"], *, what: str) -> None:
-    """Refuse a recording whose frames mostly come too seldom to be read in order."""
+    """Refuse a recording whose frames are mostly too far apart to be predicted in order."""
     step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     if step_s > GAP_S + ROUNDING_S:
         raise InputError(
-            f"{what} has a frame each {step_s:.2g} s, and --sequence follows a contact over {GAP_S:g} s at most; read "
-            "such frames by themselves, without --sequence, or record 2 a second or more"
+            f"{what} has a frame each {step_s:.2g} s, and --sequence follows a contact over {GAP_S:g} s at most; leave "
+            "out --sequence, or record 2 frames a second or more"
         )
 
 
 class Follower:
-    """Reads the frames of one sensor in order; each answer tells what the frames of this contact so far tell.
+    """Correct the predictions for the frames of a sensor, in order, by the frames of the same contact before them.
 
-    Frames go through one by one, however many are given at once, so that a recording and a running camera have the
-    same answers. Memory takes a step each `STEP_S`, at whatever rate they come; frames between are read by it and
-    leave nothing.
+    Frames go through one by one, also in a batch, so that a recording and a running camera have the same predictions.
+    Memory takes a step each `STEP_S`, at any frame rate; frames between two steps are corrected and not remembered.
 
     Examples
     --------
@@ -169,11 +174,11 @@ class Follower:
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew with the next contact."""
+        """Clear the memory, for the next contact."""
         self._memory, self._peak = np.zeros(WIDTH, dtype=np.float32), _LEAST_PEAK
         self._time_s = np.nan
         self.lost = False
-        """Whether there was a gap in this contact, so that its frames are read by themselves."""
+        """True after a gap in this contact: its frames keep the predictions of single frames."""
 
     def update(
         self,
@@ -183,13 +188,22 @@ class Follower:
         *,
         believed: Bool[np.ndarray, " frames"] | None = None,
     ) -> "Estimate":
-        """The next frames as they are read after those before.
+        """Correct the predictions for the next frames.
 
-        `estimate`: of each frame by itself, told no friction; `time_s`: when it was taken; `touches`: whether anything
-        touches. A frame that nothing touches keeps its answer, and what was before it is forgotten; so is what was
-        before a clock that runs back. After a gap (`GAP_S`) the rest of the contact keeps its answers too: nobody knows
-        what happened meanwhile, and to a head that does not know the largest pull, what slides seems to hold.
-        `believed`: False for frames whose margin is withheld; they keep their answer and leave nothing in memory.
+        A frame without contact keeps its prediction and clears the memory, and so does a clock that runs back. After a
+        gap (`GAP_S`) the rest of the contact keeps its predictions too: what happened meanwhile is unknown, and without
+        the largest pull a sliding contact looks like a held one.
+
+        Parameters
+        ----------
+        estimate
+            Prediction for each frame alone, without a friction.
+        time_s
+            Time of each frame, in seconds.
+        touches
+            True where something touches the sensor.
+        believed
+            False for frames whose margin is withheld: they keep their prediction and are not remembered.
         """
         assert estimate.probabilities is not None
         assert estimate.ratio is not None
@@ -204,11 +218,11 @@ class Follower:
             if not counts[row] or self.lost:
                 continue
             elapsed_s = LONGEST_S if isnan(self._time_s) else now_s - self._time_s
-            [told] = self._head.tell(summary[row : row + 1], np.array([elapsed_s]), peak=self._peak)
-            correction[row], memory = self._step(told)
+            [inputs] = self._head.make_inputs(summary[row : row + 1], np.array([elapsed_s]), peak=self._peak)
+            correction[row], memory = self._step(inputs)
             followed[row] = True
             if elapsed_s >= STEP_S - ROUNDING_S:
-                self._memory, self._peak, self._time_s = memory, float(told[_PEAK]), now_s
+                self._memory, self._peak, self._time_s = memory, float(inputs[_PEAK]), now_s
         calibration = self._sequence.calibration
         logits = (np.log(np.maximum(margin, _LEAST)) + correction) / calibration.temperature
         likely = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64)
@@ -219,19 +233,19 @@ class Follower:
         return replace(estimate, margin=read, probabilities=probabilities, calibration=calibration, alone=alone)
 
     def _step(
-        self, told: Float32[np.ndarray, " 8"]
+        self, inputs: Float32[np.ndarray, " 8"]
     ) -> tuple[Float32[np.ndarray, " bins"], Float32[np.ndarray, " width"]]:
-        """Correction of a frame, and what is remembered then, as `SequenceHead.forward` has them.
+        """Compute the correction of a frame and the next memory, as `SequenceHead.forward` does.
 
-        In numpy: to torch each call costs more than what it computes here.
+        In numpy: a call of torch costs more than the computation.
         """
-        seen_by, seen_bias, by_seen, by_memory, bias, memory_bias, correct_by, correct_bias = self._weights
-        seen = seen_by @ told + seen_bias
+        input_weight, input_bias, weight, recurrent, bias, recurrent_bias, out_weight, out_bias = self._weights
+        hidden = input_weight @ inputs + input_bias
         # the Gaussian error linear unit
-        seen *= np.array([(1 + erf(value / sqrt(2))) / 2 for value in seen.tolist()], dtype=np.float32)
-        added, kept = by_seen @ seen + bias, by_memory @ self._memory + memory_bias
-        gates = (1 + np.tanh((added + kept)[: 2 * WIDTH] / 2)) / 2  # the logistic function
-        reset, held = gates[:WIDTH], gates[WIDTH:]
-        fresh = np.tanh(added[2 * WIDTH :] + reset * kept[2 * WIDTH :])
-        memory = fresh + held * (self._memory - fresh)
-        return correct_by @ np.concatenate([memory, seen]) + correct_bias, memory
+        hidden *= np.array([(1 + erf(value / sqrt(2))) / 2 for value in hidden.tolist()], dtype=np.float32)
+        fed, fed_back = weight @ hidden + bias, recurrent @ self._memory + recurrent_bias
+        gates = (1 + np.tanh((fed + fed_back)[: 2 * WIDTH] / 2)) / 2  # the logistic function
+        reset, update = gates[:WIDTH], gates[WIDTH:]
+        candidate = np.tanh(fed[2 * WIDTH :] + reset * fed_back[2 * WIDTH :])
+        memory = candidate + update * (self._memory - candidate)
+        return out_weight @ np.concatenate([memory, hidden]) + out_bias, memory

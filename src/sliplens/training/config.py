@@ -1,4 +1,4 @@
-"""Recipes, all that shapes a network besides its data, and the loggers of an experiment."""
+"""Settings of a training, recipes, and loggers."""
 
 import logging
 import os
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypedDict
 
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
@@ -19,14 +19,14 @@ from sliplens.training.data import get_augmentation
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrainConfig:
-    """A training recipe; `InputError` for a number that cannot train a network, `ModelError` for an unknown head."""
+class TrainingConfig:
+    """Settings of a training; `InputError` for an impossible value, `ModelError` for an unknown head."""
 
     recipe: str = "default"
-    """Its name, kept in the manifest."""
+    """Name of the recipe, for the manifest."""
     backbone: str = DEFAULT_BACKBONE
     head: str = "point"
-    """What the network answers with; see `sliplens.models.backbones`."""
+    """Outputs of the network, a row of `sliplens.models.backbones.HEADS`."""
     image_size: int = 224
     epochs: int = 25
     batch_size: int = 64
@@ -42,14 +42,14 @@ class TrainConfig:
     untouched_share: float = 0.05
     """Images of the untouched sensor, as full stick, for each labelled frame."""
     learns: Literal["all", "weights", "ratio", "sequence"] = "all"
-    """What changes. all: weights, and the statistics of batch normalisation. weights: these statistics stay.
-    ratio: the rows of the last layer that answer with F_t / F_n, so that margins stay to the
-    bit; what that layer sees is computed once, without augmentation. sequence: a head beside the network, which makes
-    one margin of its answers to several frames; a batch is so many trials."""
+    """Parameters that change. all: weights, and the statistics of batch normalisation. weights: the weights alone.
+    ratio: the rows of the last layer that predict F_t / F_n, so that margins stay to the bit; the inputs of that layer
+    are computed once, without augmentation. sequence: a head that predicts the margin from the outputs for several
+    frames; `batch_size` then counts trials."""
     epoch_frames: int | None = None
-    """Images of an epoch, drawn from all: few trials come again, of long ones some; each frame once if None."""
+    """Images of an epoch, drawn from all; each frame once if None."""
     patience: int | None = None
-    """Epochs without gain on the validation trials after which it stops; none if None."""
+    """Epochs without gain on the validation trials after which training stops; no limit if None."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -79,9 +79,29 @@ class TrainConfig:
         get_augmentation(self.augmentation)
 
 
+class TrainingChanges(TypedDict, total=False):
+    """Fields of `TrainingConfig` that a call may change; None leaves a field as the recipe has it."""
+
+    backbone: str | None
+    head: str | None
+    image_size: int | None
+    epochs: int | None
+    batch_size: int | None
+    optimizer: Literal["adamw", "ranger21"] | None
+    learning_rate: float | None
+    weight_decay: float | None
+    mixed_precision: bool | None
+    max_minutes: float | None
+    augmentation: str | None
+    untouched_share: float | None
+    epoch_frames: int | None
+    patience: int | None
+    seed: int | None
+
+
 _RECIPES = {
-    "default": TrainConfig(head="histogram"),
-    "thesis": TrainConfig(
+    "default": TrainingConfig(head="histogram"),
+    "thesis": TrainingConfig(
         recipe="thesis",
         batch_size=124,
         optimizer="ranger21",
@@ -90,10 +110,10 @@ _RECIPES = {
         augmentation="thesis",
         untouched_share=0.0,
     ),
-    "ratio": TrainConfig(
+    "ratio": TrainingConfig(
         recipe="ratio", head="margin-and-ratio", epochs=20, weight_decay=0.0, augmentation="none", learns="ratio"
     ),
-    "sequence": TrainConfig(
+    "sequence": TrainingConfig(
         recipe="sequence",
         head="margin-and-ratio",
         epochs=60,
@@ -102,7 +122,7 @@ _RECIPES = {
         augmentation="none",
         learns="sequence",
     ),
-    "adapt": TrainConfig(
+    "adapt": TrainingConfig(
         recipe="adapt",
         head="histogram",
         epochs=20,
@@ -116,18 +136,18 @@ _RECIPES = {
 RECIPES = Table("recipe", "sliplens.recipes", _RECIPES)
 """`thesis` is that of Polak, section 4: ShuffleNetV2 x1.0 from scratch, one output, Ranger21 with its defaults, mean
 squared error, 25 epochs, batches of 124, 224 x 224 pixels, a learning rate of 8e-4, mixed precision, the best
-checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md tells why. `ratio` teaches a
-network that is there its second answer, F_t / F_n, `sequence` to read several frames, and `adapt` a sensor of your own
-from few trials, all in minutes."""
+checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md has the reasons. `ratio` teaches
+an existing network its second output, F_t / F_n, `sequence` a head for several frames, and `adapt` another sensor from
+few trials, all in minutes."""
 
 
-def get_recipe(name: str) -> TrainConfig:
+def get_recipe(name: str) -> TrainingConfig:
     """Look up a recipe by name; `InputError` lists those there are."""
     return RECIPES.pick(name)
 
 
 PROJECT = "sliplens"
-"""Of the runs in Weights & Biases, and experiment of those in MLflow."""
+"""Project in Weights & Biases, and experiment in MLflow."""
 
 
 def _tensorboard(folder: Path, _: str) -> Logger:
@@ -162,7 +182,7 @@ LOGGERS: dict[str, tuple[tuple[str, ...], Callable[[Path, str], Logger]]] = {
     # mlflow-skinny, which lacks the latter, keeps no runs on this machine
     "mlflow": (("mlflow", "sqlalchemy"), _mlflow),
 }
-"""The packages that each needs, and how it is made."""
+"""Packages that each logger needs, and the function that makes it."""
 
 
 @contextmanager
@@ -172,7 +192,7 @@ def open_logger(
     """Open a logger that keeps its files in the run's folder, and close it so that the folder can take its name.
 
     TensorBoard and MLflow write there, MLflow elsewhere if `MLFLOW_TRACKING_URI` says so. Weights & Biases too writes
-    there alone, for `wandb sync` to send, unless `WANDB_MODE` says `online`: nothing leaves the machine unasked. `csv`
+    there alone, for `wandb sync` to send, unless `WANDB_MODE` is `online`: nothing leaves the machine by default. `csv`
     opens none, for `metrics.csv` is always written.
     """
     if name == "csv":

@@ -1,4 +1,4 @@
-"""Which frames make a batch, in one process or shared among several."""
+"""Frames of a training, their augmentation, and the batches of one or several processes."""
 
 import math
 import os
@@ -22,7 +22,7 @@ from sliplens.errors import RecordingError
 from sliplens.extras import Table
 from sliplens.models.backbones import last_layer
 from sliplens.models.encodings import Encoding
-from sliplens.progress import OnProgress
+from sliplens.progress import track
 from sliplens.recordings import Dataset, Labels, TrialInfo
 
 
@@ -44,7 +44,7 @@ class Augmentation:
     mirror: bool = False
     """Mirror half of the images."""
     padding: str = "border"
-    """What `torch.nn.functional.grid_sample` puts beyond the border of an image."""
+    """Pixels beyond the border of an image, as `torch.nn.functional.grid_sample` takes it."""
     colour: float = 0.05
     """Each channel is scaled by 1 plus or minus up to this: white balance."""
     noise_sd: float = 0.03
@@ -53,7 +53,7 @@ class Augmentation:
     blur_sd_px: float = 0.8
     """Share of batches that are blurred, and the largest standard deviation of the blur in pixels."""
     neutral: float = 0.0
-    """What stands for no change in the input; `colour` scales about it."""
+    """Level of the input that means no change; `colour` scales about it."""
 
     def __call__(
         self, images: Float[Tensor, "batch colours size size"], *, generator: torch.Generator
@@ -146,21 +146,20 @@ class FrameSet(TorchDataset):
         return self.encoding.normalise(self.images[rows]), self.safety_margin[rows], self.traction_ratio[rows]
 
     def name(self, row: int) -> str:
-        """Words for a frame."""
+        """Return the name of a frame, for messages."""
         frame = "the reference frame" if self.frame[row] == UNTOUCHED else f"frame {self.frame[row]}"
         return f"{frame} of {self.trial[row]}"
 
-    def batches(self, size: int, on_progress: OnProgress | None = None) -> Iterator[Tensor]:
-        """Inputs of all frames, in their order."""
-        for rows in torch.arange(len(self)).split(size):
+    def batches(self, size: int, *, report: bool = False) -> Iterator[Tensor]:
+        """Iterate over the inputs of all frames, in their order; if `report`, report each batch as done."""
+        batches = torch.arange(len(self)).split(size)
+        for rows in track(batches, sizes=[len(rows) for rows in batches]) if report else batches:
             yield self.__getitems__(rows)[0]
-            if on_progress is not None:
-                on_progress(int(rows[-1]) + 1, len(self))
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSet(FrameSet):
-    """Frames as the last layer of a network sees them, computed once: for a training that leaves the rest as it is."""
+    """Inputs of the last layer of a network, computed once: for a training that leaves the other layers as they are."""
 
     images: Float32[Tensor, "frames features"]  # pyright: ignore[reportIncompatibleVariableOverride]
 
@@ -171,39 +170,37 @@ class FeatureSet(FrameSet):
 
 
 @torch.no_grad()
-def extract_features(
-    model: nn.Module, frames: FrameSet, *, batch_size: int, on_progress: OnProgress | None = None
-) -> FeatureSet:
-    """What the last linear layer of a network, taken in evaluation mode, is given for each frame."""
-    seen: list[Tensor] = []
+def extract_features(model: nn.Module, frames: FrameSet, *, batch_size: int) -> FeatureSet:
+    """Compute the input of the last linear layer of a network, in evaluation mode, for each frame."""
+    features: list[Tensor] = []
     was_training, device = model.training, next(model.parameters()).device
-    hook = last_layer(model).register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].float().cpu()))
+    hook = last_layer(model).register_forward_pre_hook(lambda _, inputs: features.append(inputs[0].float().cpu()))
     try:
         model.eval()
-        for images in frames.batches(batch_size, on_progress):
+        for images in frames.batches(batch_size, report=True):
             model(images.to(device))
     finally:
         hook.remove()
         model.train(was_training)
     columns = {field.name: getattr(frames, field.name) for field in fields(frames)}
-    return FeatureSet(**{**columns, "images": torch.cat(seen)})
+    return FeatureSet(**{**columns, "images": torch.cat(features)})
 
 
 def trial_friction(labels: Labels) -> float:
-    """Coefficient of static friction of a trial, the median over labelled frames that do not slip; NaN if unknown."""
+    """Return the static friction of a trial, the median over labelled frames that stick; NaN if unknown."""
     sticks = labels.labelled & (labels.safety_margin > 0)
-    known = labels.friction_coefficient[sticks & np.isfinite(labels.friction_coefficient)]
-    return float(np.median(known)) if len(known) else float("nan")
+    values = labels.friction_coefficient[sticks & np.isfinite(labels.friction_coefficient)]
+    return float(np.median(values)) if len(values) else float("nan")
 
 
 def _ratios(labels: Labels) -> Float[np.ndarray, " frames"]:
-    """F_t / F_n of each frame; NaN where a force is not known or nothing presses."""
+    """Return F_t / F_n of each frame; NaN where a force is unknown or nothing presses."""
     pressed = labels.normal_force_n > 0
     return np.where(pressed, labels.tangential_force_n / np.where(pressed, labels.normal_force_n, 1), np.nan)
 
 
-def tells_ratio(labels: Labels) -> bool:
-    """Whether F_t / F_n and the friction of any labelled frame are known."""
+def has_ratio(labels: Labels) -> bool:
+    """Return True if F_t / F_n and the friction of any labelled frame are known."""
     return bool(np.isfinite(trial_friction(labels)) and np.isfinite(_ratios(labels)[labels.labelled]).any())
 
 
@@ -215,16 +212,15 @@ def load_frames(
     image_size: int,
     untouched_share: float = 0.0,
     scratch: Path | None = None,
-    on_progress: OnProgress | None = None,
 ) -> FrameSet:
-    """Read trials, encode them, and keep the frames that have a label; those without contact have none.
+    """Load trials, encode them, and keep the frames that have a label; frames without contact have none.
 
     Frames that would take more than half of the free memory go into a file in the folder `scratch`, if there is one,
-    which is read as needed and gone when the frames are.
+    which is read as needed and deleted with the frames.
 
     `untouched_share`, for training alone, adds the untouched sensor itself, with the label 1, this often for each
     labelled frame and at least once a trial. Without a pull the safety margin is 1 however light the touch, so 1 is its
-    limit; and a network that was shown the untouched sensor gives explanations a reference that means something.
+    limit; and a network trained on the untouched sensor gives explanations a meaningful reference.
     """
     sizes = {(info.height, info.width) for info in trials}
     if len(sizes) > 1:
@@ -239,7 +235,7 @@ def load_frames(
     total = sum(count + copies_of(count) for count in counts)
     images = _allocate((total, encoding.colours, image_size, image_size), scratch)
     labels, ratios, frictions, times, rows = [], [], [], [], []
-    for done, info in enumerate(trials, start=1):
+    for info in track(trials):
         recording = data.load(info, truth=False)
         labelled = np.flatnonzero(recording.labelled)
         compare = partial(encoding.compare_small, reference=recording.reference, image_size=image_size)
@@ -255,8 +251,6 @@ def load_frames(
             times.append(np.full(copies, recording.time_s[0]))
             rows += [(recording.trial, UNTOUCHED, recording.condition, recording.day)] * copies
         frictions.append(np.full(len(rows) - sum(map(len, frictions)), trial_friction(recording)))
-        if on_progress is not None:
-            on_progress(done, len(trials))
     trial, frame, condition, day = zip(*rows, strict=True)
     return FrameSet(
         encoding=encoding,
@@ -273,7 +267,7 @@ def load_frames(
 
 
 def _allocate(shape: tuple[int, int, int, int], scratch: Path | None) -> UInt8[Tensor, "frames colours size size"]:
-    """Room for images: in memory, or in a file without a name, which is gone when nothing uses it any more."""
+    """Allocate images in memory, or in an unnamed file that is deleted with the last reference."""
     size = int(np.prod(shape))
     if scratch is None or size <= _free_memory() / 2:
         return torch.empty(shape, dtype=torch.uint8)
@@ -283,7 +277,7 @@ def _allocate(shape: tuple[int, int, int, int], scratch: Path | None) -> UInt8[T
 
 
 def _free_memory() -> int:
-    """Bytes that are free now; what is not known counts as plenty."""
+    """Return the free memory in bytes; a very large number where the system does not say."""
     try:
         return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, OSError, ValueError):
@@ -291,7 +285,7 @@ def _free_memory() -> int:
 
 
 class EpochShuffle(Sampler[int]):
-    """A random order for each epoch that depends on the seed and the epoch alone, so that resuming repeats it.
+    """Random order for each epoch that depends on the seed and the epoch alone, so that resuming repeats it.
 
     Of one order that all processes draw alike, each takes every `processes`-th frame, so that together the n-th batches
     of all processes are the n-th batch of one. Those that do not divide are left out of this epoch.
@@ -306,7 +300,7 @@ class EpochShuffle(Sampler[int]):
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Lightning calls this before each epoch."""
+        """Set the epoch; Lightning calls this before each epoch."""
         self.epoch = epoch
 
     def __len__(self) -> int:
@@ -318,18 +312,18 @@ class EpochShuffle(Sampler[int]):
         return iter(self.order(self.epoch)[self.rank :: self.processes][: len(self)])
 
     def batch(self, epoch: int, number: int, *, size: int) -> list[int]:
-        """Indices of a batch of this process, of so many frames."""
+        """Return the indices of a batch of this process."""
         return self.order(epoch)[self.rank :: self.processes][number * size : (number + 1) * size]
 
     def order(self, epoch: int) -> list[int]:
-        """Indices in the order of an epoch: each once, or as many as are drawn, none again before all others."""
+        """Return the indices of an epoch in order: each once, or as many as are drawn, none again before all others."""
         rng = np.random.default_rng((self.seed, epoch))
         rounds = [rng.permutation(self.count) for _ in range(-(-self.drawn // self.count))]
         return np.concatenate(rounds)[: self.drawn].tolist()
 
 
 class EvenShares(Sampler[list[int]]):
-    """Batches of every frame once, over all processes, and as many in each: they must take each step together."""
+    """Batches of every frame once over all processes, equally many in each: they take every step together."""
 
     def __init__(self, count: int, *, batch_size: int, rank: int = 0, processes: int = 1) -> None:
         largest_share = -(-count // processes)
@@ -349,12 +343,11 @@ class EvenShares(Sampler[list[int]]):
 def make_loaders(
     train: FrameSet, validation: FrameSet, *, shuffle: EpochShuffle, batch_size: int
 ) -> tuple[DataLoader, DataLoader]:
-    """Loaders of this process; `batch_size` is its share of the batch."""
-    common: dict[str, Any] = {"collate_fn": _as_is}
+    """Make the loaders of this process; `batch_size` is its share of the batch."""
     shares = EvenShares(len(validation), batch_size=batch_size, rank=shuffle.rank, processes=shuffle.processes)
     # a last small batch would make batch normalisation noisy
-    shuffled = DataLoader(train, sampler=shuffle, batch_size=batch_size, drop_last=True, **common)
-    return shuffled, DataLoader(validation, batch_sampler=shares, **common)
+    shuffled = DataLoader(train, sampler=shuffle, batch_size=batch_size, drop_last=True, collate_fn=_as_is)
+    return shuffled, DataLoader(validation, batch_sampler=shares, collate_fn=_as_is)
 
 
 def _as_is(batch: Any) -> Any:

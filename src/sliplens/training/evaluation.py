@@ -1,15 +1,13 @@
-"""How well a network reads the safety margin, and what markers alone tell."""
+"""Evaluation of a network on labelled trials, beside estimators that use the markers alone."""
 
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError, RecordingError
@@ -21,7 +19,7 @@ from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get
 from sliplens.models import Network
 from sliplens.models.checkpoint import Estimate, open_run, tell_each
 from sliplens.models.sequence import require_frequent
-from sliplens.progress import OnProgress, counted, note, stage, wrote
+from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting, track
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset, trial_path
 from sliplens.recordings.store import stream_frames
@@ -40,7 +38,7 @@ from sliplens.training.metrics import auroc, coverage, find_lead_times, risk_cov
 
 @dataclass(frozen=True, kw_only=True)
 class BaselinePlan:
-    """Which estimators are fitted on which trials."""
+    """Estimators, and the trials that they are fitted on."""
 
     estimators: tuple[str, ...]
     """Rows of `ESTIMATORS`."""
@@ -53,7 +51,7 @@ class BaselinePlan:
 
 @dataclass(frozen=True, kw_only=True)
 class _Followed(FieldTrial):
-    """Displacements of a trial, and how well its markers were followed."""
+    """Displacements of a trial, and the share of its markers that was followed."""
 
     in_view: int
     """Markers of all frames that were in view."""
@@ -61,7 +59,7 @@ class _Followed(FieldTrial):
 
 
 def marker_kind(trials: Sequence[TrialInfo]) -> str:
-    """Row of `KINDS` that the trials' sensors are named for, such as chromatouch-3; `auto` where there is not one."""
+    """Return the row of `KINDS` for the trials' sensors, such as chromatouch-3; `auto` if they differ or have none."""
     kinds = {next((kind for kind in KINDS if f"{trial.sensor}-".startswith(f"{kind}-")), "auto") for trial in trials}
     return kinds.pop() if len(kinds) == 1 else "auto"
 
@@ -80,18 +78,17 @@ def evaluate_baselines(
     predictions: ScoredFrames,
     *,
     folder: Path,
-    on_progress: OnProgress | None = None,
 ) -> tuple[Baselines, BaselinePredictions]:
-    """Follow markers, fit estimators on training trials, and score them on the very frames a network was scored on.
+    """Follow markers, fit estimators on training trials, and score them on the frames that a network was scored on.
 
-    The folder keeps the field of each trial: those that are there are not followed again.
+    The folder keeps the displacements of each trial for an interrupted evaluation.
     """
     estimators = {name: get_estimator(name) for name in plan.estimators}
     tested = set(predictions.trial.tolist())
     trials = {info.trial: info for info in (*plan.training, *(info for info in data.trials if info.trial in tested))}
     fields: dict[str, _Followed] = {}
     failed: dict[str, str] = {}
-    for info in counted(trials.values(), on_progress):
+    for info in track(trials.values()):
         try:
             fields[info.trial] = keep_part(folder / info.trial, _Followed, partial(_follow, data, info, plan.markers))
         except RecordingError:
@@ -99,11 +96,11 @@ def evaluate_baselines(
         except InputError as error:
             failed[info.trial] = str(error)
     fitted = [info for info in plan.training if info.trial in fields]
-    for what, usable in (("training", fitted), ("tested", tested - set(failed))):
+    for part, usable in (("training", fitted), ("tested", tested - set(failed))):
         if not usable:
             name, why = next(iter(failed.items()))
             raise InputError(
-                f"markers were followed in none of the {what} trials ({name}: {why}); name another kind with --markers"
+                f"markers were followed in none of the {part} trials ({name}: {why}); name another kind with --markers"
             )
     margins = [_margins(data, info) for info in fitted]
     mean = float(np.nanmean(np.concatenate(margins)))
@@ -123,7 +120,7 @@ def evaluate_baselines(
         known_trials=0,
         shared_trials=sum(info.trial in tested for info in plan.training),
         training_frames=sum(int(np.isfinite(margin).sum()) for margin in margins),
-        followed=sum(one.followed for one in fields.values()) / max(1, sum(one.in_view for one in fields.values())),
+        followed=sum(some.followed for some in fields.values()) / max(1, sum(some.in_view for some in fields.values())),
         failed=failed,
         estimators={name: _score(answer) for name, answer in answers.items()},
     )
@@ -139,11 +136,11 @@ def evaluate_baselines(
 def _follow(data: Dataset, info: TrialInfo, kind: str) -> _Followed:
     reference = data.read_labels(info).reference
     tracks = track_markers(stream_frames(trial_path(data.folder, info.trial)), reference, kind)
-    known = tracks.from_reference
+    rows = tracks.from_reference
     return _Followed(
         **vars(field_trial(tracks)),
-        in_view=int((tracks.status[:, known] != MarkerStatus.OUTSIDE).sum()),
-        followed=int(tracks.followed[:, known].sum()),
+        in_view=int((tracks.status[:, rows] != MarkerStatus.OUTSIDE).sum()),
+        followed=int(tracks.followed[:, rows].sum()),
     )
 
 
@@ -161,7 +158,7 @@ def _score(answers: ScoredFrames) -> BaselineScores:
 
 
 EACH = "each"
-"""What `friction` may be where every trial is told its own."""
+"""Value of `friction` for the known friction of every trial."""
 
 
 def evaluate(
@@ -178,7 +175,7 @@ def evaluate(
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Evaluation:
-    """Measure how well a network reads the safety margin of labelled trials.
+    """Measure how well a network predicts the safety margin of labelled trials.
 
     Parameters
     ----------
@@ -191,15 +188,19 @@ def evaluate(
     split
         Which trials of the data set.
     friction
-        What the network is told of the coefficient of friction, as `predict` takes it; `each` tells it that of every
-        trial, exactly, as its labels have it. A network without the answer F_t / F_n cannot be told.
+        Coefficient of friction, as `predict` takes it; `each` takes that of every trial from its labels. It needs a
+        network that predicts F_t / F_n.
     sequence
-        Read each trial in order, as `predict` takes it; frames without a label are left out.
+        If True, predict each trial in order, as `predict` does; frames without a label are left out.
     baselines, baseline_trials
         Estimators to put beside the network, rows of `markers.estimators.ESTIMATORS` or `all`, and how many training
         trials they are fitted on, spread evenly over those of the data set.
     markers
-        What markers look like, a row of `markers.KINDS`; by the sensor's name if None.
+        Kind of markers, a row of `markers.KINDS`; by the sensor's name if None.
+    overwrite
+        If True, replace a folder `out` of other settings.
+    on_progress
+        Callback for progress.
 
     Raises
     ------
@@ -210,84 +211,79 @@ def evaluate(
     RecordingError
         If no frame has a label.
     """
-    run = open_run(run)
-    told = None if friction is None else EACH if friction == EACH else as_friction(friction)
-    if told is not None:
-        run.require_ratio()
+    network = open_run(run)
+    prior = None if friction is None else EACH if friction == EACH else as_friction(friction)
+    if prior is not None:
+        network.require_ratio()
     if sequence:
-        run.follow(friction=told)
+        network.follow(friction=prior)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     trials = data.select(split=split)
     for trial in trials:
-        run.require_frame_size((trial.height, trial.width))
-    firsts = map(data.read_labels, {trial.sensor: trial for trial in reversed(trials)}.values())
-    doubts = [words for one in firsts for words in (run.doubt(one.sensor), run.doubt_colour(one.reference))]
-    if isinstance(told, Friction):
-        doubts.append(run.doubt_friction(told))
-    for words in dict.fromkeys(filter(None, doubts)):
-        note(on_progress, words)
+        network.require_frame_size((trial.height, trial.width))
     plan = _plan_baselines(baselines, data, trials, count=baseline_trials, markers=markers) if baselines else None
-    asked: dict[str, Any] = {"split": split, "friction": told, "sequence": sequence}
-    if out is None:
-        with scratch_folder() as folder:
-            return _evaluate(run, data, trials, plan, folder, **asked, on_progress=on_progress)
-    kept = run.manifest
-    recipe: dict[str, Any] = {"weights_sha256": kept.weights_sha256, "data_hash": data.hash, "input": kept.input}
-    recipe["split"] = split
-    if told is not None:
-        recipe["friction"] = told if isinstance(told, str) else told.digest
-    if sequence:
-        recipe["sequence"] = kept.sequence
-    if plan is not None:
-        trained_on = [trial.trial for trial in plan.training]
-        recipe["baselines"] = {"estimators": plan.estimators, "markers": plan.markers, "trials": trained_on}
-    with output_folder(Path(out), stage="evaluate", config=recipe, overwrite=overwrite) as output:
-        if output.complete:
-            evaluation = load_result(output.folder, Evaluation, command="sliplens evaluate")
-        else:
-            evaluation = _evaluate(run, data, trials, plan, output.folder, **asked, on_progress=on_progress)
-            save_result(evaluation, output.folder)
-    wrote(on_progress, Path(out), "scores and predictions", kept=output.complete)
-    return evaluation
 
+    def compute(folder: Path) -> Evaluation:
+        with open_stage(f"Reading {split} trials ({network.manifest.input})"):
+            frames = load_frames(data, trials, encoding=network.encoding, image_size=network.manifest.image_size)
+        with open_stage("Predicting frames"):
+            evaluation = evaluate_frames(network, frames, split=split, friction=prior, sequence=sequence)
+        evaluation = replace(evaluation, known_trials=len(find_training_trials(trials, network)))
+        if plan is None:
+            return evaluation
+        fields = folder / "fields"
+        with open_stage("Following markers"):
+            scores, predictions = evaluate_baselines(plan, data, evaluation.predictions, folder=fields)
+        shutil.rmtree(fields)
+        scores = replace(scores, known_trials=len(find_training_trials(plan.training, network)))
+        return replace(evaluation, baselines=scores, baseline_predictions=predictions)
 
-def _evaluate(
-    run: Network,
-    data: Dataset,
-    trials: Sequence[TrialInfo],
-    plan: BaselinePlan | None,
-    folder: Path,
-    *,
-    split: str,
-    friction: FrictionLike | None,
-    sequence: bool,
-    on_progress: OnProgress | None,
-) -> Evaluation:
-    size = run.manifest.image_size
-    with stage(on_progress, f"Reading {split} trials ({run.manifest.input})") as count:
-        frames = load_frames(data, trials, encoding=run.encoding, image_size=size, on_progress=count)
-    with stage(on_progress, "Predicting frames") as count:
-        evaluation = evaluate_frames(run, frames, split=split, friction=friction, sequence=sequence, on_progress=count)
-    evaluation = replace(evaluation, known_trials=len(find_known(trials, run)))
-    if plan is None:
+    with reporting(on_progress):
+        firsts = map(data.read_labels, {trial.sensor: trial for trial in reversed(trials)}.values())
+        doubts = [
+            words for first in firsts for words in (network.doubt(first.sensor), network.doubt_colour(first.reference))
+        ]
+        if isinstance(prior, Friction):
+            doubts.append(network.doubt_friction(prior))
+        for words in dict.fromkeys(filter(None, doubts)):
+            add_note(words)
+        if out is None:
+            with scratch_folder() as folder:
+                return compute(folder)
+        recipe = {
+            "weights_sha256": network.manifest.weights_sha256,
+            "data_hash": data.hash,
+            "input": network.manifest.input,
+            "split": split,
+            "friction": prior.digest if isinstance(prior, Friction) else prior,
+            "sequence": network.manifest.sequence if sequence else None,
+            "baselines": plan
+            and {
+                "estimators": plan.estimators,
+                "markers": plan.markers,
+                "trials": [trial.trial for trial in plan.training],
+            },
+        }
+        recipe = {name: value for name, value in recipe.items() if value is not None}
+        with output_folder(Path(out), stage="evaluate", config=recipe, overwrite=overwrite) as output:
+            if output.complete:
+                evaluation = load_result(output.folder, Evaluation, command="sliplens evaluate")
+            else:
+                evaluation = compute(output.folder)
+                save_result(evaluation, output.folder)
+        report_file(Path(out), "scores and predictions", kept=output.complete)
         return evaluation
-    fields = folder / "fields"
-    with stage(on_progress, "Following markers") as count:
-        scores, answers = evaluate_baselines(plan, data, evaluation.predictions, folder=fields, on_progress=count)
-    shutil.rmtree(fields)  # kept until here for whoever is interrupted
-    known = len(find_known(plan.training, run))
-    return replace(evaluation, baselines=replace(scores, known_trials=known), baseline_predictions=answers)
 
 
-def find_known(trials: Sequence[TrialInfo], run: Network) -> tuple[TrialInfo, ...]:
-    """Trials that trained or validated a network, or what it started from; told by the hashes of their files."""
-    return tuple(trial for trial in trials if trial.sha256[:12] in run.manifest.trained_on)
+def find_training_trials(trials: Sequence[TrialInfo], network: Network) -> tuple[TrialInfo, ...]:
+    """Find the trials that trained or validated a network, or the network it started from, by hashes of their files."""
+    return tuple(trial for trial in trials if trial.sha256[:12] in network.manifest.trained_on)
 
 
 def _plan_baselines(
     names: Sequence[str], data: Dataset, trials: Sequence[TrialInfo], *, count: int, markers: str | None
 ) -> BaselinePlan:
-    """Check all that may be wrong before anything is computed."""
+    """Check the request before anything is computed."""
     names = tuple(ESTIMATORS) if tuple(names) == ("all",) else tuple(names)
     for name in names:
         get_estimator(name)
@@ -304,41 +300,53 @@ def _plan_baselines(
 
 
 def evaluate_frames(
-    run: Network,
+    network: Network,
     frames: FrameSet,
     *,
     split: str = "test",
     friction: FrictionLike | None = None,
     sequence: bool = False,
     batch_size: int = 64,
-    on_progress: OnProgress | None = None,
 ) -> Evaluation:
-    """Predict frames, and score the answers for each condition, day and trial.
+    """Predict frames, and score the predictions for each condition, day and trial.
 
     Parameters
     ----------
+    network
+        Network to evaluate.
     frames
-        Labelled frames in the network's encoding and size, as `load_frames` gives them.
+        Labelled frames in the network's encoding and size, from `load_frames`.
     split
-        What they are called in the result.
-    friction
-        Coefficient of friction that is told, as `evaluate` takes it.
-    sequence
-        Read the frames of each trial in order, as `evaluate` takes it.
+        Name of the frames in the result.
+    friction, sequence
+        As `evaluate` takes them.
+    batch_size
+        Frames in a batch.
 
     Raises
     ------
     RecordingError
-        If there is no frame, or one of a trial whose friction is not known and is to be told.
+        If there is no frame, or `friction` is `each` and that of a trial is unknown.
     """
     if not len(frames):
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
     names = np.array(frames.trial)
     for name in np.unique(names) if sequence else ():
         require_frequent(np.sort(frames.time_s[names == name]), what=f"the trial {name}")
-    estimate = _estimate(run, frames.batches(batch_size, on_progress), frames.friction, told=friction)
+    batches = frames.batches(batch_size, report=True)
+    if friction == EACH:
+        traction = network.require_ratio()
+        if not np.isfinite(frames.friction).all():
+            raise RecordingError(
+                "not every trial has a coefficient of friction; set it with --friction, or leave it out"
+            )
+        quantiles = np.array(traction.friction)
+        estimate = network.estimate_batches(batches)
+        estimate = tell_each(estimate, frames.friction, trained_friction=quantiles, calibration=traction.told)
+    else:
+        estimate = network.estimate_batches(batches, friction=friction)
     if sequence:
-        estimate = _follow_trials(run, estimate, frames.trial, frames.time_s)
+        estimate = _follow_trials(network, estimate, frames.trial, frames.time_s)
     levels = estimate.calibration.offsets if estimate.calibration else ()
     intervals = {level: ends for level in levels if (ends := estimate.interval(float(level)))}
     unknown, sigma = np.full(len(frames), np.nan), estimate.sigma
@@ -370,12 +378,12 @@ def evaluate_frames(
 
     def reliability(rows: Bool[np.ndarray, " frames"]) -> Reliability:
         labels = predictions.safety_margin[rows]
-        held = {level: coverage(low[rows], high[rows], labels) for level, (low, high) in intervals.items()}
+        shares = {level: coverage(low[rows], high[rows], labels) for level, (low, high) in intervals.items()}
         width = float((high_90 - low_90)[rows].mean()) if intervals else None
-        return Reliability(coverage=held, mean_width_90=width)
+        return Reliability(coverage=shares, mean_width_90=width)
 
     return Evaluation(
-        input=run.manifest.input,
+        input=network.manifest.input,
         split=split,
         known_trials=0,
         conditions=score(conditions),
@@ -395,35 +403,22 @@ def evaluate_frames(
     )
 
 
-def _estimate(
-    run: Network, batches: Iterable[Tensor], friction: Float[np.ndarray, " frames"], *, told: FrictionLike | None
-) -> Estimate:
-    """Answers to frames with these frictions, of which as much is told as `evaluate` says."""
-    if told != EACH:
-        return run.estimate_batches(batches, friction=told)
-    traction = run.require_ratio()
-    if not np.isfinite(friction).all():
-        raise RecordingError("not every trial has a coefficient of friction to tell; name one, or leave it out")
-    estimate = run.estimate_batches(batches)
-    return tell_each(estimate, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
-
-
 def _follow_trials(
-    run: Network, estimate: Estimate, trial: Sequence[str], time_s: Float[np.ndarray, " frames"]
+    network: Network, estimate: Estimate, trial: Sequence[str], time_s: Float[np.ndarray, " frames"]
 ) -> Estimate:
-    """Read the frames of each trial in the order of their times (`Follower`); all of them touch."""
+    """Correct the frames of each trial in the order of their times (`Follower`); all of them touch."""
     assert estimate.probabilities is not None
     margin, probabilities = np.empty_like(estimate.margin), np.empty_like(estimate.probabilities)
     names, calibration, alone = np.array(trial), None, np.zeros(len(estimate.margin), dtype=bool)
     for name in dict.fromkeys(trial):
         rows = np.flatnonzero(names == name)
         rows = rows[np.argsort(time_s[rows], kind="stable")]
-        read = run.follow().update(estimate.at(rows), time_s[rows], np.ones(len(rows), dtype=bool))
-        assert read.probabilities is not None
-        margin[rows], probabilities[rows], calibration = read.margin, read.probabilities, read.calibration
-        alone[rows] = False if read.alone is None else read.alone[0]
-    kept = (alone, estimate.calibration) if alone.any() else None
-    return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration, alone=kept)
+        part = network.follow().update(estimate.at(rows), time_s[rows], np.ones(len(rows), dtype=bool))
+        assert part.probabilities is not None
+        margin[rows], probabilities[rows], calibration = part.margin, part.probabilities, part.calibration
+        alone[rows] = False if part.alone is None else part.alone[0]
+    single = (alone, estimate.calibration) if alone.any() else None
+    return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration, alone=single)
 
 
 def _ratio_r2(ratio: Float[np.ndarray, " frames"], frames: FrameSet) -> dict[str, float | None]:

@@ -36,29 +36,30 @@ _COVERED = tuple(round(1 - step / 20, 2) for step in range(20))
 def risk_coverage(
     errors: Float[np.ndarray, " frames"], trust: Mapping[str, Float[np.ndarray, " frames"] | None]
 ) -> RiskCoverage:
-    """Mean absolute error of the frames that are answered, as more and more of the least trusted are withheld.
+    """Compute the mean absolute error of the remaining frames, as more and more of the least trusted are withheld.
 
     Parameters
     ----------
     errors
         Absolute error of each frame, in margin units.
     trust
-        Reasons to withhold, by name: a number a frame, the lower the sooner it is withheld; None for one that the
-        network does not tell. `perfect`, by the errors themselves, is always told.
+        Trust in each frame, by name; the least trusted frames are withheld first. None for a measure that the network
+        lacks. `perfect`, the negative error, is always added.
 
     References
     ----------
     El-Yaniv and Wiener, *On the Foundations of Noise-free Selective Classification*, JMLR 2010.
     """
-    told = {name: values for name, values in trust.items() if values is not None} | {"perfect": -errors}
-    kept = [max(1, round(share * len(errors))) for share in _COVERED]
+    available = {name: values for name, values in trust.items() if values is not None} | {"perfect": -errors}
+    counts = [max(1, round(share * len(errors))) for share in _COVERED]
     means = {
         # stable: frames that are trusted alike are withheld in their order
         name: np.cumsum(errors[np.argsort(-values, kind="stable")]) / np.arange(1, len(errors) + 1)
-        for name, values in told.items()
+        for name, values in available.items()
     }
     return RiskCoverage(
-        covered=_COVERED, error={name: tuple(float(mean[count - 1]) for count in kept) for name, mean in means.items()}
+        covered=_COVERED,
+        error={name: tuple(mean[np.array(counts) - 1].tolist()) for name, mean in means.items()},
     )
 
 

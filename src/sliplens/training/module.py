@@ -1,15 +1,12 @@
-"""The Lightning module, the callbacks around it, and a trainer that goes on where a training stopped."""
+"""Lightning module, callbacks and trainer of a training, which resumes where it was interrupted."""
 
-import io
 import logging
 import math
-import os
 import signal
 import threading
-import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -21,21 +18,22 @@ from jaxtyping import Float
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import Callback, EarlyStopping
+from lightning.pytorch.callbacks import Callback, EarlyStopping, Timer
 from pytorch_optimizer import Ranger21
 from torch import Tensor, distributed, nn
 from torch.utils.data import DataLoader
 from torchmetrics import MeanSquaredError
 
 from sliplens.errors import InputError, ModelError
+from sliplens.files import whole_file
 from sliplens.models.backbones import BINS, Answers, bin_centres, last_layer, margin_loss, ratio_edges
-from sliplens.progress import OnProgress
+from sliplens.progress import report_progress
 from sliplens.results.evaluation import LearningCurve
-from sliplens.training.config import TrainConfig
+from sliplens.training.config import TrainingConfig
 from sliplens.training.data import Augmentation
 
-_NAMED_ROWS = 3
-"""Frames of a batch that a message names."""
+_MOST_ROWS = 3
+"""Largest number of frames of a batch in a message."""
 
 
 class DivergedError(ModelError):
@@ -43,7 +41,7 @@ class DivergedError(ModelError):
 
 
 class Regressor(lightning.LightningModule):
-    """A network with its loss, its augmentation and its optimizer.
+    """Network with its loss, its augmentation and its optimizer.
 
     With AdamW the learning rate follows the share of the training that is done, in epochs or in minutes, so that a
     training cut short by its time limit still ends on a small step.
@@ -55,16 +53,16 @@ class Regressor(lightning.LightningModule):
         self,
         model: nn.Module,
         *,
-        config: TrainConfig,
+        config: TrainingConfig,
         augmentation: Augmentation | None,
-        clock: "Clock",
+        progress: "Progress",
         batch_rows: Callable[[int, int], Sequence[str]],
     ) -> None:
         super().__init__()
         self.model = model
         self.config = config
         self.augmentation = augmentation
-        self.clock = clock
+        self.progress = progress
         self.batch_rows = batch_rows
         # sums and counts, added up over the processes: exact however the frames are shared
         self.train_mse = MeanSquaredError()
@@ -83,7 +81,7 @@ class Regressor(lightning.LightningModule):
         return self.model(images).reshape(len(images))
 
     def on_train_epoch_start(self) -> None:
-        """Take batch normalisation that is to stay as it is out of training."""
+        """Keep the statistics of batch normalisation where the configuration says so."""
         if self.config.learns == "weights":
             for module in self.modules():
                 if isinstance(module, nn.modules.batchnorm._BatchNorm):
@@ -110,25 +108,25 @@ class Regressor(lightning.LightningModule):
         return loss
 
     def _refuse(self, loss: float, batch_idx: int, *, finite: bool) -> None:
-        """Stop, and say which frames of which process brought a loss that is not finite."""
+        """Stop with an error that lists the frames, of any process, whose loss is not finite."""
         mine: tuple[float, Sequence[str]] = (loss, () if finite else self.batch_rows(self.current_epoch, batch_idx))
         losses = [mine] * self.trainer.world_size
         if self.trainer.world_size > 1:
             distributed.all_gather_object(losses, mine)
         value, rows = next(shared for shared in losses if shared[1])
-        more = f" and {len(rows) - _NAMED_ROWS} more" if len(rows) > _NAMED_ROWS else ""
+        more = f" and {len(rows) - _MOST_ROWS} more" if len(rows) > _MOST_ROWS else ""
         raise DivergedError(
             f"the training loss is {value} in epoch {self.current_epoch + 1}, at step {self.global_step}, for a batch "
-            f"of {', '.join(rows[:_NAMED_ROWS])}{more}; lower the learning rate, or look at these frames, and try again"
+            f"of {', '.join(rows[:_MOST_ROWS])}{more}; lower the learning rate, or look at these frames, and try again"
         )
 
     def validation_step(self, batch: tuple[Tensor, Tensor, Tensor], batch_idx: int) -> None:
-        """Log the validation error, of a network with two answers that over both."""
+        """Log the validation error; of a network with two outputs, over both."""
         images, labels, ratios = batch
         margins, *histograms = Answers(self.model)(images)
-        if self.ratio_centres is not None and (known := torch.isfinite(ratios)).any():
-            margins = torch.cat([margins, (histograms[1] @ self.ratio_centres)[known]])
-            labels = torch.cat([labels, ratios[known]])
+        if self.ratio_centres is not None and (finite := torch.isfinite(ratios)).any():
+            margins = torch.cat([margins, (histograms[1] @ self.ratio_centres)[finite]])
+            labels = torch.cat([labels, ratios[finite]])
         self.validation_mse.update(margins, labels)
         self.log("validation_mse", self.validation_mse, on_epoch=True)
 
@@ -136,7 +134,7 @@ class Regressor(lightning.LightningModule):
         """Set the learning rate for the share of the training that is done; Ranger21 sets its own."""
         if self.config.optimizer != "adamw":
             return
-        warm_up, done = 0.1, self.clock.fraction()
+        warm_up, done = 0.1, self.progress.fraction()
         descent = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, (done - warm_up) / (1 - warm_up)))))
         factor = max(done / warm_up, 0.02) if done < warm_up else max(descent, 0.005)
         for optimizer in self.trainer.optimizers:
@@ -146,7 +144,7 @@ class Regressor(lightning.LightningModule):
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """AdamW, without weight decay on biases and normalisation; or Ranger21 with its defaults."""
         if self.config.optimizer == "ranger21":
-            return Ranger21(self.parameters(), num_iterations=self.clock.steps, lr=self.config.learning_rate)
+            return Ranger21(self.parameters(), num_iterations=self.progress.steps, lr=self.config.learning_rate)
         decayed = [value for value in self.parameters() if value.ndim > 1]
         others = [value for value in self.parameters() if value.ndim <= 1]
         groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
@@ -154,49 +152,42 @@ class Regressor(lightning.LightningModule):
 
 
 @dataclass(kw_only=True, eq=False)
-class Clock(Callback):
-    """Stops when the epochs or the minutes are used up, and writes a table row after each epoch.
+class Progress(Callback):
+    """Count the steps, report them, and write a table row after each epoch.
 
-    Its state is part of the checkpoint: a training that was interrupted goes on with the minutes that are left. With a
-    time limit all processes go by the clock of the first: the learning rate follows it too.
+    Its state is part of the checkpoint. With a time limit all processes use the clock of the first, since the learning
+    rate follows it.
     """
 
     steps: int
-    max_minutes: float | None
-    metrics_file: Path | None
-    on_progress: OnProgress | None
-    seconds_before: float = 0.0
+    timer: Timer
+    """Clock of the training, which also stops it at the time limit; a resumed training has the time that is left."""
+    max_minutes: float | None = None
+    metrics_file: Path | None = None
+    """File of the table; None in all processes but the first."""
     step: int = 0
     rows: list[list[float]] = field(default_factory=list)
-    stopped_by: str = "epochs"
-    _started: float = field(default_factory=time.perf_counter)
     _time_share: float = 0.0
 
     @property
-    def seconds(self) -> float:
-        """Seconds spent, interruptions left out."""
-        return self.seconds_before + time.perf_counter() - self._started
+    def minutes(self) -> float:
+        """Minutes of training, interruptions left out."""
+        return self.timer.time_elapsed("train") / 60
 
     def fraction(self) -> float:
-        """Share of the training that is done."""
+        """Share of the training that is done, in steps or in minutes, whichever is larger."""
         return min(1.0, max(self.step / self.steps, self._time_share))
 
-    def curve(self) -> LearningCurve:
-        """Learning curve so far."""
-        epoch, train, validation, minutes = np.array(self.rows, dtype=np.float64).reshape(-1, 4).T
-        return LearningCurve(epoch=epoch, train_mse=train, validation_mse=validation, minutes=minutes)
+    def state_dict(self) -> dict[str, list[list[float]]]:
+        """Return the rows, for a checkpoint."""
+        return {"rows": self.rows}
 
-    def state_dict(self) -> dict[str, Any]:
-        """What a checkpoint keeps of the clock."""
-        return {"seconds": self.seconds, "rows": self.rows}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
-        self.seconds_before, self.rows = state_dict["seconds"], state_dict["rows"]
+    def load_state_dict(self, state_dict: dict[str, list[list[float]]]) -> None:
+        """Restore the rows of a checkpoint."""
+        self.rows = state_dict["rows"]
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Start the clock; from now on a request to end is an interruption."""
-        self._started = time.perf_counter()
+        """Restore the step of a checkpoint; from now on a request to end is an interruption."""
         self.step = trainer.global_step
         if threading.current_thread() is threading.main_thread():
             # Lightning 2.6 would ask the other processes from within its handler, and all would wait for ever; what was
@@ -206,63 +197,74 @@ class Clock(Callback):
     def on_train_batch_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """Look at the clock, which the module's learning rate follows."""
+        """Measure the share of the time limit, which the learning rate follows."""
         if self.max_minutes is not None:
-            self._time_share = trainer.strategy.broadcast(self.seconds) / (60 * self.max_minutes)
+            self._time_share = trainer.strategy.broadcast(self.minutes) / self.max_minutes
 
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Stop when the time is up."""
+        """Report the step."""
         self.step = trainer.global_step
-        if self.max_minutes is not None and self.step < self.steps:
-            late = self.seconds >= 60 * self.max_minutes
-            # one that stopped alone would leave the others waiting
-            if trainer.strategy.reduce_boolean_decision(late, all=False):
-                self.stopped_by, self._time_share = "time limit", 1.0
-                trainer.should_stop = True
-        if self.on_progress is not None:
-            self.on_progress(round(self.fraction() * self.steps), self.steps)
+        if trainer.is_global_zero:
+            report_progress(round(self.fraction() * self.steps), self.steps)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write the epoch's row; the validation has run by now."""
         metrics = trainer.callback_metrics
         epoch = self.step / self.steps * (trainer.max_epochs or 1)
-        train, validation = metrics["train_mse"].item(), metrics["validation_mse"].item()
-        self.add_row(epoch, train, validation)
+        row = [epoch, metrics["train_mse"].item(), metrics["validation_mse"].item(), self.minutes]
+        add_row(self.rows, row, self.metrics_file)
 
-    def add_row(self, epoch: float, train_mse: float, validation_mse: float) -> None:
-        """Add an epoch to the learning curve, and write it; `DivergedError` where it has no validation error."""
-        if not math.isfinite(validation_mse):
-            raise DivergedError(
-                f"the validation error is {validation_mse} after epoch {len(self.rows) + 1}; "
-                "lower the learning rate and try again"
-            )
-        self.rows.append([epoch, train_mse, validation_mse, self.seconds / 60])
-        if self.metrics_file is not None:
-            lines = ["epoch,train_mse,validation_mse,minutes"]
-            lines += [f"{r[0]:.3f},{r[1]:.6g},{r[2]:.6g},{r[3]:.4f}" for r in self.rows]
-            part = self.metrics_file.with_name(self.metrics_file.name + ".part")
+
+def add_row(rows: list[list[float]], row: list[float], file: Path | None) -> None:
+    """Add epoch, training MSE, validation MSE and minutes to a learning curve, and write all of it to a CSV file.
+
+    `DivergedError` if the validation error is not finite.
+    """
+    if not math.isfinite(row[2]):
+        raise DivergedError(
+            f"the validation error is {row[2]} after epoch {len(rows) + 1}; lower the learning rate and try again"
+        )
+    rows.append(row)
+    if file is not None:
+        lines = ["epoch,train_mse,validation_mse,minutes"]
+        lines += [f"{r[0]:.3f},{r[1]:.6g},{r[2]:.6g},{r[3]:.4f}" for r in rows]
+        with whole_file(file) as part:
             part.write_text("\n".join(lines) + "\n", encoding="utf-8")
-            part.replace(self.metrics_file)
+
+
+def learning_curve(rows: list[list[float]]) -> LearningCurve:
+    """Make the record of rows of epoch, training MSE, validation MSE and minutes."""
+    epoch, train, validation, minutes = np.array(rows, dtype=np.float64).reshape(-1, 4).T
+    return LearningCurve(epoch=epoch, train_mse=train, validation_mse=validation, minutes=minutes)
 
 
 class Patience(EarlyStopping):
-    """Early stopping that a resumed training does not forget: Lightning restores the count, not that it had ended."""
+    """Early stopping whose end survives a resumption: Lightning restores the count, not that training had ended."""
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """End at once where the checkpoint had waited long enough."""
+        """Stop at once if the checkpoint had waited long enough."""
         if self.wait_count >= self.patience:
             trainer.should_stop = True
 
 
 def make_trainer(
-    config: TrainConfig, *, accelerator: Literal["auto", "cpu", "gpu"] = "auto", devices: int = 1, num_nodes: int = 1
+    config: TrainingConfig, *, accelerator: Literal["auto", "cpu", "gpu"] = "auto", devices: int = 1, num_nodes: int = 1
 ) -> lightning.Trainer:
-    """Trainer of this process, which knows its number among all (`global_rank`); nothing runs yet.
+    """Make the trainer of this process, with its number among all processes (`global_rank`); nothing runs yet.
 
-    `accelerator`, `devices` and `num_nodes` are Lightning's own: devices of each node, a process each. `InputError` if
-    this machine has not the devices, or torchrun or a cluster started another number of processes.
+    Parameters
+    ----------
+    config
+        Settings of the training.
+    accelerator, devices, num_nodes
+        As Lightning takes them: devices of each node, a process each.
+
+    Raises
+    ------
+    InputError
+        If this machine lacks the devices, or torchrun or a cluster started another number of processes.
     """
     half = config.mixed_precision and accelerator != "cpu" and torch.cuda.is_available()
     shared = devices * num_nodes > 1 or TorchElasticEnvironment.detect()
@@ -299,7 +301,7 @@ def make_trainer(
 
 
 def share_of_batch(batch_size: int, processes: int) -> int:
-    """Images of a batch that one process takes."""
+    """Return the number of images of a batch that each process takes."""
     share, rest = divmod(batch_size, processes)
     if rest:
         raise InputError(
@@ -314,31 +316,21 @@ def share_of_batch(batch_size: int, processes: int) -> int:
 
 
 class WholeCheckpoints(TorchCheckpointIO):
-    """Writes each checkpoint beside the one it replaces, so that a crash or a full disk leaves the old one.
+    """Write each checkpoint beside the one it replaces, so that a crash or a full disk leaves the old one.
 
     Lightning's own way goes through the system's temporary folder, and is whole only where that is on the same disk.
     """
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
+    def save_checkpoint(self, checkpoint: Mapping[str, Any], path: str | Path, storage_options: object = None) -> None:
         """Write a checkpoint."""
         if storage_options is not None:
             raise TypeError("this way of saving takes no storage_options")
-        target = Path(path)
-        part = target.with_name(target.name + ".part")
-        buffer = io.BytesIO()
-        torch.save(checkpoint, buffer)
         try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with part.open("wb") as stream:
-                stream.write(buffer.getbuffer())
-                stream.flush()
-                os.fsync(stream.fileno())  # the new name must not come before the bytes
-            part.replace(target)
+            with whole_file(Path(path)) as part:
+                torch.save(checkpoint, part)
         except OSError as error:
-            with suppress(OSError):
-                part.unlink()
             raise InputError(
-                f"cannot save the checkpoint {target} ({error.strerror}); make room and give the same command again, "
+                f"cannot save the checkpoint {path} ({error.strerror}); make room and give the same command again, "
                 "it goes on after the last whole epoch"
             ) from None
 
@@ -346,7 +338,7 @@ class WholeCheckpoints(TorchCheckpointIO):
 def run_trainer(
     trainer: lightning.Trainer, module: Regressor, loaders: tuple[DataLoader, DataLoader], last: Path
 ) -> None:
-    """Train, going on from a checkpoint where there is one."""
+    """Train, resuming from a checkpoint if there is one."""
     on_interrupt = signal.getsignal(signal.SIGINT)
     with quiet_lightning():
         try:
@@ -367,8 +359,8 @@ def run_trainer(
         except RuntimeError as error:
             _end_others(trainer)
             lost = ("gloo", "connection closed", "connection reset", "broken pipe")
-            known = isinstance(error, torch.distributed.DistError) or any(word in str(error).lower() for word in lost)
-            if trainer.world_size > 1 and known:
+            is_lost = isinstance(error, torch.distributed.DistError) or any(word in str(error).lower() for word in lost)
+            if trainer.world_size > 1 and is_lost:
                 raise ModelError(
                     "another process of this training was lost; give the same command again, it goes on after the last "
                     "whole epoch"
