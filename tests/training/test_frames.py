@@ -6,6 +6,7 @@ import torch
 from data_sets import save_dataset
 
 from sliplens.models.encodings import ENCODINGS
+from sliplens.progress import reporting
 from sliplens.recordings import Dataset, Recording
 from sliplens.training.data import UNTOUCHED, load_frames
 
@@ -33,13 +34,8 @@ def test_a_batch_is_what_encoding_the_frames_one_by_one_gives(small_dataset: Dat
 def test_progress_counts_trials(small_dataset: Dataset):
     trials = small_dataset.select(split="train")
     seen: list[tuple[int, int]] = []
-    load_frames(
-        small_dataset,
-        trials,
-        encoding=ENCODINGS.pick("raw"),
-        image_size=32,
-        on_progress=lambda done, total: seen.append((done, total)),
-    )
+    with reporting(lambda done, total: seen.append((done, total))):
+        load_frames(small_dataset, trials, encoding=ENCODINGS.pick("raw"), image_size=32)
     assert seen == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
