@@ -259,7 +259,9 @@ def read_frames(run: Network, name: str, *, trials: int | None = None, grasp_spr
             known |= {"one_slip_unlike": learn(slipped), "one_slip_unlike_told": learn(slipped, spread=grasp_spread)}
         for what, one in known.items():
             traction = run.require_ratio()
-            estimate = untold.told(one, trained_friction=np.array(traction.friction), calibration=traction.told)
+            estimate = untold.with_friction(
+                one, trained_friction=np.array(traction.friction), calibration=traction.told
+            )
             told.setdefault(what, []).append(estimate)
         truth.append(seen.margin)
         ratios.append(seen.ratio)

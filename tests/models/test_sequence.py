@@ -233,7 +233,7 @@ def test_frames_that_come_too_seldom_are_refused(run: Network, small_dataset: Da
     trials = small_dataset.select(split="test")
     [capture] = open_source(small_dataset, trial=trials[0].trial)
     seldom = replace(capture, frame_time_s=30 * there(capture.time_s))  # one a second
-    with pytest.raises(InputError, match=r"has a frame each 1 s, .* without --sequence, or record 2 a second"):
+    with pytest.raises(InputError, match=r"has a frame each 1 s, .* leave out --sequence, or record 2 frames a second"):
         sl.predict(run, [seldom], sequence=True)
     assert len(sl.predict(run, [seldom])) == len(capture)
     frames = load_frames(small_dataset, trials, encoding=run.encoding, image_size=32)

@@ -85,8 +85,9 @@ class Predict(SourceCommand):
 
         assert self.source is not None  # see above
         run, source = (self.source, None) if self.model is None else (self.model, self.source)
-        named = {"run": run, "source": source, "options": self.options, "out": self.output}
-        predictions = self.call(predict, **named)
+        names = ("reference", "reference_frame", "split", "format", "sensor", "on", "retry_failed", "options")
+        options = {name: getattr(self, name) for name in names}
+        predictions = self.call(predict, run=run, source=source, out=self.output, **options)
         predictions = replace(predictions, rows=predictions.frame())  # a file is read back once
         _show(predictions)
         for reason, frames in predictions.withheld.items():

@@ -20,10 +20,10 @@ from sliplens.extras import Table
 
 
 def _import_torchvision() -> ModuleType:
-    """TorchVision, without torch's compiler: it imports all of that for one question that it asks when it compiles.
+    """Import TorchVision without torch's compiler, which it needs only when it compiles.
 
-    `torchvision.ops.roi_align` takes `is_compile_supported` from there, which no network here calls;
-    imported as it is, the compiler costs as much again as torch.
+    `torchvision.ops.roi_align` imports `is_compile_supported` from there, which no network here calls; the compiler
+    takes as long to import as torch.
     """
     compiler = "torch._dynamo.utils"
     hide = "torchvision" not in sys.modules and compiler not in sys.modules
@@ -56,10 +56,10 @@ _WIDTH_RATIO = 0.75
 
 
 class HistogramRegressor(nn.Module):
-    """A network whose answer is a histogram over the safety margin; it returns the mean (HL-Gauss).
+    """Network with a histogram over the safety margin as its output; it returns the mean (HL-Gauss).
 
     `backbone`: takes (batch, 3, height, width) and returns (batch, `bins`) logits; `bins`, `lowest`, `highest`: bins of
-    one width, and the margins between which they lie. With `ratio` it answers with a second histogram, over the
+    one width, and the margins between which they lie. With `ratio` it has a second histogram, over the
     traction ratio F_t / F_n; the backbone returns `RATIO_BINS` logits more then.
 
     Imani & White, *Improving Regression Performance with Distributional Losses* (2018); Farebrother et al., *Stop
@@ -84,7 +84,7 @@ class HistogramRegressor(nn.Module):
         self.backbone = backbone
         self.register_buffer("edges", torch.linspace(lowest, highest, bins + 1))
         self.register_buffer("temperature", torch.tensor(1.0))
-        # None is not part of the weights: networks with one answer are kept as they always were
+        # None is not part of the weights: files of networks with one output stay the same
         ratio_edges = torch.linspace(RATIO_LOWEST, RATIO_HIGHEST, RATIO_BINS + 1) if ratio else None
         self.register_buffer("ratio_edges", ratio_edges)
         self.register_buffer("ratio_temperature", torch.tensor(1.0) if ratio else None)
@@ -101,12 +101,12 @@ class HistogramRegressor(nn.Module):
     def split(
         self, logits: Float[Tensor, "batch all_bins"]
     ) -> tuple[Float[Tensor, "batch bins"], Float[Tensor, "batch ratio_bins"]]:
-        """Logits over the margin and over the ratio; of a network with one answer the second has no columns."""
+        """Split logits into those over the margin and those over the ratio; the second may have no columns."""
         bins = len(self.edges) - 1
         return logits[:, :bins], logits[:, bins:]
 
     def probabilities(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, "batch bins"]:
-        """Distribution over the bins, at the temperature that was fitted."""
+        """Compute the distribution over the bins, at the fitted temperature."""
         return torch.softmax(self.split(self.backbone(images))[0] / self.temperature, dim=-1)
 
     def loss(
@@ -115,15 +115,15 @@ class HistogramRegressor(nn.Module):
         labels: Float[Tensor, " batch"],
         ratios: Float[Tensor, " batch"] | None = None,
     ) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
-        """Cross-entropy against each label as a Gaussian of the bins' width, and the predicted margins.
+        """Compute the cross-entropy against each label as a Gaussian of the bins' width, and the predicted margins.
 
-        `ratios`: F_t / F_n of the frames; those whose forces are not known (NaN) teach the margin alone.
+        `ratios`: F_t / F_n of the frames; frames of unknown forces (NaN) count for the margin alone.
         """
         logits, ratio_logits = (part.float() for part in self.split(self.backbone(images)))
         loss = functional.cross_entropy(logits, histogram_targets(labels, self.edges))
-        if self.ratio_edges is not None and ratios is not None and (known := torch.isfinite(ratios)).any():
-            targets = histogram_targets(ratios[known], self.ratio_edges)
-            loss = loss + functional.cross_entropy(ratio_logits[known], targets)
+        if self.ratio_edges is not None and ratios is not None and (finite := torch.isfinite(ratios)).any():
+            targets = histogram_targets(ratios[finite], self.ratio_edges)
+            loss = loss + functional.cross_entropy(ratio_logits[finite], targets)
         return loss, torch.softmax(logits / self.temperature, dim=-1) @ self.centres
 
 
@@ -131,27 +131,27 @@ class HistogramRegressor(nn.Module):
 def watch_features(
     model: nn.Module, layer: str, then: Callable[[], None] = lambda: None
 ) -> Iterator[list[Float[Tensor, "batch features"]]]:
-    """Keep the mean over the image of each channel of a layer, batch by batch, while the model is run by this thread.
+    """Record the mean over the image of each channel of a layer, batch by batch, while this thread runs the model.
 
     `then` is called after each batch.
     """
-    kept: list[Tensor] = []
-    own = get_ident()
+    features: list[Tensor] = []
+    thread = get_ident()
 
-    def keep(_: nn.Module, __: object, output: Any) -> None:  # no tensor while torch traces it
-        if get_ident() == own:  # a running sensor's network is explained by another thread meanwhile
-            kept.append(output.mean(dim=(2, 3)))
+    def record(_: nn.Module, __: object, output: Any) -> None:  # no tensor while torch traces it
+        if get_ident() == thread:  # another thread may explain the network of a running sensor meanwhile
+            features.append(output.mean(dim=(2, 3)))
             then()
 
-    handle = model.get_submodule(layer).register_forward_hook(keep)
+    handle = model.get_submodule(layer).register_forward_hook(record)
     try:
-        yield kept
+        yield features
     finally:
         handle.remove()
 
 
 class _Watched(nn.Module):
-    """A backbone, and the features of one of its layers in the same pass."""
+    """Backbone that also returns the features of one of its layers, in the same pass."""
 
     def __init__(self, backbone: nn.Module, layer: str | None) -> None:
         super().__init__()
@@ -166,10 +166,9 @@ class _Watched(nn.Module):
 
 
 class Answers(nn.Module):
-    """A network that returns all it answers: margins, and the probabilities behind them where it has histograms.
+    """Network that returns all outputs: margins, and probabilities of its histograms.
 
-    With `layer`, a module of the network, the features by which it tells how far it knows a frame come last
-    (`Novelty`), in the same pass.
+    With `layer`, a module of the network, the features of that layer come last, in the same pass, for `Novelty`.
     """
 
     def __init__(self, model: nn.Module, layer: str | None = None) -> None:
@@ -181,9 +180,9 @@ class Answers(nn.Module):
             self.watched = _Watched(model, layer)
 
     def forward(self, image: Float[Tensor, "batch *input"]) -> tuple[Any, ...]:
-        """Margins (batch,); of histograms probabilities (batch, bins), of the margin, then of the ratio if any.
+        """Compute margins (batch,); probabilities (batch, bins) of the margin, then of the ratio, if it has them.
 
-        Then features (batch, channels of `layer`), where there is a layer.
+        Then features (batch, channels of `layer`), if there is a layer.
         """
         answer, *features = self.watched(image)
         if not isinstance(self.model, HistogramRegressor):
@@ -197,19 +196,19 @@ class Answers(nn.Module):
 
 
 def answer_names(model: nn.Module, layer: str | None = None) -> tuple[str, ...]:
-    """Names of what `Answers` returns, in its order."""
+    """Return the names of the outputs of `Answers`, in their order."""
     names = ("margin", "probabilities", "ratio_probabilities")
     names = names[: 1 if not isinstance(model, HistogramRegressor) else 2 if model.ratio_edges is None else 3]
     return names if layer is None else (*names, "features")
 
 
 def bin_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
-    """Edges of the bins of a histogram, in margin units; None for one number."""
+    """Return the edges of the bins of a histogram, in margin units; None for a single number."""
     return model.edges.double().cpu().numpy() if isinstance(model, HistogramRegressor) else None
 
 
 def ratio_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
-    """Edges of the bins over F_t / F_n; None for a network that answers with the margin alone."""
+    """Return the edges of the bins over F_t / F_n; None for a network that predicts the margin alone."""
     edges = model.ratio_edges if isinstance(model, HistogramRegressor) else None
     return None if edges is None else edges.double().cpu().numpy()
 
@@ -218,12 +217,12 @@ _Edges = TypeVar("_Edges", Tensor, np.ndarray)
 
 
 def bin_centres(edges: _Edges) -> _Edges:
-    """Values in the middle of the bins of a histogram."""
+    """Return the values in the middle of the bins of a histogram."""
     return (edges[1:] + edges[:-1]) / 2
 
 
 def histogram_targets(values: Float[Tensor, " batch"], edges: Float[Tensor, " edges"]) -> Float[Tensor, "batch bins"]:
-    """Share of a Gaussian round each label that falls into each bin; each row sums to 1."""
+    """Compute the share of a Gaussian around each label in each bin; each row sums to 1."""
     sigma = _WIDTH_RATIO * (edges[1] - edges[0])
     below = 0.5 * (1 + torch.erf((edges - values[:, None]) / (math.sqrt(2) * sigma)))
     return (below[:, 1:] - below[:, :-1]) / (below[:, -1:] - below[:, :1])
@@ -235,7 +234,7 @@ def margin_loss(
     labels: Float[Tensor, " batch"],
     ratios: Float[Tensor, " batch"] | None = None,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
-    """Loss of training, cross-entropy for histograms, else the mean squared error; and the predicted margins."""
+    """Compute the training loss, cross-entropy for histograms, else mean squared error; and the predicted margins."""
     if isinstance(model, HistogramRegressor):
         return model.loss(images, labels, ratios)
     margins = model(images).reshape(len(images)).float()
@@ -243,11 +242,11 @@ def margin_loss(
 
 
 HEADS = {"point": 1, "histogram": BINS, "margin-and-ratio": BINS + RATIO_BINS}
-"""Outputs of the backbone by head."""
+"""Number of outputs of the backbone, by head."""
 
 
 def last_layer(model: nn.Module) -> nn.Linear:
-    """The last linear layer, which makes the answers; `ModelError` if there is none."""
+    """Return the last linear layer; `ModelError` if there is none."""
     layers = [module for module in model.modules() if isinstance(module, nn.Linear)]
     if not layers:
         raise ModelError(f"{type(model).__name__} has no linear layer; choose a backbone such as resnet18")
@@ -255,44 +254,44 @@ def last_layer(model: nn.Module) -> nn.Linear:
 
 
 def fill_head(model: nn.Module, weights: Mapping[str, Tensor]) -> nn.Module:
-    """Fill a network that has one answer more, or one less, than that of these weights; margins stay what they were.
+    """Fill a network that has one output more, or one less, than that of these weights; margins stay the same.
 
-    Rows of the last layer for a ratio that is new are zero: every ratio is as likely. Those for a ratio that is not
-    wanted are left out.
+    Rows of the last layer for a new ratio are zero: every ratio is equally likely. Rows for a dropped ratio are left
+    out.
     """
     state = model.state_dict()
     for name in state.keys() & weights.keys():
-        value, kept = weights[name], state[name]
+        value, target = weights[name], state[name]
         if value.ndim:
-            value = torch.cat([value[: len(kept)], torch.zeros_like(kept[len(value) :])])
+            value = torch.cat([value[: len(target)], torch.zeros_like(target[len(value) :])])
         state[name] = value
     model.load_state_dict(state)
     return model
 
 
 REFERENCE_SIGNS = {"raw": 0.0, "difference": -1.0, "amplitude": -1.0}
-"""What the reference half of a `pair` network's first layer begins with, over its frame half, by the input of the
-network it starts from: nothing, which leaves the answers of a raw network what they were, or the opposite, T_n - T_0,
-which is |T_n - T_0| but for the sign."""
+"""Initial ratio of the reference half of a `pair` network's first layer to its frame half, by the input of the network
+it starts from: 0 leaves the predictions of a raw network the same, -1 makes T_n - T_0, which is |T_n - T_0| but for the
+sign."""
 
 
 def with_reference(weights: Mapping[str, Tensor], *, sign: float) -> dict[str, Tensor]:
-    """Weights for a network that sees the reference beside the frame, from those of one that does not."""
+    """Make weights of a network with the reference beside the frame from weights of a network without."""
     first = next(name for name, value in weights.items() if value.ndim == 4)
     return {**weights, first: torch.cat([weights[first], sign * weights[first]], dim=1)}
 
 
-def _see(model: nn.Module, colours: int) -> None:
-    """Replace the first convolution by one that takes so many channels, untrained."""
+def _set_channels(model: nn.Module, colours: int) -> None:
+    """Replace the first convolution by an untrained one with this number of input channels."""
     name, first = next((name, module) for name, module in model.named_modules() if isinstance(module, nn.Conv2d))
-    known = ("out_channels", "kernel_size", "stride", "padding", "dilation", "groups", "padding_mode")
-    options: dict[str, Any] = {option: getattr(first, option) for option in known}
-    parent, _, own = name.rpartition(".")
-    setattr(model.get_submodule(parent), own, nn.Conv2d(colours, **options, bias=first.bias is not None))
+    names = ("out_channels", "kernel_size", "stride", "padding", "dilation", "groups", "padding_mode")
+    options: dict[str, Any] = {option: getattr(first, option) for option in names}
+    parent, _, attribute = name.rpartition(".")
+    setattr(model.get_submodule(parent), attribute, nn.Conv2d(colours, **options, bias=first.bias is not None))
 
 
 def head_outputs(head: str) -> int:
-    """Outputs that a head needs of its backbone."""
+    """Return the number of outputs that a head needs of its backbone."""
     if head not in HEADS:
         raise ModelError(f"there is no head named {head!r}; choose one of {', '.join(HEADS)}")
     return HEADS[head]
@@ -306,8 +305,8 @@ BACKBONES: Table[Callable[..., nn.Module]] = Table(
     "sliplens.backbones",
     {name: _classifiers.get_model_builder(name) for name in _classifiers.list_models(_classifiers)},
 )
-"""What builds a classifier, called with `num_classes`: TorchVision's, and those that installed packages add by the
-entry point `sliplens.backbones`."""
+"""Builders of classifiers, called with `num_classes`: TorchVision's, and those that installed packages add by the entry
+point `sliplens.backbones`."""
 
 
 def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point", colours: int = 3) -> nn.Module:
@@ -341,5 +340,5 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point", colour
         raise ModelError(f"there is no backbone named {backbone!r}; choose a TorchVision classifier such as resnet18")
     model = BACKBONES[backbone](num_classes=head_outputs(head))
     if colours != 3:
-        _see(model, colours)
+        _set_channels(model, colours)
     return model if head == "point" else HistogramRegressor(model, ratio=head == "margin-and-ratio")

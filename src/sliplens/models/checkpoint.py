@@ -45,7 +45,7 @@ LARGEST_INPUT = 4096  # pixels along a side, several times what any backbone was
 
 @dataclass(frozen=True, kw_only=True)
 class Manifest:
-    """What a checkpoint is: enough to feed it right, and to tell where it comes from."""
+    """Facts of a checkpoint: how to encode its input, and where it comes from."""
 
     backbone: str
     input: str
@@ -54,7 +54,7 @@ class Manifest:
     sensor: str
     data_hash: str
     colour: bool | None = None
-    """Whether the frames it was trained on have colours; None where that is not told."""
+    """True if the frames it was trained on have colours; None if unknown."""
     head: str = "point"
     recipe: str = ""
     target: str = "safety_margin"
@@ -63,14 +63,14 @@ class Manifest:
     metrics: dict[str, float] = field(default_factory=dict)
     calibration: Calibration | None = None
     traction: Traction | None = None
-    """Of the second answer, F_t / F_n; None for a network that answers with the margin alone."""
+    """Calibration of the second output, F_t / F_n; None for a network that predicts the margin alone."""
     novelty: Novelty | None = None
-    """Where its training frames lie in its features; None where that was never fitted."""
+    """Distribution of its training frames in its features; None if never fitted."""
     sequence: SequenceManifest | None = None
-    """Of the margins that it reads from several frames; None where it reads each frame by itself alone."""
+    """Calibration of the head for several frames; None without such a head."""
     pull_direction_deg: tuple[float, float] | None = None
     """Directions in which its training trials were pulled, lowest and highest: 0 is right, 90 down the image, (0, 360)
-    all. None where they are not known."""
+    all. None if unknown."""
     versions: dict[str, str] = field(default_factory=dict)
     trained_on: tuple[str, ...] = ()
     """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""
@@ -81,7 +81,7 @@ class Manifest:
         height, width = self.frame_size
         if not 1 <= self.image_size <= LARGEST_INPUT or min(height, width) <= 0 or height * width > MOST_PIXELS:
             sizes = f"frames of {height} x {width} pixels at {self.image_size}"
-            raise ValueError(f"no network reads {sizes}")
+            raise ValueError(f"{sizes} are too small or too large for a network")
         low, high = self.pull_direction_deg or FULL_CIRCLE
         if not 0 <= low <= high <= low + 360 or low > 360:
             raise ValueError(f"pull_direction_deg is {[low, high]}; give a low from 0 to 360, then a high")
@@ -95,44 +95,44 @@ _DARKEST_FRAME, _BRIGHTEST_DIFFERENCE = 8.0, 64.0
 
 
 def sensor_kind(sensor: str) -> str:
-    """Name of a sensor without the number of the piece."""
+    """Return the name of a sensor without the number of the piece."""
     return re.sub(r"-\d+$", "", sensor)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Network:
-    """A trained network, in evaluation mode, with what it is and how it was trained."""
+    """Trained network in evaluation mode, with its manifest and the record of its training."""
 
     model: nn.Module
     manifest: Manifest
     training: Training | None = None
-    """How it was trained, with its learning curve; None where its folder does not tell."""
+    """Record of its training, with the learning curve; None if its folder has none."""
     sequence: SequenceHead | None = None
-    """What makes one margin of several frames, see `follow`; None where each frame is read by itself alone."""
+    """Head for several frames, see `follow`; None without such a head."""
 
     def __repr__(self) -> str:
-        """What it is, in a few lines: the layers are in `model`."""
-        kept = self.manifest
+        """Describe the network in a few lines; the layers are in `model`."""
+        manifest = self.manifest
         weights = sum(values.numel() for values in self.model.parameters())
-        intervals = "calibrated intervals" if kept.calibration else "no intervals"
+        intervals = "calibrated intervals" if manifest.calibration else "no intervals"
         lines = (
-            f"Network: {kept.backbone} with a {kept.head} head, {weights:,} weights, on {self.device}",
-            f"  reads {kept.input} images of {kept.sensor}, frames of {' x '.join(map(str, kept.frame_size))} px "
-            f"at {kept.image_size} px",
-            f"  tells {kept.target.replace('_', ' ')}, {intervals}",
-            f"  trained on {number_of(len(kept.trained_on), 'trial')}, recipe {kept.recipe or 'not told'}",
-            *([f"  {', '.join(f'{name} {value:.3g}' for name, value in kept.metrics.items())}"] * bool(kept.metrics)),
+            f"Network: {manifest.backbone} with a {manifest.head} head, {weights:,} weights, on {self.device}",
+            f"  input: {manifest.input} images of {manifest.sensor}, frames of "
+            f"{' x '.join(map(str, manifest.frame_size))} px at {manifest.image_size} px",
+            f"  output: {manifest.target.replace('_', ' ')}, {intervals}",
+            f"  trained on {number_of(len(manifest.trained_on), 'trial')}, recipe {manifest.recipe or 'unknown'}",
+            "  " + ", ".join(f"{name} {value:.3g}" for name, value in manifest.metrics.items()),
         )
-        return "\n".join(lines)
+        return "\n".join(filter(str.strip, lines))
 
     @property
     def device(self) -> torch.device:
-        """Where the network runs; inputs are brought there, answers come back."""
+        """Device of the network; inputs are moved there, predictions come back."""
         return next(self.model.parameters(), torch.empty(0)).device
 
     @property
     def encoding(self) -> Encoding:
-        """The input the network was trained on."""
+        """Encoding that the network was trained on."""
         return ENCODINGS.pick(self.manifest.input)
 
     def encode(
@@ -140,20 +140,12 @@ class Network:
     ) -> Float[Tensor, "batch colours size size"]:
         """Encode frames as the network was trained on them.
 
-        `reference`: the sensor untouched; None for frames that were compared before, or that need not be. Frames of
-        another size than the network's sensor has raise `ImageError`, and so do those that are no 8-bit images.
+        `reference`: the sensor untouched; None for frames that were compared before, or that need not be. `ImageError`
+        for frames of another size than those of the network's sensor, or not of 8 bits.
         """
         require_rgb(frames)
         self.require_frame_size(frames.shape[1:3])
-        size = self.manifest.image_size
-        if reference is None and self.encoding.beside:
-            raise InputError(
-                f"a network on {self.encoding.name} images sees the untouched sensor beside the frame; name its image "
-                "with --reference IMAGE, or a frame of it with --reference-frame N"
-            )
-        if reference is None:
-            return self.encoding.normalise(self.encoding.resize(frames, image_size=size))
-        return self.encoding.encode(frames, reference, image_size=size)
+        return self.encoding.encode(frames, reference, image_size=self.manifest.image_size)
 
     def require_frame_size(self, size: tuple[int, ...], *, what: str = "frames") -> None:
         """Refuse frames of another sensor."""
@@ -166,7 +158,7 @@ class Network:
             )
 
     def require_kind(self, frame: UInt8[np.ndarray, "height width 3"], *, what: str) -> None:
-        """Refuse an image without a reference that is plainly of the other kind than the network reads.
+        """Refuse an image without a reference that is plainly not of the kind that the network was trained on.
 
         A difference image is black but where something moved, a camera's is not.
         """
@@ -184,21 +176,21 @@ class Network:
             )
 
     def doubt(self, sensor: str) -> str | None:
-        """Say that frames are of another sensor than those it was trained on; None where they are not.
+        """Warn of frames of another sensor than those it was trained on; None if they are of its sensor.
 
         Sensors are of one kind if their names differ in a number at the end, such as chromatouch-1 and chromatouch-2.
         """
-        own = self.manifest.sensor
-        if not sensor or not own or sensor_kind(sensor) == sensor_kind(own):
+        trained = self.manifest.sensor
+        if not sensor or not trained or sensor_kind(sensor) == sensor_kind(trained):
             return None
         return (
-            f"the network was trained on {own} and reads frames of {sensor}: its intervals were not measured on that "
-            "sensor, so take the margins for a trend until trials with forces say how far they can be trusted "
+            f"the network was trained on {trained} and reads frames of {sensor}: its intervals were not measured on "
+            "that sensor, so take the margins for a trend until trials with forces say how far they can be trusted "
             "(`sliplens import`, then `sliplens evaluate`)"
         )
 
     def doubt_colour(self, frame: UInt8[np.ndarray, "height width 3"]) -> str | None:
-        """Say that a frame is grey where the network was trained on colours; None where it is not, or nobody knows."""
+        """Warn of a grey frame if the network was trained on colours; None otherwise, or if unknown."""
         if not self.manifest.colour or has_colour(frame):
             return None
         return (
@@ -207,7 +199,7 @@ class Network:
         )
 
     def doubt_friction(self, friction: Friction | None) -> str | None:
-        """Say that friction is told which it was not trained on; None where most of what is held possible was."""
+        """Warn of a friction outside that of its training; None where most of it lies inside."""
         if friction is None or self.manifest.traction is None:
             return None
         low, high = self.manifest.traction.friction[0], self.manifest.traction.friction[-1]
@@ -215,14 +207,14 @@ class Network:
         if weights[(low <= values) & (values <= high)].sum() >= 0.5:
             return None
         learnt = friction.note == LEARNT
-        known, cure = ("learnt from slips", "begin a new object") if learnt else ("told", "check --friction")
+        origin, cure = ("learnt from slips", "begin a new object") if learnt else ("told", "check --friction")
         return (
-            f"the friction {known} ({friction.mean:.3g}) lies outside that of the network's training, {low:.2g} to "
+            f"the friction {origin} ({friction.mean:.3g}) lies outside that of the network's training, {low:.2g} to "
             f"{high:.2g}: its intervals were not measured there, so {cure}, or take the margins for a trend"
         )
 
     def doubt_direction(self, profile: SensorProfile) -> str | None:
-        """Describe a sensor that is pulled in another direction than the training trials; None where it is not."""
+        """Warn of a sensor that is pulled in another direction than the training trials; None if it is not."""
         trained = self.manifest.pull_direction_deg
         if profile.pull_direction_deg is None or trained is None:
             return None
@@ -236,13 +228,13 @@ class Network:
         )
 
     def shear_estimator(self, reference: UInt8[np.ndarray, "height width 3"]) -> ShearEstimator | None:
-        """Estimator of the shear of frames; None for a network whose directions are all, or not known."""
+        """Make the estimator of the shear of frames; None for a network of all directions, or of unknown ones."""
         if self.manifest.pull_direction_deg in {None, FULL_CIRCLE}:
             return None
         return ShearEstimator(reference, sensor_kind(self.manifest.sensor))
 
     def doubt_shear(self, shear: Shear) -> str | None:
-        """Reason to withhold the margin of a frame that is pulled outside the trained directions; None inside."""
+        """Return the reason to withhold the margin of a frame pulled outside the trained directions; None inside."""
         trained = self.manifest.pull_direction_deg
         if trained is None or shear.excess(trained) <= DIRECTION_LIMIT:
             return None
@@ -250,7 +242,7 @@ class Network:
 
     @torch.no_grad()
     def answers(self, batches: Iterable[Tensor]) -> tuple[Tensor, ...]:
-        """What the network answers (`Answers`) to batches of encoded frames, on its device."""
+        """Compute the outputs (`Answers`) for batches of encoded frames, on the network's device."""
         network = Answers(self.model, self.feature_layer)
         parts = [network(batch.to(self.device)) for batch in batches]
         return tuple(torch.cat(answers) for answers in zip(*parts, strict=True))
@@ -258,7 +250,7 @@ class Network:
     def predict(
         self, inputs: Float[Tensor, "batch colours size size"], *, batch_size: int = 64
     ) -> Float[Tensor, " batch"]:
-        """Safety margin of encoded frames; not clipped, so that an answer outside [0, 1] shows as what it is."""
+        """Predict the safety margin of encoded frames; not clipped to [0, 1]."""
         return self.answers(inputs.split(batch_size))[0].cpu()
 
     def estimate(
@@ -268,29 +260,29 @@ class Network:
         friction: FrictionLike | None = None,
         batch_size: int = 64,
     ) -> "Estimate":
-        """Safety margin of encoded frames, with how sure it is.
+        """Predict the safety margin of encoded frames, with its uncertainty.
 
-        `friction`: what is known of the coefficient of friction, as `predict` takes it.
+        `friction`: coefficient of friction, as `predict` takes it.
         """
         return self.estimate_batches(inputs.split(batch_size), friction=friction)
 
     def estimate_batches(self, batches: Iterable[Tensor], *, friction: FrictionLike | None = None) -> "Estimate":
-        """Safety margins as `estimate` tells them, of batches of encoded frames."""
+        """Predict the safety margins of batches of encoded frames, with their uncertainty."""
         return self.to_estimate(*self.answers(batches), friction=friction)
 
     @property
     def novelty(self) -> Novelty | None:
-        """What tells how far it knows a frame; None of a network that does not tell."""
+        """Measure of the strangeness of a frame; None for a network without one."""
         novelty = self.manifest.novelty
         return novelty if novelty is not None and novelty.strangeness else None
 
     @property
     def feature_layer(self) -> str | None:
-        """Layer whose features are told beside the answers (`Answers`), for `novelty`."""
+        """Layer whose features come with the outputs (`Answers`), for `novelty`."""
         return None if self.novelty is None else self.novelty.layer
 
     def to_estimate(self, *answers: Tensor, friction: FrictionLike | None = None) -> "Estimate":
-        """Estimate from what the network answered (`Answers`), and from friction where it is told."""
+        """Make an estimate of outputs of the network (`Answers`), and of a friction if it is known."""
         names = answer_names(self.model, self.feature_layer)
         values = {name: answer.double().cpu().numpy() for name, answer in zip(names, answers, strict=True)}
         traction, of_ratio = self.manifest.traction, ratio_edges(self.model)
@@ -312,31 +304,29 @@ class Network:
         if friction is None:
             return estimate
         traction = self.require_ratio()
-        return estimate.told(
+        return estimate.with_friction(
             as_friction(friction), trained_friction=np.array(traction.friction), calibration=traction.told
         )
 
     def follow(self, *, friction: object = None) -> Follower:
-        """What reads the frames of a sensor in order.
+        """Make a corrector of predictions for the frames of a sensor in order.
 
-        `InputError` for a network that was never taught to, and where `friction` is told, which is what it looks for.
+        `InputError` for a network without a head for several frames, and with a `friction`, which the head estimates.
         """
-        kept = self.manifest.sequence
+        manifest = self.manifest.sequence
         if friction is not None:
+            raise InputError("--sequence estimates the friction, and --friction sets it; leave out either of them")
+        if self.sequence is None or manifest is None:
             raise InputError(
-                "--sequence finds out what friction may be, and --friction tells it; leave out one of them"
+                "this network has no head for several frames; leave out --sequence, or teach it with `sliplens train "
+                "DATA -o RUN --start-from NETWORK --recipe sequence`"
             )
-        if self.sequence is None or kept is None:
-            raise InputError(
-                "this network reads each frame by itself; leave out --sequence, or teach it with `sliplens train DATA "
-                "-o RUN --start-from NETWORK --recipe sequence`"
-            )
-        return Follower(self.sequence, kept)
+        return Follower(self.sequence, manifest)
 
     def require_ratio(self, *, learns: bool = False) -> Traction:
-        """What the second answer is; `InputError` for a network that answers with the margin alone.
+        """Return the calibration of F_t / F_n; `InputError` for a network that predicts the margin alone.
 
-        `learns`: it is not told friction, but is to learn it from slips.
+        `learns`: if True, the friction is to be learnt from slips, for the message.
         """
         if self.manifest.traction is None:
             why = "--same-object learns friction from F_t / F_n" if learns else "friction was told"
@@ -349,11 +339,11 @@ class Network:
 
 @dataclass(frozen=True, kw_only=True)
 class Ratio:
-    """Traction ratio F_t / F_n of some frames, and how sure it is."""
+    """Predicted traction ratio F_t / F_n of some frames, with its uncertainty."""
 
     probabilities: Float[np.ndarray, "frames bins"]
     edges: Float[np.ndarray, " edges"]
-    """Of the bins, as ratios."""
+    """Edges of the bins, as ratios."""
     calibration: Calibration | None = None
 
     @property
@@ -367,7 +357,7 @@ class Ratio:
         return spread(self.mean, self.probabilities, self.edges)
 
     def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
-        """Ratios between which each true one lies with a level of confidence, none negative; None if not calibrated."""
+        """Return an interval for each ratio at a level of confidence, not negative; None if not calibrated."""
         if self.calibration is None:
             return None
         offset = self.calibration.offset(level)
@@ -376,7 +366,7 @@ class Ratio:
 
 
 STRANGE = 0.01
-"""Share of the validation frames (`Estimate.known`) below which a frame is too unlike them for its margin to count."""
+"""Value of `Estimate.known` below which the margin of a frame is withheld."""
 STRANGE_REASON = (
     f"strange to the network (known below {100 * STRANGE:g} %); use frames of the sensor it was trained on, or train "
     "it on frames of this one"
@@ -385,31 +375,31 @@ STRANGE_REASON = (
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """Safety margins of some frames, and how sure they are."""
+    """Predicted safety margins of some frames, with their uncertainty."""
 
     margin: Float[np.ndarray, " frames"]
     calibration: Calibration | None
     probabilities: Float[np.ndarray, "frames bins"] | None = None
-    """Over the margin; None for a network that answers with one number."""
+    """Distribution over the margin; None for a network with one number as its output."""
     edges: Float[np.ndarray, " edges"] | None = None
-    """Of the bins, in margin units."""
+    """Edges of the bins, in margin units."""
     ratio: Ratio | None = None
-    """Second answer, F_t / F_n; None for a network without it."""
+    """Predicted F_t / F_n; None for a network without this output."""
     friction: Friction | None = None
-    """What was told of the friction; None where nothing was."""
+    """Friction that the margins are conditioned on; None if unknown."""
     known: Float[np.ndarray, " frames"] | None = None
-    """How far the network knows such frames, from 0 to 1: the share of its validation frames that were as strange or
-    stranger, in its features or in the spread of its answer (`Novelty.known`). None of a network that does not tell.
+    """Share of the network's validation frames that were as strange or stranger, in its features or in the spread of
+    its prediction, from 0 to 1 (`Novelty.known`). None for a network without a `Novelty`.
 
-    An unknown friction is nothing strange: a network that was trained on frictions from 0.15 to 1.2 takes wet for one
-    more of them, and no value of this warns of it."""
+    It does not warn of an unknown friction: a network that was trained on frictions from 0.15 to 1.2 takes wet for one
+    of them."""
 
     alone: tuple[Bool[np.ndarray, " frames"], Calibration | None] | None = None
-    """Which of the frames that were read in order keep the answers of one frame, and the calibration of those; None
-    where all have one calibration."""
+    """Frames, of those predicted in order, that keep the prediction of a single frame, and their calibration; None
+    where all have the same calibration."""
 
     def at(self, rows: Int[np.ndarray, " rows"] | Bool[np.ndarray, " frames"]) -> "Estimate":
-        """Some of the frames."""
+        """Select frames."""
         ratio = self.ratio and replace(self.ratio, probabilities=self.ratio.probabilities[rows])
         alone = self.alone and (self.alone[0][rows], self.alone[1])
         parts = {name: getattr(self, name) for name in ("probabilities", "known")}
@@ -418,23 +408,23 @@ class Estimate:
 
     @property
     def sigma(self) -> Float[np.ndarray, " frames"] | None:
-        """Standard deviation of each distribution; None where there is none."""
+        """Standard deviation of each distribution; None without a distribution."""
         if self.probabilities is None or self.edges is None:
             return None
         return spread(self.margin, self.probabilities, self.edges)
 
     def withheld(self, touches: Bool[np.ndarray, " frames"]) -> list[str | None]:
-        """Return why the margin of each frame is not to be believed, with the cure; None where it is.
+        """Return why the margin of each frame is not reliable, with the cure; None where it is.
 
-        `touches`: whether anything touches the sensor. An untouched one shows nothing but noise, which may be strange.
+        `touches`: True where something touches the sensor. An untouched sensor shows only noise, which may be strange.
         """
         strange = np.zeros(len(self.margin), bool) if self.known is None else touches & (self.known < STRANGE)
         return [STRANGE_REASON if each else None for each in strange]
 
     def beyond(self, error: float) -> Float[np.ndarray, " frames"]:
-        """What the network gives for an error above a number of margin units, from 0 to 1; not calibrated.
+        """Return the predicted probability of an error above a number of margin units; not calibrated.
 
-        One that answers with one number gives every frame that of a normal distribution with its validation error.
+        For a network with one number as its output, that of a normal distribution with its validation error.
         """
         if self.probabilities is None or self.edges is None:
             mse = self.calibration.mse if self.calibration else 0.0
@@ -445,27 +435,27 @@ class Estimate:
         return (self.probabilities * far).sum(axis=1)
 
     def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
-        """Margins between which each label lies with a level of confidence, within [0, 1]; None if not calibrated."""
+        """Return an interval for each margin at a level of confidence, within [0, 1]; None if not calibrated."""
         if self.calibration is None:
             return None
         offset: Any = self.calibration.offset(level)
         if self.alone is not None and self.alone[1] is not None:
-            own = self.alone[1].offsets.get(str(level), offset)  # calibrations may have other levels
-            offset = np.where(self.alone[0], own, offset)
+            single = self.alone[1].offsets.get(str(level), offset)  # calibrations may have other levels
+            offset = np.where(self.alone[0], single, offset)
         low, high = raw_interval(self.margin, self.probabilities, self.edges, level)
         # a label lies in [0, 1], so cutting there loses none
         return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
 
-    def told(
+    def with_friction(
         self,
         friction: Friction,
         *,
         trained_friction: Float[np.ndarray, " quantiles"],
         calibration: Calibration | None = None,
     ) -> "Estimate":
-        """The same frames once friction is told (`condition_on_friction`); margins then lie within [0, 1].
+        """Condition the margins on a friction (`condition_on_friction`); they then lie within [0, 1].
 
-        `calibration`: of the intervals of such margins; there are none if None.
+        `calibration`: calibration of such margins; without it they have no intervals.
         """
         assert self.probabilities is not None
         assert self.edges is not None
@@ -480,25 +470,26 @@ class Estimate:
         )
         # bins beyond 0 and 1 mean the ends
         margin = probabilities @ np.clip(bin_centres(self.edges), 0, 1)
-        told = {"calibration": calibration, "friction": friction, "alone": None}
-        return replace(self, margin=margin, probabilities=probabilities, **told)
+        return replace(
+            self, margin=margin, probabilities=probabilities, calibration=calibration, friction=friction, alone=None
+        )
 
 
-def tell_each(
+def condition_each(
     estimate: Estimate,
     friction: Float[np.ndarray, " frames"],
     *,
     trained_friction: Float[np.ndarray, " quantiles"],
     calibration: Calibration | None = None,
 ) -> Estimate:
-    """Tell each frame the friction of its own trial, exactly."""
+    """Condition each frame on the exact friction of its trial."""
     assert estimate.probabilities is not None
     margin, probabilities = np.empty_like(estimate.margin), np.empty_like(estimate.probabilities)
     for value in np.unique(friction):
         rows = friction == value
-        told = estimate.at(rows).told(Friction(float(value)), trained_friction=trained_friction)
-        assert told.probabilities is not None
-        margin[rows], probabilities[rows] = told.margin, told.probabilities
+        part = estimate.at(rows).with_friction(Friction(float(value)), trained_friction=trained_friction)
+        assert part.probabilities is not None
+        margin[rows], probabilities[rows] = part.margin, part.probabilities
     return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration)
 
 
@@ -507,7 +498,7 @@ def save_checkpoint(
 ) -> None:
     """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last.
 
-    `sequence`: the head that reads several frames, of a manifest that tells of one.
+    `sequence`: the head for several frames, of a manifest with one.
     """
     if manifest.sequence is not None and sequence is not None:
         hashed = _save_weights(folder / SEQUENCE_FILE, sequence)
@@ -547,31 +538,30 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Network:
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
     # the networks of the package come without their learning curve
-    told = (folder / "curve.parquet").is_file()
-    training = load_result(folder, Training, command="sliplens train") if told else None
+    has_curve = (folder / "curve.parquet").is_file()
+    training = load_result(folder, Training, command="sliplens train") if has_curve else None
     return Network(model=model, manifest=manifest, training=training, sequence=sequence)
 
 
 def _load_weights(path: Path, model: nn.Module, *, what: str, sha256: str) -> None:
-    """Fill a network with the weights of a file that is the one its manifest names, and holds numbers alone."""
+    """Fill a network with the weights of a file, which must be the one of its manifest and hold finite numbers."""
     if not path.is_file():
         raise CheckpointError(f"{path} is missing; train the network again or copy the whole folder")
     if hash_file(path) != sha256:
         raise CheckpointError(f"{path} is not the file its manifest describes; copy the whole folder again")
     try:
-        values, own = load_file(path, device="cpu"), model.state_dict()
+        values, state = load_file(path, device="cpu"), model.state_dict()
         model.load_state_dict(values)
     except (SafetensorError, RuntimeError) as error:
         raise CheckpointError(f"{path} does not hold {what} ({str(error).splitlines()[0]})") from None
     # halves are widened: networks of the package are stored as such
-    kept = {name: {tensor.dtype, torch.float16} for name, tensor in own.items()}
-    strange = [name for name in own if values[name].dtype not in kept[name] or not values[name].isfinite().all()]
-    if strange:
-        raise CheckpointError(f"{path} holds what is no number in {strange[0]}; train the network again")
+    for name, tensor in state.items():
+        if values[name].dtype not in {tensor.dtype, torch.float16} or not values[name].isfinite().all():
+            raise CheckpointError(f"{path} holds a value that is no finite number in {name}; train the network again")
 
 
 def read_manifest(run: str | Path) -> Manifest:
-    """Read what a network is without its weights, by the name or folder that `load` takes."""
+    """Load the manifest of a network without its weights, by the name or folder that `load` takes."""
     path = find_run(Path(run)) / MANIFEST_FILE
     manifest = load_record(path, Manifest, command="sliplens train")
     if manifest.schema_version != SCHEMA_VERSION:
@@ -608,7 +598,7 @@ def load(run: str | Path, *, device: str = "cpu") -> Network:
 
 
 def open_run(run: object, *, device: str = "cpu") -> Network:
-    """Network that a caller named: itself, its folder, or the name of one that comes with sliplens."""
+    """Return a network, or load it from its folder or by the name of one that comes with sliplens."""
     if not isinstance(run, Network | Path | str):
         raise InputError(f"{type(run).__name__} is no network; give a network, its folder or its name first")
     return run if isinstance(run, Network) else load(run, device=device)

@@ -1,4 +1,4 @@
-"""Encodings: from frames and a reference frame to the network's input."""
+"""Encodings: frames and a reference frame to the network's input."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from sliplens.errors import InputError
 from sliplens.extras import Table
 from sliplens.images import absolute_difference, require_rgb, require_same_size, signed_difference
 
@@ -18,7 +19,7 @@ Reference = UInt8[np.ndarray, "_ _ 3"]
 
 @dataclass(frozen=True, kw_only=True)
 class Encoding:
-    """How frames become a network's input.
+    """Way to make a network's input of frames.
 
     `compare` sets the frames against the reference frame T_0, still in 8 bits; `resize` brings them to the network's
     size, also in 8 bits, so that a data set can be held in memory (`compare_small` does both); `normalise` makes the
@@ -28,17 +29,17 @@ class Encoding:
     name: str
     compare: Callable[[Frames, Reference], Frames]
     empty_is_black: bool
-    """Whether an untouched sensor is a black image, so that no reference frame is needed to explain."""
+    """True where an untouched sensor gives a black image, so that an explanation needs no reference frame."""
     own_maximum: bool = True
-    """Whether each image is divided by its own maximum, as in the thesis; else by 255, which keeps its amplitude."""
+    """If True, divide each image by its own maximum, as in the thesis; else by 255, which keeps its amplitude."""
     neutral: float = 0.0
-    """What stands for no change, in the network's input."""
+    """Level of the network's input that means no change."""
     beside: bool = False
-    """Whether the network sees the reference beside the frame."""
+    """If True, the input holds the reference beside the frame."""
 
     @property
     def colours(self) -> int:
-        """Channels of the input: those of the frame, then those of the reference where it stands beside."""
+        """Number of channels of the input: those of the frame, then those of the reference where it stands beside."""
         return 6 if self.beside else 3
 
     def resize(self, compared: Frames, *, image_size: int) -> UInt8[Tensor, "batch 3 size size"]:
@@ -76,13 +77,20 @@ class Encoding:
         return images.float() / largest
 
     def encode(
-        self, frames: Frames, reference: Reference, *, image_size: int
+        self, frames: Frames, reference: Reference | None, *, image_size: int
     ) -> Float[Tensor, "batch colours size size"]:
-        """Encode frames against their reference frame."""
-        return self.normalise(self.compare_small(frames, reference, image_size=image_size))
+        """Encode frames against their reference frame; None for frames that are compared already, or need not be."""
+        if reference is not None:
+            return self.normalise(self.compare_small(frames, reference, image_size=image_size))
+        if self.beside:
+            raise InputError(
+                f"a network on {self.name} images sees the untouched sensor beside the frame; name its image with "
+                "--reference IMAGE, or a frame of it with --reference-frame N"
+            )
+        return self.normalise(self.resize(frames, image_size=image_size))
 
     def empty(self, reference: Reference, *, image_size: int) -> Float[Tensor, "colours size size"]:
-        """Encode the untouched sensor itself: what an explanation is measured against."""
+        """Encode the untouched sensor itself, the reference of an explanation."""
         return self.encode(reference[None], reference, image_size=image_size)[0]
 
 

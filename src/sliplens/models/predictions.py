@@ -1,15 +1,17 @@
-"""Safety margins of any number of frames, from any source, in the memory of a few batches."""
+"""Prediction of the safety margin of any number of frames from any source, in the memory of some thousand frames."""
 
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sliplens._version import __version__
@@ -21,17 +23,16 @@ from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
 from sliplens.models.checkpoint import Estimate, Network, open_run, sensor_kind
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
-from sliplens.progress import OnProgress, note, number_of, report_progress, reporting, stage
+from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_progress, reporting
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.labels.lag import LEAST_TOUCH, picture_change, soften
-from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.sensor import SensorProfile, load_profile
-from sliplens.recordings.source import Frame, Frames, Trials, open_trials
+from sliplens.recordings.source import Frame, Frames, SourceOptions, Trials, open_trials
 from sliplens.recordings.trial import ContactState
 from sliplens.runner import LONGEST, MakePart, Work, require_new_table, run_table
-from sliplens.shear import FULL_CIRCLE, range_words
+from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, range_words
 
 _CAMERA_EVERY = 4
 """Frames of a recording of which one is compared with the reference for the camera's motion."""
@@ -62,29 +63,29 @@ _FORCES = ("normal_force_n", "tangential_force_n")
 
 @dataclass(frozen=True, kw_only=True)
 class TrialMargins:
-    """Margins that a network reads in one trial, as a person asks for them first."""
+    """Predicted margins of one trial, and the lowest of them."""
 
     trial: str
     margin: Float[np.ndarray, " frames"]
     """In margin units, frame by frame; not clipped to [0, 1], NaN where it is withheld."""
     lowest: int | None
-    """Frame of the lowest margin, of those that touch; of all where none does, or nobody knows. None where the margin
-    of all of them is withheld."""
+    """Frame of the lowest margin of those that touch, or of all frames if none touches or contact is unknown. None if
+    all margins are withheld."""
     withheld: int
     """Number of frames whose margin is withheld."""
     touching: int | None
-    """How many frames touch; None where nobody knows."""
+    """Number of frames that touch; None if contact is unknown."""
     time_s: float | None
-    """Time of that frame; None where it is not known."""
+    """Time of the frame `lowest`; None if unknown."""
     interval: tuple[float, float] | None
-    """Ends of its 90 % interval; None for a network that was never calibrated, and without such a frame."""
+    """Ends of its 90 % interval; None for a network without calibration, and without such a frame."""
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Predictions:
-    """Safety margins that a network reads, a row a frame.
+    """Predicted safety margins, a row a frame.
 
-    It is a table to whatever takes one of Arrow: `pandas.DataFrame.from_arrow`, `polars.DataFrame`, `pyarrow.table`.
+    It is an Arrow table for other libraries: `pandas.DataFrame.from_arrow`, `polars.DataFrame`, `pyarrow.table`.
     """
 
     frames: int
@@ -97,21 +98,20 @@ class Predictions:
     schema: pa.Schema | None = None
     """Columns of the rows in the file; None where they are kept in memory."""
     notes: tuple[str, ...] = ()
-    """What was assumed, a sentence each."""
+    """Assumptions, a sentence each."""
 
     def frame(self) -> pa.Table:
         """Arrow table; `.to_pandas()` where pandas is installed.
 
         Columns are `trial`, `frame`, `file` (of a folder of images), `time_s`, `safety_margin` (where the source has
-        labels), `normal_force_n` and `tangential_force_n` (where it has forces), `touches` (whether anything does, by
-        the labels, else by how far the picture is from that of the untouched sensor), `prediction`, `sigma`, `low_90`
-        and `high_90`, `known` (as in `Estimate`) of a network that tells it, `withheld`, and `traction_ratio` and
-        `traction_ratio_sigma` of one that tells F_t / F_n. What is not known is null: the time of images without a
-        rate, sigma of a network that answers with one number, intervals of one that was never calibrated. Predictions
-        are not clipped to [0, 1].
+        labels), `normal_force_n` and `tangential_force_n` (where it has forces), `touches` (contact by the labels, else
+        by the difference from the untouched sensor), `prediction`, `sigma`, `low_90` and `high_90`, `known` (as in
+        `Estimate`) for a network with a `Novelty`, `withheld`, and `traction_ratio` and `traction_ratio_sigma` for a
+        network that predicts F_t / F_n. Unknown values are null: the time of images without a rate, sigma of a network
+        with one number as its output, intervals without calibration. Predictions are not clipped to [0, 1].
 
-        `withheld` says why a frame is not to be believed, with the cure (`Estimate.withheld`), and is null elsewhere.
-        Where it is set, whatever the network predicts is null: prediction, sigma, interval and traction ratio.
+        `withheld` is the reason why a prediction is not reliable, with the cure (`Estimate.withheld`), and null
+        elsewhere. Where it is set, prediction, sigma, interval and traction ratio are null.
         """
         if self.rows is not None:
             return self.rows
@@ -123,11 +123,11 @@ class Predictions:
         return self.frames
 
     def __repr__(self) -> str:
-        told = f"Predictions of {number_of(self.frames, 'frame')} by {self.engine}"
-        return f"{told}, in {self.path}" if self.rows is None else f"{told}\n{self.rows.to_string(preview_cols=3)}"
+        title = f"Predictions of {number_of(self.frames, 'frame')} by {self.engine}"
+        return f"{title}, in {self.path}" if self.rows is None else f"{title}\n{self.rows.to_string(preview_cols=3)}"
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
-        """Rows for whatever reads Arrow's stream (the Arrow PyCapsule interface)."""
+        """Return the rows as an Arrow stream (the Arrow PyCapsule interface)."""
         return self.frame().__arrow_c_stream__(requested_schema)
 
     @property
@@ -143,98 +143,101 @@ class Predictions:
             name: table[name].to_numpy(zero_copy_only=False).astype(np.float64)
             for name in ("prediction", "time_s", "low_90", "high_90")
         }
-        known = "touches" in table.column_names
-        touches = table["touches"].to_numpy(zero_copy_only=False).astype(bool) if known else np.ones(len(table), bool)
+        has_contact = "touches" in table.column_names
+        touches = np.ones(len(table), bool)
+        if has_contact:
+            touches = table["touches"].to_numpy(zero_copy_only=False).astype(bool)
         believed = table["withheld"].is_null().to_numpy(zero_copy_only=False)
         # the rows of a trial stand together
         bounds = dict.fromkeys([0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)])
-        found = []
+        trials = []
         for first, end in pairwise(bounds):
-            own = {name: values[first:end] for name, values in numbers.items()}
+            columns = {name: values[first:end] for name, values in numbers.items()}
             touching = touches[first:end]
             # of an untouched sensor a difference image shows noise alone, brightened
-            counted = np.where(touching | ~touching.any(), own["prediction"], np.nan)
+            counted = np.where(touching | ~touching.any(), columns["prediction"], np.nan)
             lowest = int(np.nanargmin(counted)) if np.isfinite(counted).any() else None
-            at = {name: np.nan if lowest is None else float(values[lowest]) for name, values in own.items()}
-            found.append(
+            at = {name: np.nan if lowest is None else float(values[lowest]) for name, values in columns.items()}
+            trials.append(
                 TrialMargins(
                     trial=names[first],
-                    margin=own["prediction"],
+                    margin=columns["prediction"],
                     lowest=lowest,
                     withheld=end - first - int(believed[first:end].sum()),
-                    touching=int(touching.sum()) if known else None,
+                    touching=int(touching.sum()) if has_contact else None,
                     time_s=at["time_s"] if np.isfinite(at["time_s"]) else None,
                     interval=(at["low_90"], at["high_90"]) if np.isfinite(at["low_90"]) else None,
                 )
             )
-        return found
+        return trials
+
+
+class _Options(SourceOptions, total=False):
+    """Options of `predict` besides its own parameters."""
+
+    on: str
+    retry_failed: bool
 
 
 def predict(
     run: Network | Path | str | Frames | Dataset | Sequence[Capture],
     source: Path | str | Frames | Dataset | Sequence[Capture] | None = None,
     *,
-    reference: Path | str | Frame | None = None,
-    reference_frame: int | None = None,
-    split: str | None = None,
-    format: str | None = None,
-    options: ReadOptions | None = None,
     friction: FrictionLike | None = None,
     sequence: bool = False,
-    sensor: SensorProfile | Path | str | None = None,
     engine: str = "auto",
     batch_size: int = 8,
     device: str = "cpu",
-    on: str = "serial",
-    retry_failed: bool = False,
     out: Path | str | None = None,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
+    **options: Unpack[_Options],
 ) -> Predictions:
-    """Read the safety margin of every frame; memory does not grow with the recording where `out` is named.
+    """Predict the safety margin of every frame; memory does not grow with the recording if `out` is set.
 
     Parameters
     ----------
     run
-        Network, its folder, or the name of one that comes with sliplens. It may be left out: `predict("cup.mp4")` reads
-        the source with the network that its sensor's profile names, else with `chromatouch-pair`, or
-        `chromatouch-difference` where it is difference images.
+        Network, its folder, or the name of one that comes with sliplens. It may be left out: `predict("cup.mp4")` uses
+        the network that the sensor's profile names, else `chromatouch-pair`, or `chromatouch-difference` for difference
+        images.
     source
-        Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or what `open_source` gave.
-        Images without a reference are taken for difference images, compared before.
-    reference, reference_frame
-        The sensor untouched: image, or number of the frame that shows it. Where nobody tells it of a recording, its
-        first frame is taken for it, and a note says so.
-    split, format, options, sensor
-        As `open_source` takes them.
+        Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or captures of
+        `open_source`. Images without a reference are taken for difference images, compared before.
     friction
-        What is known of the object's coefficient of friction, for a network that tells F_t / F_n: a number, (low,
-        high), or a `Friction`, such as one learnt from slips. If None, it may be any that the training had.
+        Coefficient of friction of the object, for a network that predicts F_t / F_n: a number, (low, high), or a
+        `Friction`, such as one learnt from slips. If None, any friction of the training is possible.
     sequence
-        Read each trial in order: what the frames of a contact so far tell of its friction and of sliding counts too
-        (`Follower`). The times of the frames must be known, and friction is not told then.
+        If True, predict each trial in order and correct a frame by the frames of its contact before it (`Follower`).
+        It needs the times of the frames, and no `friction`.
     engine
         `torch`, `openvino`, or `auto` for OpenVINO where it is installed and the frames are many.
     batch_size
         Frames predicted together; on a processor more are slower, their layers no longer fit its cache.
     device
         Device of a network that is loaded here: cpu or cuda.
-    on, retry_failed
-        Where the trials are read, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
-        whether those are tried again that failed three times before.
     out
         File to write, Parquet, CSV or JSON by its ending; without an ending a folder, a Parquet data set with a file a
         trial. Whole or not at all, and interrupted it goes on after its last trial; rows are kept in memory if None.
+    overwrite
+        If True, replace a file or folder `out`.
+    on_progress
+        Callback for progress.
+    options
+        `reference`, the untouched sensor as an image, or `reference_frame`, the number of the frame that shows it; for
+        a recording without either, its first frame is assumed, with a note. `split`, `format`, `options` and `sensor`
+        as `open_source` takes them. `on`, the executor: `serial`, `processes`, `processes=4` or `ray`; `retry_failed`,
+        if True, tries trials again that failed three times before.
 
     Raises
     ------
     InputError
-        If something named is missing or does not fit, or frames in memory that need a reference have none.
+        If a parameter is missing or does not fit, or frames in memory that need a reference have none.
     ImageError
         If frames are of another size than those of the network's sensor.
     RecordingError
         If the source cannot be read.
-    PartError
+    ShardError
         If some of many trials failed again and again, when all others are there.
 
     Examples
@@ -246,70 +249,61 @@ def predict(
     >>> predictions.frame().column_names[:4]
     ['trial', 'frame', 'time_s', 'prediction']
     """
+    on, retry_failed = options.pop("on", "serial"), options.pop("retry_failed", False)
+    source_options: SourceOptions = {**options}  # pyright: ignore[reportAssignmentType]
     path = None if out is None else Path(out)
     if path is not None and path.suffix:
         require_new_table(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
     if batch_size < 1:
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
-    trained = None if source is None else open_run(run, device=device)
-    read = run if source is None else source
-    if isinstance(read, Network):
-        raise InputError("name what to read: a data set, a folder of images, a video, or frames")
-    known = None if friction is None else as_friction(friction)
-    with stage(on_progress, "Opening the source"):
-        trials = open_trials(
-            read,
-            on=on,
-            resumable=path is not None,
-            reference=reference,
-            reference_frame=reference_frame,
-            split=split,
-            format=format,
-            options=options,
-            sensor=None if sensor is None else load_profile(sensor),
-        )
-    profile = _find_profile(trials, sensor)
-    if trained is None:
-        name, named_by = _find_network(trials, profile)
-        note(on_progress, f"no network was named, so {name} reads it, {named_by}")
-        trained = open_run(name, device=device)
-    if known is not None:
-        trained.require_ratio()
-    kinds = [_assume_reference(trained, one) for one in trials.kinds]
-    if sequence:
-        _require_order(trained, kinds, friction=known)
-    notes = tuple(dict.fromkeys(words for one in kinds for words in (*one.notes, *_require_comparable(trained, one))))
-    turned = None if profile is None else trained.doubt_direction(profile)
-    notes = notes if turned is None else (*notes, turned)
-    metadata = {
-        "sliplens.source": kinds[0].opened,
-        "sliplens.manifest_hash": hash_json(trained.manifest),
-        "sliplens.weights_sha256": trained.manifest.weights_sha256,
-    }
-    if known is not None:
-        doubt = trained.doubt_friction(known)
-        notes = (*notes, f"The coefficient of friction is taken for {known}.", *([] if doubt is None else [doubt]))
-        metadata["sliplens.friction"] = str(known)
-    if sequence:
-        assert trained.manifest.sequence is not None  # `_require_order`
-        notes = (*notes, "Frames were read in order: each answer counts those of its contact before it.")
-        metadata["sliplens.sequence"] = trained.manifest.sequence.weights_sha256
-    for sentence in notes:
-        note(on_progress, sentence)
-    schema = _schema(trained, kinds, metadata)
-    run_with = {"frames": trials.frames, "batch_size": batch_size}
-    make = partial(make_engine, engine, trained, **run_with)
-    recipe = run_with | {"engine": engine, **metadata}
-    recipe |= {"columns": schema.names, "device": str(trained.device), "source": trials.recipe}
-    recipe["friction"] = known and known.digest
+    network = None if source is None else open_run(run, device=device)
+    recordings = run if source is None else source
+    if isinstance(recordings, Network):
+        raise InputError("there is no source; name a data set, a folder of images, a video, or frames")
+    prior = None if friction is None else as_friction(friction)
+    sensor = options.get("sensor")
+    if sensor is not None:
+        source_options["sensor"] = load_profile(sensor)
     with reporting(on_progress):
+        with open_stage("Opening the source"):
+            trials = open_trials(recordings, on=on, resumable=path is not None, **source_options)
+        profile = _find_profile(trials, sensor)
+        if network is None:
+            name, origin = _choose_network(trials, profile)
+            add_note(f"no network was named, so {name} reads it, {origin}")
+            network = open_run(name, device=device)
+        if prior is not None:
+            network.require_ratio()
+        kinds = [_assume_reference(network, capture) for capture in trials.kinds]
+        if sequence:
+            _require_order(network, kinds, friction=prior)
+        notes = [words for capture in kinds for words in (*capture.notes, *_require_comparable(network, capture))]
+        metadata = {
+            "sliplens.source": kinds[0].opened,
+            "sliplens.manifest_hash": hash_json(network.manifest),
+            "sliplens.weights_sha256": network.manifest.weights_sha256,
+        }
+        notes.append("" if profile is None else network.doubt_direction(profile) or "")
+        if prior is not None:
+            notes += [f"The coefficient of friction is taken for {prior}.", network.doubt_friction(prior) or ""]
+            metadata["sliplens.friction"] = str(prior)
+        if sequence:
+            assert network.manifest.sequence is not None  # `_require_order`
+            notes.append("Frames were read in order: each answer counts those of its contact before it.")
+            metadata["sliplens.sequence"] = network.manifest.sequence.weights_sha256
+        notes = tuple(dict.fromkeys(filter(None, notes)))
+        for sentence in notes:
+            add_note(sentence)
+        schema = _schema(network, kinds, metadata)
+        make = partial(make_engine, engine, network, frames=trials.frames, batch_size=batch_size)
+        recipe = {"frames": trials.frames, "batch_size": batch_size, "engine": engine, **metadata}
+        recipe |= {"columns": schema.names, "device": str(network.device), "source": trials.recipe}
+        recipe["friction"] = prior and prior.digest
         written, rows = run_table(
-            _Reading(
-                trained=trained, trials=trials, schema=schema, friction=known, sequence=sequence, make_engine=make
-            ),
+            _Prediction(network=network, trials=trials, schema=schema, friction=prior, sequence=sequence, make=make),
             trials.parts(recipe, longest=None if sequence else LONGEST),
             path,
-            title=f"Predicting frames ({trained.manifest.input})",
+            title=f"Predicting frames ({network.manifest.input})",
             recipe=recipe,
             resumable=trials.travels,
             on=on,
@@ -321,7 +315,7 @@ def predict(
 
 
 def _find_profile(trials: Trials, sensor: SensorProfile | Path | str | None) -> SensorProfile | None:
-    """Profile that is named, or that a data set keeps of its first trial's sensor."""
+    """Load the named profile, or the one that a data set keeps of its first trial's sensor."""
     if sensor is not None:
         return load_profile(sensor)
     source = trials.source
@@ -330,31 +324,30 @@ def _find_profile(trials: Trials, sensor: SensorProfile | Path | str | None) -> 
     return source.profile(source.trials[0].sensor) if isinstance(source, Dataset) else None
 
 
-def _find_network(trials: Trials, profile: SensorProfile | None) -> tuple[str, str]:
-    """Network for a source where none is named, and who names it."""
+def _choose_network(trials: Trials, profile: SensorProfile | None) -> tuple[str, str]:
+    """Choose a network for a source, and say where the choice comes from."""
     if profile is not None and profile.network is not None:
         return profile.network, f"which the profile {profile.name} names"
-    if any(one.read_reference is None and not _is_recorded(one) for one in trials.kinds):
+    if any(capture.read_reference is None and not _is_recorded(capture) for capture in trials.kinds):
         return DIFFERENCE_NETWORK, "which comes with sliplens for difference images"
     return DEFAULT_NETWORK, "which comes with sliplens"
 
 
-def _require_order(trained: Network, trials: Sequence[Capture], *, friction: Friction | None) -> None:
-    """Refuse to read frames in order where the network was not taught to, or nobody knows when they were taken."""
-    trained.follow(friction=friction)
-    if any(one.time_s is None for one in trials):
-        raise InputError(
-            "--sequence reads frames by their times, and nobody tells them here; leave it out, or read a recording "
-            "whose times are known"
-        )
-    for one in trials:
-        assert one.time_s is not None
-        require_frequent(one.time_s, what=one.name)
+def _require_order(network: Network, captures: Sequence[Capture], *, friction: Friction | None) -> None:
+    """Refuse `sequence` for a network without a sequence head, and for frames of unknown times."""
+    network.follow(friction=friction)
+    for capture in captures:
+        if capture.time_s is None:
+            raise InputError(
+                f"--sequence needs the times of the frames, and those of {capture.name} are unknown; leave it out, or "
+                "name a recording with times"
+            )
+        require_frequent(capture.time_s, what=capture.name)
 
 
-def _assume_reference(trained: Network, trial: Capture) -> Capture:
-    """Take the first frame of a recording for the untouched sensor, where a network needs it and nobody tells it."""
-    if trial.read_reference is not None or not _is_recorded(trial) or trained.encoding.name == "raw":
+def _assume_reference(network: Network, trial: Capture) -> Capture:
+    """Assume that the first frame of a recording shows the untouched sensor, if a network needs a reference."""
+    if trial.read_reference is not None or not _is_recorded(trial) or network.encoding.name == "raw":
         return trial
     words = (
         f"{trial.name}: its first frame was taken for the untouched sensor; if that touches, name another with "
@@ -364,24 +357,24 @@ def _assume_reference(trained: Network, trial: Capture) -> Capture:
 
 
 def _is_recorded(trial: Capture) -> bool:
-    return trial.files is None and trial.time_s is not None  # nobody compares frames before they are recorded
+    return trial.files is None and trial.time_s is not None  # recorded frames are not difference images
 
 
-def _require_comparable(trained: Network, trial: Capture) -> Iterator[str]:
-    """Refuse a trial that the network cannot read; gives what is assumed of one that it can."""
-    trained.require_frame_size(trial.frame_size)
-    encoding = trained.encoding
-    doubt = trained.doubt(trial.sensor)
+def _require_comparable(network: Network, trial: Capture) -> Iterator[str]:
+    """Refuse a trial that does not fit the network; yield the assumptions about a trial that does."""
+    network.require_frame_size(trial.frame_size)
+    encoding = network.encoding
+    doubt = network.doubt(trial.sensor)
     if doubt is not None:
-        yield doubt + _compare_markers(trained, trial)
+        yield doubt + _compare_markers(network, trial)
     untouched = trial.read_reference
     if untouched is not None or encoding.name == "raw":  # difference images are black where nothing moved
-        grey = trained.doubt_colour(next(trial.read_frames()) if untouched is None else untouched())
+        grey = network.doubt_colour(next(trial.read_frames()) if untouched is None else untouched())
         if grey is not None:
             yield grey
     if untouched is None and not _is_recorded(trial):
-        trained.require_kind(next(trial.read_frames()), what=trial.files[0] if trial.files else "the first frame")
-    directions = trained.manifest.pull_direction_deg or FULL_CIRCLE
+        network.require_kind(next(trial.read_frames()), what=trial.files[0] if trial.files else "the first frame")
+    directions = network.manifest.pull_direction_deg or FULL_CIRCLE
     if untouched is None and encoding.name == "raw" and directions != FULL_CIRCLE:
         yield (
             f"{trial.name}: no reference was given, so neither the direction of the pull nor a motion of the camera is "
@@ -394,147 +387,177 @@ def _require_comparable(trained: Network, trial: Capture) -> Iterator[str]:
             f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
             "name its image with --reference IMAGE, or a frame of it with --reference-frame N"
         )
-    unseen = (
+    hidden = (
         f", which hide the direction of the pull; the network was trained on {range_words(directions)} (90 is down)"
     )
-    unseen = "" if directions == FULL_CIRCLE else unseen
-    yield f"{trial.name}: no reference was given, so its images were taken for difference images{unseen}."
+    hidden = "" if directions == FULL_CIRCLE else hidden
+    yield f"{trial.name}: no reference was given, so its images were taken for difference images{hidden}."
 
 
-def _compare_markers(trained: Network, trial: Capture) -> str:
-    """How far apart the markers are, beside those that a network of a simulated sensor learned from."""
+def _compare_markers(network: Network, trial: Capture) -> str:
+    """Compare the spacing of the markers with that of the simulated sensor that a network was trained on."""
     # together they take seconds to import, and most frames need none of them
     from scipy.spatial import KDTree  # noqa: PLC0415
 
     from sliplens.markers.gel import marker_spacing  # noqa: PLC0415
     from sliplens.simulation.sensor import SENSORS  # noqa: PLC0415
 
-    known = SENSORS[kind] if (kind := sensor_kind(trained.manifest.sensor)) in SENSORS else None
-    if known is None or trial.read_reference is None:
+    kind = sensor_kind(network.manifest.sensor)
+    if kind not in SENSORS or trial.read_reference is None:
         return ""
-    learned = known.geometry.project(known.geometry.marker_positions())
-    wanted_px = float(np.median(KDTree(learned).query(learned, k=2)[0][:, 1]))
-    found_px = marker_spacing(trial.read_reference())
-    if np.isnan(found_px):
+    geometry = SENSORS[kind].geometry
+    markers = geometry.project(geometry.marker_positions())
+    trained_px = float(np.median(KDTree(markers).query(markers, k=2)[0][:, 1]))
+    spacing_px = marker_spacing(trial.read_reference())
+    if np.isnan(spacing_px):
         return "; no markers were found, and it learned from how markers move: do not trust it here"
-    return f"; markers are {found_px:.1f} pixels apart, those it learned from {wanted_px:.1f}"
+    return f"; markers are {spacing_px:.1f} pixels apart, those it learned from {trained_px:.1f}"
 
 
-def _schema(trained: Network, trials: Sequence[Capture], metadata: dict[str, str]) -> pa.Schema:
-    known = {
+def _schema(network: Network, trials: Sequence[Capture], metadata: dict[str, str]) -> pa.Schema:
+    present = {
         "file": any(trial.files is not None for trial in trials),
         "safety_margin": any(trial.safety_margin is not None for trial in trials),
-        "known": trained.novelty is not None,
-        **dict.fromkeys(("traction_ratio", "traction_ratio_sigma"), trained.manifest.traction is not None),
-        "touches": all(trial.read_reference or _states(trial) for trial in trials),
+        "known": network.novelty is not None,
+        **dict.fromkeys(("traction_ratio", "traction_ratio_sigma"), network.manifest.traction is not None),
+        "touches": all(trial.read_reference or _contact_states(trial) for trial in trials),
         **dict.fromkeys(_FORCES, any(trial.labels is not None for trial in trials)),
     }
-    columns = [pa.field(name, kind) for name, kind in _COLUMNS.items() if known.get(name, True)]
+    columns = [pa.field(name, kind) for name, kind in _COLUMNS.items() if present.get(name, True)]
     return pa.schema(columns, metadata={"sliplens.version": __version__, **metadata})
 
 
-def _states(trial: Capture) -> tuple[ContactState, ...]:
-    """Contact states of the labels; none where they do not tell them."""
+def _contact_states(trial: Capture) -> tuple[ContactState, ...]:
+    """Return the contact states of the labels; none where any is unknown."""
     states = () if trial.labels is None else trial.labels.contact_state
     return () if ContactState.UNKNOWN in states else states
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Reading(Work):
-    """Work on shards of (trial, first frame, number of frames): their rows, as a Parquet file."""
+class _Prediction(Work):
+    """Prediction of parts, (trial, first frame, number of frames), into a Parquet file each."""
 
-    trained: Network
+    network: Network
     trials: Trials
     schema: pa.Schema
     friction: Friction | None
     sequence: bool
-    make_engine: Callable[[], Engine]
+    make: Callable[[], Engine]
 
     @property
     def on_gpu(self) -> bool:
-        return self.trained.device.type != "cpu"
+        return self.network.device.type != "cpu"
 
     def begin(self) -> MakePart:
-        ready, read = self.make_engine(), self.trials.reader()
-        schema = self.schema.with_metadata({"sliplens.engine": ready.name, **(self.schema.metadata or {})})
+        engine, read = self.make(), self.trials.reader()
+        schema = self.schema.with_metadata({"sliplens.engine": engine.name, **(self.schema.metadata or {})})
 
         def make(item: tuple[str, int, int], path: Path) -> None:
-            rows = self._rows(ready, *read(*item), count=item[-1])
-            write_tables((pa.Table.from_pydict(some, schema) for some in rows), path, schema)
+            capture, frames = read(*item)
+            capture = _assume_reference(self.network, capture)
+            if self.sequence and capture.time_s is not None:
+                require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
+            tables = self._tables(engine, capture, frames, count=item[-1])
+            write_tables((table.cast(schema) for table in tables), path, schema)
 
         return make
 
-    def _rows(
-        self,
-        engine: Engine,
-        capture: Capture,
-        frames: Iterator[tuple[int, Frame]],
-        *,
-        count: int,
-    ) -> Iterator[dict[str, list]]:
-        """Columns of some thousand frames at a time: what is read in order is cut nowhere else."""
-        # plain numbers: small arrays kept between the large ones of each batch would leave holes in the memory
-        rows: dict[str, list] = {name: [] for name in self.schema.names}
-        done = 0
-        capture = _assume_reference(self.trained, capture)
-        reference = None if capture.read_reference is None else capture.read_reference()
-        untouched, states = None if reference is None else soften(reference), _states(capture)
-        # batches are encoded while the ones before are under way; first frame of each, which touch, and doubts of them
-        encoded: deque[tuple[int, list[bool], list[str | None]]] = deque()
-        shear = None if reference is None else self.trained.shear_estimator(reference)
-        camera, moved = None if reference is None else CameraWatch(reference), False
-        follower = self.trained.follow() if self.sequence else None
-        if follower is not None and capture.time_s is not None:
-            require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
-
-        def encode() -> Iterator[Tensor]:
-            nonlocal moved
-            while batch := list(islice(frames, engine.batch_size)):
-                first, images = batch[0][0], [frame for _, frame in batch]
-                if states:
-                    touches = [state != ContactState.NO_CONTACT for state in states[first : first + len(batch)]]
-                elif untouched is not None:
-                    touches = [picture_change(soften(frame), untouched) >= LEAST_TOUCH for frame in images]
-                else:
-                    touches = [True] * len(batch)
-                doubts: list[str | None] = []
-                for at, (touch, frame) in enumerate(zip(touches, images, strict=True), start=first):
-                    # a camera that has moved stays so; images of a folder are of any time
-                    if camera is not None and (at % _CAMERA_EVERY == 0 or capture.files is not None):
-                        motion = camera.update(frame, touches=touch)
-                        moved = motion is not None and motion.excess_px > CAMERA_LIMIT_PX
-                    astray = self.trained.doubt_shear(shear.estimate(frame)) if shear is not None and touch else None
-                    doubts.append(CAMERA_REASON if moved else astray)
-                encoded.append((first, touches, doubts))
-                yield self.trained.encode(np.stack(images), reference)
-
-        for answers in engine.answers(encode()):
-            first, touches, doubts = encoded.popleft()
-            estimate = self.trained.to_estimate(*answers, friction=self.friction)
-            reasons = zip(estimate.withheld(np.array(touches)), doubts, strict=True)
+    def _tables(
+        self, engine: Engine, capture: Capture, frames: Iterator[tuple[int, Frame]], *, count: int
+    ) -> Iterator[pa.Table]:
+        """Predict the frames of a part; yield a table for each `LONGEST` frames."""
+        follower = self.network.follow() if self.sequence else None
+        checks = _Checks(self.network, capture)
+        while True:
+            batches = checks.encode(islice(frames, LONGEST), engine.batch_size)
+            answers = []
+            for answer in engine.answers(batches):
+                answers.append([part.cpu() for part in answer])
+                report_progress(min(count, checks.done), count)
+            if not answers:
+                return
+            estimate = self.network.to_estimate(*map(torch.cat, zip(*answers, strict=True)), friction=self.friction)
+            first, touches, doubts = checks.take()
             # of a strange picture the direction of the shear says nothing
-            withheld = [doubt if doubt == CAMERA_REASON else strange or doubt for strange, doubt in reasons]
+            withheld = [
+                doubt if doubt == CAMERA_REASON else strange or doubt
+                for strange, doubt in zip(estimate.withheld(touches), doubts, strict=True)
+            ]
+            believed = np.array([reason is None for reason in withheld])
             if follower is not None:
                 assert capture.time_s is not None  # `_require_order`
-                times, believed = capture.time_s[first : first + len(touches)], [reason is None for reason in withheld]
-                estimate = follower.update(estimate, times, np.array(touches), believed=np.array(believed))
-            columns = _columns(estimate, capture, first, withheld=withheld) | {"touches": touches}
-            for name, values in columns.items():
-                if name in rows:
-                    rows[name].extend(values)
-            report_progress(done := done + len(touches), count)
-            if len(rows["frame"]) >= LONGEST:
-                yield rows
-                rows = {name: [] for name in rows}
-        if rows["frame"]:
-            yield rows
+                times = capture.time_s[first : first + len(touches)]
+                estimate = follower.update(estimate, times, touches, believed=believed)
+            columns = _columns(estimate, capture, first, believed=believed) | {
+                "touches": pa.array(touches),
+                "withheld": pa.array(withheld, type=pa.string()),
+            }
+            yield pa.table({name: columns[name] for name in self.schema.names})
 
 
-def _columns(estimate: Estimate, trial: Capture, first: int, *, withheld: list[str | None]) -> dict[str, list]:
-    count = len(estimate.margin)
-    here, unknown = slice(first, first + count), [None] * count
+class _Checks:
+    """Frames of a trial on their way to the network: encoded in batches, with contact and doubts of each frame."""
+
+    def __init__(self, network: Network, capture: Capture) -> None:
+        self._reference = None if capture.read_reference is None else capture.read_reference()
+        self._untouched = None if self._reference is None else soften(self._reference)
+        self._shear = None if self._reference is None else network.shear_estimator(self._reference)
+        self._camera, self._moved = None if self._reference is None else CameraWatch(self._reference), False
+        self._directions = network.manifest.pull_direction_deg or FULL_CIRCLE
+        self._states, self._capture, self._network = _contact_states(capture), capture, network
+        self._first: int | None = None
+        self._touches: list[bool] = []
+        self._doubts: list[str | None] = []
+        self.done = 0
+        """Number of frames encoded so far."""
+
+    def take(self) -> tuple[int, Bool[np.ndarray, " frames"], list[str | None]]:
+        """Return number of the first frame, contacts and doubts of the frames since the last call."""
+        assert self._first is not None  # there was a frame
+        taken = self._first, np.array(self._touches), self._doubts
+        self._first, self._touches, self._doubts = None, [], []
+        return taken
+
+    def encode(self, frames: Iterator[tuple[int, Frame]], batch_size: int) -> Iterator[Tensor]:
+        """Encode frames in batches, and check each frame."""
+        encode = partial(self._network.encoding.encode, image_size=self._network.manifest.image_size)
+        size = tuple(self._network.manifest.frame_size)
+        while batch := list(islice(frames, batch_size)):
+            self._first = batch[0][0] if self._first is None else self._first
+            for number, frame in batch:
+                self._check(number, frame)
+            images = np.stack([frame for _, frame in batch])
+            if images.shape[1:3] != size:
+                self._network.require_frame_size(images.shape[1:3])
+            self.done += len(batch)
+            yield encode(images, self._reference)
+
+    def _check(self, number: int, frame: Frame) -> None:
+        """Note whether a frame touches, and why its margin may be wrong."""
+        if self._states:
+            touches = self._states[number] != ContactState.NO_CONTACT
+        else:
+            touches = self._untouched is None or picture_change(soften(frame), self._untouched) >= LEAST_TOUCH
+        # a camera that has moved stays so; images of a folder are of any time
+        if self._camera is not None and (number % _CAMERA_EVERY == 0 or self._capture.files is not None):
+            motion = self._camera.update(frame, touches=touches)
+            self._moved = motion is not None and motion.excess_px > CAMERA_LIMIT_PX
+        doubt = None
+        if self._shear is not None and touches:
+            shear = self._shear.estimate(frame)
+            if shear.excess(self._directions) > DIRECTION_LIMIT:
+                doubt = self._network.doubt_shear(shear)
+        self._touches.append(touches)
+        self._doubts.append(CAMERA_REASON if self._moved else doubt)
+
+
+def _columns(
+    estimate: Estimate, trial: Capture, first: int, *, believed: Bool[np.ndarray, " frames"]
+) -> dict[str, pa.Array]:
+    """Make the columns of consecutive frames; NaN becomes null."""
+    count, labels, ratio = len(estimate.margin), trial.labels, estimate.ratio
+    here = slice(first, first + count)
     low, high = estimate.interval(LEVEL) or (None, None)
-    ratio = estimate.ratio
     predicted = {
         "prediction": estimate.margin,
         "sigma": estimate.sigma,
@@ -543,18 +566,17 @@ def _columns(estimate: Estimate, trial: Capture, first: int, *, withheld: list[s
         "traction_ratio": None if ratio is None else ratio.mean,
         "traction_ratio_sigma": None if ratio is None else ratio.sigma,
     }
-    believed = np.array([reason is None for reason in withheld])
-    numbers = {name: None if v is None else np.where(believed, v, np.nan) for name, v in predicted.items()}
-    labels = trial.labels
     recorded = {"time_s": trial.time_s, "safety_margin": trial.safety_margin}
     recorded |= {name: None if labels is None else getattr(labels, name) for name in _FORCES}
+    numbers = {name: None if v is None else np.where(believed, v, np.nan) for name, v in predicted.items()}
     numbers |= {name: None if v is None else v[here] for name, v in recorded.items()}
     numbers["known"] = estimate.known
     return {
-        "trial": [trial.name] * count,
-        "frame": list(range(first, first + count)),
-        "file": list(trial.files[here]) if trial.files else unknown,
-        "withheld": withheld,
-        # NaN as null: nothing is known
-        **{name: unknown if v is None else pa.array(v, from_pandas=True).to_pylist() for name, v in numbers.items()},
+        "trial": pa.array([trial.name] * count),
+        "frame": pa.array(range(first, first + count)),
+        "file": pa.array(trial.files[here]) if trial.files else pa.nulls(count, pa.string()),
+        **{
+            name: pa.nulls(count, pa.float64()) if v is None else pa.array(v.astype(np.float64), from_pandas=True)
+            for name, v in numbers.items()
+        },
     }

@@ -21,7 +21,7 @@ from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.files import output_folder, remove
 from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_difference
 from sliplens.models import Network
-from sliplens.models.checkpoint import open_run, tell_each
+from sliplens.models.checkpoint import condition_each, open_run
 from sliplens.plots.style import decimals, signed, tell_ends
 from sliplens.progress import OnProgress, counted, note, number_of, stage, wrote
 from sliplens.recordings import Dataset
@@ -376,7 +376,7 @@ def tell_friction(
     if traction is None or not np.isfinite(friction).all():
         return np.full(len(friction), np.nan)
     untold = run.estimate_batches(inputs.split(64))
-    told = tell_each(untold, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
+    told = condition_each(untold, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
     return told.margin.astype(np.float64)
 
 

@@ -17,7 +17,7 @@ from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.markers import KINDS, MarkerStatus, track_markers
 from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get_estimator
 from sliplens.models import Network
-from sliplens.models.checkpoint import Estimate, open_run, tell_each
+from sliplens.models.checkpoint import Estimate, condition_each, open_run
 from sliplens.models.sequence import require_frequent
 from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting, track
 from sliplens.recordings import Dataset, TrialInfo
@@ -342,7 +342,7 @@ def evaluate_frames(
             )
         quantiles = np.array(traction.friction)
         estimate = network.estimate_batches(batches)
-        estimate = tell_each(estimate, frames.friction, trained_friction=quantiles, calibration=traction.told)
+        estimate = condition_each(estimate, frames.friction, trained_friction=quantiles, calibration=traction.told)
     else:
         estimate = network.estimate_batches(batches, friction=friction)
     if sequence:

@@ -32,7 +32,7 @@ from sliplens.models.backbones import (
     with_reference,
 )
 from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
-from sliplens.models.checkpoint import Estimate, Ratio, load, sensor_kind, tell_each
+from sliplens.models.checkpoint import Estimate, Ratio, condition_each, load, sensor_kind
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty, fit_novelty
 from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting
@@ -434,7 +434,7 @@ def calibrate(
         calibration=None,
         ratio=Ratio(probabilities=ratio_probabilities, edges=model.ratio_edges.double().cpu().numpy()),
     )
-    estimate = tell_each(estimate, validation.friction[rows.numpy()], trained_friction=quantiles)
+    estimate = condition_each(estimate, validation.friction[rows.numpy()], trained_friction=quantiles)
     with_friction = conformal_calibration(
         estimate.margin, estimate.probabilities, edges, labels[rows], temperature=calibration.temperature
     )

@@ -5,7 +5,7 @@ import math
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -321,7 +321,7 @@ class WholeCheckpoints(TorchCheckpointIO):
     Lightning's own way goes through the system's temporary folder, and is whole only where that is on the same disk.
     """
 
-    def save_checkpoint(self, checkpoint: Mapping[str, Any], path: str | Path, storage_options: object = None) -> None:
+    def save_checkpoint(self, checkpoint: dict, path: str | Path, storage_options: object = None) -> None:
         """Write a checkpoint."""
         if storage_options is not None:
             raise TypeError("this way of saving takes no storage_options")
