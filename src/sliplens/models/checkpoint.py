@@ -315,7 +315,7 @@ class Network:
         """
         manifest = self.manifest.sequence
         if friction is not None:
-            raise InputError("--sequence estimates the friction, and --friction sets it; leave out either of them")
+            raise InputError("--sequence estimates the friction, and --friction sets it; leave out one of them")
         if self.sequence is None or manifest is None:
             raise InputError(
                 "this network has no head for several frames; leave out --sequence, or teach it with `sliplens train "
