@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from labels import Seen, draw_frames
 
+from sliplens.images import soften
 from sliplens.mechanics import stick_ratio
-from sliplens.recordings.labels import LabelSettings, measure_motion, soften
+from sliplens.recordings.labels import LabelSettings, measure_motion
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.trials import prepare_trial

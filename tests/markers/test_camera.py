@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from sliplens.images import picture_change, soften
 from sliplens.live import SimulatedSource
 from sliplens.markers import Tracker
 from sliplens.markers.camera import CAMERA_LIMIT_PX, BorderMotion, CameraMotion, CameraWatch, marker_camera_motion
 from sliplens.recordings import Recording
-from sliplens.recordings.labels.lag import picture_change, soften
 
 Measure = Callable[[np.ndarray, np.ndarray], CameraMotion | None]
 Pressed = tuple[np.ndarray, np.ndarray, list[np.ndarray]]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
-from sliplens.images import require_rgb
+from sliplens.images import require_rgb, soften
 from sliplens.live.contract import LiveSource
 from sliplens.live.health import check_direction, check_novelty, margin_risk
 from sliplens.live.reading import OFF, Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
@@ -22,7 +22,6 @@ from sliplens.models.engines import Engine
 from sliplens.models.predictions import LEVEL
 from sliplens.models.sequence import require_frequent
 from sliplens.recordings.capture import Frame
-from sliplens.recordings.labels.lag import soften
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.shear import ShearEstimator
 

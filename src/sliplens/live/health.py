@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from sliplens.errors import InputError
+from sliplens.images import LEAST_TOUCH, picture_change, soften
 from sliplens.live.reading import Check, LiveFrame, small_picture
 from sliplens.markers import MarkerStatus, TrackedFrame
 from sliplens.markers.camera import CAMERA_CURE, CAMERA_LIMIT_PX, CameraWatch, block_means
 from sliplens.models.checkpoint import STRANGE, Estimate, Network
 from sliplens.recordings.capture import Forces, Frame
-from sliplens.recordings.labels.lag import LEAST_TOUCH, picture_change, soften
 from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, Shear
 
 Plane = Float32[np.ndarray, "height width"]

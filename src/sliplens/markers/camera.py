@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Complex, Float, Float32
 from scipy.ndimage import affine_transform
 
+from sliplens.images import LEAST_TOUCH
 from sliplens.markers.tracks import TrackedFrame
 from sliplens.recordings.capture import Frame
-from sliplens.recordings.labels.lag import LEAST_TOUCH
 
 Plane = Float32[np.ndarray, "height width"]
 

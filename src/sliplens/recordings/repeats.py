@@ -5,8 +5,9 @@ from itertools import islice
 import numpy as np
 from jaxtyping import Float
 
+from sliplens.images import soften
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.labels.lag import measure_motion, soften
+from sliplens.recordings.labels.lag import measure_motion
 
 # Lossless repeats change nothing, and repeats of lossy video up to an eighth of what the frames beside them do; noise
 # alone makes frames of a working camera differ by more, and what rests does so for longer than three frames.

@@ -14,13 +14,12 @@ from threadpoolctl import threadpool_limits
 from sliplens.codec import RESULT_FILE, load_record, save_record
 from sliplens.errors import PartError, RecordingError, SliplensError
 from sliplens.files import remove
-from sliplens.images import require_rgb
+from sliplens.images import Soft, require_rgb, soften
 from sliplens.progress import number_of, open_stage, report_progress
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import LeftOut, TrialInfo, trial_info, trial_path
 from sliplens.recordings.labelling import Corrections, Labelling, ReferenceChoice
-from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion, soften
-from sliplens.recordings.labels.lag import Soft
+from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.repeats import describe_repeats
 from sliplens.recordings.sensor import SensorProfile

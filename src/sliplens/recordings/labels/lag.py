@@ -1,45 +1,15 @@
 """Lag between camera and force sensor, by cross-correlation: the image moves when the force changes."""
 
 from collections.abc import Iterable
-from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Forces, Frame
+from sliplens.images import Soft
+from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import Lag
 from sliplens.recordings.labels.axes import infer_axes, mean_force, typical_step
-
-# blocks across the shorter side: wide enough to average the camera's noise, narrower than a marker's spacing
-_MOTION_BLOCKS = 28
-
-
-Soft: TypeAlias = Float32[np.ndarray, "rows columns 3"]
-"""Means of square blocks of a frame, in grey levels."""
-
-
-def soften(frame: Frame) -> Soft:
-    """Return the means of square blocks of a frame, in grey levels; incomplete blocks at the edges are left out."""
-    height, width, _ = frame.shape
-    side = max(1, min(height, width) // _MOTION_BLOCKS)
-    rows, columns = height // side, width // side
-    # row by row, not by a sum over an axis: several times as fast, and uint16 holds 257 rows of 255
-    lines = frame[: rows * side].reshape(rows, side, width, 3)
-    sums = lines[:, 0].astype(np.uint16 if side <= 257 else np.uint32)
-    for line in range(1, side):
-        sums += lines[:, line]
-    blocks = np.add.reduceat(sums[:, : columns * side], np.arange(0, columns * side, side), axis=1, dtype=np.uint32)
-    return (blocks / np.float32(side * side)).astype(np.float32)
-
-
-LEAST_TOUCH = 7.0
-"""Least `picture_change` that shows a contact, in grey levels: noise and lossy video change a picture by less."""
-
-
-def picture_change(softened: Soft, untouched: Soft) -> float:
-    """Return the 98 % quantile of the difference of a softened frame from the untouched sensor, in grey levels."""
-    return float(np.quantile(np.abs(softened - untouched).max(axis=-1), 0.98))
 
 
 def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:

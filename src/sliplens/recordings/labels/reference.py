@@ -6,9 +6,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sliplens.errors import RecordingError
+from sliplens.images import soften
 from sliplens.recordings.capture import Frame
 from sliplens.recordings.labelling import ReferenceChoice
-from sliplens.recordings.labels.lag import measure_motion, soften
+from sliplens.recordings.labels.lag import measure_motion
 from sliplens.recordings.options import REFERENCE_METHODS
 
 _STILL_TIMES = 1.5  # a still frame moves by at most so many times the motion of the stillest quarter
