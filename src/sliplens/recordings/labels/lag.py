@@ -1,6 +1,7 @@
 """Lag between camera and force sensor, by cross-correlation: the image moves when the force changes."""
 
 from collections.abc import Iterable
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
