@@ -5,7 +5,6 @@ from math import hypot, radians
 
 import numpy as np
 from jaxtyping import Complex, Float, Float32
-from scipy.ndimage import affine_transform
 
 from sliplens.images import LEAST_TOUCH
 from sliplens.markers.tracks import TrackedFrame
@@ -194,6 +193,8 @@ class BorderMotion:
 
     def explains(self, plane: Plane, motion: CameraMotion) -> bool:
         """Return True where the reference, moved so, differs from a picture by less than a contact changes it."""
+        from scipy.ndimage import affine_transform  # noqa: PLC0415 (takes as long to import as all else here)
+
         level, factor = self._levels[-1]
         blocks = block_means(plane * np.float32(self._level / _brightness(plane)), factor)
         similarity, middle = 1 + motion.zoom + 1j * radians(motion.turn_deg), (np.array(blocks.shape) - 1) / 2
