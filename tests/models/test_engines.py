@@ -122,7 +122,7 @@ def test_an_engine_with_other_predictions_is_not_used(images: Tensor):
 
 
 def with_hook(model: nn.Module) -> nn.Module:
-    model.register_forward_hook(lambda _module, _arguments, output: torch.mul(output, 2))
+    model.register_forward_hook(lambda _module, _arguments, output: 2 * output)  # pyright: ignore[reportOperatorIssue]
     return model
 
 
