@@ -126,7 +126,7 @@ def test_a_trial_of_the_default_simulation_is_labelled_though_its_frames_tell_no
     trial = simulate_trial(plan_trials(PRESETS["small"])[0])
     save_dataset(tmp_path / "data", trial, simulated=True)
     assert run("label", tmp_path / "data", "-o", tmp_path / "out", "--no-audit") == 0
-    assert "not told" in capsys.readouterr().out
+    assert "unknown" in capsys.readouterr().out
     back = load_recording(trial_path(tmp_path / "out", trial.trial))
     # six frames a second: the slip is known to a sixth of a second, in which the margin changes by some 0.02
     error = (back.safety_margin - trial.safety_margin)[there(back.valid)]

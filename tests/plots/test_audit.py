@@ -225,7 +225,7 @@ def test_a_mark_has_its_reason_in_words(doubtful: bool):
 def test_reason_why_a_lag_cannot_be_told_is_given():
     lag = Lag(lag_s=0.1, sigma_s=0.1, correlation=0.2, doubt="they correlate by 0.20 only")
 
-    assert "cannot be told: they correlate by 0.20 only" in told(draw_audit(make_trial(), make_labelling(lag=lag)))
+    assert "unknown: they correlate by 0.20 only" in told(draw_audit(make_trial(), make_labelling(lag=lag)))
 
 
 def test_charts_draw_forces_ratio_and_margin_of_the_frames():

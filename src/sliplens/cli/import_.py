@@ -126,7 +126,7 @@ def _basis(labelling: "Labelling | None", counts: dict[str, int]) -> Sequence[st
         friction = f"{mu:.3f} given" if low == high else f"{mu:.3f} [{low:.3f}, {high:.3f}]"
         if basis.lag is not None:
             sure = f"{1e3 * basis.lag.lag_s:+.1f} +- {1e3 * basis.lag.sigma_s:.1f}"
-            lag = ("not told" if basis.lag.doubt else sure) + (" (applied)" if basis.lag_applied else "")
+            lag = ("unknown" if basis.lag.doubt else sure) + (" (applied)" if basis.lag_applied else "")
     if labelling is not None and labelling.reference.index is not None:
         reference = f"frame {labelling.reference.index}"
     return friction, lag, reference

@@ -1,4 +1,4 @@
-"""Audit of an imported trial: one page that shows what its labels rest on."""
+"""Audit of an imported trial: one page with its labels and the estimates behind them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
@@ -42,7 +42,7 @@ from sliplens.plots.style import (
     signed,
     write_over,
 )
-from sliplens.progress import OnProgress, number_of, stage
+from sliplens.progress import OnProgress, number_of, open_stage, reporting, track
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.labelling import Found, FrictionEstimate, Labelling, Lag
@@ -50,7 +50,7 @@ from sliplens.recordings.store import load_recording, read_frames, read_header
 
 _MINUS = "\N{MINUS SIGN}"
 _LOOSE = 10.0  # percentage points: beyond, margins 20 points apart are hard to tell apart
-_SEEN_SIGMAS = 5.0  # an image that moves less at the onset does not speak for a slip
+_IMAGE_SIGMAS = 5.0  # an image that moves less at the onset does not confirm a slip
 _SEE_FLAGS = "in doubt: see the flags"
 _NO_TARE = "no untouched sample shows it"
 
@@ -61,70 +61,69 @@ class Fact(NamedTuple):
     head: str
     words: list[str]
     doubts: tuple[str, ...] = ()
-    """Reasons for which a label may be wrong."""
+    """Reasons why a label may be wrong."""
     indent: str = ""
 
     @property
     def lines(self) -> list[str]:
-        """Words and doubts, in the order of the page."""
+        """Return words and doubts, in the order of the page."""
         return [*self.words, *self.doubts]
 
 
 def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
-    """Tell what the labels rest on: what was declared, found and assumed, and what of it is doubtful."""
+    """Describe the declared, estimated and assumed settings behind the labels, and the doubts about them."""
     basis, reference = labelling.basis, labelling.reference
     if basis is None:
-        return _tell_given(recording, labelling)
+        return _describe_imported(recording, labelling)
     axes, limit, notes = basis.axes, basis.force_range_n, labelling.notes
     pressing = f"normal force is {'+' if axes.sign > 0 else _MINUS}{axes.normal}"
     turned = f", turned by {axes.tilt_deg:.1f} degrees" if axes.direction else ""
-    told = f"{pressing}{turned} (axis {_found(axes.normal_found)}, sign {_found(axes.sign_found)})"
+    mounting = f"{pressing}{turned} (axis {_origin(axes.normal_found)}, sign {_origin(axes.sign_found)})"
     still = f"untouched until {decimals(axes.still_until_s, 2)} s"
     noise = [f"± {_three(axes.tare_sigma_n)} N", f"noise of a sample {_three(axes.noise_n)} N"]
     tare = [f"x, y, z: {_three(axes.tare_n, signed)} N", *noise, still]
     energy, drift = decimals(reference.contact_energy, 2), decimals(reference.drift, 2)
     means = f"means over {_milli(basis.window_s)} ms; gaps over {_milli(basis.gap_s)} ms count as missing"
-    span = "range of the sensor not told" if limit is None else f"range of the sensor ± {limit:g} N"
+    span = "range of the sensor unknown" if limit is None else f"range of the sensor ± {limit:g} N"
     chosen = [f"frame {reference.index}, {reference.method}", f"contact energy {energy}, drift {drift} grey levels"]
     chosen = [reference.method] if reference.index is None else chosen
     return [
-        _tell_frames(recording),
+        _describe_frames(recording),
         *([Fact("Flags", [], tuple(f"• {flag}" for flag in basis.flags), indent="   ")] if basis.flags else []),
-        Fact("Axes", [told], (_SEE_FLAGS,) if any("axis" in note for note in axes.notes) else ()),
-        Fact(f"Tare {_found(axes.tare_found)}", tare, (_NO_TARE,) if axes.tare_found == Found.ASSUMED else ()),
-        _tell_friction(basis.friction, basis.slip_s),
-        _tell_lag(recording, basis.lag, applied=basis.lag_applied),
+        Fact("Axes", [mounting], (_SEE_FLAGS,) if any("axis" in note for note in axes.notes) else ()),
+        Fact(f"Tare {_origin(axes.tare_found)}", tare, (_NO_TARE,) if axes.tare_found == Found.ASSUMED else ()),
+        _describe_friction(basis.friction, basis.slip_s),
+        _describe_lag(recording, basis.lag, applied=basis.lag_applied),
         Fact("Forces", [f"contact from {decimals(basis.contact_threshold_n, 3)} N", means, span]),
         Fact("Reference", chosen),
         *([Fact("Notes", [f"• {note}" for note in notes], indent="   ")] if notes else []),
     ]
 
 
-def _tell_given(recording: Recording, labelling: Labelling) -> list[Fact]:
-    """Tell of labels that came with the frames, and were not found from forces."""
+def _describe_imported(recording: Recording, labelling: Labelling) -> list[Fact]:
+    """Describe labels that came with the recording and were not made from forces."""
     index, clip = labelling.reference.index, asdict(labelling.clip) if labelling.clip else {}
     which = "recorded apart from the frames" if index is None else f"frame {index}"
     labelled = bool(recording.labelled.any())
     words = ["They came with the recording; nothing was found from forces."] if labelled else ["No frame has one."]
-    known = [f"{name.replace('_', ' ')}: {_plainly(value)}" for name, value in clip.items()]
+    facts = [
+        f"{name.replace('_', ' ')}: {('no', 'yes')[value] if isinstance(value, bool) else value}"
+        for name, value in clip.items()
+    ]
     notes = [f"• {note}" for note in labelling.notes]
     counts = recording.count()
     lost = [", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")]
     return [
         Fact(f"Frames: {counts.get('valid', 0)} of {sum(counts.values())} valid", lost),
         Fact("Labels", words if labelled else [], () if labelled else tuple(words)),
-        *([Fact("Known of the whole clip", known)] if known else []),
+        *([Fact("Known of the whole clip", facts)] if facts else []),
         Fact("Reference", [which]),
         *([Fact("Notes", notes, indent="   ")] if notes else []),
     ]
 
 
-def _plainly(value: object) -> str:
-    return {True: "yes", False: "no"}[value] if isinstance(value, bool) else str(value)
-
-
-def _tell_frames(recording: Recording) -> Fact:
-    """Count the frames with a valid label, and the others by what they lack."""
+def _describe_frames(recording: Recording) -> Fact:
+    """Count the frames with a valid label, and the others by the reason."""
     states, sigma = np.array([str(state) for state in recording.contact_state]), recording.safety_margin_sigma
     lacking = {
         "missing samples": np.isnan(recording.normal_force_n),
@@ -147,7 +146,7 @@ def _tell_frames(recording: Recording) -> Fact:
     return Fact(f"Frames: {counts['valid']} of {len(states)} valid", words, tuple(doubts))
 
 
-def _tell_friction(friction: FrictionEstimate, slip_s: float | None) -> Fact:
+def _describe_friction(friction: FrictionEstimate, slip_s: float | None) -> Fact:
     exact, moved = friction.low == friction.high, friction.image_sigmas
     ends = f"{decimals(friction.low, 3)} to {decimals(friction.high, 3)}"
     interval = "taken as exact" if exact else f"68 % interval {ends}"
@@ -155,26 +154,26 @@ def _tell_friction(friction: FrictionEstimate, slip_s: float | None) -> Fact:
     later = "".join(f", and again at {later_s:.3f} s" for later_s in friction.later_onsets_s)
     slip = "no slip found" if slip_s is None else f"slips at {slip_s:.3f} s{later} on the clock of the forces"
     doubts = ["its uncertainty is unknown, and no label counts it"] if exact else []
-    if friction.found == Found.INFERRED and (moved is None or moved < _SEEN_SIGMAS):
+    if friction.found == Found.INFERRED and (moved is None or moved < _IMAGE_SIGMAS):
         doubts.append("forces alone show the slip: the image hardly moves at it")
     words = [f"μ {decimals(friction.mu, 3)}, {interval}", friction.method, *image, slip]
-    return Fact(f"Friction {_found(friction.found)}", words, (*doubts, *([_SEE_FLAGS] if friction.notes else [])))
+    return Fact(f"Friction {_origin(friction.found)}", words, (*doubts, *([_SEE_FLAGS] if friction.notes else [])))
 
 
-def _tell_lag(recording: Recording, lag: Lag | None, *, applied: bool) -> Fact:
+def _describe_lag(recording: Recording, lag: Lag | None, *, applied: bool) -> Fact:
     head = f"Lag {'applied' if applied else 'not applied'}"
     if lag is None or lag.doubt:
-        return Fact(head, [], (f"cannot be told: {lag.doubt}" if lag else "not estimated",))
+        return Fact(head, [], (f"unknown: {lag.doubt}" if lag else "not estimated",))
     late = f"camera late by {_milli(lag.lag_s)} ± {_milli(lag.sigma_s)} ms"
-    # beyond chance, and as much as half a frame: the labels are those of another frame
+    # significant, and half a frame or more: the labels are those of another frame
     least = max(2 * lag.sigma_s, np.ptp(recording.time_s) / (2 * len(recording)))
     ignored = not applied and abs(lag.lag_s) > least
     doubts = ("it is not taken off: labels may be those of the frame beside",) if ignored else ()
     return Fact(head, [late, f"correlation {decimals(lag.correlation, 2)}"], doubts)
 
 
-def _found(how: Found) -> str:
-    return "found" if how is Found.INFERRED else str(how)
+def _origin(origin: Found) -> str:
+    return "found" if origin is Found.INFERRED else str(origin)
 
 
 def _milli(value: float) -> str:
@@ -182,38 +181,38 @@ def _milli(value: float) -> str:
 
 
 def _three(values: Sequence[float], write: Callable[..., str] = decimals) -> str:
-    return ", ".join(write(one, 3) for one in values)
+    return ", ".join(write(value, 3) for value in values)
 
 
-_HIGHEST = 2.5  # times mu_s: where hardly anything presses, F_t / F_n goes anywhere
-_HIGHEST_UNKNOWN = 2.0  # where mu_s is not known
+_HIGHEST = 2.5  # times mu_s: under a light touch F_t / F_n is arbitrary
+_HIGHEST_UNKNOWN = 2.0  # where mu_s is unknown
 
 
 def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: Axes) -> None:
     """Draw F_n and F_t over time, in newtons, and the least F_n of a contact."""
     forces = {"$F_n$": (recording.normal_force_n, BLUE, "-"), "$F_t$": (recording.tangential_force_n, VERMILLION, "--")}
     for name, (force, colour, line) in forces.items():
-        told = name if np.isfinite(force).any() else "_unknown"
-        ax.plot(recording.time_s, force, color=colour, linestyle=line, linewidth=_width(recording), label=told)
+        label = name if np.isfinite(force).any() else "_unknown"
+        ax.plot(recording.time_s, force, color=colour, linestyle=line, linewidth=_width(recording), label=label)
     if threshold_n is not None:
-        told = f"contact from {threshold_n:.3g} N"
-        ax.axhline(threshold_n, color=BLACK, linestyle=":", linewidth=1.3, label=told)
+        label = f"contact from {threshold_n:.3g} N"
+        ax.axhline(threshold_n, color=BLACK, linestyle=":", linewidth=1.3, label=label)
     ax.set(ylabel="Force (N)", xmargin=0)
     if not np.isfinite(recording.normal_force_n).any():
         _leave_empty(ax, "no forces were recorded")
 
 
 def force_ratio(recording: Recording) -> Float[np.ndarray, " frames"]:
-    """F_t / F_n where something touches and presses, NaN elsewhere."""
+    """Compute F_t / F_n where something touches and presses; NaN elsewhere."""
     normal = recording.normal_force_n
     touches = (normal > 0) & np.array([state != ContactState.NO_CONTACT for state in recording.contact_state])
     return np.divide(recording.tangential_force_n, normal, where=touches, out=np.full(len(recording), np.nan))
 
 
 def end_of_ratio(ratio: Float[np.ndarray, " frames"], mu: float, *, above: float = 0.0) -> float:
-    """Where to end a chart of F_t / F_n: a little above what there is, friction and what else is drawn included.
+    """Choose the upper end of a chart of F_t / F_n: a little above ratio, friction and the value `above`.
 
-    A light touch does not stretch it; `mu` is 0 where friction is not known.
+    A light touch does not stretch it; `mu` is 0 where the friction is unknown.
     """
     least, largest = max(mu, above), float(np.max(ratio, where=np.isfinite(ratio), initial=0))
     highest = max(_HIGHEST * mu, least) if mu else _HIGHEST_UNKNOWN
@@ -230,10 +229,10 @@ def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *,
     ax.plot(recording.time_s, ratio, label="$F_t/F_n$ in contact" if np.isfinite(ratio).any() else "_", **drawn)
     mu, low, high = (friction.mu, friction.low, friction.high) if friction else (None, None, None)
     touches = np.array([state != ContactState.NO_CONTACT for state in recording.contact_state])
-    own = np.where(touches, recording.friction_coefficient, np.nan)
-    if friction is None and np.isfinite(own).any():
-        ax.plot(recording.time_s, own, color=GREEN, linewidth=1.1, label=r"$\mu$ that came with the frames")
-        mu = float(np.nanmax(own))
+    coefficient = np.where(touches, recording.friction_coefficient, np.nan)
+    if friction is None and np.isfinite(coefficient).any():
+        ax.plot(recording.time_s, coefficient, color=GREEN, linewidth=1.1, label=r"$\mu$ that came with the frames")
+        mu = float(np.nanmax(coefficient))
     if low is not None and high is not None and low < high:
         ax.axhspan(low, high, color=GREEN, alpha=0.35, linewidth=0, label="its 68 % interval")
     if mu is not None and friction is not None:
@@ -244,17 +243,17 @@ def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *,
 
 
 def plot_labels(recording: Recording, *, ax: Axes) -> None:
-    """Draw the safety margin with its uncertainty on the colours of the states, and which frames have no label."""
+    """Draw the safety margin with its uncertainty on the colours of the states, and mark frames without a label."""
     plot_margin(recording, ax=ax)
     time_s, valid, margin = recording.time_s, recording.labelled, 100 * recording.safety_margin
-    # what is no label stays in sight, but apart
+    # margins that are no labels are drawn differently
     ax.lines[0].set(color=GREY, linestyle=":", linewidth=1.3)
     sigma = recording.safety_margin_sigma
     if sigma is not None:
         low, high = margin - 100 * sigma, margin + 100 * sigma
         ax.fill_between(time_s, low, high, where=valid, color=PURPLE, alpha=0.75, linewidth=0, label=r"Γ $\pm\,\sigma$")
-    held = np.where(valid, margin, np.nan)
-    ax.plot(time_s, held, color=BLACK, linewidth=_width(recording), marker=_marker(recording), label="Γ")
+    labels = np.where(valid, margin, np.nan)
+    ax.plot(time_s, labels, color=BLACK, linewidth=_width(recording), marker=_marker(recording), label="Γ")
     ax.plot(time_s, np.where(valid, np.nan, -9), color=GREY, linewidth=4, solid_capstyle="butt", label="no valid label")
     ax.set(xlabel="", ylim=(-14, 107))
     if not np.isfinite(margin).any():
@@ -267,19 +266,19 @@ def _leave_empty(ax: Axes, words: str) -> None:
 
 
 def _width(recording: Recording) -> float:
-    """Thinner where frames are so many that noise would fill the chart."""
+    """Return a smaller line width for so many frames that noise would fill the chart."""
     return 1.5 if len(recording) <= 1000 else 0.7
 
 
 def _marker(recording: Recording) -> str:
-    """Dots where frames are so few that one alone would draw no line."""
+    """Return dots for so few frames that one alone would draw no line."""
     return "." if len(recording) <= 60 else ""
 
 
 _SHARES = (0, 1, 0.25, 0.5, 0.75)  # of the way from full stick to the slip; its ends first
-_EVEN = 0.05  # frames of like margins are spread over time: for that, a margin may be off by so much
+_EVEN = 0.05  # margin by which a frame may be off, to spread frames of similar margins over time
 _ONSET = "slip", r"as the camera sees it (lag $\pm\,\sigma$)"
-# inches; from left to right: what is told, then charts above pictures
+# inches; from left to right: facts, then charts above pictures
 _WIDTH, _HEIGHT, _EDGE, _LEFT, _GAP = 12.0, 9.0, 0.2, 3.75, 0.07
 _SPAN = _WIDTH - _LEFT - _EDGE
 _PICTURE = (_SPAN + _GAP) / (1 + len(_SHARES)) - _GAP
@@ -289,15 +288,15 @@ _LINE, _WRAP = 0.145, 43  # height of a line of facts, and its characters
 
 
 ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"]]
-"""Gives the frames of these numbers, in their order."""
+"""Reads the frames of some numbers, in their order."""
 
 
 def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadFrames | None = None) -> Figure:
-    """Draw a page from which to judge whether the labels of an imported trial can be defended.
+    """Draw a page from which to judge the labels of an imported trial.
 
     Forces, their ratio beside the static friction, and the safety margin with its uncertainty, on the camera's clock;
     beneath them the reference and five frames from full stick down to the slip, each with its absolute difference; at
-    the left what was declared, found and assumed. `read_frames` is for a trial that was loaded without its pixels.
+    the left the settings behind the labels. `read_frames` is for a trial that was loaded without its pixels.
     """
     height = float(np.clip(_PICTURE * recording.reference.shape[0] / recording.reference.shape[1], *_PICTURE_HEIGHT))
     top = _HEIGHT - _FOOT - 2 * height - _GAP
@@ -313,38 +312,37 @@ def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadF
             time_s = recording.time_s[at]
             middle = (_LEFT + column * (_PICTURE + _GAP) + _PICTURE / 2) / _WIDTH
             _lead(figure, charts, float(time_s), middle, top=top - _HEAD - _LEADER)
-        _tell(figure, recording, labelling)
+        _write_facts(figure, recording, labelling)
     return figure
 
 
 def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None = None) -> int:
-    """Draw the audit of every trial of a data set, `TRIAL.png`, and count them; pages newer than their trial stay."""
+    """Draw the audit of every trial, `TRIAL.png`, unless a newer page is there; returns the number of new pages."""
     for info in data.trials:
         if read_header(trial_path(data.folder, info.trial)).labelling is None:
             raise InputError(
-                f"{info.trial} of {data.folder} was not imported, and nothing tells what its labels rest on; "
+                f"{info.trial} of {data.folder} was not imported, so the origin of its labels is unknown; "
                 "label it into a new folder with --output"
             )
     drawn = 0
     folder.mkdir(parents=True, exist_ok=True)
-    with stage(on_progress, "Drawing pages") as count:
-        for done, info in enumerate(data.trials, start=1):
+    with reporting(on_progress), open_stage("Drawing pages"):
+        for info in track(data.trials):
             path, page = trial_path(data.folder, info.trial), folder / f"{info.trial}.png"
             if not page.is_file() or page.stat().st_mtime_ns < path.stat().st_mtime_ns:
-                # all numbers, but only the pixels that the page shows: memory stays small however long the trial
+                # without pixels but those on the page: a long trial needs little memory
                 recording = load_recording(path, pixels=False)
                 assert recording.labelling is not None
                 save_page(draw_audit(recording, recording.labelling, read_frames=partial(read_frames, path)), page)
                 drawn += 1
-            count(done, len(data.trials))
     return drawn
 
 
 def choose_along(recording: Recording) -> list[int]:
-    """Five different frames in the order of time, or all if there are fewer, evenly spaced in their margins.
+    """Choose five frames in the order of time, or all if there are fewer, evenly spaced in their margins.
 
-    They begin at full stick, pressed hardest, and end in full slip; a trial without begins at its first label, or ends
-    at its least margin. Where no frame has a margin, they are evenly spaced in time.
+    The first is at full stick, pressed hardest, the last in full slip; without these they are the first label and the
+    least margin. Where no frame has a margin, the frames are evenly spaced in time.
     """
     if not np.isfinite(recording.safety_margin).any():
         return np.unique(np.linspace(0, len(recording) - 1, len(_SHARES)).round().astype(int)).tolist()
@@ -380,14 +378,14 @@ def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, *, 
             slip_s = basis.slip_s + shift
             ax.axvline(slip_s, color=BLACK, linestyle="-.", linewidth=1.3, label=f"{_ONSET[0]} at {slip_s:.2f} s")
             if lag is not None and not lag.doubt:
-                seen = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
-                ax.axvspan(*seen, color=SKY, alpha=0.6, linewidth=0, label=_ONSET[1], zorder=0)
+                visible_s = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
+                ax.axvspan(*visible_s, color=SKY, alpha=0.6, linewidth=0, label=_ONSET[1], zorder=0)
             for later_s in basis.friction.later_onsets_s:
                 ax.axvline(later_s + shift, color=BLACK, linestyle="-.", linewidth=1.3, label="_slip")
         place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0}
         handles, names = ax.get_legend_handles_labels()
-        if ax is not charts[1]:  # what stands in all of them is told once
-            handles = [one for one, name in zip(handles, names, strict=True) if not name.startswith(_ONSET)]
+        if ax is not charts[1]:  # equal entries are written once
+            handles = [line for line, name in zip(handles, names, strict=True) if not name.startswith(_ONSET)]
         handles += tints if ax is charts[2] else []
         ax.legend(
             handles=handles, ncols=9, columnspacing=1.1, handlelength=1.9, handletextpad=0.5, fontsize=8.5, **place
@@ -400,7 +398,7 @@ def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, *, 
 
 
 def _lead(figure: Figure, charts: list[Axes], time_s: float, middle: float, *, top: float) -> None:
-    """Mark on the charts when a frame was taken, and lead from there to its picture."""
+    """Mark the time of a frame on the charts, and draw a line from there to its picture."""
     for ax in charts:
         ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1, label="_frame")
     low, high = charts[-1].get_xlim()
@@ -415,11 +413,11 @@ def _draw_pictures(
     index, *along = columns
     reference, second = recording.reference, top + height + _GAP
     free = [at for at, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
-    # the reference less itself would tell nothing, an untouched frame long before or after it tells how it drifts
+    # the difference of the reference from itself is 0; that of an untouched frame far from it shows the drift
     far = max(free, key=lambda at: abs(at - (index or 0)), default=index)
-    shown = read([at for at in (*along, far) if at is not None])
-    frames = [reference, *shown[: len(along)]]
-    untouched = reference if far is None else shown[-1]
+    images = read([at for at in (*along, far) if at is not None])
+    frames = [reference, *images[: len(along)]]
+    untouched = reference if far is None else images[-1]
     differences = absolute_difference(np.stack([untouched, *frames[1:]]), reference)
     factor = brightening([differences])
     for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
@@ -433,10 +431,10 @@ def _draw_pictures(
             ax.imshow(picture)
             ax.set(xticks=[], yticks=[])
             ax.spines[:].set(visible=True, color=STATE_COLOURS[state], linewidth=2)
-        told = _margin(recording, at) if at is not None and column else "reference"
+        title = _margin(recording, at) if at is not None and column else "reference"
         apart = "" if at is None or recording.labelled[at] or not column else ", not valid"
         lines = (
-            (told, 0.37, "bold"),
+            (title, 0.37, "bold"),
             ("recorded apart" if at is None else f"{recording.time_s[at]:.2f} s", 0.21, "normal"),
             (state + apart, 0.06, "normal"),
         )
@@ -457,8 +455,8 @@ def _margin(recording: Recording, at: int) -> str:
     return f"Γ {100 * margin:.0f}{band} %"
 
 
-def _tell(figure: Figure, recording: Recording, labelling: Labelling) -> None:
-    # whoever names a trial may write a dollar sign, which begins no formula here
+def _write_facts(figure: Figure, recording: Recording, labelling: Labelling) -> None:
+    # a dollar sign in a name begins no formula
     plain = {"parse_math": False}
     place_text(figure, _EDGE, 0.17, _cut(recording.trial, 75), fontsize=14, fontweight="bold", **plain)
     about = f"{_cut(recording.sensor, 30)}, day {recording.day}, {_cut(recording.condition, 20)}"
@@ -480,5 +478,5 @@ def _tell(figure: Figure, recording: Recording, labelling: Labelling) -> None:
 
 
 def _cut(words: str, most: int) -> str:
-    """Leave out the middle of what is too long: of a path, or of numbered trials, the end tells most."""
+    """Leave out the middle of a text that is too long: the end of a path or of a numbered name matters most."""
     return words if len(words) <= most else f"{words[: most // 3]}…{words[most // 3 + 1 - most :]}"
