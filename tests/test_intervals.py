@@ -2,7 +2,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from known_ends import ends_of, width_of
+from interval_ends import ends_of, width_of
 from scipy.special import stdtrit
 
 from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_difference

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from known_ends import ends_of
+from interval_ends import ends_of
 from torch import nn
 
 from sliplens.explainers.attribution import change_of

@@ -4,234 +4,29 @@ import math
 import re
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
+from constant_controller import Constant
 from fake_gripper import FakeGripper
-from hypothesis import given
-from hypothesis import strategies as st
 
 import sliplens as sl
 from sliplens.codec import load_result
 from sliplens.errors import InputError, SourceError
-from sliplens.grip.controllers import CONTROLLERS, FRICTION_CONSTANTS, MarginGrip, MarginLaw, Observation
+from sliplens.grip.controllers import MarginLaw
 from sliplens.grip.gripper import DryRun, GripperError, GripperState, GuardedGripper
 from sliplens.grip.hold import HoldLoop, HoldStep
-from sliplens.grip.holder import Holder
-from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.records import Hold
 from sliplens.grip.source import GripSource
 from sliplens.live.contract import LiveSource
-from sliplens.live.reading import LiveFrame, Reading, SlipState
+from sliplens.live.reading import LiveFrame
 
 plain_reader = partial(sl.LiveReader, health=None, slip=None)
-
-
-@dataclass
-class Says:
-    """Controller that notes what it sees, and says what it is told to."""
-
-    force_n: float = 2.0
-    seen: list[Observation] = field(default_factory=list)
-
-    def command(self, seen: Observation) -> np.ndarray:
-        self.seen.append(seen)
-        return np.array([self.force_n])
-
-
-def told(margin: float | None, *, low: float | None = None, slip: SlipState | None = None, friction: str | None = None):
-    return Reading(number=0, time_s=0.0, captured_s=0.0, margin=margin, low=low, slip=slip, friction=friction)
-
-
-def holder_of(controller, *, forces: np.ndarray | None = None, fingers: int = 1) -> tuple[Holder, float]:
-    """Holder that has measured some forces, one a period, and the time now."""
-    holder = Holder(controller, ceiling_n=4.0, fingers=fingers)
-    forces = np.full(90, 2.0) if forces is None else forces
-    for number, force_n in enumerate(forces):
-        holder.grip_force(number * PERIOD_S, float(force_n))
-    return holder, len(forces) * PERIOD_S
-
-
-def test_a_margin_counts_with_the_force_of_its_own_moment():
-    says = Says()
-    holder, now_s = holder_of(says, forces=np.linspace(1.0, 2.0, 91))
-    holder.update_reading(told(0.5, low=0.3), taken_s=75 * PERIOD_S)
-    answer = holder.grip_force(now_s, 3.0)
-    assert says.seen[-1].force_n == pytest.approx(1.0 + 75 / 90)
-    assert (answer.margin, answer.low) == (0.5, 0.3)
-    np.testing.assert_array_equal(says.seen[-1].margin, [[0.5, 0.5]])
-
-
-def test_two_fingers_read_each_its_margin_and_one_suffices():
-    says = Says()
-    holder, now_s = holder_of(says, forces=np.linspace(1.0, 2.0, 91), fingers=2)
-    holder.update_reading(told(0.4), taken_s=80 * PERIOD_S)
-    assert holder.grip_force(now_s, 2.0).margin == 0.4
-    np.testing.assert_array_equal(says.seen[-1].margin, [[0.4, np.nan]])
-    holder.update_reading(told(0.6), taken_s=90 * PERIOD_S, finger=1)
-    assert holder.grip_force(now_s, 2.0).margin == pytest.approx(0.5)
-    assert says.seen[-1].force_n == pytest.approx(1.0 + 85 / 90)
-
-
-@pytest.mark.parametrize("reading", [None, told(None), told(0.9)], ids=["none", "withheld", "stale"])
-def test_nothing_is_loosened_without_a_margin_whatever_a_controller_says(reading: Reading | None):
-    says = Says(force_n=2.0)
-    holder, now_s = holder_of(says)
-    if reading is not None:
-        holder.update_reading(reading, taken_s=now_s - 0.6)
-    for wanted_n, force_n in ((1.0, 2.0), (np.nan, 2.0), (3.0, 3.0), (-1.0, 3.0), (9.0, 4.0), (0.0, 4.0)):
-        says.force_n = wanted_n
-        answer = holder.grip_force(now_s, force_n)
-        assert answer.command_n == force_n
-        assert answer.why.startswith("no margin:")
-    holder.update_reading(told(0.9), taken_s=now_s)
-    assert holder.grip_force(now_s, 4.0).command_n == 0.0
-
-
-@pytest.mark.parametrize("controller", [Says(force_n=3.0), Says(force_n=0.0), "margin", "reflex"])
-def test_without_a_measured_force_the_last_command_is_repeated(controller):
-    holder, now_s = holder_of(Says(force_n=2.0))
-    holder.choose(controller)
-    holder.update_reading(told(0.1, slip=SlipState.SLIP), taken_s=now_s)
-    for step in range(60):
-        answer = holder.grip_force(now_s + step * PERIOD_S, np.nan)
-        assert (answer.command_n, answer.slip) == (2.0, False)
-        assert answer.why == "no force is measured: holds"
-    # the force of the moment of the frame was not measured either
-    holder.update_reading(told(0.1), taken_s=now_s + 0.5)
-    now_s += 1.0
-    assert holder.grip_force(now_s, 2.0).why == "no force is measured: holds"
-    holder.update_reading(told(0.1), taken_s=now_s)
-    assert holder.grip_force(now_s, 2.0).slip  # which was not forgotten
-
-
-@pytest.mark.parametrize("share", [-1.0, 0.0, 0.5, 1.5, 3.0, 1e6])
-def test_a_force_that_does_not_follow_the_commands_is_a_trouble_and_held(share):
-    holder, now_s = holder_of(Says(force_n=2.0))
-    holder.choose("margin")
-    answers = []
-    for step in range(60):
-        # a margin above the one aimed at, so that the law would loosen by the force that is measured
-        holder.update_reading(told(0.7), taken_s=now_s + step * PERIOD_S)
-        answers.append(holder.grip_force(now_s + step * PERIOD_S, share * 2.0))
-    assert {answer.command_n for answer in answers} == {2.0}
-    troubles = [answer.trouble for answer in answers]
-    assert troubles[29] is None  # for half a second it may be the actuator
-    assert len(set(troubles[32:])) == 1
-    assert f"measures {share * 2.0:.3g} N where 2 N is commanded" in str(troubles[-1])
-    # as soon as the force follows it counts again
-    holder.update_reading(told(0.1), taken_s=now_s + 1.0)
-    answer = holder.grip_force(now_s + 1.0, 2.0)
-    assert answer.trouble is None
-    assert answer.command_n >= 2.0
-
-
-@dataclass
-class Loosens:
-    """Controller of somebody else, which lets go whatever is read."""
-
-    def command(self, seen: Observation) -> np.ndarray:
-        return 0.0 * seen.command_n
-
-
-@given(
-    name=st.sampled_from([*(name for name in CONTROLLERS if name != "oracle"), "own"]),
-    command_n=st.floats(0.6, 4.0),
-    # of what is commanded, as a gripper may measure it
-    share=st.floats(0.0, 2.0),
-    read=st.lists(st.floats(0.0, 1.0), min_size=2, max_size=30),
-)
-def test_below_the_margin_aimed_at_no_controller_commands_less_than_before(name, command_n, share, read):
-    """What is acted on is at most what is read: a reading under the target is a margin under it, but for noise."""
-    holder = Holder(Loosens() if name == "own" else name, ceiling_n=5.0, command_n=command_n)
-    before = command_n
-    controller: Any = holder.controller
-    for step, margin in enumerate(read):
-        time_s = 2.0 + step * PERIOD_S
-        holder.update_reading(told(margin), taken_s=time_s)
-        after = holder.grip_force(time_s, share * before, load_n=0.0).command_n
-        acted = float(controller.acted[0]) if isinstance(controller, MarginGrip) else margin
-        if acted < getattr(controller, "target", MarginLaw.target):
-            assert after >= before
-        before = after
-
-
-def test_time_begins_at_the_touch_and_what_a_slow_gripper_missed_is_not_made_up_for():
-    says = Says()
-    holder, now_s = holder_of(says, forces=np.zeros(60))
-    assert {seen.time_s for seen in says.seen} == {0.0}
-    for step_s in (0.0, PERIOD_S, 0.3):
-        holder.grip_force(now_s := now_s + step_s, 1.0)
-    assert [seen.time_s for seen in says.seen[-3:]] == pytest.approx([0.0, PERIOD_S, PERIOD_S + 0.3])
-    assert [seen.since_s for seen in says.seen[-3:]] == pytest.approx([PERIOD_S, PERIOD_S, 3 * PERIOD_S])
-
-
-def test_a_force_grows_as_fast_at_any_rate_of_commands():
-    def grown(period_s: float) -> float:
-        law = MarginLaw()
-        seen = {"force_n": np.array([2.0]), "load_n": np.zeros(1), "slip": np.zeros(1, dtype=bool)}
-        seen |= {"margin": np.full((1, 2), 0.5), "low": np.full((1, 2), 0.5), "since_s": period_s}
-        [force_n] = law.command(Observation(time_s=2.0, command_n=np.array([1.0]), **seen))
-        return (force_n - 1.0) / period_s
-
-    assert grown(1 / 120) == pytest.approx(grown(1 / 60)) == pytest.approx(MarginLaw.up_n_s)
-
-
-def test_laws_aim_at_the_margin_itself_as_soon_as_readings_know_the_friction():
-    holder, now_s = holder_of("margin")
-    read = MarginLaw.zero + (1 - MarginLaw.zero) * MarginLaw.target  # of which MarginLaw.target is left beyond r_0
-    for friction, aim in (("0.6", FRICTION_CONSTANTS["target"]), (None, read)):
-        holder.update_reading(told(0.7, friction=friction), taken_s=now_s)
-        assert f"aims at a margin of {100 * aim:.0f} %" in holder.grip_force(now_s, 2.0).why
-    holder.update_reading(told(None, friction=None), taken_s=now_s)  # withheld, which says nothing of the friction
-    holder.update_reading(told(0.7, friction="0.6"), taken_s=now_s)
-    assert f"aims at a margin of {100 * FRICTION_CONSTANTS['target']:.0f} %" in holder.grip_force(now_s, 2.0).why
-
-
-def test_what_a_slip_teaches_of_the_friction_makes_no_law_forget_the_slip():
-    holder, now_s = holder_of("margin")
-    holder.update_reading(told(0.5, slip=SlipState.SLIP), taken_s=now_s)
-    pressed = holder.grip_force(now_s, 2.0)
-    assert pressed.slip
-    loosened = {}
-    for after_s in (0.1, MarginLaw.calm_s + 0.1):
-        holder.update_reading(told(0.95, friction="0.6"), taken_s=now_s + after_s)
-        answer = holder.grip_force(now_s + after_s, pressed.command_n)
-        loosened[after_s] = answer.command_n < pressed.command_n
-    assert list(loosened.values()) == [False, True]
-
-
-@pytest.mark.parametrize(
-    ("forces", "taken_s", "counts"),
-    [
-        (np.full(90, 2.0), 1.4, True),
-        (np.full(90, 2.0), 0.4, False),  # the fingers close
-        (np.linspace(3.0, 2.0, 90), 1.4, False),  # loosened
-        (np.linspace(2.0, 3.0, 90), 1.4, True),
-    ],
-)
-def test_a_slip_counts_once_and_only_where_the_skin_does_not_spring_back_by_itself(forces, taken_s, counts):
-    says = Says()
-    holder, now_s = Holder(says, ceiling_n=4.0), len(forces) * PERIOD_S
-    for number, force_n in enumerate(forces.tolist()):
-        holder.update_reading(told(0.9), taken_s=number * PERIOD_S)
-        says.force_n = force_n
-        # whatever noise the measured force has
-        holder.grip_force(number * PERIOD_S, force_n + 0.05 * (-1) ** number)
-    says.force_n = 2.5
-    for expected in (counts, False):
-        holder.update_reading(told(0.5, slip=SlipState.SLIP), taken_s=taken_s)
-        assert holder.grip_force(now_s, 2.0).slip is expected
-    holder.update_reading(told(0.5, slip=SlipState.STICKING), taken_s=taken_s)
-    holder.update_reading(told(0.5, slip=SlipState.SLIP), taken_s=taken_s)
-    assert holder.grip_force(now_s, 2.0).slip is counts
 
 
 @pytest.fixture
@@ -337,7 +132,7 @@ def test_however_it_ends_the_gripper_keeps_what_it_holds_with(source, given, end
     hand.set_force(3.0)  # it holds something already
     with plain_reader(source) as reader:
         given = {"on_step": lambda _: source.held.set()} | given
-        hold = sl.hold_grip(reader, hand, controller=Says(force_n=1.0), **given)
+        hold = sl.hold_grip(reader, hand, controller=Constant(force_n=1.0), **given)
     assert (hold.ended, hold.why) == (ended, f"{why}; the gripper keeps the last command of 3.00 N")
     assert set(hand.sent) == {"F 3.000"}
     assert len(hold.steps) == hold.frame().num_rows > 0
@@ -349,7 +144,7 @@ def test_what_was_told_is_kept_though_who_hears_of_it_fails(tmp_path: Path):
         raise BrokenPipeError("nobody listens")
 
     with plain_reader(Frames()) as reader, pytest.raises(BrokenPipeError):
-        sl.hold_grip(reader, DryRun(), controller=Says(force_n=1.0), on_step=fail, out=tmp_path / "hold")
+        sl.hold_grip(reader, DryRun(), controller=Constant(force_n=1.0), on_step=fail, out=tmp_path / "hold")
     hold = load_result(tmp_path / "hold", Hold, command="sliplens hold")
     assert (hold.ended, len(hold.steps)) == ("failed", 1)
     assert hold.why == ("on_step failed (nobody listens); the gripper keeps the last command of 1.00 N")
@@ -363,7 +158,7 @@ def test_a_force_that_was_told_is_noted_though_ctrl_c_comes_before_its_answer():
 
     hand = Interrupted()
     with plain_reader(Frames()) as reader:
-        hold = sl.hold_grip(reader, hand, controller=Says(force_n=1.0))
+        hold = sl.hold_grip(reader, hand, controller=Constant(force_n=1.0))
     assert hand.sent == ["F 1.000"]
     assert hold.why == "interrupted; the gripper keeps the last command of 1.00 N"
     assert hold.steps.command_n.tolist() == [1.0]
@@ -481,7 +276,10 @@ def test_a_hold_is_kept_and_no_other_takes_its_place(tmp_path: Path):
         ({"controller": "oracle"}, "needs the true margin, which a finger does not have"),
         ({"controller": "assumed-friction"}, "needs a force sensor at the wrist"),
         ({"controller": "magic"}, "there is no controller named 'magic'"),
-        ({"controller": Says(), "settings": {"force_n": 1.0}}, "settings change a controller of the table"),
+        (
+            {"controller": Constant(), "settings": {"force_n": 1.0}},
+            "settings change a controller of the table",
+        ),
         ({"gripper": "simulated"}, "`simulated` is the gripper of the source `grip`; a finger has none"),
         ({"gripper": "/dev/no-such-device"}, "no serial device"),
         ({"network": "chromatouch-difference"}, "a reader has its own network"),

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from known_ends import ends_of
+from interval_ends import ends_of
 
 from sliplens.report.comparisons import compare_deletion, compare_errors
 from sliplens.results.evaluation import ScoredFrames

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from known_ends import ends_of
+from interval_ends import ends_of
 from torch import Tensor, nn
 
 from sliplens.explainers.attribution import Attribution

@@ -318,8 +318,10 @@ class _Job:
         """Create the friction of each episode; none where it is neither given nor learnt."""
         if self.friction is None and not self.setup.same_object:
             return []
-        given = [Friction(mu) if isinstance(self.friction, str) else self.friction for mu in scripts.friction.tolist()]
-        return [SlipLearner(friction, same_object=self.setup.same_object) for friction in given]
+        frictions = [
+            Friction(mu) if isinstance(self.friction, str) else self.friction for mu in scripts.friction.tolist()
+        ]
+        return [SlipLearner(friction, same_object=self.setup.same_object) for friction in frictions]
 
     def _make_sensor(
         self, scripts: Scripts, learners: list[SlipLearner], seed: np.random.SeedSequence

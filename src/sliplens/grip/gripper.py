@@ -281,13 +281,8 @@ class RosGripper:
         self._ros = ZenohRos(address, purpose="a gripper of ROS 2")
         self._topic, self._joint, self.timeout_s = f"{key}/{_STATE_TOPIC}", joint, timeout_s
         self._message, self._message_s, self._new = b"", -math.inf, threading.Condition()
-        self._senders: list[Callable[[float], None]] = []
         try:
-            for command in commands:
-                if command.definition is not None:
-                    self._ros.define(command.kind, command.definition)
-                send = self._ros.publisher(f"{key}/{command.topic}", command.kind)
-                self._senders.append(partial(self._send, command, send))
+            self._set_force, self._set_width = (self._make_sender(key, command) for command in commands)
             self._ros.subscribe(self._topic, _STATE_KIND, self._receive)
             self._await_state(_FIRST_STATE_S)
         except SliplensError:
@@ -301,11 +296,11 @@ class RosGripper:
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
-        self._senders[0](force_n)
+        self._set_force(force_n)
 
     def set_width(self, width_m: float) -> None:
         """Open to so many metres."""
-        self._senders[1](width_m)
+        self._set_width(width_m)
 
     def read_state(self) -> GripperState:
         """Return force and width from the newest state."""
@@ -327,12 +322,20 @@ class RosGripper:
         """Close the connection."""
         self._ros.close()
 
-    def _send(self, command: RosCommand, send: Callable[[dict[str, Any], int], None], value: float) -> None:
-        try:
-            send(command.fields(value), time.time_ns())
-        except OSError as error:
-            raise GripperError(f"the gripper cannot be reached ({error}); check its bridge") from None
-        self.read_state()
+    def _make_sender(self, key: str, command: RosCommand) -> Callable[[float], None]:
+        """Return the function that sends a force or a width, and checks that the gripper still sends its state."""
+        if command.definition is not None:
+            self._ros.define(command.kind, command.definition)
+        publish = self._ros.publisher(f"{key}/{command.topic}", command.kind)
+
+        def send(value: float) -> None:
+            try:
+                publish(command.fields(value), time.time_ns())
+            except OSError as error:
+                raise GripperError(f"the gripper cannot be reached ({error}); check its bridge") from None
+            self.read_state()
+
+        return send
 
     def _receive(self, message: bytes) -> None:
         with self._new:

@@ -120,7 +120,7 @@ class TableSensor:
         friction, table, scale = state.holding_friction, self._table, self._scale
         margin, low, high, *ratio = table.read(self._tips, force, friction=friction, margins=true)
         noise = self._rng.standard_normal(true.shape)
-        known = None
+        by_friction = None
         if self._learners:
             traction = np.where(state.sliding, state.kinetic_ratio[:, None], 1 - true)
             traction = np.where(pressing, state.friction * traction, 0.0)
@@ -130,13 +130,13 @@ class TableSensor:
             ):
                 learner.update(state.time_s, slipping_s=None if np.isnan(since_s) else float(since_s))
                 learner.note(float(mean), sigma=float(sigma), time_s=state.time_s)
-            known = _margin_of_ratio(measured, scale * ratio[1], self._learners)
-        if known is None:
+            by_friction = _margin_of_ratio(measured, scale * ratio[1], self._learners)
+        if by_friction is None:
             change = (scale - 1) * (margin - true) + table.noise * scale * noise
             low, high = (end + change + (scale - 1) * (end - margin) for end in (low, high))
             margin = margin + change
         else:
-            margin, low, high = known
+            margin, low, high = by_friction
         places = self._field.at(
             self._gripper, state.force_n, friction=friction, margins=true, pulled_back=state.shear_n < 0
         )

@@ -1,16 +1,16 @@
-"""Intervals that are there."""
+"""Ends and widths of intervals that a test expects to exist."""
 
 from sliplens.intervals import Difference
 
 
 def ends_of(gap: Difference) -> tuple[float, float]:
-    """Ends of an interval, which has some."""
+    """Return the ends of an interval."""
     assert gap.low is not None
     assert gap.high is not None
     return gap.low, gap.high
 
 
 def width_of(gap: Difference) -> float:
-    """How wide it is."""
+    """Return the width of an interval."""
     low, high = ends_of(gap)
     return high - low
