@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.manifest import find_rows, pair_recordings, read_manifest
+from sliplens.recordings.manifest import find_rows, pair_recordings, read_rows
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -62,7 +62,7 @@ def test_a_manifest_says_all_of_a_trial(tmp_path: Path):
         ",b.mp4,,digit,,,,,still.png\n\n",
         encoding="utf-8",
     )
-    one, two = read_manifest(path)
+    one, two = read_rows(path)
     assert (one.trial, one.video, one.forces) == ("one", tmp_path / "a.mp4", tmp_path / "a.csv")
     assert (one.sensor, one.day, one.object, one.condition, one.mu) == (
         str(tmp_path / "tip.toml"),
@@ -99,4 +99,4 @@ def test_a_manifest_that_cannot_be_is_refused_with_its_line(tmp_path: Path, text
     path = tmp_path / "trials.csv"
     path.write_text(text)
     with pytest.raises(RecordingError, match=words):
-        read_manifest(path)
+        read_rows(path)

@@ -91,8 +91,8 @@ def _some(names: Iterable[str]) -> str:
 
     ordered = sorted(names, key=natural_key)
     rest = len(ordered) - _MOST_NAMES
-    shown = ordered if rest < 2 else [*ordered[:_MOST_NAMES], f"{rest} more"]
-    return ", ".join(shown) or "-"
+    names = ordered if rest < 2 else [*ordered[:_MOST_NAMES], f"{rest} more"]
+    return ", ".join(names) or "-"
 
 
 def _ranges(numbers: Iterable[int]) -> str:

@@ -24,8 +24,8 @@ _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
-    """Error in a data set."""
+class Violation:
+    """Law that a data set violates."""
 
     where: str
     """The trial, or the file of the data set."""
@@ -33,15 +33,15 @@ class Finding:
     """Error, and the frame it is at."""
 
 
-def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None = None) -> tuple[Finding, ...]:
+def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None = None) -> tuple[Violation, ...]:
     """Read every trial of a data set and list its errors.
 
     For each trial: its file exists, has the hash and the facts of the table, and every image can be decoded; times
     rise, forces are finite, labels lie in [0, 1] and are missing only without contact, margin and forces agree, contact
     states follow the margin, and F_t / F_n stays within the friction by 3 sigma, before a slip and after it. For the
     data set: no trial is listed twice, which would put its frames into two splits, no file is unlisted, and no
-    recording was cut off. Flags on labels, such as faults of the force sensor, are notes and not findings: frames at a
-    fault are not valid.
+    recording was cut off. Flags on labels, such as faults of the force sensor, are notes and not violations: frames
+    at a fault are not valid.
 
     Raises
     ------
@@ -49,31 +49,31 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
         If the folder is no data set at all.
     """
     data = data if isinstance(data, Dataset) else load_dataset(data)
-    folder, findings, labellings = data.folder, [], []
+    folder, violations, labellings = data.folder, [], []
     for trial, count in Counter(info.trial for info in data.trials).items():
         if count > 1:
             splits = sorted({info.split for info in data.trials if info.trial == trial})
-            findings.append(Finding(where=trial, what=f"is listed {count} times, in split {' and '.join(splits)}"))
+            violations.append(Violation(where=trial, what=f"is listed {count} times, in split {' and '.join(splits)}"))
     listed = {trial_path(folder, info.trial) for info in data.trials}
     listed |= {forces_path(folder, info.trial) for info in data.trials if info.forces_sha256}
-    findings += [
-        Finding(where=str(path.relative_to(folder)), what="is not in the table of the data set")
+    violations += [
+        Violation(where=str(path.relative_to(folder)), what="is not in the table of the data set")
         for path in sorted([*(folder / "trials").glob("*"), *(folder / "forces").glob("*")])
         if path not in listed
     ]
     if (folder / JOURNAL_FOLDER).is_dir():
-        findings.append(
-            Finding(where=JOURNAL_FOLDER, what="still runs or was cut off; finish it with sliplens recover")
+        violations.append(
+            Violation(where=JOURNAL_FOLDER, what="still runs or was cut off; finish it with sliplens recover")
         )
     # hashes and decoding release the interpreter's lock
     with ThreadPoolExecutor(os.cpu_count()) as pool, reporting(on_progress):
         checked = pool.map(lambda info: tuple(_check_trial(folder, info)), data.trials)
         for info, errors in zip(track(data.trials), checked, strict=True):
-            findings += [Finding(where=info.trial, what=error) for error in errors]
-            with suppress(SliplensError):  # an unreadable file is among the findings
+            violations += [Violation(where=info.trial, what=error) for error in errors]
+            with suppress(SliplensError):  # an unreadable file is among the violations
                 labellings.append((info.trial, read_header(trial_path(folder, info.trial)).labelling))
         report_flags(labellings)
-    return tuple(findings)
+    return tuple(violations)
 
 
 def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:

@@ -52,7 +52,7 @@ def find_rows(source: Path) -> tuple[ManifestRow, ...] | None:
     if source.is_dir():
         return None if recognise(source) else pair_recordings(source)
     if source.suffix.lower() == ".csv" and source.is_file() and "video" in _read_header(source)[0]:
-        return read_manifest(source)
+        return read_rows(source)
     return None
 
 
@@ -103,7 +103,7 @@ def _normalise(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def read_manifest(path: Path) -> tuple[ManifestRow, ...]:
+def read_rows(path: Path) -> tuple[ManifestRow, ...]:
     """Read a manifest: a CSV with a row a trial and the columns of `ManifestRow`, of which `video` alone is required.
 
     Paths are relative to the manifest; `reference` is an image or the number of a frame.
@@ -194,4 +194,4 @@ def _parse_row(cells: dict[str, str], folder: Path, where: str) -> ManifestRow:
     )
 
 
-__all__ = ["ManifestRow", "find_rows", "pair_recordings", "read_csv", "read_manifest"]
+__all__ = ["ManifestRow", "find_rows", "pair_recordings", "read_csv", "read_rows"]
