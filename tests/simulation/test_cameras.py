@@ -5,7 +5,7 @@ import pytest
 
 from sliplens.simulation import make_recipe, plan_trials
 from sliplens.simulation.filming import move_camera
-from sliplens.simulation.nuisances import Camera, Day, Nuisances, mount_camera
+from sliplens.simulation.nuisances import CameraSetup, Day, Nuisances, mount_camera
 from sliplens.simulation.trials import prepare_trial
 
 
@@ -29,13 +29,13 @@ def test_thesis_sensors_differ_more_than_their_days():
 
 def test_mounting_adds_seats_and_multiplies_light():
     day = Day(gain=1.1, gradient=0.02, gradient_direction_rad=0.0, camera_shift_px=(0.1, -0.1), glare=0.5)
-    camera = Camera(gain=0.9, gradient=0.2, gradient_direction_rad=np.pi, camera_shift_px=(1.0, 2.0), glare=0.8)
+    camera = CameraSetup(gain=0.9, gradient=0.2, gradient_direction_rad=np.pi, camera_shift_px=(1.0, 2.0), glare=0.8)
     mounted = mount_camera(day, camera)
     assert mounted.gain == pytest.approx(0.99)
     assert mounted.glare == pytest.approx(0.4)
     assert mounted.gradient == pytest.approx(0.18)
     assert mounted.camera_shift_px == pytest.approx((1.1, 1.9))
-    assert mount_camera(day, Camera()) == day
+    assert mount_camera(day, CameraSetup()) == day
 
 
 def test_a_moved_camera_turns_and_magnifies_markers_about_the_middle():

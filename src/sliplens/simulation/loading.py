@@ -18,7 +18,7 @@ _SLIP_SHARE = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Friction:
+class ContactFriction:
     """Friction of a contact and the share of it that is used, frame by frame."""
 
     coefficient: Frames
@@ -30,7 +30,7 @@ class Friction:
     slips: Bool[np.ndarray, " frames"]
 
 
-def slide(since_slip_s: Frames, *, static_friction: Frames, grasp: Grasp, stuck_until: int) -> Friction:
+def slide(since_slip_s: Frames, *, static_friction: Frames, grasp: Grasp, stuck_until: int) -> ContactFriction:
     """Compute the friction of a sliding contact: a fall from static to kinetic, then stick-slip of a spring-slider.
 
     The spring reloads the stuck contact at a steady rate from kinetic friction to what the contact regained in that
@@ -60,7 +60,7 @@ def slide(since_slip_s: Frames, *, static_friction: Frames, grasp: Grasp, stuck_
             level[first - 1] / static_friction[first - 1] * (static_friction[first:])
         )
         stuck[first:] = False
-    return Friction(coefficient=friction, used=level / friction, carried=carried, slips=~stuck)
+    return ContactFriction(coefficient=friction, used=level / friction, carried=carried, slips=~stuck)
 
 
 TRIAL_S = 8.0
@@ -207,7 +207,7 @@ def load_grasp(
         nothing = np.zeros(frames)
         course = Pull(used=np.clip(pulled + swing, 0, 1), let_back=nothing, retaken=nothing)
     sliding = slide(time_s - time_s[slip], static_friction=static, grasp=grasp, stuck_until=let_go - slip)
-    friction = Friction(
+    friction = ContactFriction(
         coefficient=np.where(index < slip, static, sliding.coefficient),
         used=np.where(index < slip, course.used, sliding.used),
         carried=np.where(index < slip, 0.0, sliding.carried),
@@ -240,14 +240,20 @@ def load_at_states(
         raise ContactError("safety margins must lie in [0, 1]; give them as fractions, not in percent")
     nothing = np.zeros(len(margins))
     used = 1 - np.nan_to_num(margins, nan=1.0)
-    states = Friction(coefficient=friction, used=used, carried=nothing, slips=margins == 0)
+    states = ContactFriction(coefficient=friction, used=used, carried=nothing, slips=margins == 0)
     normal = np.where(np.isnan(margins), 0.0, normal_force_n)
     time_s = np.arange(len(margins), dtype=np.float64)
     return _label(time_s, normal=normal, static=friction, friction=states, held_s=nothing if held_s is None else held_s)
 
 
 def _label(
-    time_s: Frames, *, normal: Frames, static: Frames, friction: Friction, held_s: Frames, course: Pull | None = None
+    time_s: Frames,
+    *,
+    normal: Frames,
+    static: Frames,
+    friction: ContactFriction,
+    held_s: Frames,
+    course: Pull | None = None,
 ) -> Loading:
     """Compute forces and labels of frames from the share of the friction that they use."""
     let_back = retaken = np.zeros(len(time_s))

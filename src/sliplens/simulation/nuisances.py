@@ -140,8 +140,8 @@ class Pulls:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera:
-    """Seat and light of a camera: its shift and turn in the image, gain, white balance, light gradient and glare."""
+class CameraSetup:
+    """Pose and light of a camera: its shift and turn in the image, gain, white balance, light gradient and glare."""
 
     gain: float = 1.0
     white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -153,7 +153,7 @@ class Camera:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Day(Camera):
+class Day(CameraSetup):
     """Draws of a day: the friction of the dry object, the gel's stiffness, light and camera."""
 
     friction: float = 0.775
@@ -208,9 +208,9 @@ class Touch:
     """Depth of the markers under the skin, in radii of the contact's sphere."""
 
 
-def draw_camera(nuisances: Nuisances, *, rng: np.random.Generator) -> Camera:
+def draw_camera(nuisances: Nuisances, *, rng: np.random.Generator) -> CameraSetup:
     """Draw the camera and the lamps that are built into a sensor, from the ranges named `sensor_...`."""
-    return Camera(
+    return CameraSetup(
         gain=rng.uniform(*nuisances.sensor_gain),
         white_balance=_three(rng, nuisances.sensor_white_balance),
         gradient=rng.uniform(*nuisances.sensor_gradient),
@@ -221,12 +221,12 @@ def draw_camera(nuisances: Nuisances, *, rng: np.random.Generator) -> Camera:
     )
 
 
-def mount_camera(day: Day, camera: Camera) -> Day:
+def mount_camera(day: Day, camera: CameraSetup) -> Day:
     """Return a day as the camera of a sensor sees it: shifts, turns and gradients add, gains and glare multiply.
 
     Examples
     --------
-    >>> mount_camera(Day(camera_shift_px=(0.1, 0.0)), Camera(camera_shift_px=(2.0, 1.0))).camera_shift_px
+    >>> mount_camera(Day(camera_shift_px=(0.1, 0.0)), CameraSetup(camera_shift_px=(2.0, 1.0))).camera_shift_px
     (2.1, 1.0)
     """
     slopes = [part.gradient * np.exp(1j * part.gradient_direction_rad) for part in (day, camera)]
