@@ -37,7 +37,8 @@ def run(
         if tells:
             # as a network that cannot tell friction reads it, counted from a zero of a half
             margin = None if frame.safety_margin is None else 0.5 + 0.5 * frame.safety_margin
-            source.hear(Reading(number=frame.number, time_s=frame.time_s, captured_s=0.0, margin=margin, slip=slip))
+            reading = Reading(number=frame.number, time_s=frame.time_s, captured_s=0.0, margin=margin, slip=slip)
+            source.update_reading(reading)
     return course
 
 

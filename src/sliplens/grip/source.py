@@ -53,8 +53,8 @@ class GripStatus:
 class GripSource(LiveSource):
     """Simulated gripper that lifts an object and holds it while water is poured in, it is pulled or wetted.
 
-    Its frames are those of one fingertip. `hear` takes the reading of each frame, as `LiveReader` passes it on, and the
-    controller acts on it: the loop is closed through pixels, with the network's true latency and withheld margins.
+    Its frames are those of one fingertip. `update_reading` takes the reading of each, which `LiveReader` passes on, and
+    the controller acts on it: the loop is closed through pixels, with the network's true latency and withheld margins.
     Without readings the gripper goes to its safe force. A dropped object is gripped again. With forces from outside
     (`set_force`), it is a `Gripper` without a controller.
 
@@ -140,7 +140,7 @@ class GripSource(LiveSource):
         with self._lock:
             self._ended_s = -np.inf
 
-    def hear(self, reading: Reading) -> None:
+    def update_reading(self, reading: Reading) -> None:
         """Take the reading of a frame."""
         with self._lock:
             if reading.number in self._frames:

@@ -98,7 +98,7 @@ class LiveSource(ABC):
     def frames(self) -> Iterator[LiveFrame]:
         """Iterate over frames as they come; ends when the source does, or soon after `close`."""
 
-    def hear(self, reading: Reading) -> None:  # noqa: B027 (most act on nothing)
+    def update_reading(self, reading: Reading) -> None:  # noqa: B027 (most act on nothing)
         """Take the reading of a frame: for a source that acts on it, as a gripper does."""
 
     def close(self) -> None:

@@ -527,7 +527,7 @@ class LiveReader:
                 place.close()
 
     def _publish(self, reading: Reading, frame: LiveFrame | None) -> None:
-        self.source.hear(reading)
+        self.source.update_reading(reading)
         with self._lock:
             self._newest = reading
             for place in self._mailboxes:

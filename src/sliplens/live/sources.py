@@ -216,9 +216,9 @@ class ProfiledSource(LiveSource):
     def __exit__(self, *error: object) -> None:
         self._source.__exit__(*error)
 
-    def hear(self, reading: Reading) -> None:
+    def update_reading(self, reading: Reading) -> None:
         """Hand on a reading."""
-        self._source.hear(reading)
+        self._source.update_reading(reading)
 
     def close(self) -> None:
         """Stop giving frames, soon."""
