@@ -32,7 +32,7 @@ def test_a_network_becomes_an_onnx_file(difference_run: Path, tmp_path: Path, ca
     pytest.importorskip("onnxscript")
     output = tmp_path / "new" / "a.onnx"
     run(difference_run, "-o", output, "--onnx")
-    assert "answers as the network does in ONNX Runtime" in capsys.readouterr().out
+    assert "ONNX Runtime predicts the same as the network" in capsys.readouterr().out
     assert names(tmp_path / "new") == ["a.onnx"]
     session = import_onnxruntime().InferenceSession(str(output), providers=["CPUExecutionProvider"])
     told = session.get_modelmeta().custom_metadata_map

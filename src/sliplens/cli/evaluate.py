@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(Command):
-    """Measure how well a network reads the safety margin, dry and wet.
+    """Measure how well a network predicts the safety margin, dry and wet.
 
     MSE, R2, MAE, the MSE in ten bins of the margin, by day and trial; whether its intervals hold, whether it knows when
     it does not know, how early it warns of a slip and how often in vain. With --baselines, what model-based estimators
@@ -37,7 +37,7 @@ class Evaluate(Command):
     baseline_trials: int = 40
     """How many training trials they are fitted on, spread evenly over those of the data set."""
     markers: str | None = None
-    """What markers look like: chromatouch, gelsight-mini, tactip or auto; by the sensor's name if not given."""
+    """Kind of markers: chromatouch, gelsight-mini, tactip or auto; by the sensor's name if not given."""
     device: Device = "cpu"
 
     def run(self) -> None:
@@ -57,9 +57,9 @@ class Evaluate(Command):
 
 
 def _print_scores(evaluation: "Evaluation") -> None:
-    known, trials = evaluation.known_trials, len(evaluation.trials)
-    if known:
-        say(f"  note: {known} of the {trials} trials trained or validated this network; its scores flatter it")
+    shared, trials = evaluation.known_trials, len(evaluation.trials)
+    if shared:
+        say(f"  note: {shared} of the {trials} trials trained or validated this network; its scores flatter it")
     print_table(
         f"{evaluation.input} images, {evaluation.split} trials",
         # so short that it fits into 80 columns
@@ -71,8 +71,8 @@ def _print_scores(evaluation: "Evaluation") -> None:
     if evaluation.sequence:
         say("several frames: each margin is read from those of its contact so far")
     if evaluation.ratio_r2:
-        told = (f"{name} {'none' if r2 is None else f'{r2:.3f}'}" for name, r2 in evaluation.ratio_r2.items())
-        say(f"F_t / F_n is read with R2 {', '.join(told)}")
+        scores = (f"{name} {'none' if r2 is None else f'{r2:.3f}'}" for name, r2 in evaluation.ratio_r2.items())
+        say(f"F_t / F_n is predicted with R2 {', '.join(scores)}")
     if evaluation.wet_auroc is not None:
         say(f"wet is told from dry by the network's own uncertainty: AUROC {evaluation.wet_auroc:.2f}")
     if evaluation.risk is not None:
@@ -81,12 +81,12 @@ def _print_scores(evaluation: "Evaluation") -> None:
 
 def _row(condition: str, evaluation: "Evaluation") -> tuple[str, ...]:
     scores, lead = evaluation.conditions[condition], evaluation.lead_times[condition]
-    held = evaluation.reliability[condition].coverage.get("0.9")
+    coverage = evaluation.reliability[condition].coverage.get("0.9")
     return (
         condition,
         f"{scores.frames:,}",
         *_errors(scores),
-        "-" if held is None else f"{100 * held:.0f} %",
+        "-" if coverage is None else f"{100 * coverage:.0f} %",
         "-" if lead.median_ms is None else f"{lead.median_ms:.0f} ms {lead.warned}/{lead.trials}",
         f"{lead.false_per_minute:.1f}",
     )

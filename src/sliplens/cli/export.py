@@ -45,8 +45,8 @@ class Export(Command):
 
         kinds = [name for name in ("onnx", "lerobot", "mcap") if getattr(self, name)]
         if len(kinds) != 1:
-            said = " and ".join(f"--{name}" for name in kinds) or "none"
-            raise InputError(f"say what to write with one of --onnx, --lerobot and --mcap, got {said}")
+            options = " and ".join(f"--{name}" for name in kinds) or "none"
+            raise InputError(f"choose what to write with one of --onnx, --lerobot and --mcap, got {options}")
         is_run, is_data = ((self.source / name).is_file() for name in ("manifest.json", DATASET_FILE))
         if self.onnx:
             if is_data and not is_run:
@@ -73,6 +73,6 @@ class Export(Command):
         trained = load(self.source)
         with OUT.status("Exporting and comparing"):
             export_onnx(trained, self.output, overwrite=self.overwrite)
-        kept = trained.manifest
-        about = f"{kept.backbone}, {kept.head} head, {kept.image_size} px, {kept.input} images"
-        wrote(self.output, f"{about}; answers as the network does in ONNX Runtime")
+        manifest = trained.manifest
+        about = f"{manifest.backbone}, {manifest.head} head, {manifest.image_size} px, {manifest.input} images"
+        wrote(self.output, f"{about}; ONNX Runtime predicts the same as the network")

@@ -24,8 +24,8 @@ class Train(Command):
     F_t / F_n, for where friction is told; its margins stay. sequence: teaches it to read several frames, beside one.
     The options below change it."""
     input: str | None = None
-    """What the network sees of a frame T_n and of the untouched sensor T_0. difference, unless --start-from sees
-    something else: |T_n - T_0|, each image divided by its own maximum. raw: T_n. signed: T_n - T_0. amplitude:
+    """Input of the network, made of a frame T_n and the untouched sensor T_0. difference, unless --start-from has
+    another: |T_n - T_0|, each image divided by its own maximum. raw: T_n. signed: T_n - T_0. amplitude:
     |T_n - T_0| as strong as it is. pair: T_n and T_0 side by side."""
     start_from: Path | None = None
     """Network whose weights to start from, a run or one that comes with sliplens: to teach it your own sensor, or to go
@@ -35,8 +35,8 @@ class Train(Command):
     backbone: str | None = None
     """A TorchVision classifier, such as resnet18."""
     head: Literal["point", "histogram", "margin-and-ratio"] | None = None
-    """What the network answers with: one number; a distribution, which tells how sure it is; or two, the second over
-    F_t / F_n, for where friction is told."""
+    """Output of the network: one number; a distribution, which shows its uncertainty; or two, the second over
+    F_t / F_n, for use with --friction."""
     image_size: int | None = None
     """Height and width of the network's input, in pixels."""
     epochs: int | None = None

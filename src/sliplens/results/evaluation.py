@@ -1,4 +1,4 @@
-"""What a network was trained on, how well it reads the safety margin, and where and why it fails."""
+"""Records of trainings, evaluations and diagnoses; none needs torch."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -39,7 +39,7 @@ PIXEL = Meta(ge=-1e5, le=1e5)
 
 @dataclass(frozen=True, kw_only=True)
 class OfNetwork:
-    """What was found of one network on some frames."""
+    """Result of one network on some frames."""
 
     input: str
     """Name of the encoding that the network sees."""
@@ -167,11 +167,11 @@ class LeadTimes:
     median_ms: float | None
     """From the first true alarm to the slip, over the warned trials; None if there is none."""
     ideal_ms: float | None
-    """The same for the true margin itself, over the trials that slip."""
+    """Median time from the first alarm of the true margin to the slip, over the trials that slip."""
     false_per_minute: Annotated[float, AMOUNT]
     """Alarms that begin while the true margin is above twice the threshold, by the minute of labelled touch."""
     threshold: Annotated[float, MARGIN]
-    """What a prediction is below at an alarm, in margin units."""
+    """Margin below which a prediction is an alarm, in margin units."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -212,7 +212,7 @@ class RiskCoverage:
         return self.error[reason][self.covered.index(share)]
 
     def __str__(self) -> str:
-        """What withholding a fifth of the frames gains, in one sentence."""
+        """Describe the gain of withholding a fifth of the frames, in one sentence."""
         words = {"known": "the least known", "spread": "the widest", "perfect": "the worst, which nobody knows"}
         parts = ", ".join(f"{100 * self.error_at(name, 0.8):.1f} ({words[name]})" for name in self.error)
         return (
@@ -284,9 +284,9 @@ class Evaluation:
     """Warnings by condition."""
     predictions: ScoredFrames
     friction: str = ""
-    """What the network was told of the coefficient of friction; empty where nothing was."""
+    """Coefficient of friction that the margins are conditioned on; empty if none."""
     sequence: bool = False
-    """Whether each margin was read from the frames of its contact so far, not from one alone."""
+    """True if each margin was predicted from the frames of its contact so far, not from a single frame."""
     ratio_r2: dict[str, float | None] = field(default_factory=dict)
     """R2 of the traction ratio F_t / F_n by condition; empty for a network that answers with the margin alone, None
     where the ratio does not vary or no force is known."""
@@ -326,7 +326,7 @@ class ErrorSlice:
     """Frames of one leaf of the tree, and their error on trials that the tree has not seen."""
 
     name: str
-    """What they have in common, in words."""
+    """Common property of the frames, in words."""
     frames: int
     trials: int
     error: float
@@ -337,7 +337,7 @@ class ErrorSlice:
 
     @property
     def holds(self) -> bool:
-        """Whether the error is larger there beyond the interval, on enough held-out trials."""
+        """True where the error is larger beyond the interval, on enough held-out trials."""
         return self.trials >= FEWEST_UNITS and self.excess.above_zero
 
 
@@ -364,7 +364,7 @@ class ExplainedErrors(ErrorTable):
 
 @dataclass(frozen=True, kw_only=True)
 class FrictionTable(Columns):
-    """The same press and pull with other frictions, a row a frame and friction, in margin units."""
+    """Frames filmed again with other frictions, a row a frame and friction, in margin units."""
 
     frame_id: Shaped[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
@@ -393,14 +393,14 @@ class Diagnosis(OfNetwork):
     """Where a network fails and why: slices of its errors, its markers, other frictions, kinds of explanations."""
 
     sentences: tuple[str, ...]
-    """What was found, with figures."""
+    """Findings, with figures."""
     left_out: str
-    """What could not be asked, and why; empty where all could."""
+    """Steps that were left out, and why; empty if none."""
     slices: tuple[ErrorSlice, ...]
     """Leaves of the tree, the largest error first."""
     slopes: tuple[FrictionSlope, ...]
     method: str
-    """What the maps show."""
+    """Quantity that the maps show."""
     errors: ErrorTable
     explained: ExplainedErrors
     frictions: FrictionTable

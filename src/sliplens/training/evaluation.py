@@ -318,8 +318,10 @@ def evaluate_frames(
         Labelled frames in the network's encoding and size, from `load_frames`.
     split
         Name of the frames in the result.
-    friction, sequence
-        As `evaluate` takes them.
+    friction
+        Coefficient of friction, as `evaluate` takes it.
+    sequence
+        If True, predict the frames of each trial in order.
     batch_size
         Frames in a batch.
 
