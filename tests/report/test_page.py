@@ -142,9 +142,8 @@ def test_simulation_alone_makes_a_page(build, workspace):
     assert "not run yet" not in text
 
 
-def test_what_carries_stands_before_what_warns(text):
-    assert text.index("What you can rely on") < text.index("What to be careful with") < text.index('class="alarms"')
-    assert 'class="caution"><dt>How far to trust D' in text.split("What to be careful with")[1]
+def test_what_limits_the_verdict_stands_before_it(text):
+    assert text.index("depends on the fill of a removed pixel") < text.index("Predicts the margin on dry objects")
 
 
 def test_scores_alone_make_a_page(build, workspace):

@@ -144,10 +144,17 @@ def test_verdict_comes_first_and_the_contents_lead_everywhere(reader):
 
 
 def test_all_five_claims_are_answered_for_both_networks(text):
-    answers = re.findall(r'<span class="badge ([a-z-]+)">', text)
+    table = text.split("<h3>The claims of the thesis</h3>")[1].split("</table>")[0]
+    outcomes = re.findall(r'<span class="badge ([a-z-]+)">', table)
 
-    # (b) compares both networks and has one answer; of methods that the thesis did not run it holds nothing
-    assert answers == ["undecided"] * (2 + 1 + 2 + 2) + ["holds"] * 2
+    # the second compares both networks and has one row; without the methods of the thesis nothing is decided
+    assert outcomes == ["undecided"] * (2 + 1 + 2 + 2) + ["holds"] * 2
+
+
+def test_which_explanation_to_believe_is_the_first_table(text):
+    first = text.split("<h2>Verdict</h2>")[1].split("</table>")[0]
+    assert "Which explanation to believe" in first
+    assert re.search(r'<td class="name">Poly-CAM</td>.*badge holds', first)
 
 
 def test_caption_of_the_bins_is_their_largest_error(caption, numbers):

@@ -6,8 +6,9 @@ Polak, *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile 
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, TypeVar
+from dataclasses import replace
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from sliplens.plots.style import (
     listed,
     method_name,
     percent,
+    signed,
     tell_ends,
 )
 from sliplens.progress import number_of
@@ -30,175 +32,112 @@ from sliplens.report.comparisons import (
     gap_from,
     mean_at,
     removal_by_setting,
-    sentence,
     share_of_strongest,
-    tell_interval,
     voting_settings,
 )
 from sliplens.report.results import Results
+from sliplens.report.verdict import OPPOSITE, Finding, Outcome, Row, Verdict, all_of, judge_gap, most_of, write_ends
 from sliplens.results.faithfulness import DeletionCurve, RemovalScores
 from sliplens.results.study import MapQuality, Truth
 
-Outcome = Literal["holds", "does not hold", "undecided"]
 Record = TypeVar("Record")
-_OPPOSITE: dict[Outcome, Outcome] = {"holds": "does not hold", "does not hold": "holds"}
-_UNSCORED = "its explanations were not scored; `sliplens study` does that"
-POLY_CAM, GRAD_CAM, NOISY = (f"{one}{AS_RUN}" for one in ("poly-cam", "grad-cam", "integrated-gradients"))
-"""What the thesis compared, as it was published and run: its claims are of these, and rest on no others."""
+POLY_CAM, GRAD_CAM, NOISY = (f"{method}{AS_RUN}" for method in ("poly-cam", "grad-cam", "integrated-gradients"))
+"""Methods as the thesis ran them: its claims are of these alone."""
 _RIVALS = (GRAD_CAM, NOISY)
-_MEASURES = {"total_variation": "total variation", "noise_stability": "stability under sensor noise"}
 _SMALL_AREA = 0.05
 
 
-@dataclass(frozen=True, kw_only=True)
-class Finding:
-    """One comparison: where, of what, its number with an interval if there is one, and what it says of the claim."""
-
-    where: str
-    """Fill and unit, or the score."""
-    compared: str
-    gap: Difference | None = None
-    value: str = ""
-    """Number where no interval is kept."""
-    outcome: Outcome | None = None
-    """None where the comparison is told but does not decide."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Answer:
-    """What one network, or two together, say of a claim."""
-
-    subject: str
-    outcome: Outcome
-    text: str
-    findings: tuple[Finding, ...] = ()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Claim:
-    """A claim of the thesis, in our words, with an answer for each network."""
-
-    layout: ClassVar[str] = "claim"
-
-    id: str
-    title: str
-    test: str
-    answers: tuple[Answer, ...]
-
-
-def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Claim, ...]:
-    """Test every claim; where the results it needs are not there, it stays undecided and says why."""
+def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Verdict, ...]:
+    """Test every claim of the thesis; it stays undecided and says why where results are missing."""
     study = results.study
-
-    def against_rivals(faithful: RemovalScores) -> Answer:
-        return _beats_rivals(faithful, results, rng=rng)
-
-    def against_chance(faithful: RemovalScores) -> Answer:
-        return _no_better(faithful, study.truth.get(faithful.input), rng=rng)
-
-    return (
-        Claim(
-            id="most-faithful",
-            title="Poly-CAM is the most faithful of the three methods",
-            test="Tested by the symmetric relevance gain (SRG): holds under a fill where Poly-CAM's is larger than "
+    unscored = "its explanations were not scored; `sliplens study` does that"
+    unmeasured = "the looks of the maps were not measured; `sliplens study` does that"
+    unknown = "only simulated touch tells what each marker does, and no such result is here"
+    claims: list[tuple[str, str, str, list[Row]]] = [
+        (
+            "most-faithful",
+            "Poly-CAM is the most faithful of the three methods",
+            "Tested by the symmetric relevance gain (SRG): holds under a fill where Poly-CAM's is larger than "
             "both others' and the 95 % interval of each difference leaves zero out.",
-            answers=_of_each(results, study.faithfulness, against_rivals, why=_UNSCORED),
+            _each(results, study.faithfulness, partial(_beats_rivals, results=results, rng=rng), why=unscored),
         ),
-        Claim(
-            id="difference",
-            title="Difference images give more faithful explanations than raw images",
-            test="Tested on the same frames, evidence lost in margin units: holds under a fill where the SRG averaged "
+        (
+            "difference",
+            "Difference images give more faithful explanations than raw images",
+            "Tested on the same frames, evidence lost in margin units: holds under a fill where the SRG averaged "
             "over the methods is larger for difference images, beyond the 95 % interval.",
-            answers=(_compare_inputs(results, rng=rng),),
+            [_compare_inputs(results, rng=rng)],
         ),
-        Claim(
-            id="grad-cam",
-            title="Grad-CAM is not faithful",
-            test="Tested against maps that know nothing of the network: holds under a fill where Grad-CAM's SRG lies "
+        (
+            "grad-cam",
+            "Grad-CAM is not faithful",
+            "Tested against maps that know nothing of the network: holds under a fill where Grad-CAM's SRG lies "
             "below chance or below the best control for sure; does not hold where it lies above both for sure.",
-            answers=_of_each(results, study.faithfulness, against_chance, why=_UNSCORED),
+            _each(results, study.faithfulness, partial(_no_better, results=results, rng=rng), why=unscored),
         ),
-        Claim(
-            id="noisy",
-            title="Integrated Gradients is noisy",
-            test="Tested by numbers: holds where its maps have a larger total variation than those of the other "
-            "two, beyond the 95 % interval. Their stability under sensor noise is told beside it and decides nothing: "
+        (
+            "noisy",
+            "Integrated Gradients is noisy",
+            "Tested by numbers: holds where its maps have a larger total variation than those of the other "
+            "two, beyond the 95 % interval. Their stability under sensor noise decides nothing: "
             "means over a few frames have no interval.",
-            answers=_of_each(
-                results,
-                study.map_quality,
-                _noisiest,
-                why="the looks of the maps were not measured; `sliplens study` does that",
-            ),
+            _each(results, study.map_quality, _noisiest, why=unmeasured),
         ),
-        Claim(
-            id="two-markers",
-            title="The network looks at the edges of two markers",
-            test="Tested on simulated touch in two parts, both needed: putting back a marker at a time, the strongest "
-            "two hold more than half of all change of the answer; and Poly-CAM's relevance lies on marker edges more "
-            "than their share of the image.",
-            answers=_of_each(
-                results,
-                study.truth,
-                lambda truth: _looks_at_two(truth, rng=rng),
-                why="only simulated touch tells what each marker does, and no such result is here",
-            ),
+        (
+            "two-markers",
+            "The network looks at the edges of two markers",
+            "Tested on simulated touch in two parts, both needed: putting back a marker at a time, the strongest "
+            "two hold more than half of all change of the prediction; and Poly-CAM's relevance lies on marker edges "
+            "more than their share of the image.",
+            _each(results, study.truth, partial(_looks_at_two, rng=rng), why=unknown),
         ),
+    ]
+    return tuple(
+        Verdict(id=key, title=title, test=test, rows=tuple(replace(row, claim=title) for row in rows))
+        for key, title, test, rows in claims
     )
 
 
-def judge_gap(gap: Difference | None) -> Outcome:
-    """Positive for sure, negative for sure, or neither."""
-    if gap is None or not gap.sure:
-        return "undecided"
-    return "holds" if gap.estimate > 0 else "does not hold"
-
-
-def all_of(outcomes: Iterable[Outcome]) -> Outcome:
-    """Join parts that must all hold: one that does not is enough."""
-    found = set(outcomes)
-    if "does not hold" in found:
-        return "does not hold"
-    return "holds" if found == {"holds"} else "undecided"
-
-
-def most_of(outcomes: Sequence[Outcome]) -> Outcome:
-    """Join settings: more than half of them agree, and none says the opposite."""
-    for outcome, opposite in _OPPOSITE.items():
-        if 2 * outcomes.count(outcome) > len(outcomes) and opposite not in outcomes:
-            return outcome
-    return "undecided"
-
-
-def _of_each(
-    results: Results, found: Mapping[str, Record], judge: Callable[[Record], Answer], *, why: str
-) -> tuple[Answer, ...]:
-    """Answer for each network, raw images last; one without a result stays open, and why."""
+def _each(results: Results, records: Mapping[str, Record], judge: Callable[[Record], Row], *, why: str) -> list[Row]:
+    """Judge each network; one without a record stays undecided."""
     names = inputs_in_order(results.study.inputs)[::-1]
-    return tuple(judge(found[name]) if name in found else _untested(input_name(name), why) for name in names)
+    return [judge(records[name]) if name in records else _untested(input_name(name), why) for name in names]
 
 
-def _untested(subject: str, why: str) -> Answer:
-    return Answer(subject=subject, outcome="undecided", text=f"Not tested: {why}.")
+def _untested(subject: str, why: str, findings: Iterable[Finding] = ()) -> Row:
+    sentence = f"Not tested: {why}."
+    return Row(claim="", subject=subject, outcome="undecided", sentence=sentence, findings=tuple(findings))
 
 
-def _over_fills(
-    subject: str, by_setting: dict[str, Outcome], findings: list[Finding], voting: Sequence[tuple[str, str]]
-) -> Answer:
-    """Answer by what holds under most fills that vote (`voting_settings`), with the intervals of the first."""
-    by_vote = [fill_name(*one) for one in voting]
-    findings = [replace(one, outcome=one.outcome if one.where in by_vote else None) for one in findings]
-    by_setting = {name: own for name, own in by_setting.items() if name in by_vote}
-    if not by_setting:
+def _decide(
+    subject: str,
+    by_setting: Mapping[str, Outcome],
+    findings: Iterable[Finding],
+    voting: Sequence[tuple[str, str]],
+) -> Row:
+    """Decide by most of the fills that vote; the number is that of the first."""
+    votes: dict[str, Outcome] = {
+        name: by_setting[name] for name in (fill_name(*setting) for setting in voting) if name in by_setting
+    }
+    findings = [replace(one, outcome=one.outcome if one.where in votes else None) for one in findings]
+    if not votes:
         why = "under no fill that was scored does a map made from the truth win for sure"
-        return replace(_untested(subject, why), findings=tuple(findings))
-    names = {found: [name for name, own in by_setting.items() if own == found] for found in (*_OPPOSITE, "undecided")}
-    text = sentence("; ".join(f"{outcome} under {listed(where)}" for outcome, where in names.items() if where))
-    first = next(one.where for one in findings if one.where in by_setting)
-    told = [f"{one.compared}: {tell_interval(one.gap)}" for one in findings if one.gap and one.where == first]
-    text += f" Under {first}, {'; '.join(told)}." if told else " "
-    outcome = most_of(list(by_setting.values()))
-    return Answer(subject=subject, outcome=outcome, text=text, findings=tuple(findings))
+        return _untested(subject, why, findings)
+    by_outcome = {
+        outcome: [name for name, vote in votes.items() if vote == outcome] for outcome in (*OPPOSITE, "undecided")
+    }
+    parts = [f"{outcome} under {listed(names)}" for outcome, names in by_outcome.items() if names]
+    first = next(finding for finding in findings if finding.where in votes)
+    sentence = "; ".join(parts)
+    return Row(
+        claim="",
+        subject=subject,
+        outcome=most_of(list(votes.values())),
+        sentence=f"{sentence[:1].upper()}{sentence[1:]}. Number: {first.compared}, {first.where}.",
+        number="" if first.gap is None else signed(first.gap.estimate, 3),
+        interval=write_ends(first.gap),
+        findings=tuple(findings),
+    )
 
 
 def _judged(where: str, gaps: Mapping[str, Difference | None]) -> list[Finding]:
@@ -208,144 +147,148 @@ def _judged(where: str, gaps: Mapping[str, Difference | None]) -> list[Finding]:
 def _by_thesis_score(
     pairs: Mapping[str, tuple[DeletionCurve, DeletionCurve]], *, rng: np.random.Generator
 ) -> list[Finding]:
+    where, direction = "score of the thesis", "(below zero = more faithful)"
     return [
-        Finding(
-            where="score of the thesis",
-            compared=f"{compared} (below zero = more faithful)",
-            gap=compare_deletion(*pair, rng=rng),
-        )
+        Finding(where=where, compared=f"{compared} {direction}", gap=compare_deletion(*pair, rng=rng))
         for compared, pair in pairs.items()
     ]
 
 
-def _beats_rivals(faithful: RemovalScores, results: Results, *, rng: np.random.Generator) -> Answer:
-    findings, by_setting, subject, method = [], {}, input_name(faithful.input), POLY_CAM
-    name = method_name(method)
+def _beats_rivals(faithful: RemovalScores, *, results: Results, rng: np.random.Generator) -> Row:
+    findings, subject, name = [], input_name(faithful.input), method_name(POLY_CAM)
+    by_setting: dict[str, Outcome] = {}
     for where, curves in removal_by_setting(faithful):
-        rivals = [one for one in _RIVALS if {one, method} <= set(curves)]
-        if len(rivals) == len(_RIVALS):
-            gaps = {one: compare_gain((curves[method], curves[one]), rng=rng) for one in rivals}
+        if {POLY_CAM, *_RIVALS} <= set(curves):
+            gaps = {rival: compare_gain((curves[POLY_CAM], curves[rival]), rng=rng) for rival in _RIVALS}
             by_setting[where] = all_of(judge_gap(gap) for gap in gaps.values())
-            findings += _judged(where, {f"SRG, {name} less {method_name(one)}": gap for one, gap in gaps.items()})
+            findings += _judged(where, {f"SRG, {name} less {method_name(rival)}": gap for rival, gap in gaps.items()})
     if not by_setting:
         return _untested(subject, "the thesis's three methods, as it ran them, were not scored together")
-    scored = next((one.curves for (own, _), one in results.scores.items() if own == faithful.input), {})
-    rivals = [one for one in _RIVALS if {one, method} <= set(scored)]
-    pairs = {f"D, {name} less {method_name(one)}": (scored[method], scored[one]) for one in rivals}
+    scored = next((record.curves for (key, _), record in results.scores.items() if key == faithful.input), {})
+    rivals = [rival for rival in _RIVALS if {rival, POLY_CAM} <= set(scored)]
+    pairs = {f"D, {name} less {method_name(rival)}": (scored[POLY_CAM], scored[rival]) for rival in rivals}
     findings += _by_thesis_score(pairs, rng=rng)
-    voting = voting_settings(faithful, results.study.truth.get(faithful.input))
-    return _over_fills(subject, by_setting, findings, voting)
+    return _decide(subject, by_setting, findings, voting_settings(faithful, results.study.truth.get(faithful.input)))
 
 
-def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Answer:
-    findings, by_setting, found = [], {}, results.study.faithfulness
+def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Row:
+    findings, by_setting, records = [], {}, results.study.faithfulness
     studied = results.study.inputs
     names = [name for name in ("difference", "raw") if name in studied] or inputs_in_order(studied)
     subject = listed([input_name(name).lower() for name in names]).capitalize()
-    if not {"difference", "raw"} <= set(found):
-        scored = listed([input_name(name).lower() for name in inputs_in_order(found)] or ["none"])
+    if not {"difference", "raw"} <= set(records):
+        scored = listed([input_name(name).lower() for name in inputs_in_order(records)] or ["none"])
         return _untested(subject, f"it compares difference images with raw ones, and scored were {scored}")
-    difference, raw = found["difference"], dict(removal_by_setting(found["raw"]))
+    difference, raw = records["difference"], dict(removal_by_setting(records["raw"]))
     for where, curves in removal_by_setting(difference):
-        methods = [one for one in (*_RIVALS, POLY_CAM) if one in curves and one in raw.get(where, {})]
-        if methods:
-            pairs = {one: (curves[one], raw[where][one]) for one in methods}
+        pairs = {
+            method: (curves[method], raw[where][method])
+            for method in (*_RIVALS, POLY_CAM)
+            if method in curves and method in raw.get(where, {})
+        }
+        if pairs:
             gap = compare_gain(*pairs.values(), rng=rng)
             by_setting[where] = judge_gap(gap)
             findings += _judged(where, {f"SRG, mean of {number_of(len(pairs), 'method')}, difference less raw": gap})
-            for one, pair in pairs.items():
-                compared = f"SRG of {method_name(one)}, difference less raw"
-                findings.append(Finding(where=where, compared=compared, gap=compare_gain(pair, rng=rng)))
+            findings += [
+                Finding(
+                    where=where,
+                    compared=f"SRG of {method_name(method)}, difference less raw",
+                    gap=compare_gain(pair, rng=rng),
+                )
+                for method, pair in pairs.items()
+            ]
     if not by_setting:
         return _untested(subject, "no method was scored on both inputs under one fill")
-    first, second = (
-        results.scores[name, results.study.source].curves if (name, results.study.source) in results.scores else {}
-        for name in ("difference", "raw")
-    )
-    methods = [one for one in (*_RIVALS, POLY_CAM) if one in first and one in second]
-    pairs = {f"D of {method_name(one)}, difference less raw": (first[one], second[one]) for one in methods}
-    voting = voting_settings(difference, *results.study.truth.values())
-    return _over_fills(subject, by_setting, [*findings, *_by_thesis_score(pairs, rng=rng)], voting)
+    keys = [(name, results.study.source) for name in ("difference", "raw")]
+    first, second = (results.scores[key].curves if key in results.scores else {} for key in keys)
+    methods = [method for method in (*_RIVALS, POLY_CAM) if method in first and method in second]
+    scored = {f"D of {method_name(one)}, difference less raw": (first[one], second[one]) for one in methods}
+    findings += _by_thesis_score(scored, rng=rng)
+    return _decide(subject, by_setting, findings, voting_settings(difference, *results.study.truth.values()))
 
 
-def _no_better(faithful: RemovalScores, truth: Truth | None, *, rng: np.random.Generator) -> Answer:
+def _no_better(faithful: RemovalScores, *, results: Results, rng: np.random.Generator) -> Row:
     findings, by_setting, subject, name = [], {}, input_name(faithful.input), method_name(GRAD_CAM)
-    leads = {fill_name(*one.key[:2]): one.lead_over_controls for one in faithful.scores if one.method == GRAD_CAM}
+    leads = {
+        fill_name(*score.key[:2]): score.lead_over_controls for score in faithful.scores if score.method == GRAD_CAM
+    }
     for where, curves in removal_by_setting(faithful):
-        own = curves.get(GRAD_CAM)
-        if own is None:
+        curve = curves.get(GRAD_CAM)
+        if curve is None:
             continue
-        nothing = mean_interval(own.srg, clusters=own.clusters, rng=rng)
-        gaps: dict[str, Difference] = {"chance": nothing}
+        gaps = {"chance": mean_interval(curve.srg, clusters=curve.clusters, rng=rng)}
         if (lead := leads.get(where)) is not None:
             gaps[method_name(lead.control)] = lead.gap
         # not faithful is what is claimed: a gain for sure speaks against it
-        by_setting[where] = _OPPOSITE.get(all_of(judge_gap(gap) for gap in gaps.values()), "undecided")
-        findings += [Finding(where=where, compared=f"SRG, {name} less {one}", gap=gap) for one, gap in gaps.items()]
-        most, chance = mean_at(own, _SMALL_AREA)
+        by_setting[where] = OPPOSITE.get(all_of(judge_gap(gap) for gap in gaps.values()), "undecided")
+        findings += [Finding(where=where, compared=f"SRG, {name} less {other}", gap=gap) for other, gap in gaps.items()]
+        most, chance = mean_at(curve, _SMALL_AREA)
         compared = f"change once {percent(_SMALL_AREA)} of the image is gone, against random order"
         findings.append(Finding(where=where, compared=compared, value=f"{most:.3f} against {chance:.3f}"))
     if not by_setting:
         return _untested(subject, f"{name} was not scored")
-    return _over_fills(subject, by_setting, findings, voting_settings(faithful, truth))
+    voting = voting_settings(faithful, results.study.truth.get(faithful.input))
+    return _decide(subject, by_setting, findings, voting)
 
 
-def _noisiest(looks: MapQuality) -> Answer:
-    subject, findings, parts = input_name(looks.input), [], []
-    rougher: Outcome = "undecided"
-    for measure, name in _MEASURES.items():
-        values = {
-            method: value
-            for method, found in looks.methods.items()
-            if method.endswith(AS_RUN) and (value := getattr(found, measure)) is not None
-        }
-        own = values.pop(NOISY, None)
-        if measure != "total_variation" and (own is None or not values):
-            continue  # it decides nothing
-        if own is None or not values:
-            return _untested(subject, f"{name} of {method_name(NOISY)} and of another method are not both known")
-        if measure == "total_variation":
-            gaps = {
-                f"{method_name(NOISY)} less {method_name(method)}": gap_from(one, NOISY)
-                for method in values
-                for one in looks.comparisons
-                if {one.first, one.second} == {NOISY, method}
-            }
-            rougher = all_of(judge_gap(gap) for gap in gaps.values())
-            findings += _judged(name, gaps)
-        others = listed([f"{method_name(method)} {decimals(value, 3)}" for method, value in values.items()])
-        parts.append(f"{name} {decimals(own, 3)} ({others})")
-        if measure != "total_variation":
-            compared = f"{method_name(NOISY)} against {others}"
-            findings.append(Finding(where=name, compared=compared, value=decimals(own, 3), outcome="undecided"))
-    return Answer(subject=subject, outcome=rougher, text=sentence(listed(parts)), findings=tuple(findings))
+def _noisiest(looks: MapQuality) -> Row:
+    subject, name = input_name(looks.input), method_name(NOISY)
+    rivals = [method for method in looks.methods if method.endswith(AS_RUN) and method != NOISY]
+    methods = [method for method in (*rivals, NOISY) if method in looks.methods]
+    variation = {method: looks.methods[method].total_variation for method in methods}
+    rivals = [method for method in rivals if variation[method] is not None]
+    if variation.get(NOISY) is None or not rivals:
+        return _untested(subject, f"total variation of {name} and of another method are not both known")
+    gaps = {
+        f"{name} less {method_name(method)}": gap_from(pair, NOISY)
+        for method in rivals
+        for pair in looks.comparisons
+        if {pair.first, pair.second} == {NOISY, method}
+    }
+    findings = _judged("total variation", gaps)
+    stability = {method: looks.methods[method].noise_stability for method in (NOISY, *rivals)}
+    findings += [
+        Finding(where="stability under sensor noise", compared=method_name(method), value=decimals(value, 3))
+        for method, value in stability.items()
+        if value is not None
+    ]
+    others = listed([f"{method_name(method)} {decimals(variation[method], 3)}" for method in rivals])
+    return Row(
+        claim="",
+        subject=subject,
+        outcome=all_of(judge_gap(gap) for gap in gaps.values()),
+        sentence=f"Total variation of its maps, against {others}.",
+        number=decimals(variation[NOISY], 3),
+        findings=tuple(findings),
+    )
 
 
-def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Answer:
+def _looks_at_two(truth: Truth, *, rng: np.random.Generator) -> Row:
     share = share_of_strongest(truth.effects, count=2, rng=rng)
-    two, told = judge_gap(None), "no marker changes the answer"
+    above_half = None
     if share is not None:
         # of a single trial there are no ends
-        known = {name: end for name in ("estimate", "low", "high") if (end := getattr(share, name)) is not None}
-        two = judge_gap(replace(share, **{name: end - 0.5 for name, end in known.items()}))
-        told = f"{percent(share.estimate)} of the change of the answer ({tell_ends(share, percent)})"
-    found, area = truth.methods.get(POLY_CAM), truth.areas["edges"]
-    mass, gap = (None, None) if found is None else (found.mass["edges"], found.edges)
-    on_edges, on_edges_told = judge_gap(gap), "No map of the thesis's Poly-CAM was held against the truth."
-    if mass is not None:
-        on_edges_told = (
-            f"{method_name(POLY_CAM)} puts {percent(mass)} of its relevance on edges, which cover {percent(area)} of "
-            "the image."
-        )
-    marked = Finding(
-        where="each marker put back", compared="share of the two strongest markers", gap=share, outcome=two
-    )
-    massed = Finding(
-        where="relevance mass", compared=f"on edges, less their {percent(area)} of the image", gap=gap, outcome=on_edges
-    )
-    return Answer(
+        ends = {name: end for name in ("estimate", "low", "high") if (end := getattr(share, name)) is not None}
+        above_half = replace(share, **{name: end - 0.5 for name, end in ends.items()})
+    method, area = truth.methods.get(POLY_CAM), truth.areas["edges"]
+    mass, gap = (None, None) if method is None else (method.mass["edges"], method.edges)
+    name, count = method_name(POLY_CAM), len(np.unique(truth.effects.marker))
+    on_edges = f"{name} puts {percent(mass)} of its relevance on edges, which cover {percent(area)} of the image"
+    if mass is None:
+        on_edges = f"no map of {name} was compared with the truth"
+    outcomes = judge_gap(above_half), judge_gap(gap)
+    where, compared = "each marker put back", "share of the two strongest markers"
+    massed = f"on edges, less their {percent(area)} of the image"
+    return Row(
+        claim="",
         subject=input_name(truth.input),
-        outcome=all_of((two, on_edges)),
-        text=f"The two strongest of up to {len(np.unique(truth.effects.marker))} markers hold {told}. {on_edges_told}",
-        findings=(marked, massed),
+        outcome=all_of(outcomes),
+        sentence=f"Share of the change that the two strongest of up to {count} markers hold; {on_edges}.",
+        number="" if share is None else percent(share.estimate),
+        interval="" if share is None else tell_ends(share, percent),
+        findings=(
+            Finding(where=where, compared=compared, gap=share, outcome=outcomes[0]),
+            Finding(where="relevance mass", compared=massed, gap=gap, outcome=outcomes[1]),
+        ),
     )

@@ -169,11 +169,6 @@ def mean_at(curve: RemovalCurve, area: float) -> tuple[float, float]:
     return most, chance
 
 
-def sentence(text: str) -> str:
-    """Write a text as a sentence."""
-    return f"{text[:1].upper()}{text[1:]}."
-
-
 def tell_sample(choice: Choice, name: str = "") -> str:
     """Write how wrong the explained answers are, and how many trials are read well enough; of one network, if named."""
     names = [name] if name in choice.mean_error else style.inputs_in_order(choice.mean_error)[::-1]

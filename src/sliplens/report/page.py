@@ -16,13 +16,13 @@ from markupsafe import Markup, escape
 
 from sliplens.errors import InputError
 from sliplens.plots.style import written_whole
-from sliplens.report.claims import Claim
+from sliplens.report.alarms import count_alarms
 from sliplens.report.comparisons import CITATION, tell_interval
 from sliplens.report.pictures import plate_strip
 from sliplens.report.plates import FOLDER, Plate, write_plates
 from sliplens.report.results import Results, load_results
 from sliplens.report.sections import Section, build_sections
-from sliplens.report.verdict import Statement, count_alarms, judge, tell_too_few
+from sliplens.report.verdict import Verdict, cautions, judge
 from sliplens.results.study import Study
 
 PAGE = "report.html"
@@ -72,10 +72,10 @@ def write_report(
     # one stream, seeded: the same results give the same intervals
     rng = np.random.default_rng(0)
     sections = build_sections(results, rng=rng)
-    claims = [block for section in sections for block in section.blocks if isinstance(block, Claim)]
-    statements = judge(results, claims=claims, rng=rng)
+    claims = [block for section in sections for block in section.blocks if isinstance(block, Verdict)]
+    verdict = judge(results, claims=claims, rng=rng)
     opening = None if results.strip is None else plate_strip(results.strip)
-    text = _render(results, statements, sections, opening=opening, waiting_for=waiting_for)
+    text = _render(results, verdict, sections, opening=opening, waiting_for=waiting_for)
     plates = [] if opening is None else [opening]
     plates += [block for section in sections for block in section.blocks if isinstance(block, Plate)]
     # the figures first: a page that is there has all that it names
@@ -87,7 +87,7 @@ def write_report(
 
 def _render(
     results: Results,
-    statements: tuple[Statement, ...],
+    verdict: tuple[Verdict, ...],
     sections: tuple[Section, ...],
     *,
     opening: Plate | None,
@@ -104,9 +104,8 @@ def _render(
         thesis=CITATION,
         waiting_for=waiting_for,
         opening=opening,
-        too_few=tell_too_few(results),
-        carrying=[one for one in statements if one.tone != "caution"],
-        warning=[one for one in statements if one.tone == "caution"],
+        verdict=verdict,
+        cautions=cautions(results),
         alarms=[*results.notes, *([mixed] if len(versions) > 1 else []), *count_alarms(results)],
         sections=sections,
         study=bool(results.study),

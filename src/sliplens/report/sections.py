@@ -9,13 +9,14 @@ import numpy as np
 from sliplens.plots.style import input_name, inputs_in_order
 from sliplens.progress import number_of
 from sliplens.report import charts, pictures, tables
-from sliplens.report.claims import Claim, judge_claims
+from sliplens.report.alarms import alarms_of, group_alarms
+from sliplens.report.claims import judge_claims
 from sliplens.report.comparisons import tell_sample
 from sliplens.report.diagnosis import show_diagnosis
 from sliplens.report.grip import show_grip
 from sliplens.report.plates import Plate, explained_of
 from sliplens.report.results import Results
-from sliplens.report.verdict import alarms_of, group_alarms
+from sliplens.report.verdict import Verdict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +31,7 @@ class Notes:
     tone: Literal["plain", "caution"] = "plain"
 
 
-Block = tables.Table | Plate | Claim | Notes
+Block = tables.Table | Plate | Verdict | Notes
 """Laid out by the template's macro of the name `layout`."""
 
 

@@ -1,19 +1,16 @@
-"""The verdict: what to believe about these networks, on which evidence, and what would overturn it."""
+"""The verdict: tables of claims about methods and networks, each with its number, interval and outcome."""
 
-import re
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.stats import binomtest
 
-from sliplens.grip.records import Grip
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.plots.style import (
-    FILL_NAMES,
     conditions_in_order,
     decimals,
     fill_name,
@@ -22,114 +19,161 @@ from sliplens.plots.style import (
     listed,
     method_name,
     methods_in_order,
-    name_methods,
     percent,
-    short_input_name,
     signed,
     source_name,
+    tell_ends,
 )
 from sliplens.progress import number_of
-from sliplens.report.claims import POLY_CAM, Claim
 from sliplens.report.comparisons import (
     NETWORK_PIXELS,
     against_control,
     compare_errors,
     gap_from,
-    sentence,
     tell_interval,
     tell_sample,
-    unfit_fills,
     voting_settings,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import Explanation
-from sliplens.results.faithfulness import CHANCE, DeletionScores, Lead, RemovalScores
+from sliplens.results.faithfulness import CHANCE, Lead, RemovalScores
 from sliplens.results.study import Localisation, Truth
 
-Tone = Literal["good", "plain", "caution"]
+Outcome = Literal["holds", "does not hold", "undecided"]
+OPPOSITE: dict[Outcome, Outcome] = {"holds": "does not hold", "does not hold": "holds"}
+"""Outcome of the opposite claim, where one is decided."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Statement:
-    """One finding: its topic, what is said, and whether it carries, is plain, or warns."""
+class Finding:
+    """Comparison behind a row of the verdict."""
 
-    topic: str
-    text: str
-    tone: Tone = "plain"
+    where: str
+    """Fill and unit, or the score."""
+    compared: str
+    gap: Difference | None = None
+    value: str = ""
+    """Number where there is no interval."""
+    outcome: Outcome | None = None
+    """None where the comparison does not decide."""
 
-    @property
-    def parts(self) -> tuple[str, str]:
-        """The first sentence, which carries the finding, and the others."""
-        first, _, others = re.sub(r"(?<=[.:]) ", "\n", self.text, count=1).partition("\n")
-        return first, others
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """Claim about a method or network with its evidence."""
+
+    claim: str
+    subject: str
+    """Network, or networks, by their inputs."""
+    outcome: Outcome | None
+    """None where the number is reported but nothing is claimed."""
+    sentence: str
+    number: str = ""
+    interval: str = ""
+    """Ends of the 95 % interval."""
+    findings: tuple[Finding, ...] = ()
 
 
-def judge(results: Results, *, claims: Sequence[Claim] = (), rng: np.random.Generator) -> tuple[Statement, ...]:
-    """State what the results show: which explanation to look at, which claims of the thesis hold, who reads how well.
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Table of claims that were tested alike."""
 
-    What carries comes first, then what warns, each in that order; what was not run is left out. Where the sample holds
-    trials that do not qualify, nothing carries for sure: an explanation of a wrong answer explains the error.
-    """
-    study, statements = results.study, []
-    for name in inputs_in_order(study.inputs)[::-1] if study else ():
-        truth, faithful = study.truth.get(name), study.faithfulness.get(name)
-        topic = f"What to believe, {input_name(name).lower()}"
-        if truth is not None and (choice := recommend(truth)) is not None:
-            found = _tell_recommended(topic, choice, truth, faithful)
-        elif faithful is not None:
-            found = replace(_believe(faithful, results), topic=topic)
-        else:
-            text = "Not known: the explanations were not scored; `sliplens study` does that."
-            found = Statement(topic=topic, text=text, tone="caution")
-        sample = "" if study.choice is None else f" {tell_sample(study.choice, name)}"
-        statements.append(replace(found, text=found.text + sample))
-    statements += _tell_claims(claims, results)
-    statements += _accuracy(results)
-    statements += _winners(results, rng=rng)
-    # a study's sound scores say more than deletion does
-    if not study:
-        statements += [
-            _faithfulness(results.scores[key], rng=rng)
-            for key in sorted(results.scores, key=lambda key: (key[1] == "real", key[0] != "raw", key))
+    layout: ClassVar[str] = "claim"
+
+    id: str
+    title: str
+    test: str
+    """Meaning of the number, and when a claim holds."""
+    rows: tuple[Row, ...]
+
+
+def judge(results: Results, *, claims: Sequence[Verdict] = (), rng: np.random.Generator) -> tuple[Verdict, ...]:
+    """Judge everything that a workspace holds, with the claims of the thesis; tables without a row are left out."""
+    study = results.study
+    tables = [_judge_methods(results)] if study else []
+    tables.append(
+        Verdict(
+            id="thesis",
+            title="The claims of the thesis",
+            test="Tested with its methods as published, on networks and data of our own: its network and most of its "
+            "data are not here, so that a claim may fail for those reasons too. All comparisons stand below.",
+            rows=tuple(row for claim in claims for row in claim.rows),
+        )
+    )
+    tables += [_judge_networks(results, rng=rng), _judge_real_touch(results)]
+    # the removal curves of a study say more than deletion does
+    tables += [] if study else [_judge_deletion(results, rng=rng)]
+    tables += [] if results.grip is None else [_judge_grip(results)]
+    return tuple(table for table in tables if table.rows)
+
+
+def cautions(results: Results) -> tuple[str, ...]:
+    """Return what limits every row of the verdict: few trials, an unsound sample, the fill, the scale."""
+    choice, found = results.study.choice, []
+    if choice is not None and len(choice.trials) < FEWEST_UNITS:
+        found.append(
+            f"This study explains {number_of(len(choice.trials), 'trial')}, and fewer than {FEWEST_UNITS} decide "
+            "nothing: below is how explanations are judged, not yet which one to believe."
+        )
+    if choice is not None and not choice.sound:
+        found.append(f"{tell_sample(choice)} An explanation of a wrong prediction explains the error.")
+    if results.scores and not results.study:
+        last = [
+            f"{np.mean([score.last_step_mean for score in scored.methods.values()]):.2f} "
+            f"({input_name(name).lower()}, {source_name(source)}, {scored.fill})"
+            for (name, source), scored in sorted(results.scores.items())
         ]
-        if results.scores:
-            statements.append(_what_deletion_measures(results))
-    real = {name: one for (name, source), one in results.explanations.items() if source == "real"}
-    statements += [_real_touch(real[name]) for name in inputs_in_order(real)]
-    statements += [_tell_grip(results.grip)] if results.grip is not None else []
-    statements += _tell_scale(results)
-    if study.choice is not None and not study.choice.sound:
-        statements = [replace(one, tone="plain") if one.tone == "good" else one for one in statements]
-    return tuple(sorted(statements, key=lambda one: one.tone == "caution"))
+        found.append(
+            "The deletion score depends on the fill of a removed pixel, and its sign is lost. With every pixel filled, "
+            f"where no map has a part, D is {listed(last)}: a score near that measures the fill."
+        )
+    if results.trainings:
+        trainings = [results.trainings[name] for name in inputs_in_order(results.trainings)]
+        sizes = [
+            f"{number_of(run.train_frames, 'frame')} of {run.image_size} px for {decimals(run.minutes, 1)} minutes "
+            f"({input_name(run.input).lower()})"
+            for run in trainings
+        ]
+        found.append(
+            f"Trained on {listed(sizes)}; the thesis took images of {NETWORK_PIXELS} px of a real sensor, so that its "
+            "figures show the scale of such errors."
+        )
+    return tuple(found)
 
 
-def _tell_grip(grip: Grip) -> Statement:
-    """What became of what was held, and how much harder than needed it was pressed."""
-    table, setup, count = grip.episodes, grip.setup, len(grip.episodes)
-    excess = f"{percent(float(table.force_excess.mean()))} harder than the least force that holds"
-    if count == 1:
-        fate = f"fell, pressed {excess}" if table.dropped[0] else f"was held, pressed {excess}"
-        text = f"The {setup.object} {fate}. One simulated episode ({setup.condition}): more of them tell how often."
-        return Statement(topic="The grip", text=text)
-    fell = int(table.dropped.sum())
-    low, high = binomtest(fell, count).proportion_ci(method="wilson")
-    text = (
-        f"Of {count:,} episodes ({setup.object}, {setup.condition}) {percent(fell / count, digits=1)} ended in a fall "
-        f"({percent(low, digits=1)} to {percent(high, digits=1)}); the controller {setup.controller} pressed {excess}."
-        " All are simulated; another controller has to be run on the same seed to be compared."
-    )
-    return Statement(topic="The grip", text=text)
+def judge_gap(gap: Difference | None) -> Outcome:
+    """Judge a difference: above zero for sure, below zero for sure, or neither."""
+    if gap is None or not gap.sure:
+        return "undecided"
+    return "holds" if gap.estimate > 0 else "does not hold"
 
 
-def tell_too_few(results: Results) -> str:
-    """Say of how few trials a study is where they decide nothing; empty where they may."""
-    trials = FEWEST_UNITS if results.study.choice is None else len(results.study.choice.trials)
-    if trials >= FEWEST_UNITS:
-        return ""
-    return (
-        f"This study explains {number_of(trials, 'trial')}, and fewer than {FEWEST_UNITS} decide "
-        "nothing: below is how explanations are judged, not yet which one to believe."
-    )
+def all_of(outcomes: Iterable[Outcome]) -> Outcome:
+    """Join parts that must all hold: one that does not is enough."""
+    distinct = set(outcomes)
+    if "does not hold" in distinct:
+        return "does not hold"
+    return "holds" if distinct == {"holds"} else "undecided"
+
+
+def most_of(outcomes: Sequence[Outcome]) -> Outcome:
+    """Join settings: more than half of them agree, and none says the opposite."""
+    for outcome, opposite in OPPOSITE.items():
+        if 2 * outcomes.count(outcome) > len(outcomes) and opposite not in outcomes:
+            return outcome
+    return "undecided"
+
+
+def write_ends(gap: Difference | None, *, digits: int = 3) -> str:
+    """Write the ends of an interval with signs; nothing where there is none."""
+    return "" if gap is None else tell_ends(gap, partial(signed, digits=digits))
+
+
+def _names(names: Iterable[str]) -> list[str]:
+    """Sort inputs: difference before raw, and before both what the thesis did not have."""
+    return inputs_in_order(names)[::-1]
+
+
+# which explanation to believe
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,302 +181,123 @@ class Recommended:
     """Method whose map ranks the markers most like their Shapley values, and whether it may be recommended."""
 
     method: str
-    found: Localisation
     correlation: Difference
     lead: Lead
     """Over the strongest control."""
+    lead_over_methods: Mapping[str, Difference]
     tied: tuple[str, ...]
-    """Other methods from which it is not told apart, the nearest first."""
+    """Other methods that it does not lead for sure, the nearest first."""
 
     @property
     def shown(self) -> bool:
-        """Whether its lead over every control and over every other method is off zero."""
+        """True where its lead over every control and over every other method is off zero."""
         return self.lead.shows_something and not self.tied
 
 
 def recommend(truth: Truth) -> Recommended | None:
-    """Method with the best signed correlation with the Shapley values; None where no method was held against them."""
-    known = {
-        name: (own.shapley.estimate, own.shapley, own.lead_over_controls)
-        for name, own in truth.methods.items()
-        if own.shapley is not None and own.lead_over_controls is not None
-    }
-    if not known:
+    """Return the method with the best correlation with the Shapley values; None where there is none."""
+    compared = _compared(truth)
+    if not compared:
         return None
-    best = max(known, key=lambda name: known[name][0])
-    over = truth.methods[best].lead_over_methods
-    return Recommended(
-        method=best,
-        found=truth.methods[best],
-        correlation=known[best][1],
-        lead=known[best][2],
-        tied=tuple(
-            sorted((one for one, gap in over.items() if not gap.above_zero), key=lambda one: over[one].estimate)
-        ),
+    name, (correlation, lead) = compared[0]
+    over = truth.methods[name].lead_over_methods
+    tied = sorted((other for other, gap in over.items() if not gap.above_zero), key=lambda other: over[other].estimate)
+    return Recommended(method=name, correlation=correlation, lead=lead, lead_over_methods=over, tied=tuple(tied))
+
+
+def _compared(truth: Truth) -> list[tuple[str, tuple[Difference, Lead]]]:
+    """Methods with their correlation and lead, the best first."""
+    compared = {
+        name: (method.shapley, method.lead_over_controls)
+        for name, method in truth.methods.items()
+        if method.shapley is not None and method.lead_over_controls is not None
+    }
+    return sorted(compared.items(), key=lambda item: -item[1][0].estimate)
+
+
+def _judge_methods(results: Results) -> Verdict:
+    rows: list[Row] = []
+    for name in _names(results.study.inputs):
+        truth, faithful = results.study.truth.get(name), results.study.faithfulness.get(name)
+        if truth is not None and _compared(truth):
+            rows += _judge_by_truth(name, truth)
+        elif faithful is not None:
+            rows += _judge_by_removal(name, faithful, truth)
+        else:
+            sentence = "Not scored yet; `sliplens study` does that."
+            rows.append(Row(claim="Any method", subject=input_name(name), outcome="undecided", sentence=sentence))
+    return Verdict(
+        id="believe",
+        title="Which explanation to believe",
+        test="Number, where the scene can be drawn anew: signed rank correlation of a map's means over the markers "
+        "with their Shapley values in this network's prediction; else the mean symmetric gain of removal, in margin "
+        "units. A method holds where it beats every map that knows nothing of what the network learned, beyond the "
+        f"95 % interval over days and trials, of which {FEWEST_UNITS} trials or more are needed.",
+        rows=tuple(rows),
     )
 
 
 _KIN = ("shapley-marker", "shapley", "integrated-gradients", "integrated-gradients-thesis", "expected-gradients")
+"""Methods that share out the prediction by the rule of Shapley, as the truth does."""
 
 
-def _tell_recommended(topic: str, best: Recommended, truth: Truth, faithful: RemovalScores | None) -> Statement:
-    name, over = method_name(best.method), best.found.lead_over_methods
-    control = method_name(best.lead.control).removesuffix(" (control)")
-    if best.correlation.units < FEWEST_UNITS:
-        return _too_few(topic, best.correlation.units)
-    evidence = (
-        "its map ranks the markers by what each adds to the answer (its Shapley value, found by drawing the scene anew "
-        f"without its motion) with a signed correlation of {tell_interval(best.correlation, digits=2)}, 1 being perfect"
-    )
-    ahead = (
-        f"its lead over the strongest map that knows nothing of what the network learned ({control}) is "
-        f"{tell_interval(best.lead.gap, digits=2)}"
-    )
-    if best.shown:
-        text = (
-            f"Believe {name}: of {number_of(len(over) + 1, 'method')} its map tells best what each marker "
-            "adds to this answer. "
-        )
-        text += sentence(f"{evidence}, {ahead}")
-        if over:
-            near = min(over, key=lambda one: over[one].estimate)
-            text += f" It leads the next method, {method_name(near)}, by {tell_interval(over[near], digits=2)}."
-    elif best.lead.shows_something:
-        tied = [f"{method_name(one)} ({tell_interval(over[one], digits=2)})" for one in best.tied]
-        text = f"No method is shown to be best: {name} comes first, and {len(tied)} of {len(over)} others tie with it. "
-        text += sentence(f"{evidence}, {ahead}")
-        text += f" Not told apart from it, by the lead over each: {listed(tied)}."
-    else:
-        text = f"None: no map is shown to tell what this network uses; the first, {name}, does not beat every control. "
-        text += sentence(f"{evidence}, but {ahead}, not off zero")
-    if truth.reliability is not None:
-        most = decimals(max(truth.reliability.estimate, 0.0) ** 0.5, 2)
-        text += f" These values are themselves estimates: even a perfect map would reach {most}."
-    if best.method in _KIN:
-        text += " It is kin to that truth by construction: both share the answer out by the rule of Shapley."
-    standing = (
-        next((one for one in rank_methods(faithful, truth) if one.method == best.method), None) if faithful else None
-    )
-    if standing is not None and standing.tested:
-        text += (
-            " When parts of the frame are removed in its order, it beats every such map under "
-            f"{len(standing.beaten)} of {len(standing.tested)} ways to fill them that can tell."
-        )
-    other = "its lead is not off zero" if best.shown else "one method leads every other and every control for sure"
-    text += _tell_limits(
-        best.correlation, f"a study of other trials, or of a second seed of the network, in which {other}"
-    )
-    tone: Tone = "good" if best.shown else "plain" if best.lead.shows_something else "caution"
-    return Statement(topic=topic, text=text, tone=tone)
-
-
-def _too_few(topic: str, trials: int) -> Statement:
-    few = "one trial is" if trials == 1 else f"{trials} trials are"
-    text = f"Not known: {few} too few to tell a method from chance; {FEWEST_UNITS} or more are needed."
-    return Statement(topic=topic, text=text, tone="caution")
-
-
-def _tell_limits(gap: Difference, overturned_by: str) -> str:
-    """Say over what it was found, and what it would take to change it."""
-    single = [what for what, count in (("network", gap.networks), ("day", gap.days)) if count == 1]
-    text = f" Found over {gap.over}"
-    if single:
-        text += f": another {' or '.join(single)} may say otherwise"
-    return f"{text}. It would be overturned by {overturned_by}."
-
-
-def _tell_claims(claims: Sequence[Claim], results: Results) -> list[Statement]:
-    if not claims:
-        return []
-    outcomes = {claim.title: {answer.outcome for answer in claim.answers} for claim in claims}
-    kinds = {
-        ("holds", "hold"): [f"“{title}”" for title, own in outcomes.items() if own == {"holds"}],
-        ("does not hold", "do not hold"): [f"“{title}”" for title, own in outcomes.items() if own == {"does not hold"}],
-        ("is undecided", "are undecided"): [f"“{title}”" for title, own in outcomes.items() if own == {"undecided"}],
-        ("differs between the networks", "differ between the networks"): [
-            f"“{title}”" for title, own in outcomes.items() if len(own) > 1
-        ],
-    }
-    told = {f"{len(titles)} {words[len(titles) > 1]}": listed(titles) for words, titles in kinds.items() if titles}
-    text = f"Of the thesis's {len(claims)} claims {listed([*told])}."
-    text += "".join(f" {count}: {titles}." for count, titles in told.items())
-    for name in inputs_in_order(results.study.truth)[::-1]:
-        best = recommend(results.study.truth[name])
-        gap = None if best is None else best.found.lead_over_methods.get(POLY_CAM)
-        if best is not None and gap is not None and gap.above_zero:
-            text += (
-                f" Its recommendation, Poly-CAM as it ran it, is not borne out on {input_name(name).lower()}: "
-                f"{method_name(best.method)} leads that map by {tell_interval(gap, digits=2)}, ranking the markers."
+def _judge_by_truth(name: str, truth: Truth) -> list[Row]:
+    best, rows = recommend(truth), []
+    assert best is not None
+    few = best.correlation.units < FEWEST_UNITS
+    for method, (correlation, lead) in _compared(truth):
+        control = method_name(lead.control).removesuffix(" (control)")
+        if few:
+            outcome, sentence = "undecided", f"Not known: {_too_few(correlation.units)}."
+        else:
+            outcome = "holds" if lead.shows_something else "does not hold" if lead.gap.below_zero else "undecided"
+            sentence = _sentence_by_truth(method, best, truth.methods[method], control)
+        kin = " Kin to this truth by construction." if method in _KIN else ""
+        rows.append(
+            Row(
+                claim=method_name(method),
+                subject=input_name(name),
+                outcome=outcome,
+                sentence=f"{sentence}{kin}",
+                number=signed(correlation.estimate, 2),
+                interval=write_ends(correlation, digits=2),
+                findings=(Finding(where=f"less {control}", compared="correlation", gap=lead.gap, outcome=outcome),),
             )
-    text += (
-        " Tested with its methods as published, on networks and data of our own: its network and most of its data are "
-        "not here, so that a claim may fail for those reasons too."
-    )
-    if results.study.choice is not None:
-        text += f" {tell_sample(results.study.choice)}"
-    return [Statement(topic="The thesis's claims", text=text)]
-
-
-def _accuracy(results: Results) -> list[Statement]:
-    statements = []
-    read = {name: results.evaluations[name].conditions for name in inputs_in_order(results.evaluations)}
-    # the network that reads best first
-    for name, scores in sorted(read.items(), key=lambda own: np.mean([one.mse for one in own[1].values()])):
-        conditions = conditions_in_order(scores)
-        r2 = [f"{decimals(scores[condition].r2, 2)} on {condition}" for condition in conditions]
-        mae = [decimals(100 * scores[condition].mae, 1) for condition in conditions]
-        asked = results.evaluations[name].predictions
-        trials, days = (len(np.unique(labels)) for labels in (asked.trial, asked.day))
-        text = (
-            f"The network reads the safety margin with R² {listed(r2)} objects of test trials; on average it is off by "
-            f"{listed(mae)} percentage points. That is of one network, over {number_of(trials, 'trial')} of "
-            f"{'one day' if days == 1 else f'{days} days'}."
         )
-        # of labels that do not vary there is no R²
-        poor = [condition for condition in conditions if (value := scores[condition].r2) is not None and value <= 0]
-        if poor:
-            text += f" On {listed(poor)} objects that is no better than always answering the mean label."
-        tone: Tone = "caution" if poor else "plain"
-        statements.append(Statement(topic=f"Accuracy, {input_name(name).lower()}", text=text, tone=tone))
-    return statements
+    return rows
 
 
-def _winners(results: Results, *, rng: np.random.Generator) -> list[Statement]:
-    evaluations, statements = results.evaluations, []
-    pairs = [
-        (condition, *names)
-        for names in combinations(inputs_in_order(evaluations), 2)
-        for condition in conditions_in_order(set.intersection(*(set(evaluations[one].conditions) for one in names)))
-    ]
-    for condition, *names in pairs:
-        both = {name: evaluations[name] for name in names}
-        mse = {name: one.conditions[condition].mse for name, one in both.items()}
-        better, worse = sorted(mse, key=lambda name: mse[name])
-        less = 1 - mse[better] / mse[worse] if mse[worse] > 0 else 0.0
-        text = (
-            f"On {condition} objects {input_name(better).lower()} have the lower error: MSE {mse[better]:.4f} against "
-            f"{mse[worse]:.4f}, {percent(less)} less."
-        )
-        shown = [one.predictions.where(one.predictions.condition == condition) for one in both.values()]
-        gap = compare_errors(shown[0], shown[1], rng=rng)
-        sure = gap is not None and gap.sure
-        if gap is None:
-            text += " The two networks did not answer the same frames, so whether that is chance was not tested."
-        elif gap.units < FEWEST_UNITS:
-            text += f" With {number_of(gap.units, 'test trial')}, that can be chance."
-        elif sure:
-            text += f" That holds beyond the 95 % interval over {gap.over}."
-        else:
-            text += f" The 95 % interval over {gap.over} does not rule out chance."
-        tone: Tone = "good" if sure else "caution"
-        first, second = map(short_input_name, names)
-        statements.append(Statement(topic=f"{first} or {second.lower()}, {condition}", text=text, tone=tone))
-    if statements:
-        seeds = "Each input stands for one trained network: another seed may change the order."
-        statements[-1] = replace(statements[-1], text=f"{statements[-1].text} {seeds}")
-    return statements
+def _sentence_by_truth(method: str, best: Recommended, found: Localisation, control: str) -> str:
+    lead = found.lead_over_controls
+    assert lead is not None
+    interval = partial(tell_interval, digits=2)
+    if not lead.shows_something:
+        return f"Not shown to beat every control: its lead over {control} is {interval(lead.gap)}."
+    if method != best.method:
+        behind = "Ties with" if method in best.tied else "Behind"
+        return f"{behind} {method_name(best.method)}, by {interval(best.lead_over_methods[method])}."
+    over = best.lead_over_methods
+    ahead = f"it leads {control}, the strongest control, by {interval(lead.gap)}"
+    if best.tied:
+        tied = listed([method_name(other) for other in best.tied])
+        return f"First, but not shown to be best: {ahead}, and ties with {tied}."
+    if not over:
+        return f"Believe it: {ahead}."
+    rival = min(over, key=lambda other: over[other].estimate)
+    return f"Believe it: {ahead}, and {method_name(rival)}, the next method, by {interval(over[rival])}."
 
 
-def _faithfulness(scored: DeletionScores, *, rng: np.random.Generator) -> Statement:
-    topic = f"Faithfulness, {input_name(scored.input).lower()}"
-    if scored.source != "simulated":
-        topic += f", {source_name(scored.source)}"
-    methods = {name: score for name, score in scored.methods.items() if name != CHANCE}
-    if not methods:
-        return Statement(topic=topic, text="No method was scored.", tone="caution")
-    best = min(methods, key=lambda name: methods[name].mean)
-    text = f"{method_name(best)} has the lowest deletion score, {methods[best].mean:.3f} ± {methods[best].sd:.3f}"
-    control = scored.methods.get(CHANCE)
-    if control is None:
-        text += "; no random control was scored, so whether that is better than chance is not known."
-        return Statement(topic=topic, text=text, tone="caution")
-    text += f"; removing pixels in random order gives {control.mean:.3f} ± {control.sd:.3f}."
-    gaps = {name: against_control(scored, name, rng=rng) for name in methods}
-    beating = [name for name, gap in gaps.items() if gap is not None and gap.below_zero]
-    failing = [method_name(name) for name in methods if name not in beating]
-    if best not in beating:
-        if methods[best].mean < control.mean:
-            text += " That is lower than chance, but not by enough to rule chance out."
-        else:
-            text += " It does not beat the control: by this score no map tells more than chance."
-    elif failing:
-        text += f" It beats the control; {listed(failing)} {'does' if len(failing) == 1 else 'do'} not."
-    else:
-        text += " It beats the control, as does every other method." if len(methods) > 1 else " It beats the control."
-    return Statement(topic=topic, text=text, tone="good" if best in beating else "caution")
-
-
-def _what_deletion_measures(results: Results) -> Statement:
-    last = []
-    for (name, source), scored in sorted(results.scores.items(), key=lambda item: (item[0][1] == "real", item[0])):
-        mean = float(np.mean([one.last_step_mean for one in scored.methods.values()]))
-        last.append(f"{decimals(mean, 2)} ({input_name(name).lower()}, {source_name(source)}, {scored.fill})")
-    text = (
-        "The deletion score depends on what a removed pixel becomes. It says how far the answer moves, not that the "
-        "map shows what slip is, and its sign is lost. With every pixel filled, where no map has a part, D is "
-        f"{listed(last)}: a score near that tells of the fill."
-    )
-    return Statement(topic="How far to trust D", text=text, tone="caution")
-
-
-def _real_touch(explained: Explanation) -> Statement:
-    topic = f"Real touch, {input_name(explained.input).lower()}"
-    labelled = [(one.safety_margin, one.prediction) for one in explained.frames if one.safety_margin is not None]
-    trials = len({one.trial for one in explained.frames if one.safety_margin is not None})
-    if not labelled:
-        text = (
-            f"Of {number_of(len(explained.frames), 'real frame')} no label is known, so nothing can be said "
-            "of the answers on them."
-        )
-        return Statement(topic=topic, text=text, tone="caution")
-    labels, answers = np.array(labelled, dtype=np.float64).T
-    error = np.abs(answers - labels).mean()
-    # that of the best constant: a network that cannot beat it has read nothing
-    constant = np.abs(labels - np.median(labels)).mean()
-    useful = error < constant
-    text = (
-        f"On {number_of(len(labels), 'frame')} of {'one trial' if trials == 1 else f'{trials} trials'} of real "
-        f"touch the network is off by {100 * error:.0f} percentage points on average; the best constant answer "
-        "would be off by "
-        f"{100 * constant:.0f}."
-    )
-    # frames with equal labels have no order
-    pairs = [(first, second) for first, second in combinations(labelled, 2) if first[0] != second[0]]
-    right = sum((first[0] - second[0]) * (first[1] - second[1]) > 0 for first, second in pairs)
-    if pairs:
-        chance = "all of them" if right == len(pairs) else "chance gives half"
-        text += f" It puts {right} of {number_of(len(pairs), 'pair')} of frames in the right order ({chance})."
-    if not useful:
-        text += " So its values do not carry over to real touch."
-    return Statement(topic=topic, text=text, tone="plain" if useful else "caution")
-
-
-def _tell_scale(results: Results) -> list[Statement]:
-    """State how little or much each network was trained on."""
-    if not results.trainings:
-        return []
-    told = []
-    for one in (results.trainings[name] for name in inputs_in_order(results.trainings)):
-        told.append(f"{number_of(one.train_frames, 'frame')} of {one.image_size} px")
-        if max(one.frame_size) > one.image_size:
-            told[-1] += f", shrunk from {one.frame_size[0]} x {one.frame_size[1]},"
-        told[-1] += f" for {decimals(one.minutes, 1)} minutes ({input_name(one.input).lower()})"
-    text = f"Trained on {listed(told)}"
-    if any(one.image_size != NETWORK_PIXELS for one in results.trainings.values()):
-        text += f"; the thesis took images of {NETWORK_PIXELS} px"
-    text += (
-        ". The thesis measured a real sensor, so its figures beside these show the scale of such errors, not a contest."
-    )
-    return [Statement(topic="What this run is", text=text)]
+def _too_few(trials: int) -> str:
+    few = "one trial is" if trials == 1 else f"{trials} trials are"
+    return f"{few} too few to tell a method from chance; {FEWEST_UNITS} or more are needed"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """How a method stands: settings (fill, unit) in which it gains for sure, against chance and the best control."""
+    """Settings (fill, unit) in which a method gains for sure, against chance and the best control."""
 
     method: str
     beaten: tuple[tuple[str, str], ...]
-    """Settings in which it does."""
     tested: tuple[tuple[str, str], ...]
     """Settings in which it was compared with a control."""
     mean_gain: float
@@ -440,7 +305,7 @@ class Standing:
 
     @property
     def qualifies(self) -> bool:
-        """Whether it does so in most settings."""
+        """True where it beats the controls in most settings."""
         return 2 * len(self.beaten) > len(self.tested)
 
 
@@ -450,145 +315,215 @@ def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[St
     A fill counts once. Fills under which a map made from the truth does not win for sure are left out.
     """
     scores = {score.key: score for score in faithful.scores}
-    leads = {key: score.lead_over_controls for key, score in scores.items()}
     standings = []
     for method in methods_in_order(score.method for score in faithful.scores if not score.control):
-        tested = [one for one in voting_settings(faithful, truth) if leads.get((*one, method))]
-        beaten = [one for one in tested if (lead := leads[*one, method]) is not None and lead.shows_something]
-        gains = [scores[*one, method].srg.estimate for one in tested]
-        mean = float(np.mean(gains)) if gains else float("-inf")
-        standings.append(Standing(method=method, beaten=tuple(beaten), tested=tuple(tested), mean_gain=mean))
-    return sorted(standings, key=lambda one: (not one.qualifies, -one.mean_gain))
-
-
-def _believe(faithful: RemovalScores, results: Results) -> Statement:
-    topic = f"Which to believe, {input_name(faithful.input).lower()}"
-    truth = results.study.truth.get(faithful.input)
-    ranked = rank_methods(faithful, truth)
-    if faithful.trials < FEWEST_UNITS:
-        return _too_few(topic, faithful.trials)
-    fills = [FILL_NAMES.get(fill, fill) for fill in unfit_fills(truth)]
-    unfit = f" Left out: {listed(fills)}, where even a map made from the truth does not win for sure." if fills else ""
-    if not any(one.tested for one in ranked):
-        why = "no method was compared with a control under a fill that can judge it"
-        return Statement(topic=topic, text=f"Not known: {why}.{unfit}", tone="caution")
-    best = ranked[0]
-    if not best.qualifies:
-        nearest = max(ranked, key=lambda one: (len(one.beaten), one.mean_gain))
-        text = (
-            "None: no method beats both chance and the best control under most fills. "
-            f"{method_name(nearest.method)} comes nearest, under {len(nearest.beaten)} of {len(nearest.tested)}, its "
-            f"mean gain {signed(nearest.mean_gain, 3)} in margin units. Maps of this network show where a method "
-            f"looked, not what the network used.{unfit}"
+        leads = {
+            setting: lead
+            for setting in voting_settings(faithful, truth)
+            if (*setting, method) in scores and (lead := scores[*setting, method].lead_over_controls) is not None
+        }
+        gains = [scores[*setting, method].srg.estimate for setting in leads]
+        standings.append(
+            Standing(
+                method=method,
+                beaten=tuple(setting for setting, lead in leads.items() if lead.shows_something),
+                tested=tuple(leads),
+                mean_gain=float(np.mean(gains)) if gains else float("-inf"),
+            )
         )
-        return Statement(topic=topic, text=text, tone="caution")
-    score = next(one for one in faithful.scores if one.key == (*best.beaten[0], best.method))
-    others = [one for one in ranked[1:] if one.qualifies]
-    lost = [fill_name(*one) for one in best.tested if one not in best.beaten]
-    but = f", but not under {listed(lost)}" if lost else ""
-    text = (
-        f"Believe {method_name(best.method)}. Under {len(best.beaten)} of {len(best.tested)} fills it finds what "
-        "the answer rests on, better than chance and than the best map that knows nothing of the network, beyond the "
-        f"95 % interval{but}. "
-        f"Under {fill_name(score.fill, score.unit)} its symmetric gain is {tell_interval(score.srg)} in margin units."
-    )
-    text += _tell_lead(faithful, best, others)
-    failing = [method_name(one.method) for one in ranked if not one.qualifies]
-    if failing:
-        text += f" {listed(failing)} {'does' if len(failing) == 1 else 'do'} not beat the controls under most fills."
-    text += unfit
-    if faithful.alarms:
-        count = len(faithful.alarms)
-        text += f" {count} {'alarm' if count == 1 else 'alarms'} about these scores: see beside their table."
-    text += " Without the scene to draw anew, no truth tells whether it also shows how much each part adds."
-    text += _tell_limits(score.srg, "a study of other trials in which it beats the controls under fewer fills")
-    return Statement(topic=topic, text=text, tone="good")
+    return sorted(standings, key=lambda standing: (not standing.qualifies, -standing.mean_gain))
 
 
-def _tell_lead(faithful: RemovalScores, best: Standing, others: list[Standing]) -> str:
-    if not others:
-        return ""
-    rival = others[0]
-    pair = {best.method, rival.method}
+def _judge_by_removal(name: str, faithful: RemovalScores, truth: Truth | None) -> list[Row]:
+    ranked, rows = rank_methods(faithful, truth), []
+    for place, standing in enumerate(ranked):
+        outcome: Outcome = "undecided"
+        if faithful.trials < FEWEST_UNITS:
+            sentence = f"Not known: {_too_few(faithful.trials)}."
+        elif not standing.tested:
+            sentence = "Not known: it was compared with a control under no fill that can judge it."
+        else:
+            outcome = "holds" if standing.qualifies else "does not hold" if not standing.beaten else "undecided"
+            lost = [fill_name(*setting) for setting in standing.tested if setting not in standing.beaten]
+            but = f", not under {listed(lost)}" if lost else ""
+            best = "Believe it: it beats" if place == 0 and standing.qualifies else "Beats"
+            sentence = (
+                f"{best} chance and every control under {len(standing.beaten)} of {len(standing.tested)} fills{but}."
+            )
+            if place and ranked[0].qualifies:
+                sentence += _compare_with_first(faithful, ranked[0], standing.method)
+        rows.append(
+            Row(
+                claim=method_name(standing.method),
+                subject=input_name(name),
+                outcome=outcome,
+                sentence=sentence,
+                number=signed(standing.mean_gain, 3) if standing.tested else "",
+            )
+        )
+    return rows
+
+
+def _compare_with_first(faithful: RemovalScores, first: Standing, method: str) -> str:
     gaps = {
-        (one.fill, one.unit): gap_from(one, best.method)
-        for one in faithful.comparisons
-        if {one.first, one.second} == pair
+        (pair.fill, pair.unit): gap_from(pair, first.method)
+        for pair in faithful.comparisons
+        if {pair.first, pair.second} == {first.method, method}
     }
-    ahead, behind = (
-        [fill_name(*one) for one, gap in gaps.items() if one in best.tested and getattr(gap, side)]
-        for side in ("above_zero", "below_zero")
+    sides = {"Behind": "above_zero", "Ahead of": "below_zero"}
+    settings = {
+        words: [fill_name(*setting) for setting, gap in gaps.items() if setting in first.tested and getattr(gap, side)]
+        for words, side in sides.items()
+    }
+    name = method_name(first.method)
+    parts = [f" {words} {name} under {listed(fills)}." for words, fills in settings.items() if fills]
+    return "".join(parts) or f" Tied with {name} under every fill."
+
+
+# networks, deletion without a study, real touch and the grip
+
+
+def _judge_networks(results: Results, *, rng: np.random.Generator) -> Verdict:
+    evaluations, rows = results.evaluations, []
+    scores = {name: evaluations[name].conditions for name in inputs_in_order(evaluations)}
+    # the network of the smallest error first
+    for name in sorted(scores, key=lambda name: np.mean([score.mse for score in scores[name].values()])):
+        predictions = evaluations[name].predictions
+        trials, days = (len(np.unique(labels)) for labels in (predictions.trial, predictions.day))
+        for condition in conditions_in_order(scores[name]):
+            score = scores[name][condition]
+            useless = score.r2 is not None and score.r2 <= 0
+            worth = ", no better than the mean label" if useless else ""
+            rows.append(
+                Row(
+                    claim=f"Predicts the margin on {condition} objects",
+                    subject=input_name(name),
+                    # of labels that do not vary there is no R²
+                    outcome="undecided" if score.r2 is None else "does not hold" if useless else "holds",
+                    sentence=f"Off by {decimals(100 * score.mae, 1)} percentage points on average{worth}; of one "
+                    f"network, over {number_of(trials, 'trial')} of {number_of(days, 'day')}.",
+                    number=f"R² {decimals(score.r2, 2)}",
+                )
+            )
+    rows += [
+        _compare_networks(results, (first, second), condition, rng=rng)
+        for first, second in combinations(scores, 2)
+        for condition in conditions_in_order(set(scores[first]) & set(scores[second]))
+    ]
+    return Verdict(
+        id="networks",
+        title="How well each network predicts the margin",
+        test="Predictions on test trials. R² above zero is better than always predicting the mean label. Each input "
+        "stands for one trained network: another seed may change the order.",
+        rows=tuple(rows),
     )
-    name = method_name(rival.method)
-    means = f"their mean gains are {signed(best.mean_gain, 3)} and {signed(rival.mean_gain, 3)}"
-    if not ahead and not behind:
-        return f" {name}, next by its mean gain, is not told apart from it under any fill."
-    if not ahead:
-        return f" {name}, next by its mean gain, is ahead of it under {listed(behind)}; {means}."
-    but = f", and behind it under {listed(behind)}; {means}" if behind else ""
-    return f" It is ahead of {name}, the next, under {listed(ahead)}{but}."
 
 
-_KINDS = {
-    r"does not beat a random order": "Methods that do not beat a random order",
-    r"no more than the control": "Methods that gain no more than a map that knows nothing of the network",
-    r"fill decides|filled image is answered": "Frames in which the fill decides, rather than the map",
-    r"rank the methods differently": "Fills that rank the methods differently",
-    r"correlates with its last step": "Scores that measure the fill rather than the map",
-    r"at an end of the margin": "Answers at an end of the margin, which can move one way only",
-    r"still correlates": "Maps that stay alike when all weights are new",
-    r"rank nothing|NaN": "Maps that rank nothing",
-    r"unexplained, more than": "Maps that do not add up to the change that they explain",
-    r"next to nothing to explain": "Frames with next to nothing to explain",
-    r"is saturated there": "Frames where the network is saturated, so that gradients say little",
-    r"masked passes chose nothing": "Layers in which the passes of Poly-CAM chose nothing: activity only",
-    r"so the map is zero": "Maps in which nothing speaks for the answer",
-    r"expected to correlate": "Maps from some of the channels that may differ from the exact ones",
-    r"hardly surer than they differ": "Maps whose contributions are hardly surer than they differ, for want of pairs",
-    r"so small that rounding": "Maps so faint that another engine or machine may give another",
-}
+def _compare_networks(results: Results, names: tuple[str, str], condition: str, *, rng: np.random.Generator) -> Row:
+    both = {name: results.evaluations[name] for name in names}
+    mse = {name: evaluation.conditions[condition].mse for name, evaluation in both.items()}
+    better, worse = sorted(mse, key=lambda name: mse[name])
+    frames = [both[name].predictions.where(both[name].predictions.condition == condition) for name in (worse, better)]
+    gap = compare_errors(frames[0], frames[1], rng=rng)
+    over = "not tested: the networks did not predict the same frames" if gap is None else f"over {gap.over}"
+    return Row(
+        claim=f"Smaller error than {input_name(worse).lower()} on {condition} objects",
+        subject=input_name(better),
+        outcome=judge_gap(gap),
+        sentence=f"MSE {mse[better]:.4f} against {mse[worse]:.4f}; the number is their difference, {over}.",
+        number=decimals(mse[worse] - mse[better], 4),
+        interval=write_ends(gap, digits=4),
+    )
 
 
-def group_alarms(alarms: Iterable[str]) -> dict[str, list[str]]:
-    """Group alarms by the kind of what they warn of; one of no known kind stands for itself."""
-    groups = defaultdict(list)
-    for alarm in alarms:
-        shown = name_methods(alarm)
-        sentence = f"{shown[:1].upper()}{shown[1:].rstrip('.')}."
-        kind = next((kind for pattern, kind in _KINDS.items() if re.search(pattern, alarm)), sentence)
-        # the same fill can be found wanting by two scores
-        if sentence not in groups[kind]:
-            groups[kind].append(sentence)
-    return dict(groups)
+def _judge_deletion(results: Results, *, rng: np.random.Generator) -> Verdict:
+    rows = []
+    for key in sorted(results.scores, key=lambda key: (key[1] == "real", key[0] != "raw", key)):
+        scored = results.scores[key]
+        source = "" if scored.source == "simulated" else f", {source_name(scored.source)}"
+        methods = {name: score for name, score in scored.methods.items() if name != CHANCE}
+        for name in sorted(methods, key=lambda name: methods[name].mean):
+            chance = scored.methods.get(CHANCE)
+            gap = None if chance is None else against_control(scored, name, rng=rng)
+            against = (
+                "no random control was scored, so that chance is not ruled out"
+                if chance is None or gap is None
+                else f"a random order has {chance.mean:.3f} ± {chance.sd:.3f}, and the difference is "
+                f"{tell_interval(gap)}"
+            )
+            rows.append(
+                Row(
+                    claim=f"{method_name(name)} beats a random order",
+                    subject=f"{input_name(scored.input)}{source}",
+                    outcome=OPPOSITE.get(judge_gap(gap), "undecided"),
+                    sentence=f"Deletion score D; {against}.",
+                    number=f"{methods[name].mean:.3f} ± {methods[name].sd:.3f}",
+                )
+            )
+    return Verdict(
+        id="deletion-verdict",
+        title="Which explanation scores best by deletion",
+        test="Mean ± standard deviation of D over frames, lower is better; holds where D lies below that of a random "
+        "order, beyond the 95 % interval.",
+        rows=tuple(rows),
+    )
 
 
-def alarms_of(results: Results, name: str, stage: str) -> tuple[str, ...]:
-    """Alarms of one network's `faithfulness`, `remedies`, `randomisation`, `score` or `explain`."""
-    if stage == "explain":
-        return tuple(
-            f"{method_name(method)}, {source_name(source)}: {warning}"
-            for (own, source), explained in results.explanations.items()
-            if own == name
-            for method, notes in explained.methods.items()
-            for warning in notes.warnings
+def _judge_real_touch(results: Results) -> Verdict:
+    real = {name: record for (name, source), record in results.explanations.items() if source == "real"}
+    rows = []
+    for name in inputs_in_order(real):
+        frames = [frame for frame in real[name].frames if frame.safety_margin is not None]
+        claim, subject = "Predicts real touch better than a constant", input_name(name)
+        if not frames:
+            sentence = f"Not known: none of {number_of(len(real[name].frames), 'real frame')} has a label."
+            rows.append(Row(claim=claim, subject=subject, outcome="undecided", sentence=sentence))
+            continue
+        labelled = [(frame.safety_margin or 0.0, frame.prediction) for frame in frames]
+        labels, predictions = np.array(labelled, dtype=np.float64).T
+        error, constant = np.abs(predictions - labels).mean(), np.abs(labels - np.median(labels)).mean()
+        # frames with equal labels have no order
+        pairs = [(first, second) for first, second in combinations(labelled, 2) if first[0] != second[0]]
+        right = sum((first[0] - second[0]) * (first[1] - second[1]) > 0 for first, second in pairs)
+        order = f"; {right} of {number_of(len(pairs), 'pair')} of frames are in order (chance: half)" if pairs else ""
+        trials = number_of(len({frame.trial for frame in frames}), "trial")
+        rows.append(
+            Row(
+                claim=claim,
+                subject=subject,
+                outcome="holds" if error < constant else "does not hold",
+                sentence=f"Mean error on {number_of(len(frames), 'frame')} of {trials}; the best constant is off by "
+                f"{100 * constant:.0f} points{order}.",
+                number=f"{100 * error:.0f} points",
+            )
         )
-    if stage == "score":
-        return tuple(
-            alarm if source == results.study.source else f"{source_name(source)}: {alarm}"
-            for (own, source), scored in results.scores.items()
-            if own == name
-            for alarm in scored.alarms
-        )
-    found = getattr(results.study, stage).get(name)
-    return () if found is None else found.alarms
+    return Verdict(
+        id="real-touch",
+        title="Does it carry over to real touch?",
+        test="Frames of a real sensor. Holds where the mean error is below that of the best constant prediction.",
+        rows=tuple(rows),
+    )
 
 
-def count_alarms(results: Results) -> tuple[str, ...]:
-    """Write a line for each kind of alarm: how often, and of which networks."""
-    counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
-    for name in inputs_in_order(results.inputs)[::-1]:
-        for stage in ("score", "remedies", "faithfulness", "randomisation", "explain"):
-            for kind, sentences in group_alarms(alarms_of(results, name, stage)).items():
-                counts[kind][input_name(name).lower()] += len(sentences)
-    told = {kind: listed([f"{name} {count}" for name, count in own.items()]) for kind, own in counts.items()}
-    return tuple(f"{kind.rstrip('.')}: {own.total()} ({told[kind]})" for kind, own in counts.items())
+def _judge_grip(results: Results) -> Verdict:
+    grip = results.grip
+    assert grip is not None
+    table, setup, count = grip.episodes, grip.setup, len(grip.episodes)
+    excess = percent(float(table.force_excess.mean()))
+    dropped = int(table.dropped.sum())
+    low, high = binomtest(dropped, count).proportion_ci(method="wilson")
+    return Verdict(
+        id="grip-verdict",
+        title="What the margin holds",
+        test="Simulated episodes that end in a fall. Another controller has to be run on the same seed to be compared.",
+        rows=(
+            Row(
+                claim=f"{setup.object}, {setup.condition}, controller {setup.controller}",
+                subject=number_of(count, "episode"),
+                outcome=None,
+                sentence=f"Pressed {excess} harder than the least force that holds.",
+                number=f"{percent(dropped / count, digits=1)} fell",
+                interval="" if count == 1 else f"{percent(low, digits=1)} to {percent(high, digits=1)}",
+            ),
+        ),
+    )
