@@ -28,10 +28,10 @@ def test_what_is_there_works_and_what_is_not_is_told_with_its_cure(few: None, tm
     items = examine_installation(reference=tmp_path, on_progress=lambda done, total: counted.append((done, total)))
     found = {item.name: item for item in items}
     assert found["data store"].works
-    assert found["extra view"] == Item(name="extra view", works=True, told=f"numpy {np.__version__}")
+    assert found["extra view"] == Item(name="extra view", works=True, detail=f"numpy {np.__version__}")
     assert found["extra onnx"].works is None
-    assert 'pip install "sliplens[onnx]"' in found["extra onnx"].told
-    assert found["reference chromatouch"].told == "1 file; images of 4 x 6 pixels"
+    assert 'pip install "sliplens[onnx]"' in found["extra onnx"].detail
+    assert found["reference chromatouch"].detail == "1 file; images of 4 x 6 pixels"
     assert found["cameras"].works is None
     assert counted[-1] == (len(items), len(items))
 

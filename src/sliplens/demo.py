@@ -46,7 +46,7 @@ SHOWN_DATA: dict[str, Any] = {"dry_trials": 8, "wet_trials": 4, "frames_per_tria
 TRAINING_DATA: dict[str, Any] = {"dry_trials": 96, "wet_trials": 8, "frames_per_trial": 48, "days": 12}
 """Trials to train networks of one's own on."""
 _OTHER_MINUTES = 3.5
-"""What the path takes beside the training, on two cores."""
+"""Minutes of everything but the training, on two cores."""
 SHORTEST_TRAINING = 1.4
 """Minutes below which a network has not learned enough to be worth explaining."""
 

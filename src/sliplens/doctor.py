@@ -1,4 +1,4 @@
-"""What is installed here and whether it works: versions, networks, engines, extras, cameras, reference data."""
+"""Check of an installation: versions, networks, engines, extras, cameras, reference data."""
 
 import os
 import re
@@ -34,8 +34,8 @@ class Item:
     name: str
     works: bool | None
     """None where it is not there, and nothing needs it."""
-    told: str
-    """What was found, or what is wrong and its cure."""
+    detail: str
+    """Version or size, or the error and its cure."""
 
 
 def examine_installation(*, reference: Path | None = None, on_progress: OnProgress | None = None) -> tuple[Item, ...]:
@@ -80,13 +80,13 @@ def _absent(what: str) -> str:
 
 def _tried(name: str, attempt: Callable[[], str | None]) -> Item:
     try:
-        return Item(name=name, works=True, told=attempt() or "")
+        return Item(name=name, works=True, detail=attempt() or "")
     except _AbsentError as error:
-        return Item(name=name, works=None, told=str(error))
+        return Item(name=name, works=None, detail=str(error))
     # another package may raise anything, and the others are to be tried as well
     except Exception as error:
-        said = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
-        return Item(name=name, works=False, told=" ".join(said.split())[:300])
+        message = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
+        return Item(name=name, works=False, detail=" ".join(message.split())[:300])
 
 
 def _versions() -> str:
@@ -147,43 +147,43 @@ def _extras() -> dict[str, list[str]]:
     """Packages of each extra for users, as they are installed."""
     extras: dict[str, list[str]] = {}
     for line in metadata.requires("sliplens") or ():
-        found = re.fullmatch(r"([\w.-]+).*;.*extra == ['\"]([\w-]+)['\"].*", line)
-        if found and found[2] not in _BUILDERS:
-            extras.setdefault(found[2], []).append(found[1])
+        records = re.fullmatch(r"([\w.-]+).*;.*extra == ['\"]([\w-]+)['\"].*", line)
+        if records and records[2] not in _BUILDERS:
+            extras.setdefault(records[2], []).append(records[1])
     return extras
 
 
 def _extra(name: str, needs: list[str]) -> str:
     """Import every package of an extra."""
-    told, modules = [], metadata.packages_distributions()
+    text, modules = [], metadata.packages_distributions()
     for package in needs:
         try:
-            told.append(f"{package} {metadata.version(package)}")
+            text.append(f"{package} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
             return _absent(f'{package} is not installed; install with `pip install "sliplens[{name}]"`')
-        own = [module for module, names in modules.items() if package in names and not module.startswith("_")]
-        for module in own[:1]:
+        rows = [module for module, names in modules.items() if package in names and not module.startswith("_")]
+        for module in rows[:1]:
             import_module(module)
-    return ", ".join(told)
+    return ", ".join(text)
 
 
 def _cameras() -> str:
     try:
-        found = list_cameras()
+        records = list_cameras()
     except InputError as error:
         return _absent(str(error))
-    if not found:
+    if not records:
         return _absent("none is connected")
-    if not any(camera.modes for camera in found):
-        raise InputError(f"{found[0].path} {found[0].name}; close what holds it, or join the group video")
-    return ", ".join(f"{camera.path} {camera.name} ({number_of(len(camera.modes), 'mode')})" for camera in found)
+    if not any(camera.modes for camera in records):
+        raise InputError(f"{records[0].path} {records[0].name}; close what holds it, or join the group video")
+    return ", ".join(f"{camera.path} {camera.name} ({number_of(len(camera.modes), 'mode')})" for camera in records)
 
 
 def _reference(folder: Path) -> str:
     """Read one image of each folder of images below."""
     files = [path for path in folder.rglob("*") if path.is_file()]
     inside = {path.parent for path in files if path.suffix == ".png"}
-    sizes = {read_image(list_images(one)[0]).shape[:2] for one in sorted(inside)}
+    sizes = {read_image(list_images(record)[0]).shape[:2] for record in sorted(inside)}
     read = ", ".join(f"images of {height} x {width} pixels" for height, width in sorted(sizes))
     return "; ".join(filter(None, (number_of(len(files), "file"), read)))
 

@@ -28,7 +28,7 @@ class Doctor:
             items = examine_installation(reference=self.reference, on_progress=count)
         width = max(len(item.name) for item in items)
         for item in items:
-            say(f"{_WORDS[item.works]:9}  {item.name:{width}}  {item.told}")
+            say(f"{_WORDS[item.works]:9}  {item.name:{width}}  {item.detail}")
         if failed := [item.name for item in items if item.works is False]:
             raise InputError(
                 f"{', '.join(failed)} {'does' if len(failed) == 1 else 'do'} not work; see the lines above"

@@ -40,21 +40,21 @@ def plate_bins(results: Results) -> Plate:
     # one scale for all conditions, or the eye compares bars that do not compare
     top = 1.15 * max((row[5] for row in rows if row[5] is not None), default=1.0)
     figure, axes = make_charts(len(conditions), each=(4.4, 3.2))
-    told = []
+    text = []
     with style.drawing_style():
         for ax, condition in zip(axes, conditions, strict=True):
             errors.plot_bins(bins[condition], ax=ax).set(ylim=(0, top))
             ax.set_title(f"{condition.capitalize()} objects", parse_math=False)
-            known = [row for row in rows if row[0] == condition and row[5] is not None]
-            if known:
-                _, name, low, high, _, mse = max(known, key=lambda row: row[5] or 0.0)
+            valid = [row for row in rows if row[0] == condition and row[5] is not None]
+            if valid:
+                _, name, low, high, _, mse = max(valid, key=lambda row: row[5] or 0.0)
                 place = f"{style.percent(low)} to {style.percent(high)}, {style.input_name(name).lower()}"
-                told.append(f"{condition}: {place}, MSE {mse:.4f}")
+                text.append(f"{condition}: {place}, MSE {mse:.4f}")
     return Plate(
         name="fig-07-mse-by-bin",
         figure=figure,
-        alt=f"Bars of the mean squared error in bins of Γ; largest, {'; '.join(told)}",
-        caption=f"Mean squared error by bins of the true safety margin. Largest error, {'; '.join(told)}. A bin "
+        alt=f"Bars of the mean squared error in bins of Γ; largest, {'; '.join(text)}",
+        caption=f"Mean squared error by bins of the true safety margin. Largest error, {'; '.join(text)}. A bin "
         "without bars holds no test frame.",
         numbers=named_columns(("condition", "input", "low", "high", "frames", "mse"), rows),
     )
@@ -62,20 +62,20 @@ def plate_bins(results: Results) -> Plate:
 
 def plate_predictions(results: Results) -> Plate:
     """Draw the answer against the label, a chart an input and condition."""
-    answers = np.concatenate([one.predictions.prediction for one in results.evaluations.values()])
+    answers = np.concatenate([evaluation.predictions.prediction for evaluation in results.evaluations.values()])
     # one scale for all, so that the scatter compares
     low, high = min(0.0, 100 * float(answers.min())), max(100.0, 100 * float(answers.max()))
-    shown = [
-        (name, condition, one.predictions.where(one.predictions.condition == condition))
+    chosen = [
+        (name, condition, evaluation.predictions.where(evaluation.predictions.condition == condition))
         for condition in _conditions(results)
         for name in style.inputs_in_order(results.evaluations)
-        for one in [results.evaluations[name]]
-        if condition in one.conditions and (one.predictions.condition == condition).any()
+        for evaluation in [results.evaluations[name]]
+        if condition in evaluation.conditions and (evaluation.predictions.condition == condition).any()
     ]
-    figure, axes = make_charts(len(shown), each=(3.4, 3.1))
+    figure, axes = make_charts(len(chosen), each=(3.4, 3.1))
     rows = []
     with style.drawing_style():
-        for ax, (name, condition, frames) in zip(axes, shown, strict=True):
+        for ax, (name, condition, frames) in zip(axes, chosen, strict=True):
             r2 = style.decimals(results.evaluations[name].conditions[condition].r2, 2)
             errors.plot_predictions(frames, colour=style.INPUT_COLOURS.get(name, style.PURPLE), ax=ax)
             ax.set(ylim=(low - 5, high + 5))
@@ -85,7 +85,8 @@ def plate_predictions(results: Results) -> Plate:
     return Plate(
         name="predictions",
         figure=figure,
-        alt=f"Predicted against true Γ: {style.listed([f'{style.input_name(one[0])}, {one[1]}' for one in shown])}",
+        alt="Predicted against true Γ: "
+        f"{style.listed([f'{style.input_name(name)}, {kind}' for name, kind, _ in chosen])}",
         caption=f"Predicted against true safety margin, {len(answers)} answers on frames of test trials. A perfect "
         "network would put every dot on the dashed line.",
         numbers=named_columns(("input", "trial", "condition", "frame", "safety_margin", "prediction"), rows),
@@ -94,28 +95,30 @@ def plate_predictions(results: Results) -> Plate:
 
 def plate_over_time(results: Results) -> Plate | None:
     """Draw label and answers through one typical test trial of each condition."""
-    chosen = {one: trial for one in _conditions(results) if (trial := _typical_trial(results, one)) is not None}
+    chosen = {
+        result: trial for result in _conditions(results) if (trial := _typical_trial(results, result)) is not None
+    }
     if not chosen:
         return None
     figure, axes = make_charts(len(chosen), each=(4.6, 3.1))
     rows = []
     with style.drawing_style():
         for ax, (condition, trial) in zip(axes, chosen.items(), strict=True):
-            shown = {}
-            for name, one in results.evaluations.items():
-                of_trial = (one.predictions.trial == trial) & (one.predictions.condition == condition)
+            drawn = {}
+            for name, evaluation in results.evaluations.items():
+                of_trial = (evaluation.predictions.trial == trial) & (evaluation.predictions.condition == condition)
                 if of_trial.any():
-                    shown[name] = frames = one.predictions.where(of_trial)
+                    drawn[name] = frames = evaluation.predictions.where(of_trial)
                     values = rows_of(frames.time_s, frames.safety_margin, frames.prediction, frames.withheld)
-                    rows += [(name, trial, *own) for own in values]
-            errors.plot_margin_over_time(shown, ax=ax).set_title(condition.capitalize(), parse_math=False)
-    told = ", ".join(f"{trial} ({condition})" for condition, trial in chosen.items())
+                    rows += [(name, trial, *value) for value in values]
+            errors.plot_margin_over_time(drawn, ax=ax).set_title(condition.capitalize(), parse_math=False)
+    text = ", ".join(f"{trial} ({condition})" for condition, trial in chosen.items())
     return Plate(
         name="over-time",
         figure=figure,
-        alt=f"True and predicted Γ over time through the test trials {told}",
+        alt=f"True and predicted Γ over time through the test trials {text}",
         caption="Safety margin through one test trial of each condition: the trial whose mean error is the median of "
-        f"all, neither the best nor the worst. Shown: {told}.",
+        f"all, neither the best nor the worst. Shown: {text}.",
         numbers=named_columns(("input", "trial", "time_s", "safety_margin", "prediction", "withheld"), rows),
     )
 
@@ -123,24 +126,24 @@ def plate_over_time(results: Results) -> Plate | None:
 def plate_learning(results: Results) -> Plate:
     """Draw the learning curves of all inputs."""
     trainings = {name: results.trainings[name] for name in style.inputs_in_order(results.trainings)}
-    told = "; ".join(
-        f"{style.input_name(name)}: best validation MSE {style.decimals(one.best_validation_mse, 4)} "
-        f"after {style.decimals(one.epochs, 1)} epochs (stopped by {one.stopped_by})"
-        for name, one in trainings.items()
+    text = "; ".join(
+        f"{style.input_name(name)}: best validation MSE {style.decimals(training.best_validation_mse, 4)} "
+        f"after {style.decimals(training.epochs, 1)} epochs (stopped by {training.stopped_by})"
+        for name, training in trainings.items()
     )
     figure, axes = make_charts(1, each=(5.6, 3.2))
     with style.drawing_style():
         errors.plot_learning_curves(trainings, ax=axes[0])
     rows = [
         (name, *values)
-        for name, one in trainings.items()
-        for values in rows_of(one.curve.epoch, one.curve.train_mse, one.curve.validation_mse)
+        for name, training in trainings.items()
+        for values in rows_of(training.curve.epoch, training.curve.train_mse, training.curve.validation_mse)
     ]
     return Plate(
         name="learning",
         figure=figure,
-        alt=f"Training and validation error by epoch. {told}",
-        caption=f"Learning curves. {told}.",
+        alt=f"Training and validation error by epoch. {text}",
+        caption=f"Learning curves. {text}.",
         numbers=named_columns(("input", "epoch", "train_mse", "validation_mse"), rows),
     )
 
@@ -149,19 +152,19 @@ def plate_faithfulness(scores: Mapping[str, DeletionScores]) -> Plate:
     """Draw the mean deletion score while pixels go, a chart an input, all of one source (thesis, Fig. 9)."""
     figure, axes = make_charts(len(scores), each=(4.6, 3.5))
     with style.drawing_style():
-        for ax, (name, one) in zip(axes, scores.items(), strict=True):
-            errors.plot_faithfulness(one.curves, pixels=_pixels(one), ax=ax).set_title(style.input_name(name))
-    told = "; ".join(f"{style.input_name(name).lower()}: {_tell_order(one)}" for name, one in scores.items())
-    source = " or ".join(sorted({style.source_name(one.source) for one in scores.values()}))
-    fill = " or ".join(sorted({one.fill for one in scores.values()}))
-    real = "-real" if all(one.source == "real" for one in scores.values()) else ""
+        for ax, (name, score) in zip(axes, scores.items(), strict=True):
+            errors.plot_faithfulness(score.curves, pixels=_pixels(score), ax=ax).set_title(style.input_name(name))
+    text = "; ".join(f"{style.input_name(name).lower()}: {_tell_order(score)}" for name, score in scores.items())
+    source = " or ".join(sorted({style.source_name(score.source) for score in scores.values()}))
+    fill = " or ".join(sorted({score.fill for score in scores.values()}))
+    real = "-real" if all(score.source == "real" for score in scores.values()) else ""
     return Plate(
         name=f"fig-09-faithfulness{real}",
         figure=figure,
-        alt=f"Deletion score D against pixels removed. Mean over all steps, {told}",
+        alt=f"Deletion score D against pixels removed. Mean over all steps, {text}",
         caption=f"Deletion score D of the thesis on {source} while pixels become {fill}, most salient first; the line "
         "is the mean over frames, the band holds the middle half of them. A curve that falls early names pixels the "
-        f"network relies on. Mean over all steps, lowest first, {told}.",
+        f"network relies on. Mean over all steps, lowest first, {text}.",
         numbers=_deletion_numbers(scores),
     )
 
@@ -170,7 +173,7 @@ def plate_each_frame(scored: DeletionScores) -> Plate:
     """Draw the thesis's curve of every frame, a chart a method (thesis, Figs. 17 and 18)."""
     methods, name = style.methods_in_order(scored.curves), style.input_name(scored.input).lower()
     figure, axes = make_charts(len(methods), each=(2.9, 2.5))
-    told = []
+    text = []
     with style.drawing_style():
         for ax, method in zip(axes, methods, strict=True):
             curve, colour = scored.curves[method], style.METHOD_COLOURS.get(method, style.PURPLE)
@@ -181,14 +184,14 @@ def plate_each_frame(scored: DeletionScores) -> Plate:
             ax.set(xlim=(0, 100), ylim=(0, 1.03), xlabel="Pixels removed (%)", ylabel="D (no unit)")
             ax.set_title(style.method_name(method), fontsize=9.5)
             means = curve.scores.mean(axis=1)
-            told.append(f"{style.method_name(method)} {means.mean():.3f} (standard deviation {means.std():.3f})")
+            text.append(f"{style.method_name(method)} {means.mean():.3f} (standard deviation {means.std():.3f})")
     frames = max(len(curve.frame_ids) for curve in scored.curves.values())
     return Plate(
         name=_EACH_FIGURES.get(scored.input, f"faithfulness-{scored.input}"),
         figure=figure,
-        alt=f"Deletion score D of every frame, {name}: {'; '.join(told)}",
+        alt=f"Deletion score D of every frame, {name}: {'; '.join(text)}",
         caption=f"Deletion score D of each of {number_of(frames, 'frame')} ({name}), in black their mean. "
-        f"Score: {'; '.join(told)}.",
+        f"Score: {'; '.join(text)}.",
         numbers=_deletion_numbers({scored.input: scored}),
     )
 
@@ -199,10 +202,12 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
     fills = settings(faithful)
     if not methods or not fills:
         return None
-    shown = [curve for key, curve in faithful.curves.items() if key[2] in methods]
-    top = max(float(curve.most_first.mean(axis=0).max()) for curve in shown)
+    chosen = [curve for key, curve in faithful.curves.items() if key[2] in methods]
+    top = max(float(curve.most_first.mean(axis=0).max()) for curve in chosen)
     # below zero where more speaks for the answer than before
-    bottom = min(float(line.mean(axis=0).min()) for one in shown for line in (one.most_first, one.least_first))
+    bottom = min(
+        float(line.mean(axis=0).min()) for record in chosen for line in (record.most_first, record.least_first)
+    )
     with style.drawing_style():
         figure = Figure(figsize=(1.75 * len(fills) + 0.9, 1.55 * len(methods) + 0.9), layout="constrained")
         axes = figure.subplots(len(methods), len(fills), squeeze=False, sharex=True, sharey=True)
@@ -230,7 +235,7 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
         name=f"sound-curves-{faithful.input}",
         figure=figure,
         alt=f"Evidence lost against the area removed, {style.input_name(faithful.input).lower()}, for "
-        f"{style.listed([style.method_name(one) for one in methods])}",
+        f"{style.listed([style.method_name(method) for method in methods])}",
         caption=f"{style.input_name(faithful.input)}: how much of the answer's change from the untouched sensor is "
         "lost while parts go, most supporting first, "
         f"least supporting first, and in {faithful.random_orders} random orders; the band holds the middle half of "
@@ -242,23 +247,25 @@ def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
 
 def plate_randomisation(results: Results) -> Plate:
     """Draw how alike maps stay as layers get new weights, a chart an input."""
-    found = results.study.randomisation
-    names = style.inputs_in_order(found)[::-1]
-    rows, told = [], []
+    records = results.study.randomisation
+    names = style.inputs_in_order(records)[::-1]
+    rows, text = [], []
     figure, axes = make_charts(len(names), each=(4.6, 3.5), sharey=True)
     with style.drawing_style():
         for ax, name in zip(axes, names, strict=True):
-            for method in style.methods_in_order(found[name].methods):
-                one = found[name].methods[method]
+            for method in style.methods_in_order(records[name].methods):
+                record = records[name].methods[method]
                 colour, line = style.METHOD_COLOURS.get(method, style.PURPLE), style.METHOD_LINES.get(method, "-")
                 dots = {"marker": "o", "markersize": 3.5, "label": style.method_name(method)}
-                similarity = np.array(one.similarity, dtype=np.float64)
-                ax.plot(one.layers, similarity, color=colour, linestyle=line, **dots)
-                rows += [(name, method, layer, value) for layer, value in zip(one.layers, one.similarity, strict=True)]
-                last = one.similarity[-1] if one.similarity else None
+                similarity = np.array(record.similarity, dtype=np.float64)
+                ax.plot(record.layers, similarity, color=colour, linestyle=line, **dots)
+                rows += [
+                    (name, method, layer, value) for layer, value in zip(record.layers, record.similarity, strict=True)
+                ]
+                last = record.similarity[-1] if record.similarity else None
                 if last is not None:
                     where = style.short_input_name(name).lower()
-                    told.append(f"{style.method_name(method)} {style.signed(last, 2)} ({where})")
+                    text.append(f"{style.method_name(method)} {style.signed(last, 2)} ({where})")
             ax.axhline(0, color=style.BLACK, linewidth=0.8, linestyle=":")
             ax.set(xlabel="Layers with new weights, from the output", ylabel="Similarity of the map (no unit)")
             ax.set_title(style.input_name(name))
@@ -267,10 +274,10 @@ def plate_randomisation(results: Results) -> Plate:
     return Plate(
         name="randomisation",
         figure=figure,
-        alt=f"Similarity of maps while layers get new weights; with all new: {', '.join(told)}",
+        alt=f"Similarity of maps while layers get new weights; with all new: {', '.join(text)}",
         caption="Similarity of each method's map to that of the trained network while layers get new weights: a map "
         "that stays alike does not show what was learned. With the last layer tested new: "
-        f"{', '.join(told) or 'not defined'}.",
+        f"{', '.join(text) or 'not defined'}.",
         numbers=named_columns(("input", "method", "layers", "similarity"), rows),
     )
 
@@ -288,15 +295,17 @@ def make_charts(count: int, *, each: tuple[float, float], sharey: bool = False) 
 
 
 def _conditions(results: Results) -> list[str]:
-    return style.conditions_in_order(name for one in results.evaluations.values() for name in one.conditions)
+    return style.conditions_in_order(
+        name for evaluation in results.evaluations.values() for name in evaluation.conditions
+    )
 
 
 def _typical_trial(results: Results, condition: str) -> str | None:
     # judged by the last input (difference where it was run), so that the choice favours neither curve by eye
-    shown = results.evaluations[style.inputs_in_order(results.evaluations)[-1]].predictions
-    shown = shown.where(shown.condition == condition)
-    error = np.abs(shown.prediction - shown.safety_margin)
-    ranked = sorted(np.unique(shown.trial).tolist(), key=lambda trial: float(error[shown.trial == trial].mean()))
+    chosen = results.evaluations[style.inputs_in_order(results.evaluations)[-1]].predictions
+    chosen = chosen.where(chosen.condition == condition)
+    error = np.abs(chosen.prediction - chosen.safety_margin)
+    ranked = sorted(np.unique(chosen.trial).tolist(), key=lambda trial: float(error[chosen.trial == trial].mean()))
     return ranked[(len(ranked) - 1) // 2] if ranked else None
 
 
@@ -306,18 +315,20 @@ def _pixels(scored: DeletionScores) -> int:
 
 def _tell_order(scored: DeletionScores) -> str:
     means = {method: float(curve.scores.mean()) for method, curve in scored.curves.items()}
-    return ", ".join(f"{style.method_name(one)} {means[one]:.3f}" for one in sorted(means, key=lambda one: means[one]))
+    return ", ".join(
+        f"{style.method_name(mean)} {means[mean]:.3f}" for mean in sorted(means, key=lambda one: means[one])
+    )
 
 
 def _deletion_numbers(scores: Mapping[str, DeletionScores]) -> dict[str, list]:
     names = ("input", "method", "pixels_removed", "share_removed", "mean", "quartile_low", "quartile_high", "sd")
     rows = []
-    for name, one in scores.items():
-        for method in style.methods_in_order(one.curves):
-            curve = one.curves[method]
+    for name, score in scores.items():
+        for method in style.methods_in_order(score.curves):
+            curve = score.curves[method]
             mean, quartiles = curve.scores.mean(axis=0), np.quantile(curve.scores, [0.25, 0.75], axis=0)
-            removed = (curve.pixels_removed, curve.pixels_removed / _pixels(one))
-            rows += [(name, method, *own) for own in rows_of(*removed, mean, *quartiles, curve.scores.std(axis=0))]
+            removed = (curve.pixels_removed, curve.pixels_removed / _pixels(score))
+            rows += [(name, method, *row) for row in rows_of(*removed, mean, *quartiles, curve.scores.std(axis=0))]
     return named_columns(names, rows)
 
 
@@ -336,5 +347,5 @@ def _tell_gains(faithful: RemovalScores, methods: list[str]) -> str:
     curves = {method: faithful.curves.get((fill, unit, method)) for method in methods}
     gains = {method: float(curve.srg.mean()) for method, curve in curves.items() if curve is not None}
     ranked = sorted(gains, key=lambda one: -gains[one])
-    told = ", ".join(f"{style.method_name(one)} {style.signed(gains[one], 3)}" for one in ranked)
-    return f"Under {style.fill_name(fill, unit)} it is {told}."
+    text = ", ".join(f"{style.method_name(record)} {style.signed(gains[record], 3)}" for record in ranked)
+    return f"Under {style.fill_name(fill, unit)} it is {text}."

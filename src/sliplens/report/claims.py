@@ -119,7 +119,7 @@ def _decide(
     votes: dict[str, Outcome] = {
         name: by_setting[name] for name in (fill_name(*setting) for setting in voting) if name in by_setting
     }
-    findings = [replace(one, outcome=one.outcome if one.where in votes else None) for one in findings]
+    findings = [replace(finding, outcome=finding.outcome if finding.where in votes else None) for finding in findings]
     if not votes:
         why = "under no fill that was scored does a map made from the truth win for sure"
         return _untested(subject, why, findings)
@@ -203,7 +203,7 @@ def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Row:
     keys = [(name, results.study.source) for name in ("difference", "raw")]
     first, second = (results.scores[key].curves if key in results.scores else {} for key in keys)
     methods = [method for method in (*_RIVALS, POLY_CAM) if method in first and method in second]
-    scored = {f"D of {method_name(one)}, difference less raw": (first[one], second[one]) for one in methods}
+    scored = {f"D of {method_name(method)}, difference less raw": (first[method], second[method]) for method in methods}
     findings += _by_thesis_score(scored, rng=rng)
     return _decide(subject, by_setting, findings, voting_settings(difference, *results.study.truth.values()))
 

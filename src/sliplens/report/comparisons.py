@@ -65,13 +65,13 @@ SECONDS: dict[str, float] = {"grad-cam": 0.029, "integrated-gradients": 0.27, "p
 
 def compare_errors(first: ScoredFrames, second: ScoredFrames, *, rng: np.random.Generator) -> Difference | None:
     """Difference in MSE of two networks, over days and trials; None unless both answered the very same frames."""
-    one, other = (own.where(np.lexsort((own.frame, own.trial))) for own in (first, second))
-    if not len(one.trial) or any(
-        not np.array_equal(getattr(one, key), getattr(other, key)) for key in ("trial", "frame")
+    record, other = (rows.where(np.lexsort((rows.frame, rows.trial))) for rows in (first, second))
+    if not len(record.trial) or any(
+        not np.array_equal(getattr(record, key), getattr(other, key)) for key in ("trial", "frame")
     ):
         return None
-    errors = [(own.prediction - own.safety_margin) ** 2 for own in (one, other)]
-    return paired_difference(errors[0], errors[1], clusters=[one.day, one.trial], rng=rng)
+    errors = [(rows.prediction - rows.safety_margin) ** 2 for rows in (record, other)]
+    return paired_difference(errors[0], errors[1], clusters=[record.day, record.trial], rng=rng)
 
 
 def compare_deletion(first: DeletionCurve, second: DeletionCurve, *, rng: np.random.Generator) -> Difference | None:
@@ -133,10 +133,10 @@ def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Gen
 
 def settings(faithful: RemovalScores) -> list[tuple[str, str]]:
     """Fills and units that were scored, in the order they are read."""
-    found = {(fill, unit) for fill, unit, _ in faithful.curves}
-    fills = style.in_order({fill for fill, _ in found}, style.FILL_NAMES)
-    units = style.in_order({unit for _, unit in found}, style.UNIT_NAMES)
-    return [(fill, unit) for unit in units for fill in fills if (fill, unit) in found]
+    records = {(fill, unit) for fill, unit, _ in faithful.curves}
+    fills = style.in_order({fill for fill, _ in records}, style.FILL_NAMES)
+    units = style.in_order({unit for _, unit in records}, style.UNIT_NAMES)
+    return [(fill, unit) for unit in units for fill in fills if (fill, unit) in records]
 
 
 def voting_settings(faithful: RemovalScores, *truths: Truth | None) -> list[tuple[str, str]]:
@@ -146,12 +146,12 @@ def voting_settings(faithful: RemovalScores, *truths: Truth | None) -> list[tupl
     """
     units = {fill: (fill, unit) for fill, unit in reversed(settings(faithful))}
     unfit = {fill for truth in truths for fill in unfit_fills(truth)}
-    return [one for one in settings(faithful) if units[one[0]] == one and one[0] not in unfit]
+    return [setting for setting in settings(faithful) if units[setting[0]] == setting and setting[0] not in unfit]
 
 
 def unfit_fills(truth: Truth | None) -> list[str]:
     """Fills under which a map made from the truth does not win for sure: they cannot judge a map."""
-    return [] if truth is None else [one.fill for one in truth.meta if not one.holds]
+    return [] if truth is None else [test.fill for test in truth.meta if not test.holds]
 
 
 def removal_by_setting(faithful: RemovalScores) -> list[tuple[str, dict[str, RemovalCurve]]]:
@@ -174,14 +174,14 @@ def tell_sample(choice: Choice, name: str = "") -> str:
     names = [name] if name in choice.mean_error else style.inputs_in_order(choice.mean_error)[::-1]
     several = len(names) > 1
     errors = [
-        f"{100 * choice.mean_error[one]:.0f} points" + (f" ({style.input_name(one).lower()})" if several else "")
-        for one in names
+        f"{100 * choice.mean_error[name]:.0f} points" + (f" ({style.input_name(name).lower()})" if several else "")
+        for name in names
     ]
-    alone = [f"{choice.qualified_alone[one]} with {style.input_name(one).lower()}" for one in names]
-    told = f", {style.listed(alone)} alone" if len(choice.inputs) > 1 else ""
+    alone = [f"{choice.qualified_alone[name]} with {style.input_name(name).lower()}" for name in names]
+    text = f", {style.listed(alone)} alone" if len(choice.inputs) > 1 else ""
     return (
         f"The sample explains answers that are off by {style.listed(errors)} on average; {choice.qualified} of "
-        f"{number_of(choice.considered, 'trial')} qualified at ±{100 * choice.tolerance:g} points{told}."
+        f"{number_of(choice.considered, 'trial')} qualified at ±{100 * choice.tolerance:g} points{text}."
     )
 
 

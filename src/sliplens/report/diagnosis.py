@@ -43,11 +43,12 @@ def table_slices(diagnosis: Diagnosis) -> Table:
         ("Slice", "Frames", "Trials", "Mean |error|", "Mean error", "Less elsewhere (95 %)"),
         [
             (
-                one.name.replace(", ", ",\n"), f"{one.frames:,}", str(one.trials), f"{100 * one.error:.1f}",
-                _points(one.bias),
-                f"{_points(one.excess.estimate)} ({tell_ends(one.excess, _points)}){', larger' if one.holds else ''}",
+                part.name.replace(", ", ",\n"), f"{part.frames:,}", str(part.trials), f"{100 * part.error:.1f}",
+                _points(part.bias),
+                f"{_points(part.excess.estimate)} ({tell_ends(part.excess, _points)})"
+                f"{', larger' if part.holds else ''}",
             )
-            for one in diagnosis.slices
+            for part in diagnosis.slices
         ],
     )  # fmt: skip
 
@@ -60,14 +61,14 @@ def plate_frictions(diagnosis: Diagnosis) -> Plate:
     """Draw the answer against the true margin as friction alone changes, a line a frame."""
     names, groups = [field.name for field in fields(FrictionTable)], diagnosis.frictions.groups("condition")
     figure, axes = make_charts(len(groups), each=(4.2, 3.6))
-    told = {
-        one.condition: f"slope {decimals(one.network.estimate, 2)}, best {decimals(one.reading.estimate, 2)}"
-        for one in diagnosis.slopes
+    text = {
+        slope.condition: f"slope {decimals(slope.network.estimate, 2)}, best {decimals(slope.reading.estimate, 2)}"
+        for slope in diagnosis.slopes
     }
     with drawing_style():
-        for ax, ((condition,), own) in zip(axes, groups.items(), strict=True):
+        for ax, ((condition,), group) in zip(axes, groups.items(), strict=True):
             ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1)
-            for rows in own.groups("frame_id").values():
+            for rows in group.groups("frame_id").values():
                 line = {
                     "color": CONDITION_COLOURS.get(condition, GREY),
                     "alpha": 0.7,
@@ -75,12 +76,12 @@ def plate_frictions(diagnosis: Diagnosis) -> Plate:
                     "markersize": 3,
                 }
                 ax.plot(100 * rows.safety_margin, 100 * rows.prediction, marker="o", **line)
-            ax.set_title(f"{condition.capitalize()}: {told.get(condition, 'no slope')}", parse_math=False)
+            ax.set_title(f"{condition.capitalize()}: {text.get(condition, 'no slope')}", parse_math=False)
             ax.set(xlabel="True Γ with that friction (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103))
     return Plate(
         name=f"diagnosis-frictions-{diagnosis.input}",
         figure=figure,
-        alt=f"Answer against true margin as friction alone changes: {told}",
+        alt=f"Answer against true margin as friction alone changes: {text}",
         caption="The same press and pull filmed anew with other frictions, the forces kept, a line a frame: a network "
         "that reads friction from what it sees rises as the dashed line does, one that answers by habit stays level. "
         "Best: the slope of the best reading of the markers, which knows how far frictions and loads range: far below "
@@ -91,10 +92,10 @@ def plate_frictions(diagnosis: Diagnosis) -> Plate:
 
 def plate_refilmed(diagnosis: Diagnosis) -> Plate:
     """Show one frame with each of its frictions."""
-    own = diagnosis.frictions.where(diagnosis.frictions.frame_id == diagnosis.shown_frame)
+    frames = diagnosis.frictions.where(diagnosis.frictions.frame_id == diagnosis.shown_frame)
     factor, name = picture_brightness(diagnosis.input, diagnosis.pictures)
     pictures = brighten(diagnosis.other_frictions, factor)
-    rows = rows_of(own.friction, own.safety_margin, own.prediction)
+    rows = rows_of(frames.friction, frames.safety_margin, frames.prediction)
     words = [f"Γ {percent(margin)}, read {percent(answer)}" for _, margin, answer in rows]
     cells = [Cell(picture=picture, words=below) for picture, below in zip(pictures, words, strict=True)]
     return Plate(
@@ -113,22 +114,27 @@ def plate_kinds(diagnosis: Diagnosis) -> Plate:
     table, maps = diagnosis.explained, diagnosis.maps
     factor, name = picture_brightness(diagnosis.input, diagnosis.pictures)
     pictures, top = brighten(diagnosis.pictures, factor), full_colour(maps)
-    rows, shown, columns = [], [], ("kind", "frames", "trials", "error", "bias", "safety_margin", "friction")
+    rows, chosen, columns = [], [], ("kind", "frames", "trials", "error", "bias", "safety_margin", "friction")
     for kind in np.unique(table.cluster).tolist():
-        own = table.where(table.cluster == kind)
-        means = [float(values.mean()) for values in (np.abs(own.error), own.error, own.safety_margin, own.friction)]
-        rows.append((kind + 1, len(own), len(np.unique(own.trial)), *means))
+        frames = table.where(table.cluster == kind)
+        means = [
+            float(values.mean())
+            for values in (np.abs(frames.error), frames.error, frames.safety_margin, frames.friction)
+        ]
+        rows.append((kind + 1, len(frames), len(np.unique(frames.trial)), *means))
         cells = []
-        for example in np.sort(own.example[own.example >= 0]).tolist():
-            one = own.where(own.example == example)
-            ((margin, answer, condition),) = rows_of(one.safety_margin, one.prediction, one.condition)
+        for example in np.sort(frames.example[frames.example >= 0]).tolist():
+            record = frames.where(frames.example == example)
+            ((margin, answer, condition),) = rows_of(record.safety_margin, record.prediction, record.condition)
             words = f"Γ {percent(margin)}, read {percent(answer)}"
             picture = pictures[example]
             painted = overlay_relevance(picture, maps[example] / top)
             cells += [Cell(picture=picture, words=words), Cell(picture=painted, words=condition)]
-        shown.append((f"Kind {kind + 1}: {number_of(len(own), 'frame')}, off by {100 * means[0]:.1f} points", cells))
-    heads = [name, "parts"] * (max(len(cells) for _, cells in shown) // 2)
-    grid = draw_grid(shown, heads=heads, below_in=0.6)
+        chosen.append(
+            (f"Kind {kind + 1}: {number_of(len(frames), 'frame')}, off by {100 * means[0]:.1f} points", cells)
+        )
+    heads = [name, "parts"] * (max(len(cells) for _, cells in chosen) // 2)
+    grid = draw_grid(chosen, heads=heads, below_in=0.6)
     with drawing_style():
         bar = place_axes(grid.figure, 1.25, grid.bottom_in + 0.12, 4.2, 0.14)
         ends = (-100 * top, 100 * top, 0, 1)
@@ -137,7 +143,7 @@ def plate_kinds(diagnosis: Diagnosis) -> Plate:
     return Plate(
         name=f"diagnosis-kinds-{diagnosis.input}",
         figure=grid.figure,
-        alt=f"Examples of each kind of explanation: {'; '.join(words for words, _ in shown)}",
+        alt=f"Examples of each kind of explanation: {'; '.join(words for words, _ in chosen)}",
         caption=f"Kinds of explanations, that of the largest error first (k-means on {diagnosis.method}, each frame's "
         "divided by the sum of their sizes), and the frames nearest to the middle of each.",
         numbers=named_columns(columns, rows),

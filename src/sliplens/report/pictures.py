@@ -87,23 +87,24 @@ _STATE_FIGURES = {"difference": "fig-15-methods-difference", "raw": "fig-16-meth
 
 def plate_methods(results: Results) -> Plate | None:
     """Draw the methods beside each other at one margin, a row an input (thesis, Fig. 8); None without maps."""
-    rows, numbers, told, methods = [], [], [], shown_methods(results)
+    rows, numbers, text, methods = [], [], [], shown_methods(results)
     for name in inputs_in_order(results.inputs)[::-1]:
         explained = explained_of(results, name)
         frames = [] if explained is None else shown_frames(results, explained)
         if explained is None or not frames:
             continue
         frame = min(frames, key=lambda one: abs(one.level - THESIS_LEVEL) if one.level is not None else 1.0)
-        own = explained.frames[frame.index]
+        shown_frame = explained.frames[frame.index]
         pictures, called = bright_pictures(explained, [frame.index])
         picture = pictures[frame.index]
-        cells = [Cell(picture=picture, words=_answer(own))]
+        cells = [Cell(picture=picture, words=_answer(shown_frame))]
         for method in methods:
             saliency = explained.saliency.get(method)
             cells.append(Cell(picture=saliency if saliency is None else show_map(picture, saliency[frame.index])))
             numbers += [] if saliency is None else [_measured(explained, method, frame)]
         rows.append((f"{short_input_name(name)}\n({called.lower()})", cells))
-        told.append(f"{short_input_name(name).lower()} {own.id}, {_answer(own).replace('true', 'true Γ')}")
+        answer = _answer(shown_frame).replace("true", "true Γ")
+        text.append(f"{short_input_name(name).lower()} {shown_frame.id}, {answer}")
     if not rows:
         return None
     heads = ["Input", *(method_name(method) for method in methods)]
@@ -111,8 +112,8 @@ def plate_methods(results: Results) -> Plate | None:
     return Plate(
         name="fig-08-methods",
         figure=draw_grid(rows, heads=heads, bar=True).figure,
-        alt=f"Saliency maps of {listed(heads[1:])} side by side; {'; '.join(told)}",
-        caption=f"Methods beside each other on one frame near Γ {percent(THESIS_LEVEL)} ({'; '.join(told)}). Colours "
+        alt=f"Saliency maps of {listed(heads[1:])} side by side; {'; '.join(text)}",
+        caption=f"Methods beside each other on one frame near Γ {percent(THESIS_LEVEL)} ({'; '.join(text)}). Colours "
         f"are relative to each map's own saliency. Share of the image with a saliency above 0.5: {', '.join(spread)}.",
         numbers=named_columns(_SALIENCY_COLUMNS, numbers),
         pixels=True,
@@ -169,28 +170,33 @@ def _plate(
 ) -> Plate | None:
     if not frames:
         return None
-    trials = {explained.frames[one.index].trial for one in frames}
-    pictures, called = bright_pictures(explained, [one.index for one in frames])
-    rows = [(called, [Cell(picture=pictures[one.index], words=_answer(explained.frames[one.index])) for one in frames])]
+    trials = {explained.frames[frame.index].trial for frame in frames}
+    pictures, called = bright_pictures(explained, [frame.index for frame in frames])
+    rows = [
+        (
+            called,
+            [Cell(picture=pictures[frame.index], words=_answer(explained.frames[frame.index])) for frame in frames],
+        )
+    ]
     for method in methods:
         maps = explained.saliency[method]
-        cells = [Cell(picture=show_map(pictures[one.index], maps[one.index])) for one in frames]
+        cells = [Cell(picture=show_map(pictures[frame.index], maps[frame.index])) for frame in frames]
         rows.append((method_name(method), cells))
-    numbers = {method: [_measured(explained, method, one) for one in frames] for method in methods}
+    numbers = {method: [_measured(explained, method, frame) for frame in frames] for method in methods}
     moves = ""
     for method, measured in numbers.items():
-        known = [row[8] for row in measured if np.isfinite(row[8])]
-        moves += f", {method_name(method)} {signed(known[-1] - known[0], 0)}" if len(known) > 1 else ""
+        valid = [row[8] for row in measured if np.isfinite(row[8])]
+        moves += f", {method_name(method)} {signed(valid[-1] - valid[0], 0)}" if len(valid) > 1 else ""
     if moves:
         moves = f"From the first to the last frame the centre of the saliency moves down by, in pixels: {moves[2:]}."
-    answers = [explained.frames[one.index] for one in frames]
-    errors = [abs(one.prediction - one.safety_margin) for one in answers if one.safety_margin is not None]
+    answers = [explained.frames[frame.index] for frame in frames]
+    errors = [abs(answer.prediction - answer.safety_margin) for answer in answers if answer.safety_margin is not None]
     off = f" The network is off by at most {100 * max(errors):.1f} percentage points on these frames." if errors else ""
     return Plate(
         name=name,
-        figure=draw_grid(rows, heads=[f"Γ {percent(one.level)}" for one in frames], bar=True).figure,
-        alt=f"{what}: {listed([method_name(one) for one in methods])} at Γ "
-        f"{', '.join(percent(one.level) for one in frames)}",
+        figure=draw_grid(rows, heads=[f"Γ {percent(frame.level)}" for frame in frames], bar=True).figure,
+        alt=f"{what}: {listed([method_name(method) for method in methods])} at Γ "
+        f"{', '.join(percent(frame.level) for frame in frames)}",
         caption=f"{what}: {'one trial' if len(trials) == 1 else 'frames'} from full stick to full slip.{off} "
         "Colours are relative to each map's own saliency, so brightness does not compare between maps. "
         f"{moves}{_tell_blank(explained, frames, methods)}",
@@ -200,7 +206,7 @@ def _plate(
 
 
 def _tell_blank(explained: Explanation, frames: list[ShownFrame], methods: list[str]) -> str:
-    blank = sum(not explained.saliency[method][one.index].any() for method in methods for one in frames)
+    blank = sum(not explained.saliency[method][frame.index].any() for method in methods for frame in frames)
     if not blank:
         return ""
     maps = "1 map has" if blank == 1 else f"{blank} maps have"
@@ -209,13 +215,13 @@ def _tell_blank(explained: Explanation, frames: list[ShownFrame], methods: list[
 
 def _measured(explained: Explanation, method: str, frame: ShownFrame) -> tuple[Any, ...]:
     """Numbers of a map drawn: where its weight lies, and on how much of the image."""
-    own = explained.frames[frame.index]
+    shown_frame = explained.frames[frame.index]
     saliency = explained.saliency[method][frame.index].astype(np.float64)
     total, (y, x) = saliency.sum(), np.indices(saliency.shape)
     right, down = (float((saliency * axis).sum() / total) if total > 0 else float("nan") for axis in (x, y))
-    label = float("nan") if own.safety_margin is None else own.safety_margin
+    label = float("nan") if shown_frame.safety_margin is None else shown_frame.safety_margin
     above = float((saliency > 0.5).mean())
-    return explained.input, method, own.id, frame.level, label, own.prediction, above, right, down
+    return explained.input, method, shown_frame.id, frame.level, label, shown_frame.prediction, above, right, down
 
 
 def _answer(frame: ExplainedFrame) -> str:
@@ -224,14 +230,14 @@ def _answer(frame: ExplainedFrame) -> str:
 
 def shown_methods(results: Results) -> list[str]:
     """Methods that have maps, the controls left out."""
-    found = {method for one in results.explanations.values() for method in one.saliency}
-    return methods_in_order(name for name in found if not is_control(name))
+    records = {method for explanation in results.explanations.values() for method in explanation.saliency}
+    return methods_in_order(name for name in records if not is_control(name))
 
 
 def plate_deletion(results: Results) -> Plate | None:
     """Illustrate deletion on one frame, with the score below (thesis, Fig. 5); None without a scored map."""
     for explained, scored, index in _materials(results):
-        methods = [one for one in methods_in_order(scored.curves) if one in explained.saliency]
+        methods = [method for method in methods_in_order(scored.curves) if method in explained.saliency]
         if methods:
             return _illustrate(explained, scored, "poly-cam" if "poly-cam" in methods else methods[-1], index)
     return None
@@ -239,24 +245,24 @@ def plate_deletion(results: Results) -> Plate | None:
 
 def plate_removal(results: Results, method: str) -> Plate | None:
     """Draw what one method has removed, with y and D at each step, a row an input (thesis, Figs. 19 to 21)."""
-    rows, numbers, told = [], [], []
+    rows, numbers, text = [], [], []
     for explained, scored, index in _materials(results):
         if method not in explained.saliency or method not in scored.curves:
             continue
         steps = _steps(scored.curves[method], explained, index)
         rows.append((short_input_name(explained.input), _removed(explained, method, index, steps, fill=scored.fill)))
         numbers += _steps_told(explained, method, index, steps)
-        told.append(f"{input_name(explained.input)}: {_tell_fall(explained, index, steps)}")
+        text.append(f"{input_name(explained.input)}: {_tell_fall(explained, index, steps)}")
     if not rows:
         return None
-    fill = " or ".join(sorted({one.fill for one in results.scores.values()}))
+    fill = " or ".join(sorted({score.fill for score in results.scores.values()}))
     heads = ["Saliency", *(f"{percent(share)} gone" for share in SHARES)]
     return Plate(
         name=_FIGURES.get(method, f"removal-{method}"),
         figure=draw_grid(rows, heads=heads, bar=True, cell_in=1.3).figure,
-        alt=f"What {method_name(method)} calls most important is removed step by step. {'. '.join(told)}",
+        alt=f"What {method_name(method)} calls most important is removed step by step. {'. '.join(text)}",
         caption=f"{method_name(method)}: what is gone, the answer y and the score D at each step of the thesis's "
-        f"deletion ({fill} fill). {'. '.join(told)}.",
+        f"deletion ({fill} fill). {'. '.join(text)}.",
         numbers=named_columns(_STEP_COLUMNS, numbers),
         pixels=True,
     )
@@ -264,16 +270,16 @@ def plate_removal(results: Results, method: str) -> Plate | None:
 
 def plate_highlighted(results: Results) -> Plate | None:
     """Draw the frame without all that has a saliency above 0.5, a row an input (thesis, Fig. 10)."""
-    rows, numbers, told, methods = [], [], [], shown_methods(results)
+    rows, numbers, text, methods = [], [], [], shown_methods(results)
     for explained, _, index in _materials(results):
-        name, own, picture = explained.input, explained.frames[index], explained.pictures[index]
+        name, frames, picture = explained.input, explained.frames[index], explained.pictures[index]
         remedies = results.study.remedies.get(name)
         variant = None if remedies is None else remedies.variants.get(_HALF)
         if remedies is None or variant is None:
             continue
-        cells, own_told = [Cell(picture=picture, words=f"y {percent(own.prediction)}")], []
+        cells, own_told = [Cell(picture=picture, words=f"y {percent(frames.prediction)}")], []
         for method in methods:
-            curve = remedies.curves.get((_HALF, method), {}).get(own.id)
+            curve = remedies.curves.get((_HALF, method), {}).get(frames.id)
             if curve is None or method not in explained.saliency:
                 cells.append(Cell(picture=None))
                 continue
@@ -283,31 +289,31 @@ def plate_highlighted(results: Results) -> Plate | None:
             cells.append(Cell(picture=_without(picture, mask, variant.fill), words=words))
             numbers += _steps_told(explained, method, index, [step])
             own_told.append(f"{method_name(method)} {words}")
-        told += [f"{input_name(name)}: whole y {percent(own.prediction)}; {'; '.join(own_told)}"] if own_told else []
+        text += [f"{input_name(name)}: whole y {percent(frames.prediction)}; {'; '.join(own_told)}"] if own_told else []
         rows.append((short_input_name(name), cells))
-    if not told:
+    if not text:
         return None
     heads = ["Whole", *(method_name(method) for method in methods)]
     return Plate(
         name="fig-10-highlighted",
         figure=draw_grid(rows, heads=heads, cell_in=1.25 * CELL_IN).figure,
-        alt=f"One frame without what each method highlights. {'. '.join(told)}",
-        caption=f"All pixels with a saliency above 0.5 removed, the answer y and the score D then. {'. '.join(told)}.",
+        alt=f"One frame without what each method highlights. {'. '.join(text)}",
+        caption=f"All pixels with a saliency above 0.5 removed, the answer y and the score D then. {'. '.join(text)}.",
         numbers=named_columns(_STEP_COLUMNS, numbers),
         pixels=True,
     )
 
 
 def _illustrate(explained: Explanation, scored: DeletionScores, method: str, index: int) -> Plate:
-    curve, own = scored.curves[method], explained.frames[index]
+    curve, frame = scored.curves[method], explained.frames[index]
     steps = _steps(curve, explained, index)
     cells = [
-        Cell(picture=explained.pictures[index], words=f"y {percent(own.prediction)}"),
+        Cell(picture=explained.pictures[index], words=f"y {percent(frame.prediction)}"),
         *_removed(explained, method, index, steps, fill=scored.fill),
     ]
     heads = ["Input", "Saliency", *(f"{percent(share)} gone" for share in SHARES)]
     grid = draw_grid([(short_input_name(explained.input), cells)], heads=heads, below_in=2.2, cell_in=1.2)
-    row = curve.frame_ids.index(own.id)
+    row = curve.frame_ids.index(frame.id)
     share = 100 * curve.pixels_removed / explained.image_size**2
     with drawing_style():
         wide = grid.figure.get_size_inches()[0]
@@ -316,7 +322,7 @@ def _illustrate(explained: Explanation, scored: DeletionScores, method: str, ind
         ax.set(xlabel="Pixels removed (%)", ylabel="D (no unit)", xlim=(0, 100), ylim=(0, 1.03))
         answer = ax.twinx()
         answer.plot(share, 100 * curve.predictions[row], color=VERMILLION, linestyle="--", label="answer y")
-        answer.axhline(100 * own.prediction, color=GREY, linewidth=0.8, linestyle=":")
+        answer.axhline(100 * frame.prediction, color=GREY, linewidth=0.8, linestyle=":")
         answer.set(ylabel=MARGIN_LABEL)
         answer.grid(visible=False)
         lines = [*ax.lines, answer.lines[0]]
@@ -325,10 +331,10 @@ def _illustrate(explained: Explanation, scored: DeletionScores, method: str, ind
     return Plate(
         name="fig-05-deletion",
         figure=grid.figure,
-        alt=f"Deletion on frame {own.id}: {_tell_fall(explained, index, steps)}",
-        caption=f"How the score of the thesis comes about: {method_name(method)} on frame {own.id} "
-        f"({input_name(explained.input).lower()}, true Γ {percent(own.safety_margin)}). The most salient pixels become "
-        f"{scored.fill} first; D = (1 \N{MINUS SIGN} |y \N{MINUS SIGN} y whole|)², mean over all steps {mean:.3f}. "
+        alt=f"Deletion on frame {frame.id}: {_tell_fall(explained, index, steps)}",
+        caption=f"How the score of the thesis comes about: {method_name(method)} on frame {frame.id} "
+        f"({input_name(explained.input).lower()}, true Γ {percent(frame.safety_margin)}). The most salient pixels "
+        f"become {scored.fill} first; D = (1 \N{MINUS SIGN} |y \N{MINUS SIGN} y whole|)², mean over all steps {mean:.3f}. "
         f"Answers: {_tell_fall(explained, index, steps)}.",
         numbers={"pixels_removed": curve.pixels_removed, "share_removed": share / 100, **columns},
         pixels=True,
@@ -341,7 +347,9 @@ def _materials(results: Results) -> Iterator[tuple[Explanation, DeletionScores, 
         explained, scored = explained_of(results, name), results.scores.get((name, results.study.source))
         if explained is None or scored is None:
             continue
-        index = told_frame(explained, {method: one for method, one in scored.curves.items() if not is_control(method)})
+        index = told_frame(
+            explained, {method: curve for method, curve in scored.curves.items() if not is_control(method)}
+        )
         if index is not None:
             yield explained, scored, index
 
@@ -352,22 +360,22 @@ def _steps(curve: DeletionCurve, explained: Explanation, index: int) -> list[tup
     share = curve.pixels_removed / explained.image_size**2
     return [
         (int(curve.pixels_removed[at]), float(curve.predictions[row, at]), float(curve.scores[row, at]))
-        for at in (np.abs(share - one).argmin() for one in SHARES)
+        for at in (np.abs(share - record).argmin() for record in SHARES)
     ]
 
 
 def _removed(
     explained: Explanation, method: str, index: int, steps: list[tuple[int, float, float]], *, fill: str
 ) -> list[Cell]:
-    saliency, own = explained.saliency[method][index], explained.frames[index]
+    saliency, rows = explained.saliency[method][index], explained.frames[index]
     # as the network saw it: made brighter, a difference would no longer compare with the fill
     picture = explained.pictures[index]
-    shown = [show_map(bright_pictures(explained, [index])[0][index], saliency)]
-    shown += [_without(picture, gone(saliency, pixels), fill) for pixels, _, _ in steps]
-    answers = [(own.prediction, 1.0), *((answer, score) for _, answer, score in steps)]
+    chosen = [show_map(bright_pictures(explained, [index])[0][index], saliency)]
+    chosen += [_without(picture, gone(saliency, pixels), fill) for pixels, _, _ in steps]
+    answers = [(rows.prediction, 1.0), *((answer, score) for _, answer, score in steps)]
     return [
-        Cell(picture=one, words=f"y {percent(answer)}, D {score:.2f}")
-        for one, (answer, score) in zip(shown, answers, strict=True)
+        Cell(picture=record, words=f"y {percent(answer)}, D {score:.2f}")
+        for record, (answer, score) in zip(chosen, answers, strict=True)
     ]
 
 
@@ -381,17 +389,17 @@ def _without(
 def _steps_told(
     explained: Explanation, method: str, index: int, steps: list[tuple[int, float, float]]
 ) -> list[tuple[Any, ...]]:
-    own = explained.frames[index]
+    shown_frame = explained.frames[index]
     return [
-        (explained.input, method, own.id, pixels, pixels / explained.image_size**2, answer, score)
-        for pixels, answer, score in [(0, own.prediction, 1.0), *steps]
+        (explained.input, method, shown_frame.id, pixels, pixels / explained.image_size**2, answer, score)
+        for pixels, answer, score in [(0, shown_frame.prediction, 1.0), *steps]
     ]
 
 
 def _tell_fall(explained: Explanation, index: int, steps: list[tuple[int, float, float]]) -> str:
     parts = [
-        f"{percent(share)} gone y {percent(one[1])}, D {one[2]:.2f}"
-        for share, one in zip(SHARES, steps, strict=True)
+        f"{percent(share)} gone y {percent(step[1])}, D {step[2]:.2f}"
+        for share, step in zip(SHARES, steps, strict=True)
         if share in _TOLD
     ]
     return "; ".join([f"whole y {percent(explained.frames[index].prediction)}", *parts])
@@ -433,7 +441,7 @@ def plate_contact_states(states: States) -> Plate | None:
         bar = place_axes(grid.figure, 1.25, grid.bottom_in + 0.05, 2.6, 0.12)
         grid.figure.colorbar(mappable, cax=bar, orientation="horizontal", label="Displacement (px)")
     moves = ["unknown" if field is None else f"{_longest(field):.1f} px" for field in fields.values()]
-    told = "; ".join(
+    text = "; ".join(
         f"{move} at {frame.contact_state}, Γ {percent(frame.safety_margin)}"
         for move, frame in zip(moves, chosen, strict=True)
     )
@@ -442,7 +450,7 @@ def plate_contact_states(states: States) -> Plate | None:
         figure=grid.figure,
         alt=f"Camera image, displacement field and difference image at {listed(heads).replace(chr(10), ', ')}",
         caption=f"What a touch looks like, trial {states.trial}: camera image with the markers' displacement (from "
-        f"{states.markers_from}), the field between them, and the difference image. Largest displacement: {told}.",
+        f"{states.markers_from}), the field between them, and the difference image. Largest displacement: {text}.",
         numbers=_marker_numbers(chosen),
         pixels=True,
     )
@@ -457,13 +465,13 @@ def plate_fields_beside_saliency(results: Results) -> Plate | None:
     method = _poly_cam(explained)
     if states is None or explained is None or method is None:
         return None
-    known = {explained.frames[one.index].id: one for one in shown_frames(results, explained)}
+    valid = {explained.frames[frame.index].id: frame for frame in shown_frames(results, explained)}
     marked, rows = [], []
     for frame in states.frames:
         field = _field(frame)
-        if frame.id not in known or field is None:
+        if frame.id not in valid or field is None:
             continue
-        fitted = _resized(explained.saliency[method][known[frame.id].index], frame.raw.shape[:2])
+        fitted = _resized(explained.saliency[method][valid[frame.id].index], frame.raw.shape[:2])
         title = f"Γ {percent(frame.safety_margin)}"
         marked.append(MarkedFrame(title=title, frame=frame.raw, field=field, saliency=fitted))
         rows.append((frame.id, frame.safety_margin, _longest(field), _share_on_moving(fitted, field)))
@@ -473,7 +481,8 @@ def plate_fields_beside_saliency(results: Results) -> Plate | None:
     return Plate(
         name="fig-12-poly-cam-raw" if explained.input == "raw" else f"poly-cam-{explained.input}",
         figure=draw_fields_beside_saliency(marked),
-        alt=f"Camera frame, displacement field and Poly-CAM side by side at {listed([one.title for one in marked])}",
+        alt="Camera frame, displacement field and Poly-CAM side by side at "
+        f"{listed([frame.title for frame in marked])}",
         caption=f"{method_name(method)} on {input_name(explained.input).lower()} beside the displacement of the "
         "markers. Share of the saliency that lies where the "
         f"skin moves by more than half of that frame's largest displacement: {shares}.",
@@ -520,8 +529,8 @@ def _marker_numbers(frames: list[StateFrame]) -> dict[str, np.ndarray]:
     counts = [len(frame.rest_px) for frame in frames]
     rest, now = (np.concatenate([getattr(frame, name) for frame in frames]) for name in ("rest_px", "now_px"))
     names = {"frame_id": "id", "contact_state": "contact_state", "safety_margin": "safety_margin"}
-    told = {name: np.repeat([getattr(frame, own) for frame in frames], counts) for name, own in names.items()}
-    return told | dict(zip(("rest_x_px", "rest_y_px", "x_px", "y_px"), (*rest.T, *now.T), strict=True))
+    text = {name: np.repeat([getattr(frame, rows) for frame in frames], counts) for name, rows in names.items()}
+    return text | dict(zip(("rest_x_px", "rest_y_px", "x_px", "y_px"), (*rest.T, *now.T), strict=True))
 
 
 def _bare(ax: Axes) -> None:
@@ -535,37 +544,40 @@ def plate_truth(results: Results, name: str) -> Plate | None:
     if truth is None or explained is None:
         return None
     places = {frame.id: index for index, frame in enumerate(explained.frames)}
-    chosen = _spread_out([one for one in truth.frame_ids if one in places], explained, places)
+    chosen = _spread_out([frame_id for frame_id in truth.frame_ids if frame_id in places], explained, places)
     if not chosen:
         return None
     methods = _best_methods(truth, explained)
-    pictures, called = bright_pictures(explained, [places[one] for one in chosen])
+    pictures, called = bright_pictures(explained, [places[record] for record in chosen])
     rows = []
     for frame_id in chosen:
         index, row = places[frame_id], truth.frame_ids.index(frame_id)
-        picture, own = pictures[index], explained.frames[index]
+        picture, frames = pictures[index], explained.frames[index]
         effects = (truth.shapley_maps[row], truth.network_maps[row], truth.margin_maps[row])
         cells = [Cell(picture=picture)]
         cells += [
-            Cell(picture=_painted(picture, one, percentile=100.0), words=f"up to {100 * np.abs(one).max():.1f} points")
-            for one in effects
+            Cell(
+                picture=_painted(picture, effect, percentile=100.0),
+                words=f"up to {100 * np.abs(effect).max():.1f} points",
+            )
+            for effect in effects
         ]
         maps = [explained.relevance[method][index] for method in methods]
-        cells += [Cell(picture=_painted(picture, one, percentile=FULL_COLOUR_PERCENTILE)) for one in maps]
-        rows.append((f"Γ {percent(own.safety_margin)}\n{reading_words(own.prediction, own.withheld)}", cells))
+        cells += [Cell(picture=_painted(picture, record, percentile=FULL_COLOUR_PERCENTILE)) for record in maps]
+        rows.append((f"Γ {percent(frames.safety_margin)}\n{reading_words(frames.prediction, frames.withheld)}", cells))
     truths = ("Shapley values\nin the answer", "Put back alone:\nthe answer", "Put back alone:\nthe margin")
-    heads = [called, *truths, *(method_name(one) for one in methods)]
+    heads = [called, *truths, *(method_name(method) for method in methods)]
     return Plate(
         name=f"truth-{name}",
         figure=draw_grid(rows, heads=heads).figure,
         alt=f"{input_name(name)}: Shapley value and single effect of each marker in the answer, and its effect on the "
-        f"best reading of the margin, beside the maps of {listed([method_name(one) for one in methods])}",
+        f"best reading of the margin, beside the maps of {listed([method_name(method) for method in methods])}",
         caption=f"{input_name(name)}: what each marker does to the network's answer, in whatever company of markers "
         "(Shapley value) and alone, and to the best reading of the margin, in percentage points (value less value with "
         "that marker put back where it rested), beside the maps nearest to the first. Orange lowers, blue raises; full "
         f"colour at the largest effect of each picture, and at a map's {FULL_COLOUR_PERCENTILE:g}th percentile. "
         f"{_tell_match(truth, methods)}",
-        numbers={name: getattr(truth.effects, own) for name, own in _EFFECT_COLUMNS.items()},
+        numbers={name: getattr(truth.effects, rows) for name, rows in _EFFECT_COLUMNS.items()},
         pixels=True,
     )
 
@@ -578,8 +590,8 @@ def _painted(
 
 def _spread_out(ids: list[str], explained: Explanation, places: dict[str, int]) -> list[str]:
     """Pick a few frames from high to low margin, by their labels."""
-    known = [one for one in ids if explained.frames[places[one]].safety_margin is not None]
-    ranked = sorted(known, key=lambda one: -(explained.frames[places[one]].safety_margin or 0.0))
+    valid = [record for record in ids if explained.frames[places[record]].safety_margin is not None]
+    ranked = sorted(valid, key=lambda one: -(explained.frames[places[one]].safety_margin or 0.0))
     if len(ranked) <= _TRUTH_FRAMES:
         return ranked
     return [ranked[place] for place in np.linspace(0, len(ranked) - 1, _TRUTH_FRAMES).round().astype(int)]
@@ -587,19 +599,19 @@ def _spread_out(ids: list[str], explained: Explanation, places: dict[str, int]) 
 
 def _best_methods(truth: Truth, explained: Explanation) -> list[str]:
     """Methods whose maps correlate best with the Shapley values, as the verdict has it."""
-    known = {name: found.shapley for name in explained.relevance if (found := truth.methods.get(name)) is not None}
-    likeness = {name: gap.estimate for name, gap in known.items() if gap is not None and not is_control(name)}
+    valid = {name: records.shapley for name in explained.relevance if (records := truth.methods.get(name)) is not None}
+    likeness = {name: gap.estimate for name, gap in valid.items() if gap is not None and not is_control(name)}
     return sorted(methods_in_order(likeness), key=lambda name: -likeness[name])[:_TRUTH_METHODS]
 
 
 def _tell_match(truth: Truth, methods: list[str]) -> str:
     parts = [
-        f"{method_name(one)} {signed(found.estimate, 2)}"
-        for one in methods
-        if one in truth.methods and (found := truth.methods[one].shapley) is not None
+        f"{method_name(method)} {signed(records.estimate, 2)}"
+        for method in methods
+        if method in truth.methods and (records := truth.methods[method].shapley) is not None
     ]
-    told = f"Spearman's correlation with the Shapley values: {', '.join(parts)}." if parts else ""
+    text = f"Spearman's correlation with the Shapley values: {', '.join(parts)}." if parts else ""
     gap = truth.shapley_against_margin
     if gap is not None:
-        told += f" These and what moves the margin correlate by {tell_interval(gap, digits=2)}."
-    return told.strip()
+        text += f" These and what moves the margin correlate by {tell_interval(gap, digits=2)}."
+    return text.strip()

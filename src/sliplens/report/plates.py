@@ -78,13 +78,13 @@ def draw_grid(
             place_text(figure, _LEFT_IN - 0.1, top + high / 2, name, **aside)
             axes.append([])
             for column, cell in enumerate(cells):
-                left = _LEFT_IN + column * (cell_in + _GAP_IN)
-                ax = place_axes(figure, left, top, cell_in, high)
+                left_in = _LEFT_IN + column * (cell_in + _GAP_IN)
+                ax = place_axes(figure, left_in, top, cell_in, high)
                 _show(cell.picture, ax=ax)
                 axes[-1].append(ax)
                 if cell.words:
                     below = {"ha": "center", "fontsize": 7.5, "parse_math": False}
-                    place_text(figure, left + cell_in / 2, top + high + 0.03, cell.words, **below)
+                    place_text(figure, left_in + cell_in / 2, top + high + 0.03, cell.words, **below)
             top += high + _GAP_IN + (_WORDS_IN if has_words else 0)
         for column, words in enumerate(heads):
             place = _LEFT_IN + column * (cell_in + _GAP_IN) + cell_in / 2
@@ -129,11 +129,11 @@ class Plate:
     """Name of its files, without suffix."""
     figure: Figure
     alt: str
-    """What it shows, in words."""
+    """Description in words."""
     caption: str
     numbers: Numbers
     pixels: bool = False
-    """Whether it is made of photographs."""
+    """True where it is made of photographs."""
 
     @cached_property
     def picture(self) -> Picture:
@@ -146,9 +146,9 @@ class Plate:
     @property
     def files(self) -> str:
         """Where its files are found."""
-        found = re.match(r"fig-(\d+)-", self.name)
-        told = f"Fig. {int(found[1])} of the thesis, for this data;" if found else "Also"
-        return f"{told} {FOLDER}/{self.name}.pdf, numbers in {self.name}.csv."
+        records = re.match(r"fig-(\d+)-", self.name)
+        text = f"Fig. {int(records[1])} of the thesis, for this data;" if records else "Also"
+        return f"{text} {FOLDER}/{self.name}.pdf, numbers in {self.name}.csv."
 
 
 def named_columns(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, list]:
@@ -158,7 +158,7 @@ def named_columns(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[s
 
 def rows_of(*arrays: np.ndarray) -> list[tuple[Any, ...]]:
     """Turn columns of equal length into rows of Python's own values."""
-    return list(zip(*(one.tolist() for one in arrays), strict=True))
+    return list(zip(*(array.tolist() for array in arrays), strict=True))
 
 
 def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[Path, ...]:
@@ -222,7 +222,7 @@ def bright_pictures(
 def picture_brightness(name: str, pictures: Iterable[UInt8[np.ndarray, "height width 3"]]) -> tuple[float, str]:
     """By how much to brighten pictures of an input, all alike, and what to call them then."""
     # where no change is black; elsewhere the ground would turn white
-    factor = brightening([one[None] for one in pictures]) if name in {"difference", "amplitude"} else 1.0
+    factor = brightening([picture[None] for picture in pictures]) if name in {"difference", "amplitude"} else 1.0
     return factor, "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"
 
 

@@ -48,16 +48,16 @@ class Results:
     strip: Strip | None = None
     """One trial from stick to slip."""
     study: Study = field(default_factory=Study)
-    """What a study adds; false where none was run."""
+    """Records of a study; false where none was run."""
     notes: tuple[str, ...] = ()
-    """What a reader must know of how the results were chosen."""
+    """Sentences on how the results were chosen."""
 
     @property
     def inputs(self) -> set[str]:
         """Inputs that any stage tells of."""
         of_source = {name for name, _ in (*self.explanations, *self.scores)}
-        named = {*self.trainings, *self.evaluations, *self.diagnoses} | of_source
-        return named | self.study.inputs if self.study or not named else named
+        names_used = {*self.trainings, *self.evaluations, *self.diagnoses} | of_source
+        return names_used | self.study.inputs if self.study or not names_used else names_used
 
 
 def load_results(workspace: Path) -> Results:
@@ -78,7 +78,7 @@ def load_results(workspace: Path) -> Results:
     runs = {folder: load_record(folder / RUN_FILE, Provenance, command="sliplens") for folder in folders}
     # last finished last, so that it replaces the earlier ones
     runs = dict(sorted(runs.items(), key=lambda item: item[1].finished))
-    found: dict[tuple[str, str, str], Any] = {}
+    records: dict[tuple[str, str, str], Any] = {}
     folder_of: dict[tuple[str, str, str], Path] = {}
     notes = []
     for folder, run in runs.items():
@@ -96,26 +96,26 @@ def load_results(workspace: Path) -> Results:
         name = getattr(result, "input", "")
         # frames of a real sensor are explained beside a study's own
         key = (run.stage, name, getattr(result, "source", "") if run.stage in _BY_SOURCE else "")
-        if key in found:
+        if key in records:
             notes.append(
                 f"Two folders hold a result of “{' '.join(filter(None, key))}”: {folder.name} finished last and is "
                 f"shown, {folder_of[key].name} is not."
             )
-        found[key], folder_of[key] = result, folder
-    if not found:
+        records[key], folder_of[key] = result, folder
+    if not records:
         raise InputError(
             f"{workspace} holds no result to report; run `sliplens simulate` and the stages after it into this folder"
         )
 
     def of(stage: str) -> dict[str, Any]:
-        return {name: value for (own, name, _), value in found.items() if own == stage}
+        return {name: value for (rows, name, _), value in records.items() if rows == stage}
 
     choice: Choice | None = of("choice").get("")
     config = workspace / CONFIG_FILE
     of_study = {stage: of(stage) for stage in TABLES}
     if choice is not None:
         for stage in _BY_SOURCE:
-            of_study[stage] = {key[1]: found[key] for key in found if key[::2] == (stage, choice.source)}
+            of_study[stage] = {key[1]: records[key] for key in records if key[::2] == (stage, choice.source)}
     return Results(
         workspace=workspace,
         runs={folder.name: run for folder, run in runs.items()},
@@ -124,8 +124,8 @@ def load_results(workspace: Path) -> Results:
         evaluations=of("evaluate"),
         diagnoses=of("diagnose"),
         grip=of("grip").get(""),
-        explanations={key[1:]: value for key, value in found.items() if key[0] == "explain"},
-        scores={key[1:]: value for key, value in found.items() if key[0] == "score"},
+        explanations={key[1:]: value for key, value in records.items() if key[0] == "explain"},
+        scores={key[1:]: value for key, value in records.items() if key[0] == "score"},
         strip=next(iter(of("strip").values()), None),
         study=Study(
             folder=workspace,

@@ -44,9 +44,9 @@ class Section:
     short_title: str
     intro: str | Callable[[Results], str]
     apart: bool = False
-    """Whether they are no part of a study, which does not miss them."""
+    """True where a study does not have it."""
     simulated: bool = False
-    """Whether a study has them of simulated data alone."""
+    """True where a study has it of simulated data alone."""
     test: str = ""
     """Test of a study whose results they are, which it may leave out; empty where every study has them."""
     build: Callable[[Results, np.random.Generator], Iterable[Block | None]] = lambda *_: ()
@@ -54,7 +54,7 @@ class Section:
     needs: Callable[[Results], Collection[str]] = lambda results: results.inputs
     """Inputs that its results are there for; one that is missing is named."""
     of_sample: bool = False
-    """Whether its scores are of the study's sample, how sound which is said beside each."""
+    """True where its scores are of the study's sample: the page says beside each how sound that is."""
     missing: tuple[str, ...] = ()
     blocks: tuple[Block, ...] = ()
     """In the order they are read."""
@@ -73,8 +73,8 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
         if not blocks:
             absent.append(section.short_title)
             continue
-        asked = _names(results.inputs) if results.study else []
-        without = [name for name in asked if name not in section.needs(results)]
+        expected = _names(results.inputs) if results.study else []
+        without = [name for name in expected if name not in section.needs(results)]
         missing = tuple(f"{input_name(name)}: not run yet; `sliplens study` makes it." for name in without)
         intro = section.intro if isinstance(section.intro, str) else section.intro(results)
         if results.study.choice is not None and section.of_sample:
@@ -97,21 +97,21 @@ def _accuracy(results: Results, _: np.random.Generator) -> Iterable[Block | None
 
 
 def _faithfulness(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
-    found = results.study.faithfulness
-    for name in _names(found):
-        yield tables.table_scores(found[name], results.scores.get((name, results.study.source)))
-        yield tables.table_leads(found[name])
+    records = results.study.faithfulness
+    for name in _names(records):
+        yield tables.table_scores(records[name], results.scores.get((name, results.study.source)))
+        yield tables.table_leads(records[name])
         yield _alarms(results, name, "faithfulness")
-        yield tables.table_equal_areas(found[name])
-        yield tables.table_agreement(found[name])
-        yield charts.plate_removal_curves(found[name])
+        yield tables.table_equal_areas(records[name])
+        yield tables.table_agreement(records[name])
+        yield charts.plate_removal_curves(records[name])
 
 
 def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | None]:
     by_source = {
         source: {name: results.scores[name, source] for name in _names(scored)}
         for source in ("simulated", "real")
-        if (scored := [name for name, own in results.scores if own == source])
+        if (scored := [name for name, score in results.scores if score == source])
     }
     # beside the sound scores stands D already
     yield from (
@@ -119,25 +119,25 @@ def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | No
     )
     yield pictures.plate_deletion(results)
     yield from (charts.plate_faithfulness(scores) for scores in by_source.values())
-    remedies, own = results.study.remedies, by_source.get(results.study.source, {})
-    for name in _names({*own, *remedies}):
+    remedies, rows = results.study.remedies, by_source.get(results.study.source, {})
+    for name in _names({*rows, *remedies}):
         yield _alarms(results, name, "score")
         if name in remedies:
-            yield tables.table_remedies(remedies[name], own.get(name))
+            yield tables.table_remedies(remedies[name], rows.get(name))
             yield _alarms(results, name, "remedies")
     yield pictures.plate_highlighted(results)
-    if own:
+    if rows:
         yield from (pictures.plate_removal(results, method) for method in pictures.shown_methods(results))
     if results.study:
-        yield from (charts.plate_each_frame(scored) for scored in own.values())
+        yield from (charts.plate_each_frame(scored) for scored in rows.values())
 
 
 def _randomisation(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
-    found = results.study.randomisation
-    if found:
+    records = results.study.randomisation
+    if records:
         yield charts.plate_randomisation(results)
-        yield tables.table_randomisation(found)
-        yield from (_alarms(results, name, "randomisation") for name in _names(found))
+        yield tables.table_randomisation(records)
+        yield from (_alarms(results, name, "randomisation") for name in _names(records))
 
 
 def _maps(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
@@ -157,12 +157,12 @@ def _maps(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
 
 
 def _real(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
-    shown = {name: one for (name, source), one in results.explanations.items() if source == "real"}
-    if shown:
+    chosen = {name: explanation for (name, source), explanation in results.explanations.items() if source == "real"}
+    if chosen:
         yield tables.table_real(results)
         if results.study.source != "real":
-            for name in _names(shown):
-                yield pictures.plate_states(results, shown[name])
+            for name in _names(chosen):
+                yield pictures.plate_states(results, chosen[name])
                 yield _alarms(results, name, "explain") if explained_of(results, name) is None else None
 
 
@@ -174,21 +174,21 @@ def _cost(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
 
 
 def _truth(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
-    found = results.study.truth
-    for name in _names(found):
+    records = results.study.truth
+    for name in _names(records):
         yield pictures.plate_truth(results, name)
-        yield tables.table_localisation(found[name])
-        yield tables.table_meta(found[name])
-        yield _notes(f"How this was measured, {input_name(name).lower()}", [found[name].summary])
+        yield tables.table_localisation(records[name])
+        yield tables.table_meta(records[name])
+        yield _notes(f"How this was measured, {input_name(name).lower()}", [records[name].summary])
 
 
 def _diagnosis(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     for name in _names(results.diagnoses):
-        found = results.diagnoses[name]
-        groups = {sentence: [sentence] for sentence in found.sentences}
+        records = results.diagnoses[name]
+        groups = {sentence: [sentence] for sentence in records.sentences}
         yield Notes(title=f"What was found, {input_name(name).lower()}", groups=groups)
-        yield _notes("Left out", [found.left_out], tone="caution")
-        yield from show_diagnosis(found)
+        yield _notes("Left out", [records.left_out], tone="caution")
+        yield from show_diagnosis(records)
 
 
 def _recipe(results: Results, absent: list[str]) -> Section:
@@ -350,7 +350,7 @@ SECTIONS: tuple[Section, ...] = (
         intro=lambda results: (
             ""
             if results.study.choice is None
-            else " ".join([results.study.choice.summary, *(f"{told}." for told in results.study.left_out.values())])
+            else " ".join([results.study.choice.summary, *(f"{text}." for text in results.study.left_out.values())])
         ),
         build=lambda results, _: () if results.study.choice is None else (tables.table_trials(results.study.choice),),
     ),

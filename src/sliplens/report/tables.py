@@ -96,7 +96,10 @@ def make_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str | 
         "name" if place < names else "thesis" if cell.kind == "thesis" else "number" for place, cell in enumerate(heads)
     ]
     cells = tuple(
-        tuple(one if isinstance(one, Cell) else Cell(text=one, kind=kind) for one, kind in zip(row, kinds, strict=True))
+        tuple(
+            record if isinstance(record, Cell) else Cell(text=record, kind=kind)
+            for record, kind in zip(row, kinds, strict=True)
+        )
         for row in rows
     )
     return Table(caption=caption, head=heads, rows=cells)
@@ -109,8 +112,8 @@ def tell_spread(mean: float, sd: float) -> str:
 
 def _each_method(records: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
     """Input, method, and what a record of the input holds of the method, in the order they are read."""
-    found = {name: records[name].methods for name in inputs_in_order(records)}
-    return [(name, method, methods[method]) for name, methods in found.items() for method in methods_in_order(methods)]
+    result = {name: records[name].methods for name in inputs_in_order(records)}
+    return [(name, method, methods[method]) for name, methods in result.items() for method in methods_in_order(methods)]
 
 
 def _best(text: str, best: bool) -> Cell:
@@ -120,7 +123,7 @@ def _best(text: str, best: bool) -> Cell:
 def table_accuracy(results: Results) -> Table:
     """Tabulate MSE, R2 and MAE by condition and input (thesis, Table 1)."""
     evaluations, rows = results.evaluations, []
-    for condition in conditions_in_order(name for one in evaluations.values() for name in one.conditions):
+    for condition in conditions_in_order(name for evaluation in evaluations.values() for name in evaluation.conditions):
         scores = {
             name: evaluations[name].conditions[condition]
             for name in inputs_in_order(evaluations)
@@ -133,14 +136,14 @@ def table_accuracy(results: Results) -> Table:
             r2, mae, counts = decimals(score.r2, 3), decimals(100 * score.mae, 1), f"{score.frames} / {score.trials}"
             thesis = decimals(thesis_mse, 4), decimals(thesis_r2, 2)
             rows.append((condition.capitalize(), input_name(name), mse, thesis[0], r2, thesis[1], mae, counts))
-    told = "".join(
+    text = "".join(
         f" {input_name(name)}: the network was told the friction, {evaluations[name].friction}."
         for name in inputs_in_order(evaluations)
         if evaluations[name].friction
     )
     return make_table(
         "How well each network reads the safety margin on test trials. MSE in squared margin units (Γ from 0 to 1), "
-        f"MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the {MARK}.{told}",
+        f"MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the {MARK}.{text}",
         ("Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Frames / trials"),
         rows,
         names=2,
@@ -152,7 +155,7 @@ def table_deletion(scores: Mapping[str, DeletionScores], *, rng: np.random.Gener
     rows, gaps = [], []
     for name, method, score in _each_method(scores):
         scored = scores[name]
-        lowest = min((own.mean for other, own in scored.methods.items() if other != CHANCE), default=None)
+        lowest = min((method.mean for other, method in scored.methods.items() if other != CHANCE), default=None)
         gaps.append(against_control(scored, method, rng=rng))
         against = _interval(gaps[-1], digits=3)
         last, thesis = decimals(score.last_step_mean, 3), _thesis_score(name, method, scored.methods)
@@ -174,22 +177,26 @@ def table_seconds(results: Results) -> Table:
     """Tabulate the seconds a frame that each method took, one column for each input and origin of the frames."""
     keys = sorted(results.explanations, key=lambda key: (key[1] == "real", key[0] != "raw", key))
     explained = {key: results.explanations[key] for key in keys}
-    methods = {name for one in explained.values() for name in one.methods}
-    sides = " and ".join(map(str, sorted({one.image_size for one in explained.values()})))
+    methods = {name for explanation in explained.values() for name in explanation.methods}
+    sides = " and ".join(map(str, sorted({explanation.image_size for explanation in explained.values()})))
     return make_table(
         f"Seconds to explain one frame, images of {sides} px. The thesis timed images of {NETWORK_PIXELS} px on an RTX "
         "3060 Ti and did not wait for the GPU to finish, so its seconds show the order of magnitude only.",
         ("Method", *(f"{short_input_name(name)}, {source}" for name, source in keys), "Thesis"),
         [
-            (method_name(one), *(_seconds_of(own, one) for own in explained.values()), _thesis_seconds(one, methods))
-            for one in methods_in_order(methods)
+            (
+                method_name(method),
+                *(_seconds_of(explanation, method) for explanation in explained.values()),
+                _thesis_seconds(method, methods),
+            )
+            for method in methods_in_order(methods)
         ],
     )
 
 
 def table_real(results: Results) -> Table:
     """Tabulate label and answers of each real frame."""
-    explained = {name: one for (name, source), one in results.explanations.items() if source == "real"}
+    explained = {name: explanation for (name, source), explanation in results.explanations.items() if source == "real"}
     names = inputs_in_order(explained)
     read = {(name, frame.id): frame.prediction for name in names for frame in explained[name].frames}
     frames = {frame.id: frame for name in names for frame in explained[name].frames}
@@ -198,8 +205,12 @@ def table_real(results: Results) -> Table:
         f"{number_of(len(frames), 'real frame')}: the recorded safety margin, and what each network reads.",
         ("Frame", "Objects", "True Γ", *(f"Read from {input_name(name).lower()}" for name in names)),
         [
-            (one.id, one.condition.capitalize(), *(percent(value) for value in (one.safety_margin, *answers[one.id])))
-            for one in sorted(frames.values(), key=lambda one: (-(one.safety_margin or 0), one.id))
+            (
+                frame.id,
+                frame.condition.capitalize(),
+                *(percent(value) for value in (frame.safety_margin, *answers[frame.id])),
+            )
+            for frame in sorted(frames.values(), key=lambda one: (-(one.safety_margin or 0), one.id))
         ],
         names=2,
     )
@@ -208,44 +219,44 @@ def table_real(results: Results) -> Table:
 def table_training(results: Results) -> Table:
     """Tabulate how each network was trained."""
     runs = [results.trainings[name] for name in inputs_in_order(results.trainings)]
-    frames = [(one.train_frames, one.validation_frames) for one in runs]
+    frames = [(run.train_frames, run.validation_frames) for run in runs]
     rows = (
-        ("Backbone", *(one.backbone for one in runs)),
-        ("Image side (camera)", *(f"{one.image_size} px ({' x '.join(map(str, one.frame_size))})" for one in runs)),
+        ("Backbone", *(run.backbone for run in runs)),
+        ("Image side (camera)", *(f"{run.image_size} px ({' x '.join(map(str, run.frame_size))})" for run in runs)),
         ("Frames: training / validation", *(" / ".join(map(_whole, counts)) for counts in frames)),
-        ("Epochs", *(decimals(one.epochs, 1) for one in runs)),
-        ("Minutes", *(decimals(one.minutes, 1) for one in runs)),
-        ("Stopped by", *(one.stopped_by for one in runs)),
-        ("Best validation MSE", *(decimals(one.best_validation_mse, 4) for one in runs)),
-        ("Parameters", *(_whole(one.parameters) for one in runs)),
-        ("Seed", *(str(one.seed) for one in runs)),
+        ("Epochs", *(decimals(run.epochs, 1) for run in runs)),
+        ("Minutes", *(decimals(run.minutes, 1) for run in runs)),
+        ("Stopped by", *(run.stopped_by for run in runs)),
+        ("Best validation MSE", *(decimals(run.best_validation_mse, 4) for run in runs)),
+        ("Parameters", *(_whole(run.parameters) for run in runs)),
+        ("Seed", *(str(run.seed) for run in runs)),
     )
-    return make_table("How each network was trained.", ("", *(input_name(one.input) for one in runs)), rows)
+    return make_table("How each network was trained.", ("", *(input_name(run.input) for run in runs)), rows)
 
 
 def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Table:
     """Tabulate the thesis's deletion score (its Table 2) beside the symmetric gain under every fill."""
     fills = settings(faithful)
     scores = {score.key: score for score in faithful.scores}
-    gains = [(key[:2], one.srg.estimate) for key, one in scores.items() if not one.control]
+    gains = [(key[:2], score.srg.estimate) for key, score in scores.items() if not score.control]
     top = {fill: max((gain for setting, gain in gains if setting == fill), default=None) for fill in fills}
     plain = {} if scored is None else scored.methods
     methods = {*(score.method for score in faithful.scores), *plain}
-    lowest = min((one.mean for name, one in plain.items() if not is_control(name)), default=None)
+    lowest = min((record.mean for name, record in plain.items() if not is_control(name)), default=None)
     fill = f", {scored.fill} fill" if scored else ""
     return make_table(
         f"{input_name(faithful.input)}: the deletion score D of the thesis{fill} (mean ± standard deviation over "
         "frames; lower = more faithful) beside the symmetric relevance gain, SRG: the mean change of the answer with "
         "the most supporting parts gone first, less that with the least supporting first, in margin units; 0 = a map "
-        f"that tells nothing. 95 % intervals over {tell_over(one.srg for one in faithful.scores)}; * = the "
+        f"that tells nothing. 95 % intervals over {tell_over(score.srg for score in faithful.scores)}; * = the "
         f"interval leaves zero out. Bold: best of its column, controls left out. Grey column: the {MARK}.",
-        ("Method", "Score D", "Score D, thesis", *(f"SRG, {fill_name(*one)}" for one in fills)),
+        ("Method", "Score D", "Score D, thesis", *(f"SRG, {fill_name(*setting)}" for setting in fills)),
         [
             (
                 method_name(method),
                 _score_cell(plain.get(method), lowest),
                 _thesis_score(faithful.input, method, methods),
-                *(_gain_cell(scores.get((*one, method)), top[one]) for one in fills),
+                *(_gain_cell(scores.get((*setting, method)), top[setting]) for setting in fills),
             )
             for method in methods_in_order(methods)
         ],
@@ -268,9 +279,9 @@ def table_leads(faithful: RemovalScores) -> Table:
         "knows nothing of what the network learned, named beside it; 95 % intervals in margin units, each end the "
         "lowest of those over all such maps. Bold: ahead of every one for sure. Otherwise the method has shown "
         "nothing about this network under that fill.",
-        ("Method", *(fill_name(*one) for one in fills)),
+        ("Method", *(fill_name(*setting) for setting in fills)),
         [
-            (method_name(method), *(tell(leads.get((*one, method))) for one in fills))
+            (method_name(method), *(tell(leads.get((*setting, method))) for setting in fills))
             for method in methods_in_order({key[2] for key in leads})
         ],
     )
@@ -285,14 +296,16 @@ def table_equal_areas(faithful: RemovalScores) -> Table | None:
     scores = {score.method: score for score in faithful.scores if score.key[:2] == (fill, unit)}
     areas = [area for area in _AREAS if any(area in score.at for score in scores.values())]
     top = {
-        area: max((one.at[area] for one in scores.values() if area in one.at and not one.control), default=None)
+        area: max((score.at[area] for score in scores.values() if area in score.at and not score.control), default=None)
         for area in areas
     }
 
     def lost(score: RemovalScore, area: float) -> Cell:
         return _best(decimals(score.at.get(area), 3), not score.control and score.at.get(area, np.nan) == top[area])
 
-    rows = [(method_name(one), *(lost(scores[one], area) for area in areas)) for one in methods_in_order(scores)]
+    rows = [
+        (method_name(method), *(lost(scores[method], area) for area in areas)) for method in methods_in_order(scores)
+    ]
     curve = next(curve for key, curve in faithful.curves.items() if key[:2] == (fill, unit))
     chance = (f"{faithful.random_orders} random orders", *(decimals(mean_at(curve, area)[1], 3) for area in areas))
     return make_table(
@@ -305,13 +318,13 @@ def table_equal_areas(faithful: RemovalScores) -> Table | None:
 
 def table_agreement(faithful: RemovalScores) -> Table | None:
     """Tabulate Kendall's tau between the fills' rankings of the methods as a map of heat; None where it is unknown."""
-    rows = [one for one in faithful.agreement if one.unit == "pixel"] or list(faithful.agreement)
+    rows = [record for record in faithful.agreement if record.unit == "pixel"] or list(faithful.agreement)
     if not rows:
         return None
-    taus = {pair: one.tau for one in rows for pair in ((one.first, one.second), (one.second, one.first))}
+    taus = {pair: row.tau for row in rows for pair in ((row.first, row.second), (row.second, row.first))}
     fills = in_order({name for pair in taus for name in pair}, FILL_NAMES)
-    known = [one.tau for one in rows if one.tau is not None]
-    worst = f" The lowest is {signed(min(known), 2)}." if known else ""
+    valid = [row.tau for row in rows if row.tau is not None]
+    worst = f" The lowest is {signed(min(valid), 2)}." if valid else ""
     return make_table(
         f"{input_name(faithful.input)}: how far two fills agree on the order of the methods "
         f"({UNIT_NAMES.get(rows[0].unit, rows[0].unit)}): Kendall's tau, 1 for the same order, 0 for unrelated ones; "
@@ -326,9 +339,9 @@ def table_agreement(faithful: RemovalScores) -> Table | None:
 
 def table_remedies(remedies: Remedies, scored: DeletionScores | None) -> Table:
     """Tabulate the thesis's own remedies for its score, and insertion, beside the score as it was."""
-    methods = methods_in_order({name for one in remedies.variants.values() for name in one.methods})
+    methods = methods_in_order({name for variant in remedies.variants.values() for name in variant.methods})
     titles = {name: name.replace("-", " ").capitalize() for name in remedies.variants}
-    variants = [(titles[name], one.better, one.methods) for name, one in remedies.variants.items()]
+    variants = [(titles[name], variant.better, variant.methods) for name, variant in remedies.variants.items()]
     if scored is not None:
         variants.insert(0, (f"As in the thesis ({scored.fill})", "lower", scored.methods))
     rows = []
@@ -336,10 +349,10 @@ def table_remedies(remedies: Remedies, scored: DeletionScores | None) -> Table:
         means = [scores[name].mean for name in methods if name in scores and not is_control(name)]
         best = (min if better == "lower" else max)(means, default=None)
         rows.append((title, better, *(_score_cell(scores.get(name), best) for name in methods)))
-    told = " ".join(f"{titles[name]}: {one.summary.rstrip('.')}." for name, one in remedies.variants.items())
+    text = " ".join(f"{titles[name]}: {variant.summary.rstrip('.')}." for name, variant in remedies.variants.items())
     return make_table(
         f"{input_name(remedies.input)}: the score of the thesis with the remedies it proposes, and insertion; mean ± "
-        f"standard deviation over frames, the best method of each row bold. {told}",
+        f"standard deviation over frames, the best method of each row bold. {text}",
         ("Variant", "Better is", *(method_name(name) for name in methods)),
         rows,
         names=2,
@@ -349,14 +362,18 @@ def table_remedies(remedies: Remedies, scored: DeletionScores | None) -> Table:
 def table_looks(looks: Mapping[str, MapQuality]) -> Table:
     """Tabulate what the eye judges of maps."""
     return make_table(
-        f"Looks of the maps, means over {number_of(max(one.frames for one in looks.values()), 'frame')}. "
+        f"Looks of the maps, means over {number_of(max(record.frames for record in looks.values()), 'frame')}. "
         "Resolution: depth of the valley between neighbouring markers (1 = told apart). Total variation: mean step "
         "between pixels over the "
         "map's range (noise has 1/3). Gini: 1 = one pixel has all. Stability: correlation of the map with that of the "
         "frame under other sensor noise, and with that of the next frame.",
         ("Input", "Method", *(_LOOK_NAMES[measure] for measure in MAP_MEASURES)),
         [
-            (input_name(name), method_name(method), *(decimals(getattr(measures, one), 3) for one in MAP_MEASURES))
+            (
+                input_name(name),
+                method_name(method),
+                *(decimals(getattr(measures, record), 3) for record in MAP_MEASURES),
+            )
             for name, method, measures in _each_method(looks)
         ],
         names=2,
@@ -365,7 +382,9 @@ def table_looks(looks: Mapping[str, MapQuality]) -> Table:
 
 def table_randomisation(randomisation: Mapping[str, Randomisation]) -> Table:
     """Tabulate what is left of a map once every layer has new weights, and how its complexity rises."""
-    counts = {one.layers[0] for found in randomisation.values() for one in found.methods.values() if one.layers}
+    counts = {
+        method.layers[0] for records in randomisation.values() for method in records.methods.values() if method.layers
+    }
     first = f"{counts.pop()} layers new" if len(counts) == 1 else "First layers new"
     return make_table(
         "Weights drawn anew, layer by layer from the output: similarity of the map to the trained network's (1 = "
@@ -376,10 +395,10 @@ def table_randomisation(randomisation: Mapping[str, Randomisation]) -> Table:
             (
                 input_name(name),
                 method_name(method),
-                *(decimals(one.similarity[place] if one.similarity else None, 2) for place in (0, -1)),
-                *(decimals(rise, 2) for rise in (one.complexity_rise, one.smooth_complexity_rise)),
+                *(decimals(record.similarity[place] if record.similarity else None, 2) for place in (0, -1)),
+                *(decimals(rise, 2) for rise in (record.complexity_rise, record.smooth_complexity_rise)),
             )
-            for name, method, one in _each_method(randomisation)
+            for name, method, record in _each_method(randomisation)
         ],
         names=2,
     )
@@ -388,26 +407,26 @@ def table_randomisation(randomisation: Mapping[str, Randomisation]) -> Table:
 def table_times(timing: Mapping[str, Timing]) -> Table:
     """Tabulate seconds a frame, with the forward pass and without it, beside those of the thesis."""
     names = inputs_in_order(timing)
-    rows, methods = [], {one for name in names for one in timing[name].methods}
+    rows, methods = [], {method for name in names for method in timing[name].methods}
     for method in methods_in_order(methods):
         cells = []
-        for whole, one in ((timing[name].frames, timing[name].methods.get(method)) for name in names):
-            part = f" on {number_of(one.frames, 'frame')}" if one is not None and one.frames < whole else ""
-            spread = "" if one is None else f" ({_seconds(one.low)} to {_seconds(one.high)}{part})"
-            cells.append(UNKNOWN if one is None else f"{_seconds(one.seconds)}{spread}")
-            cells.append(_seconds(None if one is None else one.seconds_without_forward))
+        for whole, record in ((timing[name].frames, timing[name].methods.get(method)) for name in names):
+            part = f" on {number_of(record.frames, 'frame')}" if record is not None and record.frames < whole else ""
+            spread = "" if record is None else f" ({_seconds(record.low)} to {_seconds(record.high)}{part})"
+            cells.append(UNKNOWN if record is None else f"{_seconds(record.seconds)}{spread}")
+            cells.append(_seconds(None if record is None else record.seconds_without_forward))
         rows.append((method_name(method), *cells, _thesis_seconds(method, methods)))
-    told = "; ".join(
-        f"{input_name(name).lower()}: {one.device}"
-        f"{f' with {one.threads} threads' if one.threads and one.device == 'cpu' else ''}, "
-        f"{number_of(one.frames, 'frame')}, a forward pass takes {_seconds(one.forward_seconds)} s"
+    text = "; ".join(
+        f"{input_name(name).lower()}: {record.device}"
+        f"{f' with {record.threads} threads' if record.threads and record.device == 'cpu' else ''}, "
+        f"{number_of(record.frames, 'frame')}, a forward pass takes {_seconds(record.forward_seconds)} s"
         for name in names
-        for one in [timing[name]]
+        for record in [timing[name]]
     )
     heads = [f"{short_input_name(name)}, {what}" for name in names for what in ("with forward pass", "without")]
     return make_table(
         f"Seconds to explain one frame: median over the sample's frames after a warm-up, their range, and on how many "
-        f"of them a slow method was timed ({told}). The thesis "
+        f"of them a slow method was timed ({text}). The thesis "
         f"timed images of {NETWORK_PIXELS} px on an RTX 3060 Ti without waiting for the GPU, and left Grad-CAM's "
         "forward pass out.",
         ("Method", *heads, "Thesis"),
@@ -417,7 +436,7 @@ def table_times(timing: Mapping[str, Timing]) -> Table:
 
 def table_trials(choice: Choice) -> Table:
     """Tabulate the trials of the study, and how far each network was off at worst."""
-    names = inputs_in_order({*choice.inputs, *(name for one in choice.trials for name in one.worst_error)})
+    names = inputs_in_order({*choice.inputs, *(name for trial in choice.trials for name in trial.worst_error)})
     return make_table(
         f"The {number_of(len(choice.trials), 'trial')} of the study ({choice.condition}): the worst error of "
         f"each network at the chosen margins, in percentage points; within {percent(choice.tolerance)} at all of "
@@ -425,12 +444,12 @@ def table_trials(choice: Choice) -> Table:
         ("Trial", "Qualified", *(f"Worst error, {short_input_name(name).lower()}" for name in names), "Frames scored"),
         [
             (
-                one.trial,
-                "yes" if one.qualified else "no",
-                *(percent(one.worst_error.get(name), digits=1) for name in names),
-                str(sum(frame.trial == one.trial and frame.scored for frame in choice.frames)),
+                trial.trial,
+                "yes" if trial.qualified else "no",
+                *(percent(trial.worst_error.get(name), digits=1) for name in names),
+                str(sum(frame.trial == trial.trial and frame.scored for frame in choice.frames)),
             )
-            for one in choice.trials
+            for trial in choice.trials
         ],
         names=2,
     )
@@ -438,13 +457,16 @@ def table_trials(choice: Choice) -> Table:
 
 def table_localisation(truth: Truth) -> Table:
     """Tabulate where relevance lies, and how well maps rank the markers."""
-    names = [*methods_in_order(set(truth.methods) - set(_TRUTHS)), *(one for one in _TRUTHS if one in truth.methods)]
+    names = [
+        *methods_in_order(set(truth.methods) - set(_TRUTHS)),
+        *(record for record in _TRUTHS if record in truth.methods),
+    ]
     heads = [f"{what}, {_REGION_NAMES[region]}" for what in ("Mass", "Strongest") for region in REGIONS]
     rows = []
     for name in names:
-        found, lead = truth.methods[name], truth.methods[name].lead_over_controls
-        gaps = (found.shapley, lead and lead.gap, found.network, found.margin)
-        shares = [percent(own[region]) for own in (found.mass, found.rank) for region in REGIONS]
+        records, lead = truth.methods[name], truth.methods[name].lead_over_controls
+        gaps = (records.shapley, lead and lead.gap, records.network, records.margin)
+        shares = [percent(rows[region]) for rows in (records.mass, records.rank) for region in REGIONS]
         title = "Random map (control)" if name == CHANCE else method_name(name)  # here it is a map, not an order
         rows.append((title, *shares, *map(_interval, gaps)))
     nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), *4 * ["0"])
@@ -454,7 +476,7 @@ def table_localisation(truth: Truth) -> Table:
         "marker with its "
         "Shapley value in the network's answer, with what putting it back alone changes there, and with the same of "
         "the best reading of the margin (95 % interval over "
-        f"{tell_over(one.shapley for one in truth.methods.values())}). Lead: the first of these less that of the "
+        f"{tell_over(method.shapley for method in truth.methods.values())}). Lead: the first of these less that of the "
         "strongest map that knows nothing of what the network learned; a method whose lead is not above zero for sure "
         "has shown nothing about this network.",
         ("Method", *heads, *_CORRELATIONS),
@@ -475,15 +497,15 @@ def table_meta(truth: Truth) -> Table | None:
         ("Fill", "Changes counted", "Holds", *_GAINS),
         [
             (
-                FILL_NAMES.get(one.fill, one.fill),
+                FILL_NAMES.get(record.fill, record.fill),
                 counted,
                 "yes" if test.holds else "no",
                 *(decimals(value, 3) for value in (test.oracle, test.degraded)),
                 _interval(test.gap, digits=3),
                 decimals(test.changed, 3),
             )
-            for one in truth.meta
-            for counted, test in (("along the answer's", one), ("by size", one.by_size))
+            for record in truth.meta
+            for counted, test in (("along the answer's", record), ("by size", record.by_size))
         ],
         names=3,
     )

@@ -46,9 +46,9 @@ class ChosenFrame:
     level: Annotated[float, MARGIN]
     safety_margin: Annotated[float, MARGIN]
     scored: bool
-    """Whether it counts in the scores."""
+    """True where it counts in the scores."""
     shown: bool
-    """Whether the panels show it."""
+    """True where the panels show it."""
     day: int = 1
 
 
@@ -68,7 +68,7 @@ class Choice:
     mean_error: dict[str, float]
     """Mean error of the answers on the scored frames, in margin units, by input."""
     summary: str
-    """What was done, in a sentence or two."""
+    """Description of the choice in a sentence or two."""
     source: str
     condition: str
     inputs: tuple[str, ...]
@@ -79,7 +79,7 @@ class Choice:
 
     @property
     def sound(self) -> bool:
-        """Whether every trial that was taken qualifies; otherwise errors are explained too."""
+        """True where every trial that was taken qualifies; otherwise errors are explained too."""
         return all(trial.qualified for trial in self.trials)
 
 
@@ -115,7 +115,7 @@ class ShownFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class StateFrame(ShownFrame, MarkerPlaces):
-    """The same with its picture, its absolute difference from the untouched sensor, and its markers."""
+    """Shown frame with its picture, its absolute difference from the untouched sensor, and its markers."""
 
     raw: UInt8[np.ndarray, "height width 3"]
     difference: UInt8[np.ndarray, "height width 3"]
@@ -149,8 +149,8 @@ class States:
         """The frames that are shown, with their pictures and markers."""
         none = MarkerPlaces(rest_px=np.empty((0, 2)), now_px=np.empty((0, 2)))
         return tuple(
-            StateFrame(**vars(shown), **vars(self.markers.get(shown.id, none)), raw=raw, difference=difference)
-            for shown, raw, difference in zip(self.shown, self.raw, self.difference, strict=True)
+            StateFrame(**vars(chosen), **vars(self.markers.get(chosen.id, none)), raw=raw, difference=difference)
+            for chosen, raw, difference in zip(self.shown, self.raw, self.difference, strict=True)
         )
 
     @cached_property
@@ -158,8 +158,10 @@ class States:
         """Markers by frame, in the order of their numbers; frames in which none could be followed are absent."""
         rows = self.table.where(np.argsort(self.table.marker, kind="stable"))
         return {
-            frame: MarkerPlaces(rest_px=np.c_[own.rest_x_px, own.rest_y_px], now_px=np.c_[own.x_px, own.y_px])
-            for (frame,), own in rows.groups("frame_id").items()
+            frame: MarkerPlaces(
+                rest_px=np.c_[frames.rest_x_px, frames.rest_y_px], now_px=np.c_[frames.x_px, frames.y_px]
+            )
+            for (frame,), frames in rows.groups("frame_id").items()
         }
 
 
@@ -168,7 +170,7 @@ class UntrainedMaps(OfNetwork):
     """Maps of networks whose weights were drawn anew: controls that every map has to beat."""
 
     maps: dict[str, Annotated[Float32[np.ndarray, "frames size size"], ANSWER]]
-    """What the methods rank by, towards those networks' own targets, by method with `NEW_WEIGHTS`. Poly-CAM has 5 % of
+    """Maps that the methods rank by, towards the targets of those networks, by method with `NEW_WEIGHTS`. Poly-CAM has 5 % of
     its channels here and no likeness, Shapley values 100 pairs."""
 
 
@@ -189,7 +191,7 @@ class RandomisedMethod:
 
 @dataclass(frozen=True, kw_only=True)
 class Randomisation(OfNetwork):
-    """Whether explanations notice that the network's weights were drawn anew."""
+    """Change of explanations as the network's weights are drawn anew."""
 
     frames: int
     methods: dict[str, RandomisedMethod]
@@ -198,7 +200,7 @@ class Randomisation(OfNetwork):
 
 @dataclass(frozen=True, kw_only=True)
 class MapMeasures:
-    """What the eye judges of a method's maps, as means over frames; None where undefined."""
+    """Looks of a method's maps, as means over frames; None where undefined."""
 
     resolution: float | None
     total_variation: float | None
@@ -218,7 +220,7 @@ class Roughness:
 
 @dataclass(frozen=True, kw_only=True)
 class MapQuality(OfNetwork):
-    """What the eye judges of maps, by method."""
+    """Looks of maps, by method."""
 
     frames: int
     repeated_frames: int
@@ -267,7 +269,7 @@ class Localisation:
     lead_over_controls: Lead | None
     """Of the correlation with the Shapley values; None for what is no method."""
     lead_over_methods: dict[str, Difference]
-    """The same correlation less that of each other method."""
+    """Correlation with the Shapley values less that of each other method."""
     edges: Difference | None
     """Mass on the edges of markers less the share of the image that they cover."""
 
@@ -285,7 +287,7 @@ class OracleTest:
 
     @property
     def holds(self) -> bool:
-        """Whether `gap` is above zero for sure, as no few trials can show; else the gain cannot judge maps."""
+        """True where `gap` is above zero for sure, as few trials cannot show; else the gain cannot judge maps."""
         return self.gap is not None and self.gap.above_zero
 
 
@@ -302,7 +304,7 @@ class MetaTest(OracleTest):
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerEffects(Columns):
-    """What each marker does to the network's answer and to the true margin, a row a marker and frame."""
+    """Effect of each marker on the network's prediction and on the true margin, a row a marker and frame."""
 
     frame_id: Shaped[np.ndarray, " rows"]
     day: Int64[np.ndarray, " rows"]
@@ -325,7 +327,7 @@ class MarkerEffects(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class Truth(OfNetwork):
-    """What a network should have looked at, which only a simulation tells."""
+    """Comparison of explanations with the effects of markers, known in simulation."""
 
     frames: int
     areas: dict[str, float | None]
@@ -486,8 +488,8 @@ class Study:
     @property
     def inputs(self) -> set[str]:
         """Inputs that some stage tells of; both where none does."""
-        found = {name for table in self._tests for name in table} | set(self.choice.inputs if self.choice else ())
-        return found or {"difference", "raw"}
+        records = {name for table in self._tests for name in table} | set(self.choice.inputs if self.choice else ())
+        return records or {"difference", "raw"}
 
     @property
     def source(self) -> str:
@@ -504,11 +506,13 @@ class Study:
         chosen = sum(frame.scored for frame in self.choice.frames)
         tested = {**self.faithfulness, **self.truth}
         return {
-            name: say_left_out(chosen - one.frames, chosen, name) for name, one in tested.items() if one.frames < chosen
+            name: say_left_out(chosen - record.frames, chosen, name)
+            for name, record in tested.items()
+            if record.frames < chosen
         }
 
     def __bool__(self) -> bool:
-        """Whether anything of a study was run."""
+        """True where any step of a study was run."""
         return any(self._tests) or self.choice is not None or self.states is not None
 
     @property

@@ -1,4 +1,4 @@
-"""What is known of maps without a score: how they look, whether they change with the weights, what they cost."""
+"""Properties of maps beside a score: looks, dependence on the weights, cost."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -115,22 +115,22 @@ class Measuring(MethodStage[MapQuality]):
     def join(self, pieces: Sequence[_Measured]) -> MapQuality:
         """Measures of all methods, compared with each other."""
         explained, rng = self.material.explained, np.random.default_rng(self.seed)
-        known, clusters = dict(zip(self.material.explainers, pieces, strict=True)), explained.clusters
+        valid, clusters = dict(zip(self.material.explainers, pieces, strict=True)), explained.clusters
         return MapQuality(
             input=explained.input,
             source=explained.source,
             frames=len(explained.frames),
             repeated_frames=len(self.material.references[:_REPEATED]),
             noise_sd=pieces[0].noise_sd,
-            methods={name: one.measures for name, one in known.items()},
+            methods={name: record.measures for name, record in valid.items()},
             # stability was tried on few frames: no interval would mean anything
             comparisons=tuple(
                 Roughness(
                     first=first,
                     second=second,
-                    gap=paired_difference(one.roughness, other.roughness, clusters=clusters, rng=rng),
+                    gap=paired_difference(record.roughness, other.roughness, clusters=clusters, rng=rng),
                 )
-                for (first, one), (second, other) in combinations(known.items(), 2)
+                for (first, record), (second, other) in combinations(valid.items(), 2)
             ),
         )
 
@@ -141,11 +141,11 @@ def _once_more(
     """The frames with more camera noise, and the frames that follow them, as the network gets them; grey levels."""
     infos = {info.trial: info for info in data.trials}
     noisy, following, levels = [], [], []
-    for own in chosen:
-        recording = data.load(infos[own.trial], truth=False)
-        frame = recording.frames[own.frame].astype(np.float64)
+    for rows in chosen:
+        recording = data.load(infos[rows.trial], truth=False)
+        frame = recording.frames[rows.frame].astype(np.float64)
         # the last frame has none after it
-        other = recording.frames[own.frame + 1 if own.frame + 1 < len(recording) else own.frame - 1]
+        other = recording.frames[rows.frame + 1 if rows.frame + 1 < len(recording) else rows.frame - 1]
         # most pixels do not move from one frame to the next: what they differ by is noise, twice
         sd = float(np.median(np.abs(frame - other)) / _NORMAL_QUARTILE / np.sqrt(2))
         levels.append(sd)
@@ -256,7 +256,7 @@ class Randomising(MethodStage[Randomisation]):
         return find
 
     def join(self, pieces: Sequence[RandomisedMethod]) -> Randomisation:
-        """What was found of all methods."""
+        """Join the records of all methods."""
         methods = dict(zip(self.material.explainers, pieces, strict=True))
         return Randomisation(
             input=self.material.explained.input,
@@ -266,8 +266,8 @@ class Randomising(MethodStage[Randomisation]):
             alarms=tuple(
                 f"{name} still correlates by {last:.2f} with its maps when all weights are new: it shows the image "
                 "rather than what the network learned"
-                for name, one in methods.items()
-                if (last := one.similarity[-1]) is not None and last > _STILL_SIMILAR
+                for name, method in methods.items()
+                if (last := method.similarity[-1]) is not None and last > _STILL_SIMILAR
             ),
         )
 
@@ -291,7 +291,7 @@ def _shortened(explainer: Explainer, *, passes_matter: bool = False) -> Explaine
 
 
 def _asks_often(explainer: Explainer) -> bool:
-    """Whether a map takes so many passes that no frame is explained sixteen times over; no matter how fast they are."""
+    """Return True where a map takes so many passes that no frame is explained sixteen times over."""
     return isinstance(explainer, Shapley) or (isinstance(explainer, PolyCam) and explainer.score != "thesis")
 
 
@@ -346,22 +346,22 @@ class Untrained(MaterialStage[UntrainedMaps]):
             with suppress(ModelError):  # without layers that have a map
                 maps["weights-1"] = list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())
             for name, frame in counted(list(product(material.explainers, frames)), on_map):
-                one, empty = inputs[frame, None], references[frame, None]
-                found = _influence(controls[name](model, one, reference=empty))
-                maps.setdefault(name, []).append(found[0].astype(np.float32))
-            return _TrialMaps(maps={name + NEW_WEIGHTS: np.stack(own) for name, own in maps.items()})
+                record, empty = inputs[frame, None], references[frame, None]
+                records = _influence(controls[name](model, record, reference=empty))
+                maps.setdefault(name, []).append(records[0].astype(np.float32))
+            return _TrialMaps(maps={name + NEW_WEIGHTS: np.stack(rows) for name, rows in maps.items()})
 
         return find
 
     def join(self, pieces: Sequence[_TrialMaps]) -> UntrainedMaps:
         """Maps of all frames."""
         explained = self.material.explained
-        maps = join_trials(explained, [one.maps for one in pieces])
+        maps = join_trials(explained, [piece.maps for piece in pieces])
         return UntrainedMaps(input=explained.input, source=explained.source, maps=maps)
 
 
 def _influence(explanation: Attribution) -> Maps:
-    """What the method ranks pixels by, towards the network's own target: the sign of another's says nothing."""
+    """Return the map that pixels are ranked by, towards the target of the explained network."""
     return explanation.influence.double().cpu().numpy()
 
 

@@ -1,4 +1,4 @@
-"""What a study looks at: trials, frames, their markers, the methods, and the fastest way to ask a network."""
+"""Trials, frames, markers and methods of a study."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
@@ -71,8 +71,8 @@ def choose_frames(
     if not 0 <= tolerance <= 1:
         raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
     infos = data.select(split=split, condition=condition)
-    looked = (_look_at(info, networks, data, tolerance=tolerance) for info in track(infos))
-    candidates = [one for one in looked if one is not None]
+    measured = (_look_at(info, networks, data, tolerance=tolerance) for info in track(infos))
+    candidates = [record for record in measured if record is not None]
     if not candidates:
         raise RecordingError(
             f"none of the {number_of(len(infos), f'{condition} trial')} of split {split!r} has a labelled frame "
@@ -82,25 +82,25 @@ def choose_frames(
         )
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
     taken = sorted(candidates, key=lambda one: 0.0 if one.trial.qualified else one.trial.worst)[:trials]
-    shown = min((one.trial for one in taken), key=lambda trial: trial.worst).trial
+    chosen = min((record.trial for record in taken), key=lambda trial: trial.worst).trial
     scored = [level in SCORED_LEVELS for level in LEVELS]
     choice = Choice(
         trials_wanted=trials,
         tolerance=tolerance,
         considered=len(candidates),
-        qualified=sum(one.trial.qualified for one in candidates),
+        qualified=sum(candidate.trial.qualified for candidate in candidates),
         qualified_alone={
-            name: sum(one.trial.worst_error[name] <= tolerance for one in candidates) for name in networks
+            name: sum(candidate.trial.worst_error[name] <= tolerance for candidate in candidates) for name in networks
         },
-        mean_error={name: float(np.mean([one.errors[name][scored] for one in taken])) for name in networks},
+        mean_error={name: float(np.mean([record.errors[name][scored] for record in taken])) for name in networks},
         summary="",
         source=data.source,
         condition=condition,
         inputs=tuple(networks),
         levels=LEVELS,
         scored_levels=SCORED_LEVELS,
-        trials=tuple(one.trial for one in taken),
-        frames=tuple(frame for one in taken for frame in one.frames(shown=one.trial.trial == shown)),
+        trials=tuple(record.trial for record in taken),
+        frames=tuple(frame for record in taken for frame in record.frames(shown=record.trial.trial == chosen)),
     )
     return replace(choice, summary=_summarise(choice, len(infos)))
 
@@ -185,9 +185,9 @@ def show_states(choice: Choice, data: Dataset) -> States:
     infos = {info.trial: info for info in data.trials}
     # so that the table of a study without markers has its columns
     tables = [_table("", np.empty((0, 2)), np.empty((0, 2)))]
-    shown, raw, difference, untracked = [], [], [], []
+    drawn, raw, difference, untracked = [], [], [], []
     simulated = True
-    groups = [(trial, list(own)) for trial, own in groupby(choice.frames, key=lambda frame: frame.trial)]
+    groups = [(trial, list(rows)) for trial, rows in groupby(choice.frames, key=lambda frame: frame.trial)]
     for trial, chosen in track(groups):
         recording = data.load(infos[trial])
         simulated = simulated and recording.truth is not None
@@ -198,13 +198,13 @@ def show_states(choice: Choice, data: Dataset) -> States:
         for frame in chosen:
             if frame.shown:
                 state, margin = str(recording.contact_state[frame.frame]).replace("_", " "), frame.safety_margin
-                shown.append(ShownFrame(id=frame.id, level=frame.level, safety_margin=margin, contact_state=state))
+                drawn.append(ShownFrame(id=frame.id, level=frame.level, safety_margin=margin, contact_state=state))
                 raw.append(recording.frames[frame.frame])
                 difference.append(absolute_difference(raw[-1][None], recording.reference)[0])
     return States(
         trial=next(frame.trial for frame in choice.frames if frame.shown),
         markers_from="simulation" if simulated else "tracking",
-        shown=tuple(shown),
+        shown=tuple(drawn),
         untracked=tuple(untracked),
         raw=np.stack(raw),
         difference=np.stack(difference),
@@ -254,11 +254,11 @@ _AS_PUBLISHED = Likeness(pearson_r=0.999, top_overlap=0.97)
 def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = STUDY_BUDGET) -> dict[str, Explainer]:
     """Explainers of a study: rows of `EXPLAINERS`, Poly-CAM with some of the channels measured at first."""
     require_methods(methods)
-    own: dict[str, Explainer] = {
+    rows: dict[str, Explainer] = {
         "poly-cam": get_explainer("poly-cam", budget=budget),
         THESIS_POLY_CAM: get_explainer(THESIS_POLY_CAM, budget=budget, likeness=_AS_PUBLISHED),
     }
-    return {name: own.get(name) or EXPLAINERS[name] for name in methods}
+    return {name: rows.get(name) or EXPLAINERS[name] for name in methods}
 
 
 def with_markers(
@@ -266,25 +266,31 @@ def with_markers(
     images: Float[Tensor, "frames colours size size"],
     places: Callable[[], Sequence[Float[Tensor, "_markers 2"]]],
 ) -> dict[str, Explainer]:
-    """The same, but those that look for markers are told their places in each image, which are asked only for them."""
+    """Give explainers that look for markers the places in each image; `places` is called only for those."""
     find = cache(lambda: KnownMarkers(images=images, places=tuple(places())))
     return {
-        name: replace(one, markers_px=find()) if isinstance(one, RegionMethod) and callable(one.markers_px) else one
-        for name, one in explainers.items()
+        name: replace(explainer, markers_px=find())
+        if isinstance(explainer, RegionMethod) and callable(explainer.markers_px)
+        else explainer
+        for name, explainer in explainers.items()
     }
 
 
 def without_markers(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]:
-    """The same where markers are not known: tiles are asked instead."""
-    named = {name.removesuffix("-marker"): one for name, one in explainers.items()}
-    return {name: EXPLAINERS[name] if isinstance(one, RegionMethod) else one for name, one in named.items()}
+    """Replace explainers of markers, where these are unknown, by explainers of tiles."""
+    names_used = {name.removesuffix("-marker"): explainer for name, explainer in explainers.items()}
+    return {
+        name: EXPLAINERS[name] if isinstance(record, RegionMethod) else record for name, record in names_used.items()
+    }
 
 
 def as_the_thesis_ran(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]:
-    """The same, but the thesis's Poly-CAM with all its channels: for what it costs, not for what it shows."""
+    """Give the thesis's Poly-CAM all its channels, to time it as it was run there."""
     return {
-        name: replace(one, budget=1.0) if name == THESIS_POLY_CAM and isinstance(one, PolyCam) else one
-        for name, one in explainers.items()
+        name: replace(explainer, budget=1.0)
+        if name == THESIS_POLY_CAM and isinstance(explainer, PolyCam)
+        else explainer
+        for name, explainer in explainers.items()
     }
 
 
@@ -315,7 +321,7 @@ class Material:
     trained: Network
     explained: Explanation
     inputs: Float[Tensor, "frames colours size size"]
-    """What the network got, in [0, 1]."""
+    """Inputs of the network, in [0, 1]."""
     references: Float[Tensor, "frames colours size size"]
     """The untouched sensor for each frame."""
     chosen: tuple[ChosenFrame, ...]
@@ -325,7 +331,7 @@ class Material:
     """By name, with the options that made the maps."""
 
     def take(self, rows: Sequence[int]) -> "Material":
-        """What belongs to some of the frames, by their numbers."""
+        """Select frames by their numbers."""
         chosen = list(rows)
         return replace(
             self,
@@ -336,26 +342,26 @@ class Material:
         )
 
     def raises_only(self, method: str) -> bool:
-        """Whether a method tells only what raises the answer, as one with the published ReLU does."""
+        """Return True where a method shows only what raises the prediction, as one with the published ReLU does."""
         return getattr(self.explainers.get(method), "relu", False)
 
     def influence(self, method: str) -> Float[np.ndarray, "frames size size"]:
-        """What a method ranks pixels by (`Explanation.influence`)."""
+        """Return the map that a method ranks pixels by (`Attribution.influence`)."""
         relevance = self.explained.relevance[method]
         return relevance if self.raises_only(method) else relevance * self.explained.towards[:, None, None]
 
     def units(self) -> dict[str, list[Units]]:
-        """What can be removed at once, for each frame: pixels, tiles, and markers where they are known in every one."""
+        """Units of removal of each frame: pixels, tiles, and markers where they are known in every frame."""
         shape = (self.inputs.shape[-2], self.inputs.shape[-1])
         count = len(self.inputs)
         tile = max(1, round(_TILE_PX * shape[0] / 224))
-        found = {"pixel": [tile_units(shape, size=1)] * count, "tile": [tile_units(shape, size=tile)] * count}
+        records = {"pixel": [tile_units(shape, size=1)] * count, "tile": [tile_units(shape, size=tile)] * count}
         if all(frame.id in self.markers for frame in self.explained.frames):
-            found["marker"] = [
+            records["marker"] = [
                 marker_units(shape, centres, reach_px=reach)
                 for centres, reach in (self.places(frame.id) for frame in self.explained.frames)
             ]
-        return found
+        return records
 
     def places(self, frame: str) -> tuple[Float[np.ndarray, "seen 2"], float]:
         """Where the network sees the markers of a frame, and how far each one reaches (`network_places`)."""
@@ -376,7 +382,7 @@ class MaterialStage(Stage[Result]):
 
 
 class MethodStage(MaterialStage[Result]):
-    """The same, a method a shard."""
+    """A stage with a part for each method."""
 
     def shards(self) -> Iterator[Part]:
         """All methods."""
@@ -434,6 +440,6 @@ def marker_places(
 ) -> list[Float[Tensor, "_markers 2"]]:
     """Where the markers of each frame are, in the network's pixels; those that were not followed are left out."""
     now = [markers[frame.id].now_px for frame in chosen]
-    known = [places[np.isfinite(places).all(axis=1)] for places in now]
+    valid = [places[np.isfinite(places).all(axis=1)] for places in now]
     manifest = trained.manifest
-    return [to_network_px(places, manifest.frame_size, image_size=manifest.image_size) for places in known]
+    return [to_network_px(places, manifest.frame_size, image_size=manifest.image_size) for places in valid]

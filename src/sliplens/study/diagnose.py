@@ -104,8 +104,8 @@ def diagnose(
     run = open_run(run)
     data = data if isinstance(data, Dataset) else load_dataset(data)
     name, weights = run.manifest.input, run.manifest.weights_sha256
-    kept = None if out is None else Path(out) / f"evaluate-{name}"
-    answers = evaluate(run, data, kept, split=split, overwrite=overwrite, on_progress=on_progress).predictions
+    record = None if out is None else Path(out) / f"evaluate-{name}"
+    answers = evaluate(run, data, record, split=split, overwrite=overwrite, on_progress=on_progress).predictions
     make = partial(_diagnose, run, data, answers, on_progress, trials=trials, pairs=pairs, seed=seed)
     if out is None:
         return make(None)
@@ -134,8 +134,8 @@ def _diagnose(
     with stage(on_progress, "Reading what may explain the errors") as count:
         errors = tabulate_errors(data, answers, on_progress=count)
     slices, errors = find_slices(errors, seed=seed)
-    own = errors.where(_spread_rows(errors, trials))
-    chosen = frames_at(run, data, list(zip(own.trial.tolist(), own.frame.tolist(), strict=True)))
+    values = errors.where(_spread_rows(errors, trials))
+    chosen = frames_at(run, data, list(zip(values.trial.tolist(), values.frame.tolist(), strict=True)))
     explained, left_out = explain_frames(run, chosen, methods=()), ""
     try:
         frames = stage_frames(run, explained, data)
@@ -146,30 +146,32 @@ def _diagnose(
             ig, method = "integrated-gradients", "Integrated Gradients"
             maps = explain_frames(run, chosen, methods=(ig,), parts=parts, on_progress=count).relevance[ig]
         rows = adaptive_avg_pool2d(torch.from_numpy(maps)[:, None], _BLOCKS).flatten(1).double().numpy()
-        looked = dict.fromkeys((*_LOOKED, "limit"), np.full(len(own), np.nan))
-        frictions, pictures, shown = as_frictions([]), explained.pictures[:0], ""
+        measured = dict.fromkeys((*_LOOKED, "limit"), np.full(len(values), np.nan))
+        frictions, pictures, drawn = as_frictions([]), explained.pictures[:0], ""
     else:
         with stage(on_progress, "Asking for each marker's part") as count:
-            found = find_contributions(run, explained, frames, pairs=pairs, seed=seed, parts=parts, on_progress=count)
-        size, rows = run.manifest.image_size, np.stack([one.values for one in found])
-        maps = np.stack([find_places(one, image_size=size).paint(row) for one, row in zip(frames, rows, strict=True)])
-        looked = {name: np.array([getattr(one, name) for one in found]) for name in _LOOKED}
-        looked["limit"] = np.array([reading_limit(one.scene, one.number) for one in frames])
+            records = find_contributions(run, explained, frames, pairs=pairs, seed=seed, parts=parts, on_progress=count)
+        size, rows = run.manifest.image_size, np.stack([record.values for record in records])
+        maps = np.stack(
+            [find_places(frame, image_size=size).paint(row) for frame, row in zip(frames, rows, strict=True)]
+        )
+        measured = {name: np.array([getattr(record, name) for record in records]) for name in _LOOKED}
+        measured["limit"] = np.array([reading_limit(frame.scene, frame.number) for frame in frames])
         method = "Shapley values of the markers"
         with stage(on_progress, "Filming with other frictions") as count:
-            frictions, pictures, shown = refilm(run, frames, own.condition.tolist(), on_progress=count)
-    kinds, examples, silhouette = cluster_explanations(rows, np.abs(own.error), seed=seed)
-    place = np.full(len(own), -1)
+            frictions, pictures, drawn = refilm(run, frames, values.condition.tolist(), on_progress=count)
+    kinds, examples, silhouette = cluster_explanations(rows, np.abs(values.error), seed=seed)
+    place = np.full(len(values), -1)
     place[examples] = np.arange(len(examples))
-    told = tell_friction(run, network_inputs(run, explained), own.friction)
-    table = ExplainedErrors(**vars(own), **looked, told=told, cluster=kinds, example=place)
-    slopes, known = friction_slopes(frictions, rng), (say_errors(errors, rng), say_slices(slices))
-    known += (*say_limits(table, rng), *say_told(table, rng), *map(say_slope, slopes))
-    sentences = (*known, *say_looked(table, slices, rng), say_kinds(table, silhouette))
+    text = tell_friction(run, network_inputs(run, explained), values.friction)
+    table = ExplainedErrors(**vars(values), **measured, told=text, cluster=kinds, example=place)
+    slopes, valid = friction_slopes(frictions, rng), (say_errors(errors, rng), say_slices(slices))
+    valid += (*say_limits(table, rng), *say_told(table, rng), *map(say_slope, slopes))
+    sentences = (*valid, *say_looked(table, slices, rng), say_kinds(table, silhouette))
     return Diagnosis(
         input=run.manifest.input, source=data.source, sentences=sentences, left_out=left_out, slices=slices,
         slopes=slopes, method=method, errors=errors, explained=table, frictions=frictions,
-        pictures=explained.pictures[examples], maps=maps[examples].astype(np.float32), shown_frame=shown,
+        pictures=explained.pictures[examples], maps=maps[examples].astype(np.float32), shown_frame=drawn,
         other_frictions=pictures,
     )  # fmt: skip
 
@@ -177,22 +179,22 @@ def _diagnose(
 def tabulate_errors(data: Dataset, answers: ScoredFrames, *, on_progress: OnProgress | None = None) -> ErrorTable:
     """Put beside each answer what may have made it wrong."""
     pieces = []
-    for (trial,), own in counted(answers.groups("trial").items(), on_progress):
-        info, places = data.find(trial), [np.full(len(own), np.nan)] * 2
+    for (trial,), rows in counted(answers.groups("trial").items(), on_progress):
+        info, places = data.find(trial), [np.full(len(rows), np.nan)] * 2
         recording = data.load(info)
         if recording.truth is not None:
-            touching = (recording.truth.contact_map[own.frame] > 0).astype(np.float64)
+            touching = (recording.truth.contact_map[rows.frame] > 0).astype(np.float64)
             pixels = np.maximum(touching.sum(axis=(1, 2)), 1)
             along = [touching.sum(axis=axis) for axis in (1, 2)]
-            places = [one @ (np.arange(one.shape[1]) + 0.5) / one.shape[1] / pixels for one in along]
+            places = [record @ (np.arange(record.shape[1]) + 0.5) / record.shape[1] / pixels for record in along]
         table = ErrorTable(
-            **vars(own),
-            sensor=np.repeat(info.sensor, len(own)),
-            friction=recording.friction_coefficient[own.frame].astype(np.float64),
-            normal_force_n=recording.normal_force_n[own.frame].astype(np.float64),
+            **vars(rows),
+            sensor=np.repeat(info.sensor, len(rows)),
+            friction=recording.friction_coefficient[rows.frame].astype(np.float64),
+            normal_force_n=recording.normal_force_n[rows.frame].astype(np.float64),
             contact_x=places[0],
             contact_y=places[1],
-            slice=np.full(len(own), -1),
+            slice=np.full(len(rows), -1),
         )
         pieces.append(table)
     return ErrorTable.joined(pieces)
@@ -203,7 +205,7 @@ _Say = Callable[[float, float], str]
 
 
 def _features(errors: ErrorTable) -> list[tuple[Float64[np.ndarray, " frames"], _Say]]:
-    """What the tree may cut by: what is known of all frames, and varies."""
+    """Features that the tree may cut by: known of all frames, and varying."""
 
     def say_kind(kind: str, others: str, low: float, _: float) -> str:
         return kind if low > 0 else others
@@ -231,8 +233,8 @@ def _features(errors: ErrorTable) -> list[tuple[Float64[np.ndarray, " frames"], 
 def hold_out(errors: ErrorTable, *, seed: int) -> Bool[np.ndarray, " frames"]:
     """Frames of every second trial of each condition, drawn."""
     rng, trials = np.random.default_rng(seed), []
-    for own in errors.groups("condition").values():
-        trials += rng.permutation(np.unique(own.trial))[1::2].tolist()
+    for rows in errors.groups("condition").values():
+        trials += rng.permutation(np.unique(rows.trial))[1::2].tolist()
     return np.isin(errors.trial, trials)
 
 
@@ -245,14 +247,14 @@ def find_slices(errors: ErrorTable, *, seed: int) -> tuple[tuple[ErrorSlice, ...
     """
     from sklearn.tree import DecisionTreeRegressor  # noqa: PLC0415 (an extra)
 
-    rng, held, features = np.random.default_rng(seed), hold_out(errors, seed=seed), _features(errors)
+    rng, compared, features = np.random.default_rng(seed), hold_out(errors, seed=seed), _features(errors)
     columns = np.column_stack([np.zeros(len(errors)), *(values for values, _ in features)])
     # both: where it errs either way alike, or not at all, the mean error alone tells nothing
-    wanted = np.stack([np.abs(errors.error), errors.error], axis=1)[~held]
+    wanted = np.stack([np.abs(errors.error), errors.error], axis=1)[~compared]
     least, rules = wanted.var(axis=0).mean(), {"max_leaf_nodes": _SLICES, "min_samples_leaf": _LEAST_SHARE}
     grown = DecisionTreeRegressor(**rules, min_impurity_decrease=_LEAST_GAIN * least, random_state=seed)
-    tree = grown.fit(columns[~held], wanted).tree_
-    leaves, tested, found = grown.apply(columns), errors.where(held), []
+    tree = grown.fit(columns[~compared], wanted).tree_
+    leaves, tested, records = grown.apply(columns), errors.where(compared), []
     bounds: dict[int, dict[int, tuple[float, float]]] = {0: {}}
     for node in range(tree.node_count):  # a parent comes before its children
         at, cut, ranges = int(tree.feature[node]), float(tree.threshold[node]), bounds[node]
@@ -260,16 +262,16 @@ def find_slices(errors: ErrorTable, *, seed: int) -> tuple[tuple[ErrorSlice, ...
         if at >= 0:
             bounds[int(tree.children_left[node])] = {**ranges, at: (low, cut)}
             bounds[int(tree.children_right[node])] = {**ranges, at: (cut, high)}
-        elif (inside := leaves[held] == node).any():
+        elif (inside := leaves[compared] == node).any():
             name = ", ".join(features[column - 1][1](*ends) for column, ends in ranges.items()) or "all frames"
             there, excess = tested.where(inside), excess_error(tested, inside, rng, comparisons=int(tree.n_leaves))
             error, bias, trials = float(np.abs(there.error).mean()), float(there.error.mean()), len(set(there.trial))
-            own = ErrorSlice(name=name, frames=len(there), trials=trials, error=error, bias=bias, excess=excess)
-            found.append((node, own))
-    found.sort(key=lambda pair: -pair[1].error)
-    place = {node: at for at, (node, _) in enumerate(found)}
+            rows = ErrorSlice(name=name, frames=len(there), trials=trials, error=error, bias=bias, excess=excess)
+            records.append((node, rows))
+    records.sort(key=lambda pair: -pair[1].error)
+    place = {node: at for at, (node, _) in enumerate(records)}
     slices = np.array([place.get(leaf, -1) for leaf in leaves.tolist()], dtype=np.int64)
-    return tuple(one for _, one in found), replace(errors, slice=slices)
+    return tuple(record for _, record in records), replace(errors, slice=slices)
 
 
 def _mean(
@@ -307,8 +309,8 @@ def _spread_rows(errors: ErrorTable, trials: int) -> Int64[np.ndarray, " rows"]:
         names = list(dict.fromkeys(errors.trial[errors.condition == condition].tolist()))
         count = min(trials, len(names))
         for trial in (names[at * len(names) // count] for at in range(count)):
-            own = np.flatnonzero(errors.trial == trial)
-            rows += sorted({int(own[np.abs(errors.safety_margin[own] - level).argmin()]) for level in LEVELS})
+            frames = np.flatnonzero(errors.trial == trial)
+            rows += sorted({int(frames[np.abs(errors.safety_margin[frames] - level).argmin()]) for level in LEVELS})
     return np.array(rows)
 
 
@@ -376,8 +378,8 @@ def tell_friction(
     if traction is None or not np.isfinite(friction).all():
         return np.full(len(friction), np.nan)
     untold = run.estimate_batches(inputs.split(64))
-    told = condition_each(untold, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
-    return told.margin.astype(np.float64)
+    conditioned = condition_each(untold, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
+    return conditioned.margin.astype(np.float64)
 
 
 def refilm(
@@ -391,26 +393,26 @@ def refilm(
     for frame, condition in counted(list(zip(frames, conditions, strict=True)), on_progress):
         at, scene = frame.number, frame.scene
         if scene is not last:  # frames of a trial stand together
-            own, last = scene.loading.friction_coefficient, scene
-            films = [film_with_friction(scene, factor * own) for factor in FRICTION_FACTORS]
-        known = [film for film in films if np.isfinite(film.loading.safety_margin[at])]
-        drawn = np.concatenate([film.film.draw(slice(at, at + 1)).numpy() for film in known])
+            values, last = scene.loading.friction_coefficient, scene
+            films = [film_with_friction(scene, factor * values) for factor in FRICTION_FACTORS]
+        valid = [film for film in films if np.isfinite(film.loading.safety_margin[at])]
+        drawn = np.concatenate([film.film.draw(slice(at, at + 1)).numpy() for film in valid])
         inputs = run.encode(drawn, frame.reference).to(run.device)
         pictures[frame.id] = (255 * frame_of(inputs)).round().byte().permute(0, 2, 3, 1).cpu().numpy()
-        for film, answer in zip(known, run.predict(inputs).tolist(), strict=True):
+        for film, answer in zip(valid, run.predict(inputs).tolist(), strict=True):
             truth = (film.loading.friction_coefficient[at], film.loading.safety_margin[at])
             rows.append((frame.id, frame.trial, condition, frame.day, *truth, answer, reading_slope(film, at)))
     of_last = [frame for frame, condition in zip(frames, conditions, strict=True) if condition == conditions[-1]]
-    shown = min(of_last, key=lambda frame: abs(frame.safety_margin - 0.5)).id
-    return as_frictions(rows), pictures[shown], shown
+    chosen = min(of_last, key=lambda frame: abs(frame.safety_margin - 0.5)).id
+    return as_frictions(rows), pictures[chosen], chosen
 
 
 def as_frictions(rows: Sequence[tuple[Any, ...]]) -> FrictionTable:
     """Table of rows, or of none."""
     columns = dict(zip((field.name for field in fields(FrictionTable)), zip(*rows, strict=True), strict=False))
     kinds = {"frame_id": str, "trial": str, "condition": str, "day": np.int64}
-    named = {field.name: kinds.get(field.name, np.float64) for field in fields(FrictionTable)}
-    return FrictionTable(**{name: np.array(columns.get(name, ()), dtype=kind) for name, kind in named.items()})
+    names_used = {field.name: kinds.get(field.name, np.float64) for field in fields(FrictionTable)}
+    return FrictionTable(**{name: np.array(columns.get(name, ()), dtype=kind) for name, kind in names_used.items()})
 
 
 def friction_slopes(frictions: FrictionTable, rng: np.random.Generator) -> tuple[FrictionSlope, ...]:
@@ -421,13 +423,13 @@ def friction_slopes(frictions: FrictionTable, rng: np.random.Generator) -> tuple
     """
     slopes = []
     for (condition,), table in frictions.groups("condition").items():
-        frames = [own.where(np.argsort(own.safety_margin)) for own in table.groups("frame_id").values()]
-        frames = [own for own in frames if np.ptp(own.safety_margin) > 0]
+        frames = [rows.where(np.argsort(rows.safety_margin)) for rows in table.groups("frame_id").values()]
+        frames = [frame for frame in frames if np.ptp(frame.safety_margin) > 0]
         if frames:
-            network = np.array([np.polyfit(own.safety_margin, own.prediction, 1)[0] for own in frames])
-            areas = [np.trapezoid(own.reading_slope, own.safety_margin) for own in frames]
-            reading = np.array(areas) / [np.ptp(own.safety_margin) for own in frames]
-            firsts = FrictionTable.joined([own.where(np.array([0])) for own in frames])
+            network = np.array([np.polyfit(frame.safety_margin, frame.prediction, 1)[0] for frame in frames])
+            areas = [np.trapezoid(frame.reading_slope, frame.safety_margin) for frame in frames]
+            reading = np.array(areas) / [np.ptp(frame.safety_margin) for frame in frames]
+            firsts = FrictionTable.joined([frame.where(np.array([0])) for frame in frames])
             mean, best, gap = (_mean(values, firsts, rng) for values in (network, reading, network - reading))
             slopes.append(FrictionSlope(condition=condition, network=mean, reading=best, gap=gap))
     return tuple(slopes)
@@ -455,9 +457,9 @@ def cluster_explanations(
     order = sorted(np.unique(best).tolist(), key=lambda label: -sizes[best == label].mean())
     kinds, examples = np.array([order.index(label) for label in best.tolist()], dtype=np.int64), []
     for kind in range(len(order)):
-        own = np.flatnonzero(kinds == kind)
-        away = np.linalg.norm(rows[own] - rows[own].mean(axis=0), axis=1)
-        examples += own[np.argsort(away, kind="stable")[:_EXAMPLES]].tolist()
+        frames = np.flatnonzero(kinds == kind)
+        away = np.linalg.norm(rows[frames] - rows[frames].mean(axis=0), axis=1)
+        examples += frames[np.argsort(away, kind="stable")[:_EXAMPLES]].tolist()
     return kinds, examples, highest
 
 
@@ -478,14 +480,17 @@ def _off(table: ErrorTable) -> str:
 
 def say_errors(errors: ErrorTable, rng: np.random.Generator) -> str:
     """Say how large the error is, in each condition, and whether it is larger on wet objects."""
-    groups = {condition: own for (condition,), own in errors.groups("condition").items()}
-    each = [f"{_off(own)} on {name} objects ({signed(100 * own.error.mean(), 1)} mean)" for name, own in groups.items()]
+    groups = {condition: rows for (condition,), rows in errors.groups("condition").items()}
+    each = [
+        f"{_off(group)} on {name} objects ({signed(100 * group.error.mean(), 1)} mean)"
+        for name, group in groups.items()
+    ]
     text = f"Over {_frames(errors)} the answer is {_off(errors)} percentage points on average: {', '.join(each)}."
     if {"dry", "wet"} - set(groups):
         return text
     both = ErrorTable.joined([groups["wet"], groups["dry"]])
     text += f" Wet less dry: {_say_excess(both, rng)}."
-    ends = [np.array([own.friction.min(), own.friction.max()]) for own in (groups["wet"], groups["dry"])]
+    ends = [np.array([rows.friction.min(), rows.friction.max()]) for rows in (groups["wet"], groups["dry"])]
     low, high = max(first for first, _ in ends), min(last for _, last in ends)
     alike = both.where((both.friction >= low) & (both.friction <= high))  # nowhere, where friction is not known
     fewest = min(len(np.unique(alike.trial[alike.condition == name])) for name in ("dry", "wet"))
@@ -504,17 +509,17 @@ def _say_excess(both: ErrorTable, rng: np.random.Generator) -> str:
 
 def say_slices(slices: Sequence[ErrorSlice]) -> str:
     """Say where the error is larger on trials that the tree has not seen."""
-    tested = [one for one in slices if one.trials >= FEWEST_UNITS]
+    tested = [part for part in slices if part.trials >= FEWEST_UNITS]
     if not tested:
         return f"Where the error is larger is not known: no slice has the {FEWEST_UNITS} held-out trials to test it on."
-    held = [one for one in tested if one.holds]
+    compared = [record for record in tested if record.holds]
     texts = [
-        f"{one.name}: off by {100 * one.error:.1f} ({signed(100 * one.bias, 1)} mean) in "
-        f"{number_of(one.frames, 'frame')} of {number_of(one.trials, 'trial')}, against elsewhere "
-        f"{_gap(one.excess, points=True)}"
-        for one in held or tested[:1]
+        f"{record.name}: off by {100 * record.error:.1f} ({signed(100 * record.bias, 1)} mean) in "
+        f"{number_of(record.frames, 'frame')} of {number_of(record.trials, 'trial')}, against elsewhere "
+        f"{_gap(record.excess, points=True)}"
+        for record in compared or tested[:1]
     ]
-    if not held:
+    if not compared:
         return (
             "No slice found on half of the trials has a larger error on the other half beyond chance, all slices taken "
             f"together. The largest is {texts[0]}."
@@ -525,13 +530,13 @@ def say_slices(slices: Sequence[ErrorSlice]) -> str:
 def say_limits(table: ExplainedErrors, rng: np.random.Generator) -> list[str]:
     """Say how much of the error is in the picture already: what no unbiased reader of one frame does better than."""
     texts = []
-    for condition, own in _enough(table, table.limit).items():
-        squared, least = own.error**2, own.limit**2
-        gap = _mean(squared - least, own, rng)
+    for condition, rows in _enough(table, table.limit).items():
+        squared, least = rows.error**2, rows.limit**2
+        gap = _mean(squared - least, rows, rng)
         verdict = "above" if gap.above_zero else "below" if gap.below_zero else "not told from"
         reached, bound = (100 * np.sqrt(values.mean()) for values in (squared, least))
         texts.append(
-            f"On {condition} objects the root mean squared error in {_frames(own)} is {reached:.1f} points. It is "
+            f"On {condition} objects the root mean squared error in {_frames(rows)} is {reached:.1f} points. It is "
             f"{verdict} the {bound:.1f} points that no unbiased reader of the markers of one frame comes below, who is "
             f"told how far the friction of {condition} objects ranges and no more (over {gap.over})."
         )
@@ -541,39 +546,39 @@ def say_limits(table: ExplainedErrors, rng: np.random.Generator) -> list[str]:
 def say_told(table: ExplainedErrors, rng: np.random.Generator) -> list[str]:
     """Say what is left of the error where the network is told the friction that holds."""
     texts = []
-    for condition, own in _enough(table, table.told).items():
-        told = replace(own, prediction=own.told)
-        gain = _mean(np.abs(told.error) - np.abs(own.error), own, rng)
-        texts.append(f"{_off(told)} points on {condition} objects, untold {_off(own)}: {_gap(gain, points=True)}")
+    for condition, rows in _enough(table, table.told).items():
+        text = replace(rows, prediction=rows.told)
+        gain = _mean(np.abs(text.error) - np.abs(rows.error), rows, rng)
+        texts.append(f"{_off(text)} points on {condition} objects, untold {_off(rows)}: {_gap(gain, points=True)}")
     return [f"Told the friction that holds, the same network is {'; '.join(texts)}."] if texts else []
 
 
 def _enough(table: ExplainedErrors, known: Float64[np.ndarray, " frames"]) -> dict[str, ExplainedErrors]:
     """Frames of each condition, where a value is known and trials are enough to say something."""
-    groups = {name: own for (name,), own in table.where(np.isfinite(known)).groups("condition").items()}
-    return {name: own for name, own in groups.items() if len(np.unique(own.trial)) >= FEWEST_UNITS}
+    groups = {name: rows for (name,), rows in table.where(np.isfinite(known)).groups("condition").items()}
+    return {name: group for name, group in groups.items() if len(np.unique(group.trial)) >= FEWEST_UNITS}
 
 
 def say_looked(table: ExplainedErrors, slices: Sequence[ErrorSlice], rng: np.random.Generator) -> list[str]:
     """Say how far the markers' parts are those of the best reading, in each condition and where the error is larger."""
     groups = {f"on {name} objects": table.condition == name for (name,) in table.groups("condition")}
-    groups["in the slices of larger error"] = np.isin(table.slice, [at for at, one in enumerate(slices) if one.holds])
-    known = {name: table.where(rows & np.isfinite(table.agreement)) for name, rows in groups.items()}
+    groups["in the slices of larger error"] = np.isin(table.slice, [at for at, part in enumerate(slices) if part.holds])
+    valid = {name: table.where(rows & np.isfinite(table.agreement)) for name, rows in groups.items()}
     return [
-        f"In {_frames(own)} {name} the markers' parts in the answer rank as in the best reading, to a signed rank "
-        f"correlation (Spearman's) of {_gap(_mean(own.agreement, own, rng, (-1.0, 1.0)))}; of the parts in contact, "
-        f"{100 * own.network_slipping.mean():.0f} % of the answer's and {100 * own.reading_slipping.mean():.0f} % of "
+        f"In {_frames(rows)} {name} the markers' parts in the answer rank as in the best reading, to a signed rank "
+        f"correlation (Spearman's) of {_gap(_mean(rows.agreement, rows, rng, (-1.0, 1.0)))}; of the parts in contact, "
+        f"{100 * rows.network_slipping.mean():.0f} % of the answer's and {100 * rows.reading_slipping.mean():.0f} % of "
         "the best reading's are of slipping markers: "
-        f"{_gap(_mean(own.network_slipping - own.reading_slipping, own, rng), points=True)}." + _say_sampling(own)
-        for name, own in known.items()
-        if len(np.unique(own.trial)) >= FEWEST_UNITS
+        f"{_gap(_mean(rows.network_slipping - rows.reading_slipping, rows, rng), points=True)}." + _say_sampling(rows)
+        for name, rows in valid.items()
+        if len(np.unique(rows.trial)) >= FEWEST_UNITS
     ]
 
 
 def _say_sampling(table: ExplainedErrors) -> str:
     reliability = float(table.reliability.mean())
-    told = f" Another estimate of the answer's from as many scenes would correlate with this one by {reliability:.2f}."
-    return told if np.isfinite(reliability) else ""
+    text = f" Another estimate of the answer's from as many scenes would correlate with this one by {reliability:.2f}."
+    return text if np.isfinite(reliability) else ""
 
 
 def say_slope(slope: FrictionSlope) -> str:
@@ -592,7 +597,7 @@ def say_kinds(table: ExplainedErrors, silhouette: float | None) -> str:
         return "The explanations are too few to be sorted into kinds."
     kinds = [table.where(table.cluster == kind) for kind in np.unique(table.cluster)]
     distinct = "distinct" if silhouette >= _DISTINCT else "hardly distinct: they shade into one another"
-    first, last = (f"({_frames(own)}) is {_off(own)} percentage points" for own in (kinds[0], kinds[-1]))
+    first, last = (f"({_frames(rows)}) is {_off(rows)} percentage points" for rows in (kinds[0], kinds[-1]))
     return (
         f"Explanations fall into {len(kinds)} kinds (silhouette {decimals(silhouette, 2)}, {distinct}). That of the "
         f"largest error {first}, that of the smallest {last}."

@@ -125,10 +125,13 @@ def stage_frames(trained: Network, explained: Explanation, data: Dataset) -> tup
                 raise InputError(f"{name} is not the frame of {data.folder} that was explained; explain it again")
             truth = recording.truth
             assert truth is not None  # what was rebuilt has its truth
-            own: dict[str, Any] = {"id": name, "day": infos[trial].day, "trial": trial, "number": number}
-            own |= {"safety_margin": float(recording.safety_margin[number]), "contact_map": truth.contact_map[number]}
+            frames: dict[str, Any] = {"id": name, "day": infos[trial].day, "trial": trial, "number": number}
+            frames |= {
+                "safety_margin": float(recording.safety_margin[number]),
+                "contact_map": truth.contact_map[number],
+            }
             markers = visible_markers(scene.film.sensor)
-            staged[row] = StagedFrame(**own, scene=scene, reference=recording.reference, markers=markers)
+            staged[row] = StagedFrame(**frames, scene=scene, reference=recording.reference, markers=markers)
     return tuple(staged[row] for row in range(len(explained.frames)))
 
 
@@ -226,8 +229,8 @@ def _gains(curves: RemovalCurves, towards: float) -> Float[np.ndarray, "2 3"]:
 def marker_means(maps: Maps, places: Sequence[Places]) -> list[Float[np.ndarray, " markers"]]:
     """Mean of each frame's map over each of its markers, where it is and where it was."""
     return [
-        unit_means(values.astype(np.float64), one.units)[: len(one.now_px)]
-        for values, one in zip(maps, places, strict=True)
+        unit_means(values.astype(np.float64), place.units)[: len(place.now_px)]
+        for values, place in zip(maps, places, strict=True)
     ]
 
 
@@ -235,7 +238,13 @@ def _by_region(places: Sequence[Places], measure: Callable[[int, np.ndarray], fl
     """Means over the frames that have the region: where nothing slips there is nothing to find."""
     return {
         region: mean_of_known(
-            np.array([measure(at, own) for at, own in enumerate(getattr(one, region) for one in places) if own.any()])
+            np.array(
+                [
+                    measure(at, place)
+                    for at, place in enumerate(getattr(place, region) for place in places)
+                    if place.any()
+                ]
+            )
         )
         for region in REGIONS
     }
@@ -257,11 +266,11 @@ def mean_of_defined(
 ) -> Difference | None:
     """Mean over the frames in which a score is defined, with its interval (`mean_interval`); None if in none."""
     values = np.array(list(measured))
-    known = np.isfinite(values)
-    if not known.any():
+    valid = np.isfinite(values)
+    if not valid.any():
         return None
     rng = np.random.default_rng(seed)
-    return mean_interval(values[known], clusters=clusters[:, known], rng=rng, limits=limits)
+    return mean_interval(values[valid], clusters=clusters[:, valid], rng=rng, limits=limits)
 
 
 _Interval = Callable[[Iterable[float]], Difference | None]
@@ -275,7 +284,7 @@ def meta_test(effects: Sequence[FrameEffects], interval: _Interval) -> tuple[Met
     """
     tests = []
     for fill in effects[0].gains:
-        gains = np.stack([own.gains[fill] for own in effects])
+        gains = np.stack([effect.gains[fill] for effect in effects])
         along, by_size = (_test_oracle(gains[:, row], interval) for row in (0, 1))
         tests.append(MetaTest(fill=fill, by_size=by_size, **vars(along)))
     return tuple(tests)
@@ -294,27 +303,28 @@ def reliability_of(values: Float64[np.ndarray, " markers"], errors: Float64[np.n
 
 def _sum_over_change(effects: Sequence[FrameEffects], change: Float[np.ndarray, " frames"], name: str) -> float | None:
     """How many times the changes of the answers the effects of a name add up to, over all frames."""
-    sums = np.array([getattr(own, name).sum() for own in effects])
+    sums = np.array([getattr(effect, name).sum() for effect in effects])
     return float((np.sign(change) * sums).sum() / np.abs(change).sum()) if change.any() else None
 
 
 def _summarise(truth: Truth) -> str:
     """Say what the effects add up to and how sure they are, which fills can tell, and who looks where it should."""
-    told = {name: "unknown" if times is None else f"{times:.2f} times" for name, times in truth.sums.items()}
+    text = {name: "unknown" if times is None else f"{times:.2f} times" for name, times in truth.sums.items()}
     summary = (
         "Put back one at a time, all markers together change the answer by "
-        f"{told['network']} its whole change; their Shapley values, from {truth.pairs} pairs of scenes a frame, add up "
-        f"to {told['shapley']}."
+        f"{text['network']} its whole change; their Shapley values, from {truth.pairs} pairs of scenes a frame, add up "
+        f"to {text['shapley']}."
     )
     if truth.reliability is not None:
         summary += f" A second estimate of these would correlate with this one by {truth.reliability.estimate:.2f}."
-    held, by_size = (
+    signed, by_size = (
         [test.fill for test in truth.meta if (test if along else test.by_size).holds] for along in (True, False)
     )
     summary += (
         " The map of the Shapley values ranks above one of which half is shuffled, beyond the 95 % interval, "
-        f"under {len(held)} of {len(truth.meta)} fills ({', '.join(held) or 'none'}) along the answer's change, which "
-        f"asks for signs; under {len(by_size)} ({', '.join(by_size) or 'none'}) by size, which asks for strength alone."
+        f"under {len(signed)} of {len(truth.meta)} fills ({', '.join(signed) or 'none'}) along the answer's change, "
+        f"which asks for signs; under {len(by_size)} ({', '.join(by_size) or 'none'}) by size, "
+        "which asks for strength alone."
     )
     agreement = truth.shapley_against_margin
     if agreement is not None:
@@ -358,8 +368,8 @@ class JudgingByTruth(Stage[Truth]):
     def shards(self) -> Iterator[Part]:
         """All frames."""
         for index, frame in enumerate(self.explained.frames):
-            known = {"recipe": "truth", "content": "", "first": index, "frames": 1}
-            yield part(index, trial=frame.trial, name=frame.id, **known)
+            valid = {"recipe": "truth", "content": "", "first": index, "frames": 1}
+            yield part(index, trial=frame.trial, name=frame.id, **valid)
 
     @cached_property
     def _staged(self) -> tuple[tuple[StagedFrame, ...], list[Places], int]:
@@ -384,14 +394,16 @@ class JudgingByTruth(Stage[Truth]):
             answers = answer(np.eye(count + 1, count, k=-1, dtype=bool))
             # a run that goes on draws the same; a first guess would lean the truth towards the map that gave it
             rng = np.random.default_rng((seed, index))
-            found = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
-            shuffled = shuffle_half(found.values, rng=rng)
+            records = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
+            shuffled = shuffle_half(records.values, rng=rng)
             empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
             change = change_of(inputs[index].cpu(), empty).double().numpy()
-            oracles = [towards * found.values, towards * shuffled]
-            known = [*oracles, unit_means(change, place.units)[:count], *map(np.abs, oracles)]
+            oracles = [towards * records.values, towards * shuffled]
+            valid = [*oracles, unit_means(change, place.units)[:count], *map(np.abs, oracles)]
             orders = [
-                unit_order(place.paint(one), place.units, least_first=least) for one in known for least in (False, True)
+                unit_order(place.paint(record), place.units, least_first=least)
+                for record in valid
+                for least in (False, True)
             ]
             curves = {
                 name: removal_curves(
@@ -407,15 +419,15 @@ class JudgingByTruth(Stage[Truth]):
             curves[TRUE_FILL] = marker_curves(
                 predict,
                 lambda _, back: redraw(index, back),
-                np.concatenate([influence_orders(one[None]) for one in known]),
+                np.concatenate([influence_orders(record[None]) for record in valid]),
             )
             return FrameEffects(
-                shapley=found.values,
-                shapley_error=found.standard_errors,
+                shapley=records.values,
+                shapley_error=records.standard_errors,
                 network=answers[0] - answers[1:],
                 margin=marker_readings(frame.scene, frame.number)[1],
                 shuffled=shuffled,
-                gains={name: _gains(own, towards) for name, own in curves.items()},
+                gains={name: _gains(curve, towards) for name, curve in curves.items()},
             )
 
         return find
@@ -427,16 +439,16 @@ class JudgingByTruth(Stage[Truth]):
         size = trained.manifest.image_size
         # along the answer's change, as the maps are
         along = [
-            {name: sign * getattr(own, name) for name in (*_EFFECTS, "shuffled")}
-            for sign, own in zip(explained.towards, effects, strict=True)
+            {name: sign * getattr(effect, name) for name in (*_EFFECTS, "shuffled")}
+            for sign, effect in zip(explained.towards, effects, strict=True)
         ]
         judged = dict(self.maps) | {
             CHANCE: np.random.default_rng(seed).random((len(frames), size, size)),
-            ORACLE: _paint(places, [own["shapley"] for own in along]),
-            DEGRADED: _paint(places, [own["shuffled"] for own in along]),
+            ORACLE: _paint(places, [rows["shapley"] for rows in along]),
+            DEGRADED: _paint(places, [rows["shuffled"] for rows in along]),
         }
         change = np.array([frame.prediction - frame.reference_prediction for frame in explained.frames])
-        painted = {name: _paint(places, [getattr(one, name) for one in effects]) for name in _EFFECTS}
+        painted = {name: _paint(places, [getattr(effect, name) for effect in effects]) for name in _EFFECTS}
         interval = partial(mean_of_defined, clusters=explained.clusters, seed=seed)
         alike = partial(interval, limits=(-1.0, 1.0))
         truth = Truth(
@@ -448,11 +460,11 @@ class JudgingByTruth(Stage[Truth]):
             methods=_judge(judged, places, along, explained.clusters, seed=seed),
             pairs=pairs,
             reliability=interval(
-                (reliability_of(one.shapley, one.shapley_error) for one in effects), limits=(0.0, 1.0)
+                (reliability_of(effect.shapley, effect.shapley_error) for effect in effects), limits=(0.0, 1.0)
             ),
             sums={name: _sum_over_change(effects, change, name) for name in ("shapley", "network")},
-            shapley_against_margin=alike(rank_correlation(one.shapley, one.margin) for one in effects),
-            network_against_margin=alike(rank_correlation(one.network, one.margin) for one in effects),
+            shapley_against_margin=alike(rank_correlation(effect.shapley, effect.margin) for effect in effects),
+            network_against_margin=alike(rank_correlation(effect.network, effect.margin) for effect in effects),
             meta=meta_test(effects, interval),
             summary="",
             effects=_table(frames, places, effects),
@@ -472,44 +484,46 @@ def _judge(
     means = {name: marker_means(values, places) for name, values in maps.items()}
     alike = {
         name: {
-            truth: np.array([rank_correlation(values, own[truth]) for values, own in zip(of_map, effects, strict=True)])
+            truth: np.array(
+                [rank_correlation(values, effect[truth]) for values, effect in zip(of_map, effects, strict=True)]
+            )
             for truth in _EFFECTS
         }
         for name, of_map in means.items()
     }
     # a map that tells no marker from another ranks them as chance does
-    ranks = {name: np.nan_to_num(own["shapley"]) for name, own in alike.items()}
-    controls = {name: own for name, own in ranks.items() if is_control(name) and name != CHANCE}
-    rng, found = np.random.default_rng(seed), {}
+    ranks = {name: np.nan_to_num(rows["shapley"]) for name, rows in alike.items()}
+    controls = {name: rank for name, rank in ranks.items() if is_control(name) and name != CHANCE}
+    rng, records = np.random.default_rng(seed), {}
     interval = partial(mean_of_defined, clusters=clusters, seed=seed, limits=(-1.0, 1.0))
     methods = [name for name in maps if not is_control(name) and name not in (ORACLE, DEGRADED)]
     for name, values in maps.items():
-        others = [one for one in methods if one != name] if name in methods else []
+        others = [method for method in methods if method != name] if name in methods else []
         positive = np.clip(values.astype(np.float64), 0, None)
         on_edges = (
-            relevance_mass(own, place.edges) - place.edges.mean() for own, place in zip(positive, places, strict=True)
+            relevance_mass(rows, place.edges) - place.edges.mean() for rows, place in zip(positive, places, strict=True)
         )
-        found[name] = Localisation(
+        records[name] = Localisation(
             mass=_by_region(places, lambda frame, region, own=positive: relevance_mass(own[frame], region)),
             rank=_by_region(places, lambda frame, region, own=positive: relevance_rank(own[frame], region)),
             lead_over_controls=lead_over_controls(ranks[name], controls, clusters=clusters, rng=rng)
             if name in methods
             else None,
             lead_over_methods={
-                one: paired_difference(ranks[name], ranks[one], clusters=clusters, rng=rng) for one in others
+                other: paired_difference(ranks[name], ranks[other], clusters=clusters, rng=rng) for other in others
             },
             edges=interval(on_edges),
             **{truth: interval(values) for truth, values in alike[name].items()},
         )
-    return found
+    return records
 
 
 def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Sequence[FrameEffects]) -> MarkerEffects:
     pieces = []
-    for frame, place, own in zip(frames, places, effects, strict=True):
-        told = {name: getattr(frame, name) for name in ("day", "trial", "safety_margin")} | {"frame_id": frame.id}
-        columns = {name: np.repeat(value, len(frame.markers)) for name, value in told.items()}
-        columns |= {name: getattr(own, name) for name in ("shapley", "shapley_error", "network", "margin")}
+    for frame, place, effect in zip(frames, places, effects, strict=True):
+        text = {name: getattr(frame, name) for name in ("day", "trial", "safety_margin")} | {"frame_id": frame.id}
+        columns = {name: np.repeat(value, len(frame.markers)) for name, value in text.items()}
+        columns |= {name: getattr(effect, name) for name in ("shapley", "shapley_error", "network", "margin")}
         columns |= {"x_px": place.now_px[:, 0], "y_px": place.now_px[:, 1]}
         pieces.append(MarkerEffects(**columns, marker=frame.markers.astype(np.int64), state=place.state))
     return MarkerEffects.joined(pieces)
@@ -542,4 +556,4 @@ def true_curves(
 
 
 def _paint(places: Sequence[Places], values: Sequence[Float[np.ndarray, " markers"]]) -> Maps:
-    return np.stack([place.paint(own) for place, own in zip(places, values, strict=True)])
+    return np.stack([place.paint(value) for place, value in zip(places, values, strict=True)])

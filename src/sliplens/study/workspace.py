@@ -134,8 +134,8 @@ def explain_source(
         methods = tuple(explainers)
     else:
         explainers = choose(methods=methods)
-    own: dict[str, Any] = {"methods": methods, "explainers": explainers, "on": on, "retry_failed": retry_failed}
-    explain = partial(explain_frames, trained, chosen, **own)
+    rows: dict[str, Any] = {"methods": methods, "explainers": explainers, "on": on, "retry_failed": retry_failed}
+    explain = partial(explain_frames, trained, chosen, **rows)
     frames = number_of(len(chosen.ids), "frame")
     title = f"Explaining {frames} ({trained.manifest.input}, {chosen.source})"
     if out is None:
@@ -154,7 +154,9 @@ def explain_source(
                 show = _show_first(output.folder, chosen.ids, on_progress) if colours == "signed" else None
                 explained = explain(parts=output.folder / "parts", on_map=show, on_progress=count)
                 # while the stage is open: what differs in numbers alone is then shown once
-                for warning in dict.fromkeys(one for notes in explained.methods.values() for one in notes.warnings):
+                for warning in dict.fromkeys(
+                    warning for notes in explained.methods.values() for warning in notes.warnings
+                ):
                     warned = [method for method, notes in explained.methods.items() if warning in notes.warnings]
                     note(on_progress, f"{', '.join(warned)}: {warning}")
             draw_explained(explained, output.folder, colours=colours)
@@ -206,8 +208,8 @@ def score_explained(
         with stage(on_progress, title) as count:
             return score(on_progress=count)
     maps = hashlib.sha256()
-    for own in explained.saliency.values():
-        maps.update(own.tobytes())
+    for rows in explained.saliency.values():
+        maps.update(rows.tobytes())
     recipe: dict[str, Any] = {"weights_sha256": trained.manifest.weights_sha256, "maps_sha256": maps.hexdigest()}
     recipe |= {"input": explained.input, "source": explained.source, "fill": fill, "steps": steps, "seed": seed}
     with output_folder(out, stage="score", config=recipe, overwrite=overwrite) as output:
@@ -288,7 +290,7 @@ def _short(name: str) -> str:
 
 def _show_first(folder: Path, ids: Sequence[str], on_progress: OnProgress | None) -> OnMap:
     """Draw the first map as soon as it is there, on a scale of its own: something to look at while others are made."""
-    shown = []
+    chosen = []
 
     def show(
         method: str,
@@ -296,13 +298,13 @@ def _show_first(folder: Path, ids: Sequence[str], on_progress: OnProgress | None
         picture: UInt8[np.ndarray, "height width 3"],
         relevance: Float32[np.ndarray, "height width"],
     ) -> None:
-        if shown or not np.isfinite(relevance).all():
+        if chosen or not np.isfinite(relevance).all():
             return
         path = folder / "overlays" / method / f"{ids[index]}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         points = _points(relevance)
         write_png(path, overlay_relevance(picture, points / _common_scale(points[None])))
-        shown.append(path)
+        chosen.append(path)
         wrote(on_progress, path, "a first picture; the folder takes its name when all are there")
 
     return show
@@ -319,10 +321,10 @@ def _choose_explainers(
     """The explainers with the options that these frames allow."""
     free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
     background = trained.encoding.normalise(chosen.images[free]) if free else None
-    own: dict[str, Explainer] = {"expected-gradients": ExpectedGradients(background=background)}
-    own["poly-cam"], inputs = get_explainer("poly-cam", budget=budget), trained.encoding.normalise(chosen.images)
-    named = {name: own.get(name) or EXPLAINERS[name] for name in methods}
-    return with_markers(named, inputs, lambda: _find_markers(trained, chosen, source))
+    rows: dict[str, Explainer] = {"expected-gradients": ExpectedGradients(background=background)}
+    rows["poly-cam"], inputs = get_explainer("poly-cam", budget=budget), trained.encoding.normalise(chosen.images)
+    names_used = {name: rows.get(name) or EXPLAINERS[name] for name in methods}
+    return with_markers(names_used, inputs, lambda: _find_markers(trained, chosen, source))
 
 
 def _find_markers(
@@ -363,24 +365,24 @@ def explain_trial(
     method asks for markers and none are found, it is told of tiles.
     """
     margin = known_margin(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
-    shown = tuple(sorted({nearest_frame(margin, level) for level in levels}))
+    chosen = tuple(sorted({nearest_frame(margin, level) for level in levels}))
     inputs = run.encode(recording.frames, recording.reference)
     estimate = run.estimate(inputs)
     unknown = np.full(len(margin), np.nan)
     low, high = estimate.interval(_CONFIDENCE) or (unknown, unknown)
     withheld = estimate.withheld(np.isfinite(margin))
     believed = np.array([reason is None for reason in withheld])
-    named, explained, size = study_explainers([method]), inputs[list(shown)], run.manifest.image_size
+    names_used, explained, size = study_explainers([method]), inputs[list(chosen)], run.manifest.image_size
     reference = run.encoding.empty(recording.reference, image_size=size)
     try:
-        named = with_markers(
-            named, explained, lambda: [markers_in_recording(recording, row, image_size=size) for row in shown]
+        names_used = with_markers(
+            names_used, explained, lambda: [markers_in_recording(recording, row, image_size=size) for row in chosen]
         )
     except SliplensError:  # another sensor, or no OpenCV
-        named = without_markers(named)
-    [(method, explainer)] = named.items()
+        names_used = without_markers(names_used)
+    [(method, explainer)] = names_used.items()
     explanation = explainer(
-        run.model, explained, reference=reference.expand(len(shown), -1, -1, -1), on_progress=on_progress
+        run.model, explained, reference=reference.expand(len(chosen), -1, -1, -1), on_progress=on_progress
     )
     read = {"prediction": estimate.margin, "low": low, "high": high}
     read = {name: np.where(believed, values, np.nan) for name, values in read.items()} | {"safety_margin": margin}
@@ -390,7 +392,7 @@ def explain_trial(
         withheld=np.array([reason or "" for reason in withheld]),
         **{name: values.astype(np.float64) for name, values in read.items()},
     )
-    maps, pictures = explanation.relevance.to(torch.float32).cpu().numpy(), recording.frames[list(shown)]
+    maps, pictures = explanation.relevance.to(torch.float32).cpu().numpy(), recording.frames[list(chosen)]
     of_trial = {"trial": recording.trial, "condition": recording.condition, "source": source, "method": method}
-    own: dict[str, Any] = {"readings": readings, "shown": shown, "pictures": pictures, "relevance": maps}
-    return Strip(**of_trial, input=run.manifest.input, **own)
+    rows: dict[str, Any] = {"readings": readings, "shown": chosen, "pictures": pictures, "relevance": maps}
+    return Strip(**of_trial, input=run.manifest.input, **rows)
