@@ -334,8 +334,8 @@ def _illustrate(explained: Explanation, scored: DeletionScores, method: str, ind
         alt=f"Deletion on frame {frame.id}: {_tell_fall(explained, index, steps)}",
         caption=f"How the score of the thesis comes about: {method_name(method)} on frame {frame.id} "
         f"({input_name(explained.input).lower()}, true Γ {percent(frame.safety_margin)}). The most salient pixels "
-        f"become {scored.fill} first; D = (1 \N{MINUS SIGN} |y \N{MINUS SIGN} y whole|)², mean over all steps {mean:.3f}. "
-        f"Answers: {_tell_fall(explained, index, steps)}.",
+        f"become {scored.fill} first; D = (1 \N{MINUS SIGN} |y \N{MINUS SIGN} y whole|)², mean over all steps "
+        f"{mean:.3f}. Answers: {_tell_fall(explained, index, steps)}.",
         numbers={"pixels_removed": curve.pixels_removed, "share_removed": share / 100, **columns},
         pixels=True,
     )

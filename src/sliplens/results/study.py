@@ -170,8 +170,8 @@ class UntrainedMaps(OfNetwork):
     """Maps of networks whose weights were drawn anew: controls that every map has to beat."""
 
     maps: dict[str, Annotated[Float32[np.ndarray, "frames size size"], ANSWER]]
-    """Maps that the methods rank by, towards the targets of those networks, by method with `NEW_WEIGHTS`. Poly-CAM has 5 % of
-    its channels here and no likeness, Shapley values 100 pairs."""
+    """Maps that the methods rank by, towards the targets of those networks, by method with `NEW_WEIGHTS`. Poly-CAM has
+    5 % of its channels here and no likeness, Shapley values 100 pairs."""
 
 
 @dataclass(frozen=True, kw_only=True)
