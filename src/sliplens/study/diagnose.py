@@ -378,7 +378,9 @@ def tell_friction(
     if traction is None or not np.isfinite(friction).all():
         return np.full(len(friction), np.nan)
     untold = run.estimate_batches(inputs.split(64))
-    conditioned = condition_each(untold, friction, trained_friction=np.array(traction.friction), calibration=traction.told)
+    conditioned = condition_each(
+        untold, friction, trained_friction=np.array(traction.friction), calibration=traction.told
+    )
     return conditioned.margin.astype(np.float64)
 
 
