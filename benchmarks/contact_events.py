@@ -1,25 +1,75 @@
-"""What happens to a contact, and what a user gives with it, that labels must not take for something else.
+"""Simulated trials as a force sensor mounted anyhow records them, and events that labels must not misread.
 
 Each kind changes a simulated trial at three strengths: its loading, with the frames drawn anew where it changed, the
 motion of its frames, the axes of its force sensor, or the settings of its labels.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
-from labels import Seen, draw_frames
+from jaxtyping import Bool, Float, UInt8
 
 from sliplens.images import soften
 from sliplens.mechanics import stick_ratio
+from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels import LabelSettings, measure_motion
 from sliplens.recordings.trial import ContactState, contact_states
+from sliplens.simulation import TrialPlan
+from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.trials import prepare_trial
 
+FORCE_HZ = 500
+LONGEST_LAG_S = 0.06
+_SAMPLES_A_FRAME = 18  # 27.8 frames a second
+_LARGEST_OFFSET_N = 1.0
 _FALL_S = 0.06  # of the simulated slip
 _QUIET_S = 0.6  # what is recorded after a release
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seen:
+    """A simulated trial, before anything spoils it."""
+
+    plan: TrialPlan
+    loading: Loading
+    """At the force sensor's rate."""
+    frames: np.ndarray
+    """Which samples have a frame."""
+    motion: Float[np.ndarray, " frames"]
+
+
+def film_trial(plan: TrialPlan) -> Seen:
+    """Simulate a trial and measure the motion of its frames."""
+    loading, film = prepare_trial(plan)
+    frames = np.arange(_SAMPLES_A_FRAME // 2, plan.frames, _SAMPLES_A_FRAME)
+    return Seen(
+        plan=plan, loading=loading, frames=frames, motion=measure_motion(map(soften, draw_frames(film, frames)))
+    )
+
+
+def draw_frames(film: Film, frames: np.ndarray) -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+    """Draw frames, one at a time."""
+    for index in frames:
+        yield film.draw(slice(int(index), int(index) + 1))[0].numpy()
+
+
+def spoil(seen: Seen, *, noise_n: float, rng: np.random.Generator) -> tuple[Forces, int, int]:
+    """Forces as a sensor mounted anyhow would record them, the column that presses, and its sign."""
+    loading, direction, sign = seen.loading, rng.uniform(-np.pi, np.pi), int(rng.choice((-1, 1)))
+    contact = np.stack(
+        (
+            sign * loading.normal_force_n,
+            np.cos(direction) * loading.tangential_force_n,
+            np.sin(direction) * loading.tangential_force_n,
+        ),
+        axis=1,
+    )
+    order = rng.permutation(3)
+    force = contact[:, order] + rng.uniform(-_LARGEST_OFFSET_N, _LARGEST_OFFSET_N, 3)
+    force += rng.normal(0, noise_n, force.shape)
+    return Forces(time_s=loading.time_s, force_n=force, source=seen.plan.trial), int(np.argmin(order)), sign
 
 
 @dataclass(frozen=True, kw_only=True)

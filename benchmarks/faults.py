@@ -4,7 +4,7 @@
 fast release, slips that are sudden or that the image hardly shows, a pull that is let go, tilted axes, an image or
 forces at rest.
 
-Each trial is filmed once, seen through noise, offset, lag, turned axes and a wrong sign as in `labels.py`, and labelled
+Each trial is filmed once, seen through noise, offset, lag, turned axes and a wrong sign, and labelled
 without a fault and with each. Of the valid labels is told how many are off by more than 3 sigma, or have no truth; of
 the frames that are valid without a fault, and that no faulty sample comes near, how many still are. Trials alternate
 between forces of 500 and of 100 samples a second, and between held to the end and let go. Shares have standard errors
@@ -20,9 +20,19 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from labels import FORCE_HZ, LONGEST_LAG_S, Seen, film_trial, spoil
 
-from contact_events import EVENTS, Case, near_events, settings_of, tilt
+from contact_events import (
+    EVENTS,
+    FORCE_HZ,
+    LONGEST_LAG_S,
+    Case,
+    Seen,
+    film_trial,
+    near_events,
+    settings_of,
+    spoil,
+    tilt,
+)
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels import LARGEST_SIGMA, FoundLabels, LabelSettings, label_trial
