@@ -3,8 +3,8 @@
 The network that comes with the package by default; the images are those of `SLIPLENS_REFERENCE`, or of any folder whose
 files are named as `image_433_20.png`, with the safety margin in percent at the end. Five frames of one trial say
 little, the less as the simulator was fitted to them: so each answer is told with its interval, the error also where the
-frames are moved a little (2 px, 2 degrees and 3 % of their size at most, drawn evenly), and with `--refit` what the
-simulator's markers do in a frame that its fit left out. Nothing is to be chosen by these figures.
+frames are moved a little (2 px, 2 degrees and 3 % of their size at most, drawn evenly). Nothing is to be chosen by
+these figures.
 """
 
 import argparse
@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from realism.refit import leave_one_out
 from torch.nn import functional
 
 from sliplens.errors import SliplensError
@@ -80,13 +79,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path(NETWORK), help="a trained network, or one of the package")
     parser.add_argument("--frames", type=Path, default=FRAMES, help="folder of images whose names end in _GG.png")
-    parser.add_argument("--refit", action="store_true", help="fit the simulator's markers anew, a frame left out each")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     try:
         told = read_real_frames(options.run, options.frames)
-        if options.refit:
-            told["left_out"] = leave_one_out(options.frames.parent)
     except SliplensError as error:
         sys.exit(f"{Path(__file__).name}: {error}")
     if options.json:
@@ -102,8 +98,6 @@ def main() -> None:
         )
     print(f"mean absolute error {told['mae']:.3f}, order {'right' if told['order_right'] else 'wrong'}")
     print(f"under jitter {told['jittered_mae']['mean']:.3f} +- {told['jittered_mae']['sd']:.3f}")
-    for margin, fit in told.get("left_out", {}).items():
-        print(f"markers at {margin}: {fit['left_out_px']:.2f} px left out, {fit['fitted_px']:.2f} px fitted")
 
 
 if __name__ == "__main__":
