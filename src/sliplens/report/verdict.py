@@ -108,21 +108,21 @@ def judge(results: Results, *, claims: Sequence[Verdict] = (), rng: np.random.Ge
 
 def cautions(results: Results) -> tuple[str, ...]:
     """Return what limits every row of the verdict: few trials, an unsound sample, the fill, the scale."""
-    choice, found = results.study.choice, []
+    choice, sentences = results.study.choice, []
     if choice is not None and len(choice.trials) < FEWEST_UNITS:
-        found.append(
+        sentences.append(
             f"This study explains {number_of(len(choice.trials), 'trial')}, and fewer than {FEWEST_UNITS} decide "
             "nothing: below is how explanations are judged, not yet which one to believe."
         )
     if choice is not None and not choice.sound:
-        found.append(f"{tell_sample(choice)} An explanation of a wrong prediction explains the error.")
+        sentences.append(f"{tell_sample(choice)} An explanation of a wrong prediction explains the error.")
     if results.scores and not results.study:
         last = [
             f"{np.mean([score.last_step_mean for score in scored.methods.values()]):.2f} "
             f"({input_name(name).lower()}, {source_name(source)}, {scored.fill})"
             for (name, source), scored in sorted(results.scores.items())
         ]
-        found.append(
+        sentences.append(
             "The deletion score depends on the fill of a removed pixel, and its sign is lost. With every pixel filled, "
             f"where no map has a part, D is {listed(last)}: a score near that measures the fill."
         )
@@ -133,11 +133,11 @@ def cautions(results: Results) -> tuple[str, ...]:
             f"({input_name(run.input).lower()})"
             for run in trainings
         ]
-        found.append(
+        sentences.append(
             f"Trained on {listed(sizes)}; the thesis took images of {NETWORK_PIXELS} px of a real sensor, so that its "
             "figures show the scale of such errors."
         )
-    return tuple(found)
+    return tuple(sentences)
 
 
 def judge_gap(gap: Difference | None) -> Outcome:
@@ -261,14 +261,13 @@ def _judge_by_truth(name: str, truth: Truth) -> list[Row]:
                 sentence=f"{sentence}{kin}",
                 number=signed(correlation.estimate, 2),
                 interval=write_ends(correlation, digits=2),
-                findings=(Finding(where=f"less {control}", compared="correlation", gap=lead.gap, outcome=outcome),),
             )
         )
     return rows
 
 
-def _sentence_by_truth(method: str, best: Recommended, found: Localisation, control: str) -> str:
-    lead = found.lead_over_controls
+def _sentence_by_truth(method: str, best: Recommended, record: Localisation, control: str) -> str:
+    lead = record.lead_over_controls
     assert lead is not None
     interval = partial(tell_interval, digits=2)
     if not lead.shows_something:

@@ -26,14 +26,14 @@ class Stage(Work, Generic[Result]):
     piece: ClassVar[type]
     """Record of a shard."""
     title: ClassVar[str]
-    """What is done, as a person is told."""
+    """Description of the work, shown to the user."""
 
     trained: Network
     """Network that the stage asks."""
 
     @property
     def on_gpu(self) -> bool:
-        """Whether the network runs on a graphics card."""
+        """True where the network runs on a graphics card."""
         return self.trained.device.type != "cpu"
 
     @abstractmethod
@@ -76,24 +76,24 @@ class Stage(Work, Generic[Result]):
         every = list(self.shards())
         with nullcontext(parts) if parts else scratch_folder() as folder:
 
-            def read(one: Part) -> Any:
-                return load_result(folder / one.path, self.piece, command="the interrupted command")
+            def read(each: Part) -> Any:
+                return load_result(folder / each.path, self.piece, command="the interrupted command")
 
-            def show(one: Part) -> None:
+            def show(each: Part) -> None:
                 if on_piece is not None:
-                    on_piece(one.item, read(one))
+                    on_piece(each.item, read(each))
 
             with reporting(on_progress):
                 run_parts(work or self, every, folder, title=self.title, on_part=show, **how)
-            return self.join([read(one) for one in every])
+            return self.join([read(each) for each in every])
 
 
 def trial_shards(explained: Explanation, *about: str, maps: int = 1) -> Iterator[Part]:
     """A shard of (*about, trial) for each trial of explained frames, of so many maps a frame."""
     for number, (trial, rows) in enumerate(explained.trials.items()):
         # the folder of the parts is one of these explanations and options alone (`files.output_folder`)
-        known = {"recipe": about, "content": "", "first": number, "frames": maps * len(rows)}
-        yield part((*about, trial), trial=trial, name=" ".join((*about, trial)), **known)
+        options = {"recipe": about, "content": "", "first": number, "frames": maps * len(rows)}
+        yield part((*about, trial), trial=trial, name=" ".join((*about, trial)), **options)
 
 
 def join_trials(
@@ -101,4 +101,4 @@ def join_trials(
 ) -> dict[str, np.ndarray]:
     """Arrays of all frames, whose axis is named, from those of each trial (`trial_shards`)."""
     order = np.argsort([row for rows in explained.trials.values() for row in rows])
-    return {name: np.concatenate([own[name] for own in pieces], axis=axis).take(order, axis) for name in pieces[0]}
+    return {name: np.concatenate([piece[name] for piece in pieces], axis=axis).take(order, axis) for name in pieces[0]}

@@ -91,7 +91,7 @@ class Places:
     now_px: Float[np.ndarray, "markers 2"]
     """Where the frame's `markers` are, as x, y."""
     state: Int[np.ndarray, " markers"]
-    """Whether each of them slips (1), sticks (2), or lies outside of the contact (0)."""
+    """State of each of them: slips (1), sticks (2), or lies outside of the contact (0)."""
 
     def paint(self, values: Float[np.ndarray, " markers"]) -> Float[np.ndarray, "size size"]:
         """Map with one value on each marker, 0 elsewhere."""
@@ -191,14 +191,14 @@ TRUTH_PAIRS = 400
 """Pairs of scenes for the Shapley values of a frame: their standard error is then about a quarter of their spread."""
 
 _EFFECTS = ("shapley", "network", "margin")
-"""What a map is held against, as `MarkerEffects` and `Localisation` name it."""
+"""Effects that a map is compared with, as `MarkerEffects` and `Localisation` name it."""
 
 Maps = Float[np.ndarray, "frames size size"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameEffects:
-    """What each marker of a frame does, in margin units; columns of `MarkerEffects`."""
+    """Effects of each marker of a frame, in margin units; columns of `MarkerEffects`."""
 
     shapley: Float64[np.ndarray, " markers"]
     shapley_error: Float64[np.ndarray, " markers"]
@@ -277,7 +277,7 @@ _Interval = Callable[[Iterable[float]], Difference | None]
 
 
 def meta_test(effects: Sequence[FrameEffects], interval: _Interval) -> tuple[MetaTest, ...]:
-    """Whether each fill ranks the map that knows the effects above the one that knows half.
+    """Test whether each fill ranks the map of all effects above the one of which half is shuffled.
 
     A gain counts changes of the answer towards the target, as `score_maps` does when it is told, and maps rank what
     speaks for it before what speaks against it. `by_size` counts how large changes are, and maps rank by |value|.
