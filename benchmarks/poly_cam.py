@@ -36,13 +36,13 @@ from sliplens.explainers.attribution import (
     top_overlap,
 )
 from sliplens.explainers.cam import capture, find_layers
+from sliplens.explainers.frames import frames_from_dataset, frames_from_folder
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.files import machine, versions
 from sliplens.models import Network
 from sliplens.models.checkpoint import load
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.simulation import SimulationRecipe, simulate_dataset
-from sliplens.study import frames_from_dataset, frames_from_folder
 
 NETWORKS = ("chromatouch-difference", "thesis-raw")
 REAL = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference")) / "chromatouch" / "difference"
@@ -52,11 +52,11 @@ RECIPE = SimulationRecipe(dry_trials=8, wet_trials=0, frames_per_trial=24, seed=
 
 def pick_inputs(trained: Network, data: Dataset, *, real: Path, count: int) -> tuple[Tensor, Tensor]:
     """Inputs and references: real difference images where the network takes them, then simulated frames."""
-    chosen = [frames_from_dataset(trained, data, split="test")]
+    chosen = [frames_from_dataset(trained, data, FrameSelection())]
     if trained.manifest.input == "difference" and real.is_dir():
         chosen.insert(0, frames_from_folder(trained, real))
     images = torch.cat([trained.encoding.normalise(one.images) for one in chosen])
-    references = torch.cat([one.references for one in chosen])
+    references = torch.cat([trained.encoding.normalise(one.references) for one in chosen])
     # first and last of each kind, and then between: small and large changes alike
     order = torch.linspace(0, len(images) - 1, min(count, len(images))).round().long()
     return images[order], references[order]

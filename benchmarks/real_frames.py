@@ -19,8 +19,8 @@ import torch
 from torch.nn import functional
 
 from sliplens.errors import SliplensError
+from sliplens.explainers.frames import frames_from_folder
 from sliplens.models.checkpoint import load
-from sliplens.study import frames_from_folder
 
 NETWORK = "chromatouch-difference"
 FRAMES = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference")) / "chromatouch" / "difference"

@@ -27,7 +27,7 @@ from sliplens.report.verdict import recommend
 from sliplens.results import Study
 from sliplens.results.study import StudyConfig
 from sliplens.simulation import simulate
-from sliplens.study import run_study
+from sliplens.study.run import run_study
 
 LATER: dict[str, Any] = {"dry_trials": 32, "wet_trials": 8, "days": 8, "test_days": 4}
 """Days 5 to 8 of the preset's sensor, which has four."""

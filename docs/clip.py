@@ -31,7 +31,7 @@ def draw_pictures(recording: Recording) -> Iterator[Image.Image]:
     rows = sl.predict(_NETWORK, recording.frames, reference=recording.reference).frame()
     touched = np.flatnonzero(np.isfinite(recording.safety_margin))[::2]
     explanation = sl.explain(_NETWORK, recording.frames[touched], reference=recording.reference, method=METHOD)
-    maps = explanation.relevance.cpu().numpy()
+    maps = explanation.relevance[METHOD]
     limit = full_colour(maps)
     for at, relevance in zip(touched.tolist(), maps, strict=True):
         yield _draw(recording, rows, touched, at, overlay_relevance(recording.frames[at], relevance / limit))

@@ -9,6 +9,7 @@ Each map is signed and in margin units: orange lowers the margin, blue raises it
 import matplotlib.pyplot as plt
 
 import sliplens as sl
+from sliplens.explainers.table import get_explainer
 
 data = sl.simulate(dry_trials=4, wet_trials=1, days=4, frames_per_trial=40)
 trial = data.load(data.trials[0])
@@ -28,7 +29,9 @@ options = {
     "grad-cam-thesis": {},
 }
 maps = {
-    method: sl.explain("chromatouch-difference", frame, reference=trial.reference, method=method, **chosen)
+    method: sl.explain(
+        "chromatouch-difference", frame, reference=trial.reference, method=get_explainer(method, **chosen)
+    )
     for method, chosen in options.items()
 }
 
@@ -42,8 +45,9 @@ plt.show()
 # %%
 # They do not agree, and that alone tells none of them true. What else an explanation says of itself:
 for method, explanation in maps.items():
-    for warning in explanation.warnings:
-        print(f"{method}: {warning}")
+    for notes in explanation.methods.values():
+        for warning in notes.warnings:
+            print(f"{method}: {warning}")
 
 # %%
 # See :doc:`plot_06_does_the_map_tell_the_truth` for a test that asks no map.

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.stats import spearmanr
 
 import sliplens as sl
+from sliplens.explainers.table import get_explainer
 from sliplens.simulation import PRESETS, plan_trials
 from sliplens.simulation.intervention import draw_with_markers_back, visible_markers
 from sliplens.simulation.trials import prepare_trial, simulate_trial
@@ -51,9 +52,9 @@ y, x = np.mgrid[:size, :size]
 near = np.hypot(x - places[:, 0, None, None], y - places[:, 1, None, None]) < 4
 said = {}
 for method, options in methods.items():
-    [relevance] = sl.explain(
-        network, frame[None], reference=trial.reference, method=method, **options
-    ).relevance.numpy()
+    explainer = get_explainer(method, **options)
+    explanation = sl.explain(network, frame[None], reference=trial.reference, method=explainer)
+    [relevance] = explanation.relevance[explanation.method]
     said[method] = np.array([relevance[disc].mean() for disc in near])
 
 # %%

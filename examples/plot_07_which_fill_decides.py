@@ -9,21 +9,19 @@ their place, the fill, can decide the test: with a fill that no sensor ever show
 import matplotlib.pyplot as plt
 
 import sliplens as sl
+from sliplens.explainers.table import get_explainer
 
 data = sl.simulate(dry_trials=4, wet_trials=1, days=4, frames_per_trial=40)
 trial = data.load(data.trials[0])
 frames, untouched = trial.frames[[22, 28]], trial.reference
 network = sl.load("chromatouch-difference")
-maps = sl.explain(network, frames, reference=untouched, method="occlusion", tile_px=28)
+maps = sl.explain(network, frames, reference=untouched, method=get_explainer("occlusion", tile_px=28))
 
 # %%
 # The same maps of the same two frames under three fills: the untouched sensor, a blur of the image, and grey as in
 # the thesis.
 fills = ("reference", "blur", "grey")
-scores = {
-    fill: sl.score(network, frames, maps, reference=untouched, fill=fill, unit="tile", random_orders=2)
-    for fill in fills
-}
+scores = {fill: sl.score(network, maps, fill=fill, unit="tile", random_orders=2, steps=0) for fill in fills}
 
 # %%
 # The gap between the dashed and the full line is the gain: how much more is lost where the map says "most" than where
@@ -32,7 +30,7 @@ scores = {
 figure, axes = plt.subplots(ncols=3, figsize=(12, 3.8), sharey=True, layout="constrained")
 for ax, (fill, found) in zip(axes, scores.items(), strict=True):
     sl.plot(found, ax)
-    ax.set_title(f"{fill}: gain {found.symmetric_gain.mean():.2f}", loc="left")
+    ax.set_title(f"{fill}: gain {found.score(maps.method).srg.estimate:.2f}", loc="left")
     ax.get_legend().remove()
 for ax in axes[1:]:
     ax.set_ylabel("")

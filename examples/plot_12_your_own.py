@@ -30,18 +30,19 @@ trial = data.load(data.trials[0])
 class Midpoint(Method):
     """Gradient half-way between reference and image, times their difference."""
 
+    method = "midpoint"
     share: float = 0.5
 
-    def _explain(self, comparison: Comparison, *, on_progress: object) -> Attribution:
+    def _explain(self, comparison: Comparison) -> Attribution:
         added = comparison.images - comparison.reference
         point = (comparison.reference + self.share * added).requires_grad_()
         [gradient] = torch.autograd.grad(comparison.predict(point).sum(), point)
-        return comparison.explanation((gradient * added).sum(dim=1).detach(), complete=False, method="midpoint")
+        return comparison.attribution((gradient * added).sum(dim=1).detach(), complete=False)
 
 
 frame = trial.frames[24:25]
 own = sl.explain("chromatouch-difference", frame, reference=trial.reference, method=Midpoint())
-known = sl.explain("chromatouch-difference", frame, reference=trial.reference, method="integrated-gradients", steps=20)
+known = sl.explain("chromatouch-difference", frame, reference=trial.reference, method="integrated-gradients")
 
 figure, axes = plt.subplots(ncols=2, figsize=(8, 4.4), layout="compressed")
 for ax, explanation in zip(axes, (own, known), strict=True):
@@ -75,7 +76,9 @@ plt.show()
 # In the ``pyproject.toml`` of a package of yours::
 #
 #     [project.entry-points."sliplens.explainers"]
-#     midpoint = "my_package:Midpoint"
+#     midpoint = "my_package:MIDPOINT"
+#
+# with ``MIDPOINT = ExplainerRow(title="Midpoint gradient", load=Midpoint)``, and a colour and line where you like.
 #
 # Then ``--method midpoint`` and ``method="midpoint"`` know it. CONTRIBUTING.md lists all tables with their entry
 # points.

@@ -8,8 +8,6 @@ from sliplens._version import __version__
 if TYPE_CHECKING:
     from sliplens.doctor import examine_installation
     from sliplens.errors import SliplensError
-    from sliplens.explainers.table import explain
-    from sliplens.faithfulness.scoring import score
     from sliplens.friction import Friction
     from sliplens.grip.episodes import run_episodes
     from sliplens.grip.hold import hold_grip
@@ -32,7 +30,9 @@ if TYPE_CHECKING:
     from sliplens.simulation.sharing import compare_datasets
     from sliplens.simulation.trials import simulate
     from sliplens.study.diagnose import diagnose
+    from sliplens.study.explaining import explain
     from sliplens.study.run import run_study
+    from sliplens.study.scoring import score
     from sliplens.training.evaluation import evaluate
     from sliplens.training.fitting import train
 
@@ -48,7 +48,7 @@ _MODULES = {
     "draft_corrections": "sliplens.recordings.corrections",
     "evaluate": "sliplens.training.evaluation",
     "examine_installation": "sliplens.doctor",
-    "explain": "sliplens.explainers.table",
+    "explain": "sliplens.study.explaining",
     "export_lerobot": "sliplens.recordings.exporting",
     "export_mcap": "sliplens.recordings.exporting",
     "export_onnx": "sliplens.models.onnx",
@@ -64,7 +64,7 @@ _MODULES = {
     "recover_dataset": "sliplens.recordings.dataset",
     "run_episodes": "sliplens.grip.episodes",
     "run_study": "sliplens.study.run",
-    "score": "sliplens.faithfulness.scoring",
+    "score": "sliplens.study.scoring",
     "simulate": "sliplens.simulation.trials",
     "split_dataset": "sliplens.recordings.splits",
     "track": "sliplens.markers.tracking",

@@ -18,8 +18,9 @@ from sliplens.report import write_report
 from sliplens.results.explanation import Strip
 from sliplens.results.study import Setting, StudyConfig
 from sliplens.simulation.trials import simulate
-from sliplens.study import explain_source, explain_trial, run_study, score_explained
-from sliplens.study.scoring import STEPS
+from sliplens.study.explaining import explain, make_strip
+from sliplens.study.run import run_study
+from sliplens.study.scoring import STEPS, score
 from sliplens.training import evaluate, train
 
 NETWORKS = {"difference": DIFFERENCE_NETWORK, "raw": "thesis-raw"}
@@ -122,8 +123,8 @@ def run_demo(
     if real is not None:
         maps = folder / "explain-real"
         network = networks["difference"]
-        explain_source(network, real, labels_in_names=True, out=maps, on_progress=on_progress)
-        score_explained(network, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
+        explain(network, real, labels_in_names=True, out=maps, on_progress=on_progress)
+        score(network, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
     return show()
 
 
@@ -168,8 +169,8 @@ def _make_strip(out: Path, data: Dataset, network: str, *, on_progress: OnProgre
     config = {"data_hash": data.hash, "trial": info.trial, "weights_sha256": run.manifest.weights_sha256}
     with output_folder(out, stage="strip", config=config) as output:
         if not output.complete:
-            with stage(on_progress, "Explaining a grip from stick to slip") as count:
-                strip = explain_trial(run, data.load(info), source=data.source, method=STRIP_METHOD, on_progress=count)
+            with stage(on_progress, "Explaining a grip from stick to slip"):
+                strip = make_strip(run, data.load(info), source=data.source, method=STRIP_METHOD)
             save_result(strip, output.folder)
     wrote(on_progress, out, "a grip from stick to slip", kept=output.complete)
     return load_result(out, Strip, command="sliplens demo")

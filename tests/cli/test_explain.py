@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 import tyro
-from matplotlib.figure import Figure
 from PIL import Image
 
 from sliplens.cli.explain import Explain
@@ -17,9 +16,7 @@ from sliplens.explainers.table import EXPLAINERS
 from sliplens.files import read_json
 from sliplens.images import list_images, read_image
 from sliplens.recordings import Dataset
-from sliplens.results import load_explanation
-from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
-from sliplens.study.workspace import draw_explained
+from sliplens.results.explanation import load_explanation
 
 QUICK = ("--method", "grad-cam", "occlusion")
 
@@ -63,52 +60,14 @@ def test_maps_overlays_and_a_panel(difference_run: Path, small_dataset: Dataset,
     assert "kept" in capsys.readouterr().out
 
 
-def of_relevance(relevance: np.ndarray) -> Explanation:
-    """Explanations of grey frames 0, 1, ..."""
-    frame = {"trial": "t", "condition": "dry", "safety_margin": 0.2, "prediction": 0.2, "reference_prediction": 1.0}
-    return Explanation(
-        input="difference",
-        source="real",
-        weights_sha256="",
-        frames=tuple(ExplainedFrame(id=str(number), **frame) for number in range(len(relevance))),
-        methods={"occlusion": MethodNotes(seconds_per_frame=0.0, warnings=())},
-        images=np.full((len(relevance), 3, 8, 8), 100, dtype=np.uint8),
-        pictures=np.full((len(relevance), 8, 8, 3), 100, dtype=np.uint8),
-        relevance={"occlusion": relevance},
-        saliency={"occlusion": np.abs(relevance)},
-    )
-
-
-def test_a_frame_with_nothing_to_explain_looks_empty(tmp_path: Path):
-    relevance = np.zeros((2, 8, 8), dtype=np.float32)
-    relevance[0, 2:4, 2:4] = -0.2  # 80 points of margin; the second frame changes by a hundredth of a point
-    relevance[1, 2:4, 2:4] = 0.000025
-    explained = of_relevance(relevance)
-    draw_explained(explained, tmp_path, colours="signed")
-    strong, empty = (read_image(tmp_path / "overlays" / "occlusion" / f"{one.id}.png") for one in explained.frames)
-    assert np.ptp(strong[2, 2].astype(int)) > 100
-    assert np.ptp(empty.astype(int)) <= 1
-    with Image.open(tmp_path / "panel.png") as panel:  # two rows, and the colours that they are drawn in below
-        assert panel.height > panel.width
-
-
-def test_a_panel_of_many_frames_shows_a_few_from_the_first_to_the_last(tmp_path: Path, monkeypatch):
-    shown = {}
-    monkeypatch.setattr("sliplens.study.workspace.draw_panel", lambda _, **words: shown.update(words) or Figure())
-    draw_explained(of_relevance(np.zeros((40, 8, 8), dtype=np.float32)), tmp_path, colours="signed")
-    columns = [int(title.partition("\n")[0]) for title in shown["titles"]]
-    assert (columns[0], columns[-1], len(columns)) == (0, 39, 12)
-    assert set(np.diff(columns)) == {3, 4}  # 39 steps over 11 gaps
-    assert "12 of 40 frames" in shown["bar_label"]
-    assert len(list((tmp_path / "overlays" / "occlusion").iterdir())) == 40
-
-
 def test_without_a_method_the_recommended_one_explains(difference_run: Path, difference_folder: Path, tmp_path: Path):
     run(difference_run, "--frames", difference_folder, "-o", tmp_path / "maps")
     explained = load_explanation(tmp_path / "maps")
     assert list(explained.relevance) == ["shapley"]  # difference images show no markers
     for notes in explained.methods.values():
-        assert all(re.match(r"[123] of 3 frames \(frame", warning) for warning in notes.warnings)
+        tiles, *others = notes.warnings
+        assert tiles.startswith("tiles, not markers")
+        assert all(re.match(r"[123] of 3 frames \(frame", warning) for warning in others)
 
 
 def test_colours_of_the_thesis(difference_run: Path, difference_folder: Path, tmp_path: Path):
@@ -125,26 +84,17 @@ def test_colours_of_the_thesis(difference_run: Path, difference_folder: Path, tm
 
 
 def test_a_budget_reaches_poly_cam(difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch):
-    seen = []
+    budgets = []
 
-    def explain(trained, chosen, *, explainers, **_):
-        seen.append(explainers["poly-cam"].budget)
+    def interrupt(network, chosen, explainer, rows, **_):
+        budgets.append(explainer.budget)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sliplens.study.workspace.explain_frames", explain)
+    monkeypatch.setattr("sliplens.study.explaining.explain_rows", interrupt)
+    words = ("--budget", 0.25, "--method", "poly-cam", "-o", tmp_path / "maps")
     with pytest.raises(KeyboardInterrupt):
-        run(
-            difference_run,
-            "--frames",
-            difference_folder,
-            "-o",
-            tmp_path / "maps",
-            "--budget",
-            0.25,
-            "--method",
-            "poly-cam",
-        )
-    assert seen == [0.25]
+        run(difference_run, "--frames", difference_folder, *words)
+    assert budgets == [0.25]
 
 
 def test_expected_gradients_take_the_frames_without_slip(
@@ -169,7 +119,7 @@ def test_markers_are_occluded_where_each_frame_has_them(
         asked.append(f"{recording.trial}-f{row:04d}")
         return MARKERS + len(asked)  # elsewhere in every frame
 
-    monkeypatch.setattr("sliplens.study.workspace.markers_in_recording", places)
+    monkeypatch.setattr("sliplens.explainers.frames.markers_in_recording", places)
     run(difference_run, small_dataset.folder, "-o", tmp_path / "maps", "--method", "occlusion-marker")
     explained = load_explanation(tmp_path / "maps")
     assert asked == [frame.id for frame in explained.frames]
@@ -184,7 +134,7 @@ def test_markers_are_found_in_camera_frames_only(
     raw_run: Path, difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch
 ):
     words = ("-o", tmp_path / "maps", "--method", "occlusion-marker")
-    refused("markers are found in camera frames", difference_run, "--frames", difference_folder, *words)
+    refused("markers do not show in difference images", difference_run, "--frames", difference_folder, *words)
     assert not (tmp_path / "maps").exists()
     seen = []
 
@@ -192,7 +142,7 @@ def test_markers_are_found_in_camera_frames_only(
         seen.append(frame)
         return MARKERS
 
-    monkeypatch.setattr("sliplens.study.workspace.markers_in_frame", places)
+    monkeypatch.setattr("sliplens.explainers.frames.markers_in_frame", places)
     paths = list_images(difference_folder)
     run(raw_run, "--frames", difference_folder, "--reference", paths[0], *words)
     assert all(np.array_equal(one, read_image(path)) for one, path in zip(seen, paths, strict=True))
@@ -212,7 +162,7 @@ def test_mistakes_are_told_before_anything_is_written(
     refused("name either a data set or --frames", difference_run, *here)
     refused("name either a data set or", difference_run, small_dataset.folder, "--frames", difference_folder, *here)
     refused("--trials must be at least 1, got 0", difference_run, small_dataset.folder, *here, "--trials", 0)
-    refused("no explainer named 'lime'; choose", difference_run, small_dataset.folder, *here, "--method", "lime")
+    refused("no method named 'lime'; choose", difference_run, small_dataset.folder, *here, "--method", "lime")
     refused("budget is 2.0; give a share", difference_run, small_dataset.folder, *here, "--budget", 2)
     assert not (tmp_path / "maps").exists()
     with pytest.raises(InputError, match="nothing does not exist"):

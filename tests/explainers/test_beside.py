@@ -5,16 +5,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from quick import QUICK, SHORT
+from quick import DEFAULTS, QUICK, SHORT
 from torch import Tensor, nn
 
 from sliplens.explainers.gradients import ExpectedGradients
 from sliplens.explainers.poly_cam import PolyCam
-from sliplens.explainers.table import EXPLAINERS
 from sliplens.faithfulness.controls import control_maps, smooth_maps
 
 pytestmark = pytest.mark.usefixtures("short_guess")
-CHEAP = dict(EXPLAINERS) | {
+CHEAP = DEFAULTS | {
     **QUICK,
     "poly-cam": PolyCam(budget=0.1, likeness=None),
     "poly-cam-thesis": PolyCam(score="thesis", level=5, budget=0.1, likeness=None),

@@ -1,4 +1,4 @@
-"""`explain`: frames in, a record out, with a method by its name and its options."""
+"""`explain` of arrays: frames in, a record out, by a method's name or an explainer."""
 
 import numpy as np
 import pytest
@@ -35,14 +35,21 @@ def test_frames_are_compared_with_the_untouched_sensor_and_explained_against_it(
     explanation = sliplens.explain(run, FRAMES, reference=UNTOUCHED, method="grad-cam")
     inputs, empty = (run.encode(frames, UNTOUCHED) for frames in (FRAMES, UNTOUCHED[None]))
     expected = GradCam()(run.model, inputs, reference=empty[0])
-    torch.testing.assert_close(explanation.relevance, expected.relevance)
-    torch.testing.assert_close(explanation.images, inputs)
-    torch.testing.assert_close(explanation.reference_prediction, run.predict(empty).expand(2))
+    np.testing.assert_allclose(explanation.relevance["grad-cam"], expected.relevance, atol=1e-6)
+    np.testing.assert_allclose(explanation.saliency["grad-cam"], expected.saliency, atol=1e-6)
+    np.testing.assert_allclose(explanation.influence("grad-cam"), expected.influence, atol=1e-6)
+    assert [frame.reference_prediction for frame in explanation.frames] == pytest.approx(
+        [float(run.predict(empty))] * 2
+    )
+    table = explanation.frame()
+    assert table["change"].to_pylist() == pytest.approx(expected.change.tolist(), abs=1e-6)
+    assert table["completeness_gap"].to_pylist() == pytest.approx(expected.completeness_gap.tolist(), abs=1e-6)
 
 
 def test_difference_images_need_no_reference_and_other_networks_do(trained):
-    explanation = sliplens.explain(trained("difference"), FRAMES, method="grad-cam")
-    torch.testing.assert_close(explanation.images.amax(dim=(1, 2, 3)), torch.ones(2))  # as the thesis scales them
+    explanation = sliplens.explain(trained("difference"), FRAMES, method="layer-cam")
+    assert not explanation.references.any()
+    assert np.isnan(explanation.frame()["completeness_gap"].to_numpy()).all()  # LayerCAM promises no sum
     with pytest.raises(InputError, match="a network on raw images needs the untouched sensor; give it as reference"):
         sliplens.explain(trained("raw"), FRAMES, method="grad-cam")
 
@@ -50,37 +57,41 @@ def test_difference_images_need_no_reference_and_other_networks_do(trained):
 def test_a_method_takes_its_options(trained):
     run = trained("difference")
     assert get_explainer("poly-cam", variant="+") == PolyCam(variant="+")
-    coarse = sliplens.explain(run, FRAMES[:1], method="occlusion", tile_px=SIZE)
-    assert len(coarse.relevance.unique()) == 1  # one tile is the whole image
+    coarse = sliplens.explain(run, FRAMES[:1], method=get_explainer("occlusion", tile_px=SIZE))
+    assert len(np.unique(coarse.relevance["occlusion"])) == 1  # one tile is the whole image
+    both = sliplens.explain(run, FRAMES[:1], method=["grad-cam", get_explainer("occlusion", tile_px=32)])
+    assert list(both.relevance) == list(both.methods) == ["grad-cam", "occlusion"]
     with pytest.raises(InputError, match="grad-cam has no option 'tile_px'; it has layer, contrast, relu, batch_size"):
-        sliplens.explain(run, FRAMES, method="grad-cam", tile_px=8)
+        get_explainer("grad-cam", tile_px=8)
     with pytest.raises(InputError, match="there is no method named 'gradcam'; choose one of grad-cam"):
-        sliplens.explain(run, FRAMES, method="gradcam")
+        sliplens.explain("no such run", FRAMES, method="gradcam")
 
 
-def test_markers_are_found_in_the_frames_that_the_caller_gave(trained):
+def test_markers_are_found_in_the_camera_frames(trained):
     """Difference images show none; each frame has its own."""
     pytest.importorskip("cv2", reason="OpenCV, of the extra markers, is not installed")
     grids = [make_grid(columns=4, rows=4, pitch=14.0, at=(10.0 + shift, 10.0)) for shift in (0.0, 3.0, -2.0)]
     untouched, *frames = (draw_dots(grid, size=(SIZE, SIZE), radius=3.0) for grid in grids)
     run = trained("difference")
-    explanation = sliplens.explain(run, np.stack(frames), reference=untouched, pairs=40)
+    explanation = sliplens.explain(run, np.stack(frames), reference=untouched)
     assert explanation.method == "shapley-marker"
-    assert not any("tiles" in warning for warning in explanation.warnings)
-    for row, frame in enumerate(frames):
-        regions = marker_regions((SIZE, SIZE), markers_in_frame(frame, image_size=SIZE))
-        flat = [explanation.relevance[row][regions == number].unique() for number in regions.unique()]
-        assert len(flat) == 17
-        assert all(len(values) == 1 for values in flat)
+    assert not any("tiles" in warning for warning in explanation.methods["shapley-marker"].warnings)
+    for relevance, frame in zip(explanation.relevance["shapley-marker"], frames, strict=True):
+        regions = marker_regions((SIZE, SIZE), markers_in_frame(frame, image_size=SIZE)).numpy()
+        values = [np.unique(relevance[regions == number]) for number in np.unique(regions)]
+        assert len(values) == 17
+        assert all(len(value) == 1 for value in values)
     with pytest.raises(InputError, match="markers do not show in difference images"):
         sliplens.explain(run, np.stack(frames), method="shapley-marker")
 
 
 def test_without_a_method_tiles_explain_where_no_markers_show_and_it_says_why(trained):
     explanation = sliplens.explain(trained("difference"), FRAMES[:1])
-    assert explanation.method == "shapley"
-    assert explanation.warnings[0].startswith("tiles, not markers: markers do not show in difference images")
-    torch.testing.assert_close(explanation.relevance.sum(dim=(1, 2)), explanation.change, atol=1e-5, rtol=0)
+    notes = explanation.methods["shapley"]
+    assert notes.warnings[0].startswith("tiles, not markers: markers do not show in difference images")
+    [frame] = explanation.frames
+    change = frame.prediction - frame.reference_prediction
+    assert explanation.relevance["shapley"].sum() == pytest.approx(change, abs=1e-5)
 
 
 def test_frames_of_another_sensor_or_none_at_all_are_refused(trained):
@@ -90,8 +101,14 @@ def test_frames_of_another_sensor_or_none_at_all_are_refused(trained):
         sliplens.explain(trained("difference"), FRAMES[:0])
 
 
-def test_the_table_has_a_row_an_image(trained):
-    explanation = sliplens.explain(trained("difference"), FRAMES, method="layer-cam")
-    table = explanation.frame()
-    assert table["change"].to_pylist() == explanation.change.tolist()
-    assert np.isnan(table["completeness_gap"].to_numpy()).all()  # LayerCAM promises no sum
+def test_a_map_that_is_not_finite_is_an_error(trained):
+    class Holes(GradCam):
+        method = "holes"
+
+        def __call__(self, model, images, *, reference=None):
+            attribution = super().__call__(model, images, reference=reference)
+            attribution.relevance[:, :2, 0] = torch.nan
+            return attribution
+
+    with pytest.raises(sliplens.SliplensError, match=r"the map of frame-0000 by holes holds NaN or infinity in 2 of"):
+        sliplens.explain(trained("difference"), FRAMES, method=Holes())

@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from quick import DEFAULTS
 from torch import nn
 
 from sliplens.errors import ImageError, ModelError
@@ -14,6 +15,7 @@ from sliplens.explainers.occlusion import Occlusion
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
 from sliplens.explainers.table import EXPLAINERS
+from sliplens.progress import reporting
 
 # LRP has laws of its own, in test_lrp.py; what the thesis ran is of f itself, and obeys none: test_thesis.py
 NAMES = [name for name in EXPLAINERS if name != "lrp" and not name.endswith("-thesis")]
@@ -22,7 +24,7 @@ every_explainer = pytest.mark.parametrize("name", NAMES)
 # an untrained network is so rough that integrated gradients would go to their most steps in every test
 SHORT = IntegratedGradients(steps=4, max_steps=8)
 MARKERS = torch.tensor([[3.0, 3.0], [5.0, 60.0], [30.0, 31.0], [47.0, 12.0]])
-QUICK = dict(EXPLAINERS) | {
+QUICK = DEFAULTS | {
     "integrated-gradients": SHORT,
     "expected-gradients": ExpectedGradients(integrated=SHORT),
     "smooth-grad": SmoothGrad(samples=3),
@@ -126,8 +128,8 @@ def test_model_is_given_back_as_it_was_when_interrupted(name, network, images):
 
     model = in_use(network("small shufflenet"))
     before = state_of(model)
-    with pytest.raises(KeyboardInterrupt):
-        QUICK[name](model, images[:2], on_progress=interrupt)
+    with pytest.raises(KeyboardInterrupt), reporting(interrupt):
+        QUICK[name](model, images[:2])
     assert_same(state_of(model), before)
 
 

@@ -4,6 +4,7 @@ from torch import nn
 
 from sliplens.errors import InputError
 from sliplens.explainers.gradients import IntegratedGradients
+from sliplens.progress import reporting
 
 
 class Linear(nn.Module):
@@ -104,7 +105,8 @@ def test_one_pass_is_bounded(network, images):
 
 def test_progress_counts_images(network, images):
     seen = []
-    IntegratedGradients()(network("gap"), images, on_progress=lambda *step: seen.append(step))
+    with reporting(lambda *step: seen.append(step)):
+        IntegratedGradients()(network("gap"), images)
     assert seen == [(1, 3), (2, 3), (3, 3)]
 
 

@@ -4,17 +4,14 @@ import copy
 
 import pytest
 import torch
-from quick import QUICK, SHORT
+from quick import DEFAULTS, QUICK, SHORT
 
 from sliplens.explainers.poly_cam import PolyCam
-from sliplens.explainers.table import EXPLAINERS
 
 pytestmark = pytest.mark.usefixtures("short_guess")
 every_network = pytest.mark.parametrize("name", ["shufflenet", "resnet", "mobilenet", "vgg"])
 # and one small layer for Poly-CAM; the thesis's level is one of ShuffleNetV2's layers
-CHEAP = {
-    name: explain for name, explain in (dict(EXPLAINERS) | QUICK).items() if name not in ("lrp", "poly-cam-thesis")
-}
+CHEAP = {name: explain for name, explain in (DEFAULTS | QUICK).items() if name not in ("lrp", "poly-cam-thesis")}
 FIRST = {"shufflenet": "conv1", "resnet": "relu", "mobilenet": "features.0", "vgg": "features.1"}
 
 

@@ -13,6 +13,7 @@ from sliplens.errors import InputError
 from sliplens.explainers.attribution import EXACT, check_rounding, effect_rounding
 from sliplens.explainers.cam import capture, find_layers
 from sliplens.explainers.poly_cam import PolyCam
+from sliplens.progress import reporting
 
 
 @lru_cache
@@ -220,7 +221,8 @@ def test_constant_channels_cost_no_pass(variant, passes, network, images):
 def test_progress_counts_the_channels_of_every_image(network, images):
     steps = []
     model = network("small shufflenet")
-    PolyCam(batch_size=20)(model, images[:2], on_progress=lambda done, total: steps.append((done, total)))
+    with reporting(lambda done, total: steps.append((done, total))):
+        PolyCam(batch_size=20)(model, images[:2])
     done, totals = zip(*steps, strict=True)
     assert set(totals) == {2 * (8 + 8 + 16 + 16 + 24)}
     assert list(done) == sorted(set(done))

@@ -10,6 +10,7 @@ from sliplens.explainers.attribution import pearson_r, top_overlap
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.poly_cam_budget import GaussianProcess, Likeness
 from sliplens.models import engines as passes
+from sliplens.progress import reporting
 
 
 def kernel_of(places):
@@ -155,7 +156,8 @@ def test_more_is_measured_where_the_map_is_not_expected_to_be_alike(network, ima
 def test_all_channels_are_measured_where_nothing_less_is_asked(network, images):
     model, seen = network("small shufflenet"), []
     explain = PolyCam(budget=0.25, likeness=Likeness(pearson_r=1.0))
-    explanation = explain(model, images[:1], on_progress=lambda *step: seen.append(step))
+    with reporting(lambda *step: seen.append(step)):
+        explanation = explain(model, images[:1])
     (told,) = explanation.approximations
     assert told.measured == told.channels
     torch.testing.assert_close(explanation.relevance, PolyCam()(model, images[:1]).relevance)

@@ -2,14 +2,14 @@
 
 import pytest
 import torch
+from quick import DEFAULTS
 from torch import nn
 
 from sliplens.explainers.cam import GradCam
 from sliplens.explainers.gradients import IntegratedGradients, SmoothGrad
-from sliplens.explainers.table import EXPLAINERS
 
 # noise as small as a flat network is flat for
-METHODS = dict(EXPLAINERS) | {"smooth-grad": SmoothGrad(samples=4, noise=0.01)}
+METHODS = DEFAULTS | {"smooth-grad": SmoothGrad(samples=4, noise=0.01)}
 BY_GRADIENT = ("grad-cam", "hires-cam", "layer-cam", "smooth-grad", "integrated-gradients")
 
 

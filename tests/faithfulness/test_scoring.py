@@ -1,6 +1,7 @@
-"""`score` and `score_by_deletion` of a linear network, where the effect of every pixel is known."""
+"""`score` of a linear network, where the effect of every pixel is known."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,9 +10,9 @@ from captum import attr
 from torch import Tensor, nn
 
 import sliplens
-from sliplens.errors import InputError, SaliencyError
+from sliplens.errors import CheckpointError, InputError, SaliencyError
+from sliplens.explainers.table import get_explainer
 from sliplens.faithfulness.removal import AREAS
-from sliplens.faithfulness.scoring import score_by_deletion
 from sliplens.models import Network
 from sliplens.models.checkpoint import Manifest
 
@@ -43,36 +44,53 @@ EFFECTS = SLOPES.numpy() * FRAMES.astype(np.float64).mean(axis=-1) / 255
 TOWARDS = np.sign(EFFECTS.sum(axis=(1, 2)))[:, None, None]
 
 
+def gain_of(faithfulness, method: str = "maps") -> np.ndarray:
+    return next(curve for (_, _, name), curve in faithfulness.curves.items() if name == method).symmetric_gain
+
+
 def test_the_gain_of_the_true_effects_is_their_ordered_sum(run):
     faithfulness = sliplens.score(run, FRAMES, EFFECTS, random_orders=3)
     removed = np.round(np.array(AREAS) * SIZE * SIZE).astype(int)
+    curve = faithfulness.curves["reference", "pixel", "maps"]
     for image, effects in enumerate((EFFECTS * TOWARDS).reshape(3, -1)):
         most, least = (np.append(0, np.cumsum(order))[removed] for order in (np.sort(effects)[::-1], np.sort(effects)))
-        np.testing.assert_allclose(faithfulness.curves[:2, image], [most, least], atol=1e-6)
-    gains = faithfulness.symmetric_gain
-    assert faithfulness.interval().low <= gains.mean() <= faithfulness.interval().high
-    assert all(gains.mean() > control.symmetric_gain.mean() for control in faithfulness.controls.values())
+        np.testing.assert_allclose(curve.most_first[image], most, atol=1e-6)
+        np.testing.assert_allclose(curve.least_first[image], least, atol=1e-6)
+    score = faithfulness.score("maps")
+    assert score.srg.estimate == pytest.approx(curve.symmetric_gain.mean())
+    assert all(score.srg.estimate > other.srg.estimate for other in faithfulness.scores if other.control)
+    assert score.lead_over_controls.gap.estimate > 0
     assert not any("gains" in alarm for alarm in faithfulness.alarms)
-    assert faithfulness.frame().num_rows == 3 * len(AREAS)
+    assert faithfulness.frame().num_rows == len(faithfulness.scores) * 3 * len(AREAS)
 
 
 def test_frames_with_next_to_nothing_to_explain_count_and_an_alarm_says_so(run):
     # grey everywhere: 0.9 + 100 x (-0.005 x level / 255), which changes by 0.02 at a level of 10.2
     dark, less_dark = (np.full((1, SIZE, SIZE, 3), level, dtype=np.uint8) for level in (10, 11))
     frames = np.concatenate([dark, less_dark, dark])
-    faithfulness = sliplens.score(run, frames, EFFECTS, random_orders=1)
-    assert len(faithfulness.symmetric_gain) == 3
+    faithfulness = sliplens.score(run, frames, EFFECTS, random_orders=1, steps=0)
+    assert (faithfulness.frames, faithfulness.deletion) == (3, None)
     assert any(alarm.startswith("next to nothing to explain in 2 of 3 frames") for alarm in faithfulness.alarms)
-    assert not any("nothing to explain" in alarm for alarm in sliplens.score(run, less_dark, EFFECTS[:1]).alarms)
+    others = sliplens.score(run, less_dark, EFFECTS[:1], steps=0).alarms
+    assert not any("nothing to explain" in alarm for alarm in others)
 
 
 def test_an_explanation_is_scored_by_what_works_towards_its_target(run):
-    explanation = sliplens.explain(run, FRAMES, method="occlusion", tile_px=1)
-    np.testing.assert_allclose(explanation.relevance, EFFECTS, atol=1e-6)
-    scored = sliplens.score(run, FRAMES, explanation, random_orders=1)
+    explanation = sliplens.explain(run, FRAMES, method=get_explainer("occlusion", tile_px=1))
+    np.testing.assert_allclose(explanation.relevance["occlusion"], EFFECTS, atol=1e-6)
+    scored = sliplens.score(run, explanation, random_orders=1)
     by_hand = sliplens.score(run, FRAMES, EFFECTS * TOWARDS, signed=False, random_orders=1)
-    np.testing.assert_allclose(scored.symmetric_gain, by_hand.symmetric_gain, atol=1e-6)
-    assert scored.method == "occlusion"
+    np.testing.assert_allclose(gain_of(scored, "occlusion"), gain_of(by_hand), atol=1e-6)
+    same = sliplens.score(run, FRAMES, explanation, random_orders=1)
+    np.testing.assert_array_equal(gain_of(same, "occlusion"), gain_of(scored, "occlusion"))
+
+
+def test_several_methods_are_scored_together_and_as_each_alone(run):
+    both = sliplens.explain(run, FRAMES, method=[get_explainer("occlusion", tile_px=1), "integrated-gradients"])
+    scored = sliplens.score(run, both, random_orders=1, steps=5)
+    assert {score.method for score in scored.scores if not score.control} == set(both.methods)
+    assert [(gap.first, gap.second) for gap in scored.comparisons] == [("occlusion", "integrated-gradients")]
+    assert set(scored.deletion.methods) == {*both.methods, "random"}
 
 
 def test_a_map_the_wrong_way_round_loses_to_every_control(run):
@@ -81,16 +99,46 @@ def test_a_map_the_wrong_way_round_loses_to_every_control(run):
 
 
 def test_deletion_removes_the_most_salient_first_and_a_random_order_beside(run):
-    curves = score_by_deletion(run, FRAMES, EFFECTS, fill="black", steps=5)
+    scores = sliplens.score(run, FRAMES, EFFECTS, random_orders=1, steps=5).deletion_scores
     base = 0.9 + EFFECTS.sum(axis=(1, 2))
-    np.testing.assert_allclose(curves.base, base, atol=1e-6)
-    np.testing.assert_allclose(curves.predictions[:, -1], 0.9, atol=1e-6)
-    salient = np.sort(np.maximum(EFFECTS * TOWARDS, 0).reshape(3, -1))[:, ::-1]
-    lost = TOWARDS[:, 0, 0] * salient[:, :20].sum(axis=1)
-    np.testing.assert_allclose(curves.predictions[:, 0], base - lost, atol=1e-6)
-    assert curves.control is not None
-    assert (curves.auc < curves.control.auc).all()
-    assert curves.frame().num_rows == 15
+    curve = scores.curves["maps"]
+    # grey replaces what a pixel was by a half
+    change = (EFFECTS - SLOPES.numpy() / 2).reshape(3, -1)
+    orders = np.argsort(np.maximum(EFFECTS * TOWARDS, 0).astype(np.float32).reshape(3, -1), axis=1, kind="stable")
+    lost = np.take_along_axis(change, orders[:, ::-1][:, :20], axis=1).sum(axis=1)
+    np.testing.assert_allclose(curve.predictions[:, 0], base - lost, atol=1e-6)
+    np.testing.assert_allclose(curve.predictions[:, -1], 0.9 + SLOPES.numpy().sum() / 2, atol=1e-6)
+    np.testing.assert_allclose(curve.scores, (1 - np.abs(base[:, None] - curve.predictions)) ** 2, atol=1e-6)
+    assert (scores.fill, scores.steps) == ("grey", 5)
+    assert set(scores.methods) == {"maps", "random"}
+
+
+def test_a_folder_holds_the_record_that_is_returned_without_one(run, tmp_path):
+    explanation = sliplens.explain(run, FRAMES, method=get_explainer("occlusion", tile_px=1))
+    scored = sliplens.score(run, explanation, random_orders=1, steps=4)
+    saved = sliplens.score(run, explanation, random_orders=1, steps=4, out=tmp_path / "scores")
+    assert saved.scores == scored.scores
+    assert saved.deletion == scored.deletion
+    np.testing.assert_array_equal(saved.table.most_first, scored.table.most_first)
+    progress = []
+    again = sliplens.score(
+        run,
+        explanation,
+        random_orders=1,
+        steps=4,
+        out=tmp_path / "scores",
+        on_progress=lambda *step: progress.append(step),
+    )
+    assert again.scores == scored.scores
+    assert not progress
+    assert not (tmp_path / "scores" / "parts").exists()
+
+
+def test_an_explanation_of_another_network_is_refused(run):
+    explanation = sliplens.explain(run, FRAMES, method="integrated-gradients")
+    other = replace(run, manifest=replace(run.manifest, weights_sha256="other"))
+    with pytest.raises(CheckpointError, match="made with another network; explain the frames again with this run"):
+        sliplens.score(other, explanation)
 
 
 @pytest.mark.parametrize(
@@ -102,14 +150,17 @@ def test_deletion_removes_the_most_salient_first_and_a_random_order_beside(run):
     ],
 )
 def test_maps_that_are_not_of_the_frames_are_refused(run, maps, message):
-    for score in (sliplens.score, score_by_deletion):
-        with pytest.raises(SaliencyError, match=message):
-            score(run, FRAMES, maps)
+    with pytest.raises(SaliencyError, match=message):
+        sliplens.score(run, FRAMES, maps)
 
 
-def test_an_unknown_fill_is_refused_before_anything_is_read():
+def test_an_impossible_option_is_refused_before_a_network_is_loaded(run):
     with pytest.raises(InputError, match="there is no fill named 'pink'"):
         sliplens.score("no such run", FRAMES, EFFECTS, fill="pink")
+    with pytest.raises(InputError, match="0 random orders are too few; --random-orders must be at least 1"):
+        sliplens.score("no such run", FRAMES, EFFECTS, random_orders=0)
+    with pytest.raises(InputError, match="no maps to score; give an explanation"):
+        sliplens.score(run, FRAMES)
 
 
 class Curved(Linear):
@@ -137,46 +188,38 @@ def captum_maps(curved: Network) -> np.ndarray:
     return attributions.sum(dim=1).detach().numpy()
 
 
-def test_predictions_of_these_frames_rise_and_fall(curved: Network):
-    explanation = sliplens.explain(curved, BOTH_WAYS, method="integrated-gradients")
-    assert (explanation.change[:3] > 0).all()
-    assert (explanation.change[3:] < 0).all()
-
-
 @pytest.mark.parametrize("fill", ["reference", "grey", "black", "white", "blur", "noisy-linear"])
 @pytest.mark.parametrize("unit", ["pixel", "tile"])
-def test_an_array_of_captum_and_our_explanation_score_alike(
-    curved: Network, captum_maps: np.ndarray, fill: str, unit: str
-):
+def test_an_array_of_captum_and_our_explanation_score_alike(curved: Network, captum_maps: np.ndarray, fill: str, unit):
     ours = sliplens.explain(curved, BOTH_WAYS, method="integrated-gradients")
+    assert ours.towards.tolist() == [1] * 3 + [-1] * 3
     # Captum integrates by 200 points of Gauss and Legendre, ours until the sum is complete
-    np.testing.assert_allclose(ours.relevance.numpy(), captum_maps, atol=1e-5)
-    options = {"fill": fill, "unit": unit, "random_orders": 1}
+    np.testing.assert_allclose(ours.relevance["integrated-gradients"], captum_maps, atol=1e-5)
+    options = {"fill": fill, "unit": unit, "random_orders": 1, "steps": 10 if unit == "pixel" else 0}
     by_array, by_record = (sliplens.score(curved, BOTH_WAYS, maps, **options) for maps in (captum_maps, ours))
     # pixels that differ by less than the integration may be removed in another order
-    np.testing.assert_allclose(by_array.symmetric_gain, by_record.symmetric_gain, atol=1e-3)
-    for name, control in by_array.controls.items():
-        np.testing.assert_array_equal(control.symmetric_gain, by_record.controls[name].symmetric_gain)
+    np.testing.assert_allclose(gain_of(by_array), gain_of(by_record, "integrated-gradients"), atol=1e-3)
+    for score in by_array.scores:
+        if score.control:
+            assert score.srg.estimate == by_record.score(score.method).srg.estimate
+    if by_array.deletion is not None:
+        first, second = (by.deletion_scores.curves for by in (by_array, by_record))
+        np.testing.assert_allclose(first["maps"].predictions, second["integrated-gradients"].predictions, atol=1e-3)
 
 
 def test_a_signed_map_gains_in_every_frame_and_its_negative_loses_as_much(curved: Network, captum_maps: np.ndarray):
     gain, loss = (
-        sliplens.score(curved, BOTH_WAYS, maps, random_orders=1).symmetric_gain for maps in (captum_maps, -captum_maps)
+        gain_of(sliplens.score(curved, BOTH_WAYS, maps, random_orders=1, steps=0))
+        for maps in (captum_maps, -captum_maps)
     )
     assert (gain > 0).all()
     np.testing.assert_allclose(loss, -gain, atol=1e-6)  # single precision of the network's input
 
 
-def test_deletion_takes_an_array_as_it_takes_an_explanation(curved: Network, captum_maps: np.ndarray):
-    ours = sliplens.explain(curved, BOTH_WAYS, method="integrated-gradients")
-    by_array, by_record = (score_by_deletion(curved, BOTH_WAYS, maps, steps=10) for maps in (captum_maps, ours))
-    np.testing.assert_allclose(by_array.predictions, by_record.predictions, atol=1e-3)  # as above
-
-
-@pytest.mark.parametrize("score", [sliplens.score, score_by_deletion])
-def test_an_array_without_negatives_cannot_explain_a_fall_unless_it_is_called_unsigned(score, curved: Network):
+def test_an_array_without_negatives_cannot_explain_a_fall_unless_it_is_called_unsigned(curved: Network):
+    score = partial(sliplens.score, curved, steps=0, random_orders=1)
     with pytest.raises(SaliencyError, match=r"map 0 has no number below 0.*give signed=False"):
-        score(curved, FRAMES, np.abs(EFFECTS))
-    score(curved, FRAMES, np.abs(EFFECTS), signed=False)
-    score(curved, UP, np.abs(EFFECTS))
-    score(curved, FRAMES, np.zeros_like(EFFECTS))  # an alarm says that it ranks nothing
+        score(FRAMES, np.abs(EFFECTS))
+    score(FRAMES, np.abs(EFFECTS), signed=False)
+    score(UP, np.abs(EFFECTS))
+    score(FRAMES, np.zeros_like(EFFECTS))  # an alarm says that it ranks nothing

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.scoring import deletion_curves, deletion_order, deletion_score
+from sliplens.faithfulness.scoring import delete_pixels, deletion_order, deletion_score
 from sliplens.images import read_image
 
 pytestmark = pytest.mark.real
@@ -54,7 +53,7 @@ def test_deletion_reproduces_the_recorded_masks_to_the_pixel(chromatouch_folder:
         seen.extend(batch)
         return batch.mean(dim=(1, 2, 3))
 
-    deletion_curves(look, image[None], deletion_order(saliency)[None], fill=get_fill("grey"))
+    delete_pixels(look, image[None], deletion_order(saliency)[None], fill="grey")
     for step in (*range(0, 224, 16), 223):
         # the authors' pictures: times 255, cut off to whole levels
         picture = (255 * seen[step]).permute(1, 2, 0).numpy().astype(np.uint8)

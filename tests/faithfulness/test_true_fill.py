@@ -10,6 +10,7 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.faithfulness.removal import SHARES, answer_scenes, score_maps_by_marker
+from sliplens.progress import reporting
 
 IMAGES, MARKERS = 3, 40
 
@@ -47,8 +48,8 @@ def test_the_curve_is_the_sum_of_what_the_markers_did(weights, rng):
         falling = np.append(0, np.cumsum(np.sort(one)[::-1]))
         rising = np.append(0, np.cumsum(np.sort(one)))
         counts = [round(share * MARKERS) for share in SHARES]
-        np.testing.assert_allclose(found.curves[0, image], falling[counts], atol=1e-12)
-        np.testing.assert_allclose(found.curves[1, image], rising[counts], atol=1e-12)
+        np.testing.assert_allclose(found.most_first[image], falling[counts], atol=1e-12)
+        np.testing.assert_allclose(found.least_first[image], rising[counts], atol=1e-12)
 
 
 def test_in_random_orders_the_answer_falls_evenly(weights, rng):
@@ -56,7 +57,7 @@ def test_in_random_orders_the_answer_falls_evenly(weights, rng):
     found = score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, random_orders=400)["truth"]
     total = weights.sum(axis=1, keepdims=True)
     # the sum of some of 40 weights of deviation 0.26 / 40: at most 0.26 * sqrt(40) / 2 / 40, over 20 for 400 orders
-    np.testing.assert_allclose(found.curves[2], total * found.areas, atol=5 * 0.26 * np.sqrt(40) / 2 / 40 / 20)
+    np.testing.assert_allclose(found.random, total * found.areas, atol=5 * 0.26 * np.sqrt(40) / 2 / 40 / 20)
 
 
 def test_who_knows_more_gains_more(weights, rng):
@@ -87,12 +88,13 @@ def test_the_batch_size_bounds_what_is_drawn_at_once_and_changes_nothing(weights
         found.append(score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, batch_size=size))
         assert toy.largest <= size
     for one in found[1:]:
-        np.testing.assert_allclose(one["truth"].curves, found[0]["truth"].curves, atol=1e-12)
+        np.testing.assert_allclose(one["truth"].most_first, found[0]["truth"].most_first, atol=1e-12)
 
 
 def test_progress_is_told_in_images(weights, rng):
     toy, heard = Toy(weights), []
-    score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, on_progress=lambda *at: heard.append(at))
+    with reporting(lambda *step: heard.append(step)):
+        score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng)
     assert heard == [(1, 3), (2, 3), (3, 3)]
 
 

@@ -223,6 +223,8 @@ def explained(
     *,
     source: str = "simulated",
 ) -> Explanation:
+    towards = np.array([np.sign(frame.prediction - frame.reference_prediction) for frame in frames], dtype=np.float32)
+    towards = towards[:, None, None]
     return Explanation(
         input=name,
         source=source,
@@ -230,9 +232,9 @@ def explained(
         frames=frames,
         methods=methods,
         images=np.moveaxis(pictures, -1, 1),
+        references=np.zeros_like(np.moveaxis(pictures, -1, 1)),
         pictures=pictures,
-        relevance={key: np.float32(0.01) * maps for key, maps in saliency.items()},
-        saliency=saliency,
+        relevance={key: np.float32(0.01) * towards * maps for key, maps in saliency.items()},
     )
 
 

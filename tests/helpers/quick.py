@@ -5,9 +5,11 @@ import torch
 from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
 from sliplens.explainers.occlusion import Occlusion
 from sliplens.explainers.shapley import Shapley
+from sliplens.explainers.table import EXPLAINERS, get_explainer
 
 SHORT = IntegratedGradients(steps=8, max_steps=40)
 MARKERS = torch.tensor([[10.0, 12.0], [40.0, 20.0], [25.0, 50.0]])
+DEFAULTS = {name: get_explainer(name) for name in EXPLAINERS}
 QUICK = {
     "integrated-gradients": SHORT,
     "expected-gradients": ExpectedGradients(integrated=SHORT),

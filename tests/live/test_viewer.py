@@ -341,9 +341,9 @@ def explained_of(trial: Recording, frames: list[int]) -> Explanation:
         ),
         methods={"poly-cam": MethodNotes(seconds_per_frame=0.1, warnings=())},
         images=trial.frames[frames].transpose(0, 3, 1, 2),
+        references=trial.frames[frames].transpose(0, 3, 1, 2),
         pictures=trial.frames[frames],
         relevance={"poly-cam": relevance},
-        saliency={"poly-cam": np.abs(relevance) / np.abs(relevance).max()},
     )
 
 

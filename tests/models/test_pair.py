@@ -9,7 +9,6 @@ import torch
 
 import sliplens as sl
 from sliplens.errors import InputError, ModelError
-from sliplens.explainers.table import explain
 from sliplens.faithfulness.fills import FILLS, get_fill
 from sliplens.models import Network, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import REFERENCE_SIGNS, with_reference
@@ -88,11 +87,12 @@ def test_from_training_to_an_explanation(small_dataset: Dataset, raw_run: Path, 
     own = tested.prediction[tested.trial == recording.trial][:2]
     np.testing.assert_allclose(rows, own, atol=1e-5)
     for method in ("integrated-gradients", "occlusion"):
-        explanation = explain(again, frames, reference=reference, method=method)
-        np.testing.assert_allclose(explanation.prediction.numpy(), own, atol=1e-5)
+        explanation = sl.explain(again, frames, reference=reference, method=method)
+        np.testing.assert_allclose([frame.prediction for frame in explanation.frames], own, atol=1e-5)
         # the untouched sensor, twice
         empty = again.predict(again.encode(reference[None], reference))
-        torch.testing.assert_close(explanation.reference_prediction, empty.expand(2), atol=1e-5, rtol=0)
+        untouched = [frame.reference_prediction for frame in explanation.frames]
+        np.testing.assert_allclose(untouched, empty.expand(2).numpy(), atol=1e-5)
     with sl.LiveReader(frames, again, reference=reference, engine="torch", health=None, slip=None) as reader:
         *_, last = reader.readings()
     assert last.margin == pytest.approx(np.clip(own[-1], 0, 1), abs=1e-4)

@@ -10,13 +10,13 @@ from scipy.stats import spearmanr
 
 import sliplens
 from sliplens.errors import InputError
+from sliplens.explainers.frames import frames_from_folder
 from sliplens.faithfulness.controls import cascade
 from sliplens.files import find_run, shipped_names
 from sliplens.models import Network
 from sliplens.recordings import Recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 from sliplens.simulation.plan import PULLS
-from sliplens.study import frames_from_folder
 
 
 def test_the_networks_that_come_with_the_package():

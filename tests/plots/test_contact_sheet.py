@@ -19,8 +19,8 @@ from sliplens.plots.contact_sheet import (
     draw_contact_sheet,
     write_contact_sheet,
 )
-from sliplens.plots.saliency import NOMINAL_MARGINS
 from sliplens.recordings import ContactState, GroundTruth, Recording
+from sliplens.results.explanation import MARGIN_LEVELS
 
 NO_CONTACT, CONTACT, INCIPIENT_SLIP, FULL_SLIP, _ = ContactState
 
@@ -60,7 +60,7 @@ def factor_told(figure: Figure) -> float:
 def test_chosen_frames_are_the_nearest_to_the_margins(pull):
     trial = pulled_trial(pull=pull)
 
-    for nominal, index in zip(NOMINAL_MARGINS, choose_margins(trial), strict=True):
+    for nominal, index in zip(MARGIN_LEVELS, choose_margins(trial), strict=True):
         nearest = np.nanmin(np.abs(trial.safety_margin - nominal))
         # frames within half a percentage point are told apart by their force alone
         assert abs(trial.safety_margin[there(index)] - nominal) <= nearest + 0.005
@@ -276,7 +276,7 @@ def test_one_frame_and_no_label_can_be_drawn():
     figure = draw_contact_sheet([one])
     figure.draw_without_rendering()
 
-    assert sum("no frame" in text for text in texts(figure)) == len(NOMINAL_MARGINS)
+    assert sum("no frame" in text for text in texts(figure)) == len(MARGIN_LEVELS)
 
 
 def test_drawing_leaves_matplotlib_as_it_was(tmp_path):

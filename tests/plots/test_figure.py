@@ -5,16 +5,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 from made_up import write_workspace
 from matplotlib.figure import Figure
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.explainers.attribution import Attribution
 from sliplens.models.predictions import Predictions
 from sliplens.report import load_results
 from sliplens.results.evaluation import ScoredFrames
+from sliplens.results.explanation import Explanation
 
 
 @pytest.fixture(scope="module")
@@ -23,18 +22,14 @@ def results(tmp_path_factory):
 
 
 @pytest.fixture
-def explanation() -> Attribution:
-    relevance = torch.zeros(2, 8, 8)
+def explanation(results) -> Explanation:
+    """Two frames, the second with one pixel that raises the prediction and one that lowers it."""
+    some = results.explanations["raw", "simulated"].take([0, 1])
+    relevance = np.zeros(some.relevance["grad-cam"].shape, dtype=np.float32)
     relevance[1, 2, 3], relevance[1, 6, 6] = 0.4, -0.4
-    return Attribution(
-        images=torch.full((2, 3, 8, 8), 0.5),
-        relevance=relevance.requires_grad_(),
-        method="grad-cam",
-        target="",
-        prediction=torch.tensor([0.3, 0.2]),
-        reference_prediction=torch.tensor([1.0, 1.0]),
-        seconds=0.1,
-    )
+    frames = tuple(replace(frame, prediction=0.2, reference_prediction=1.0) for frame in some.frames)
+    methods = {"grad-cam": some.methods["grad-cam"]}
+    return replace(some, frames=frames, methods=methods, relevance={"grad-cam": relevance})
 
 
 def test_records_of_a_workspace_have_a_figure_each(results):
@@ -57,12 +52,6 @@ def test_what_raises_is_blue_and_what_lowers_is_orange(explanation):
     assert pixels[2, 3, 2] > pixels[2, 3, 0]
     assert pixels[6, 6, 0] > pixels[6, 6, 2]
     assert "why 20" in ax.get_title(loc="left")
-
-
-def test_of_a_frame_beside_its_reference_the_frame_is_drawn(explanation):
-    beside = torch.cat([explanation.images, torch.zeros_like(explanation.images)], dim=1)
-    alone, both = (sl.plot(one, index=1).axes[0] for one in (explanation, replace(explanation, images=beside)))
-    np.testing.assert_array_equal(both.images[0].get_array(), alone.images[0].get_array())
 
 
 def test_axes_of_ones_own_are_drawn_on(results):

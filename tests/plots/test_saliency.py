@@ -1,11 +1,23 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from PIL import Image
 
 from sliplens.errors import SaliencyError
-from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, plot_colour_bar, stretch_saliency
+from sliplens.images import read_image
+from sliplens.plots.saliency import (
+    draw_explanation,
+    full_colour,
+    overlay_relevance,
+    overlay_saliency,
+    plot_colour_bar,
+    stretch_saliency,
+)
 from sliplens.plots.style import ORANGE, SKY
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 
 
 def test_overlay_has_the_size_of_its_picture(rng):
@@ -93,3 +105,44 @@ def test_stretching_leaves_an_empty_map_empty_and_shows_a_single_pixel():
     dot = np.zeros((20, 50))
     dot[3, 4] = 0.1
     assert stretch_saliency(dot)[3, 4] == 1
+
+
+def of_relevance(relevance: np.ndarray) -> Explanation:
+    """Explanations of grey frames 0, 1, ..."""
+    frame = {"trial": "t", "condition": "dry", "safety_margin": 0.2, "prediction": 0.2, "reference_prediction": 1.0}
+    return Explanation(
+        input="difference",
+        source="real",
+        weights_sha256="",
+        frames=tuple(ExplainedFrame(id=str(number), **frame) for number in range(len(relevance))),
+        methods={"occlusion": MethodNotes(seconds_per_frame=0.0, warnings=())},
+        images=np.full((len(relevance), 3, 8, 8), 100, dtype=np.uint8),
+        references=np.full((len(relevance), 3, 8, 8), 100, dtype=np.uint8),
+        pictures=np.full((len(relevance), 8, 8, 3), 100, dtype=np.uint8),
+        relevance={"occlusion": relevance},
+    )
+
+
+def test_a_frame_with_nothing_to_explain_looks_empty(tmp_path: Path):
+    relevance = np.zeros((2, 8, 8), dtype=np.float32)
+    relevance[0, 2:4, 2:4] = -0.2  # 80 points of margin; the second frame changes by a hundredth of a point
+    relevance[1, 2:4, 2:4] = 0.000025
+    explained = of_relevance(relevance)
+    draw_explanation(explained, tmp_path, colours="signed")
+    strong, empty = (read_image(tmp_path / "overlays" / "occlusion" / f"{one.id}.png") for one in explained.frames)
+    assert np.ptp(strong[2, 2].astype(int)) > 100
+    assert np.ptp(empty.astype(int)) <= 1
+    with Image.open(tmp_path / "panel.png") as panel:  # two rows, and the colours that they are drawn in below
+        assert panel.height > panel.width
+
+
+def test_a_panel_of_many_frames_shows_a_few_from_the_first_to_the_last(tmp_path: Path, monkeypatch):
+    figures = []
+    monkeypatch.setattr("sliplens.plots.saliency.Figure.savefig", lambda figure, *_, **__: figures.append(figure))
+    draw_explanation(of_relevance(np.zeros((40, 8, 8), dtype=np.float32)), tmp_path, colours="signed")
+    [figure] = figures
+    columns = [int(ax.get_title().partition("\n")[0]) for ax in figure.axes[:12]]
+    assert (columns[0], columns[-1], len(columns)) == (0, 39, 12)
+    assert set(np.diff(columns)) == {3, 4}  # 39 steps over 11 gaps
+    assert "12 of 40 frames" in figure.axes[-1].get_xlabel()
+    assert len(list((tmp_path / "overlays" / "occlusion").iterdir())) == 40

@@ -17,10 +17,10 @@ from sliplens.results.faithfulness import (
     Agreement,
     Comparison,
     DeletionScores,
+    Faithfulness,
     Lead,
     Remedies,
     RemovalScore,
-    RemovalScores,
     RemovalTable,
     Variant,
     VariantTable,
@@ -391,7 +391,7 @@ def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random
         workspace / f"faithfulness-{name}",
         "faithfulness",
         {},
-        RemovalScores(
+        Faithfulness(
             input=name,
             source="simulated",
             frames=len(rows),

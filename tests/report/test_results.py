@@ -159,9 +159,12 @@ def change_arrays(workspace: Path, **arrays: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"saliency/grad-cam": np.zeros((6, 12, 12))}, r"holds float64 of shape \(6, 12, 12\) as 'saliency/grad-cam'"),
-        ({"saliency/grad-cam": np.zeros((5, 24, 24), np.float32)}, r"holds float32 of shape \(5, 24, 24\) as"),
-        ({"images": np.zeros((6, 3, 20, 20), np.uint8)}, r"of shape \(6, 24, 24, 3\) as 'pictures' where UInt8"),
+        (
+            {"relevance/grad-cam": np.zeros((6, 12, 12))},
+            r"holds float64 of shape \(6, 12, 12\) as 'relevance/grad-cam'",
+        ),
+        ({"relevance/grad-cam": np.zeros((5, 24, 24), np.float32)}, r"holds float32 of shape \(5, 24, 24\) as"),
+        ({"images": np.zeros((6, 3, 20, 20), np.uint8)}, r"of shape \(6, 3, 24, 24\) as 'references' where UInt8"),
     ],
 )
 def test_arrays_that_do_not_fit_their_frames_are_told(workspace, arrays, message):
@@ -172,15 +175,15 @@ def test_arrays_that_do_not_fit_their_frames_are_told(workspace, arrays, message
 
 
 def test_maps_that_are_not_finite_are_told(workspace):
-    change_arrays(workspace, **{"saliency/poly-cam": np.full((6, 24, 24), np.nan, dtype=np.float32)})
+    change_arrays(workspace, **{"relevance/poly-cam": np.full((6, 24, 24), np.nan, dtype=np.float32)})
 
-    with pytest.raises(InputError, match="holds nan as 'saliency/poly-cam', which must be at least 0 and at most 1"):
+    with pytest.raises(InputError, match="holds nan as 'relevance/poly-cam', which must be at least -1000"):
         load_results(workspace)
 
 
 def test_a_method_without_maps_is_told(workspace):
     path = workspace / "maps-raw-real" / "arrays.npz"
-    np.savez(path, allow_pickle=False, **{k: v for k, v in np.load(path).items() if k != "saliency/grad-cam"})
+    np.savez(path, allow_pickle=False, **{k: v for k, v in np.load(path).items() if k != "relevance/grad-cam"})
 
-    with pytest.raises(InputError, match=r"holds no saliency of grad-cam; make it again with `sliplens explain`"):
+    with pytest.raises(InputError, match=r"holds no relevance of grad-cam; make it again with `sliplens explain`"):
         load_results(workspace)

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sliplens.explainers.explain import explain_frames
+from sliplens.explainers.frames import frames_at
 from sliplens.models import Network, load_checkpoint
 from sliplens.recordings import Dataset
 from sliplens.results.study import Choice, MarkerPlaces
-from sliplens.study import explain_frames
 from sliplens.study.choice import Material, choose_frames, gather, study_explainers
-from sliplens.study.explaining import frames_at
 
 METHODS = ("grad-cam", "integrated-gradients")
 
@@ -34,8 +34,7 @@ def material(network: Network, fine_dataset: Dataset, choice: Choice) -> Materia
     grid = np.stack([x.ravel(), y.ravel()], axis=1)
     return gather(
         network,
-        explain_frames(network, chosen, methods=METHODS, explainers=explainers),
-        fine_dataset,
+        explain_frames(network, chosen, explainers),
         tuple(frame for frame in choice.frames if frame.scored),
         markers={frame.id: MarkerPlaces(rest_px=grid, now_px=grid) for frame in choice.frames},
         explainers=explainers,

@@ -12,13 +12,15 @@ from sliplens.explainers.attribution import Attribution
 from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.table import get_explainer
 from sliplens.faithfulness.controls import cascade, gini, total_variation
+from sliplens.faithfulness.scoring import influences
 from sliplens.recordings import Dataset
+from sliplens.results.explanation import MethodNotes
 from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.results.study import Setting, StudyConfig
 from sliplens.study.checks import Measuring, Randomising, Untrained, time_explainers
 from sliplens.study.choice import Material
 from sliplens.study.run import Records, judge_by_truth
-from sliplens.study.scoring import Removal, influences
+from sliplens.study.scoring import Removal
 
 
 class ShowsTheImage:
@@ -41,7 +43,11 @@ def with_image(material: Material, explainer: ShowsTheImage) -> Material:
     shown = (material.inputs.mean(dim=1).numpy() * material.explained.towards[:, None, None]).astype(np.float32)
     return replace(
         material,
-        explained=replace(material.explained, relevance={"image": shown, **material.explained.relevance}),
+        explained=replace(
+            material.explained,
+            methods={"image": MethodNotes(seconds_per_frame=0.0, warnings=()), **material.explained.methods},
+            relevance={"image": shown, **material.explained.relevance},
+        ),
         explainers={"image": explainer, **material.explainers},
     )
 
@@ -119,7 +125,9 @@ def test_a_map_of_what_raises_the_answer_ranks_by_its_order_and_is_held_against_
     first, *others = explained.frames
     fell = replace(first, prediction=first.reference_prediction - 0.3)
     rose = [replace(one, prediction=one.reference_prediction + 0.3) for one in others]
-    explained = replace(explained, frames=(fell, *rose), relevance={**explained.relevance, name: relevance})
+    notes = MethodNotes(seconds_per_frame=0.0, warnings=(), raises_only=True)
+    methods, maps = {**explained.methods, name: notes}, {**explained.relevance, name: relevance}
+    explained = replace(explained, frames=(fell, *rose), methods=methods, relevance=maps)
     explainers = {**material.explainers, name: get_explainer(name)}
     records = Records(
         folder=Path("nowhere"),
@@ -130,7 +138,7 @@ def test_a_map_of_what_raises_the_answer_ranks_by_its_order_and_is_held_against_
     )
     own = replace(material, explained=explained, explainers=explainers)
     control = {f"{name}{NEW_WEIGHTS}": relevance}
-    vars(records).update(material=own, influence={**influences(own), **control})
+    vars(records).update(material=own, influence={**influences(own.trained, own.explained), **control})
     # parts are removed in the published order
     np.testing.assert_array_equal(records.influence[name], relevance)
     compared = judge_by_truth(records).maps
@@ -143,10 +151,12 @@ def test_a_map_of_what_raises_the_answer_ranks_by_its_order_and_is_held_against_
 def test_a_method_that_ignores_the_weights_shows_nothing_about_the_network(material: Material):
     shows_the_image = with_image(material, ShowsTheImage())
     small = replace(shows_the_image, explainers={"image": ShowsTheImage()})
-    maps = {**influences(small), **Untrained(material=small).make().maps}
+    maps = {**influences(small.trained, small.explained), **Untrained(material=small).make().maps}
     np.testing.assert_allclose(maps["image-new-weights"], maps["image"], atol=1e-6)
     grey = (Setting(fill="grey", unit="pixel"),)
-    scored = Removal(material=small, maps=maps, settings=grey, random_orders=1).make()
+    scored = Removal(
+        trained=small.trained, explained=small.explained, units=small.units(), maps=maps, settings=grey, random_orders=1
+    ).make()
     (lead,) = [score.lead_over_controls for score in scored.scores if score.method == "image"]
     assert lead is not None
     assert ends_of(lead.gap)[1] <= 0

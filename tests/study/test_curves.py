@@ -7,41 +7,48 @@ import torch
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError
-from sliplens.faithfulness.removal import Faithfulness
-from sliplens.intervals import paired_difference
-from sliplens.results.faithfulness import RemovalScores
-from sliplens.results.study import Setting
-from sliplens.study.choice import Material
-from sliplens.study.scoring import (
+from sliplens.faithfulness.scoring import (
     EQUAL_AREAS,
-    STUDY_AREAS,
-    Influence,
-    Removal,
     compare_fills,
     influences,
     judge_curves,
     ranking_alarms,
 )
+from sliplens.intervals import paired_difference
+from sliplens.results.explanation import Explanation
+from sliplens.results.faithfulness import Faithfulness, RemovalCurve
+from sliplens.results.study import Setting
+from sliplens.study.choice import Material
+from sliplens.study.scoring import STUDY_AREAS, Influence, Removal
 
 PIXELS = Setting(fill="grey", unit="pixel")
 MARKERS = Setting(fill="reference", unit="marker")
 AREAS = np.array([0.0, 0.5, 1.0])
 
 
-def straight(most: float, least: float, *, frames: int = 8) -> Faithfulness:
+def straight(most: float, least: float, *, frames: int = 8) -> RemovalCurve:
     """Curves that rise at once to a level and stay: their areas differ by three quarters of the levels' difference."""
-    curve = np.array([0.0, 1.0, 1.0])
-    return Faithfulness(
-        areas=AREAS, curves=np.stack([np.tile(level * curve, (frames, 1)) for level in (most, least, 0.0)])
+    most_first, least_first, random = (np.tile([0.0, level, level], (frames, 1)) for level in (most, least, 0.0))
+    return RemovalCurve(areas=AREAS, most_first=most_first, least_first=least_first, random=random)
+
+
+def removal_of(material: Material, *settings: Setting, units: bool = True) -> Removal:
+    return Removal(
+        trained=material.trained,
+        explained=material.explained,
+        maps=influences(material.trained, material.explained),
+        units=material.units() if units else {},
+        settings=settings,
+        random_orders=2,
     )
 
 
 @pytest.fixture(scope="module")
-def scored(material: Material) -> RemovalScores:
-    return Removal(material=material, maps=influences(material), settings=(PIXELS, MARKERS), random_orders=2).make()
+def scored(material: Material) -> Faithfulness:
+    return removal_of(material, PIXELS, MARKERS).make()
 
 
-def test_removing_by_hand_gives_the_same_change(material: Material, scored: RemovalScores):
+def test_removing_by_hand_gives_the_same_change(material: Material, scored: Faithfulness):
     frame, area = material.explained.frames[0], 0.2
     relevance = material.explained.relevance["grad-cam"][0]
     towards = np.sign(frame.prediction - frame.reference_prediction)
@@ -58,7 +65,7 @@ def test_removing_by_hand_gives_the_same_change(material: Material, scored: Remo
     assert found == pytest.approx(expected, abs=1e-5)
 
 
-def test_every_method_and_control_is_scored_under_every_setting(material: Material, scored: RemovalScores):
+def test_every_method_and_control_is_scored_under_every_setting(material: Material, scored: Faithfulness):
     names = {*material.explainers, "edges", "change", "local-change", "weights-1", "centre"}
     keys = {(setting.fill, setting.unit, name) for setting in (PIXELS, MARKERS) for name in names}
     assert {score.key for score in scored.scores} == set(scored.curves) == keys
@@ -68,9 +75,9 @@ def test_every_method_and_control_is_scored_under_every_setting(material: Materi
     assert set(scored.scores[0].at) == set(EQUAL_AREAS)
 
 
-def test_scores_are_the_areas_under_the_stored_curves(scored: RemovalScores, tmp_path: Path):
+def test_scores_are_the_areas_under_the_stored_curves(scored: Faithfulness, tmp_path: Path):
     save_result(scored, tmp_path)
-    back = load_result(tmp_path, RemovalScores, command="sliplens study")
+    back = load_result(tmp_path, Faithfulness, command="sliplens study")
     assert back.scores == scored.scores
     for score in back.scores:
         curve = back.curves[score.key]
@@ -85,10 +92,10 @@ def test_markers_that_are_not_known_everywhere_are_no_unit(material: Material):
 
 def test_a_fill_that_is_unknown_is_refused_before_anything_is_made(material: Material):
     with pytest.raises(InputError, match="no fill named 'pink'"):
-        Removal(material=material, maps={}, settings=(Setting(fill="pink", unit="pixel"),))
+        removal_of(material, Setting(fill="pink", unit="pixel"))
 
 
-def test_an_interrupted_run_goes_on_after_the_last_trial(material: Material, tmp_path: Path, scored: RemovalScores):
+def test_an_interrupted_run_goes_on_after_the_last_trial(material: Material, tmp_path: Path, scored: Faithfulness):
     calls = []
 
     def interrupt(done: int, total: int) -> None:
@@ -96,7 +103,7 @@ def test_an_interrupted_run_goes_on_after_the_last_trial(material: Material, tmp
         if done > 3:  # of three frames each trial has
             raise KeyboardInterrupt
 
-    removal = Removal(material=material, maps=influences(material), settings=(PIXELS, MARKERS), random_orders=2)
+    removal = removal_of(material, PIXELS, MARKERS)
     with pytest.raises(KeyboardInterrupt):
         removal.make(tmp_path, on_progress=interrupt)
     assert len(list(tmp_path.glob("trial=*/*/result.json"))) == 1
@@ -107,9 +114,9 @@ def test_an_interrupted_run_goes_on_after_the_last_trial(material: Material, tmp
     assert again.scores == scored.scores
 
 
-def test_a_trial_is_scored_as_it_is_among_others(material: Material, scored: RemovalScores):
+def test_a_trial_is_scored_as_it_is_among_others(material: Material, scored: Faithfulness):
     alone = material.take(material.explained.trials[material.explained.frames[0].trial])
-    found = Removal(material=alone, maps=influences(alone), settings=(PIXELS,), random_orders=2).make()
+    found = removal_of(alone, PIXELS).make()
     key = (PIXELS.fill, PIXELS.unit, "grad-cam")
     one, other = found.curves[key], scored.curves[key]
     assert other.frame_ids[:3] == one.frame_ids
@@ -120,15 +127,15 @@ def test_a_trial_is_scored_as_it_is_among_others(material: Material, scored: Rem
 def test_curves_found_in_another_way_are_kept_over_an_interruption(material: Material, tmp_path: Path):
     asked = []
 
-    def draw(part: Material, maps: Influence, *_: object) -> dict[str, Faithfulness]:
+    def draw(part: Explanation, maps: Influence, _: int) -> dict[str, RemovalCurve]:
         asked.append("drawn")
-        return {name: straight(0.2, 0.1, frames=len(part.inputs)) for name in maps}
+        return {name: straight(0.2, 0.1, frames=len(part.frames)) for name in maps}
 
-    def stop(*_: object) -> dict[str, Faithfulness]:
+    def stop(*_: object) -> dict[str, RemovalCurve]:
         raise KeyboardInterrupt
 
     true, other = Setting(fill="true", unit="marker"), Setting(fill="other", unit="marker")
-    removal = Removal(material=material, maps=influences(material), settings=(), random_orders=2)
+    removal = removal_of(material)
     with pytest.raises(KeyboardInterrupt):
         replace(removal, further={true: draw, other: stop}).make(tmp_path)
     found = replace(removal, further={true: draw, other: draw}).make(tmp_path)
@@ -140,9 +147,9 @@ def test_curves_found_in_another_way_are_kept_over_an_interruption(material: Mat
 def test_a_method_is_better_only_when_the_interval_leaves_zero_out():
     rng = np.random.default_rng(0)
     level = rng.uniform(0.3, 0.5, 8)
-    noisy = Faithfulness(
-        areas=AREAS,
-        curves=np.stack([value[:, None] * np.array([0.0, 1.0, 1.0]) for value in (level, np.zeros(8), np.zeros(8))]),
+    nothing = np.zeros((8, 3))
+    noisy = RemovalCurve(
+        areas=AREAS, most_first=level[:, None] * np.array([0.0, 1.0, 1.0]), least_first=nothing, random=nothing
     )
     found = {PIXELS: {"poly-cam": noisy, "grad-cam": straight(0.1, 0.0), "occlusion": noisy, "edges": straight(0, 0)}}
     scores, comparisons = judge_curves(found, clusters=np.stack([np.ones(8), np.arange(8)]), seed=0)

@@ -3,13 +3,13 @@
 import pytest
 import torch
 
+from sliplens.explainers.explain import with_markers
 from sliplens.study.choice import (
     STUDY_METHODS,
     THESIS_POLY_CAM,
     as_the_thesis_ran,
     method_options,
     study_explainers,
-    with_markers,
     without_markers,
 )
 

@@ -5,17 +5,16 @@ import torch
 from sliplens.codec import load_result, save_result
 from sliplens.faithfulness.scoring import deletion_order
 from sliplens.results.faithfulness import Remedies
-from sliplens.study import score_explained
 from sliplens.study.choice import Material
-from sliplens.study.scoring import RemedialDeletion
+from sliplens.study.scoring import Deletion, RemedialDeletion
 
 STEPS = 8
 
 
 @pytest.fixture(scope="module")
 def remedies(material: Material) -> Remedies:
-    grey = score_explained(material.trained, material.explained, steps=STEPS)
-    return RemedialDeletion(material=material, grey=grey, steps=STEPS).make()
+    frames = {"trained": material.trained, "explained": material.explained, "steps": STEPS}
+    return RemedialDeletion(grey=Deletion(**frames).make(), **frames).make()
 
 
 def test_insertion_shows_only_the_most_salient_pixels(material: Material, remedies: Remedies):

@@ -6,7 +6,7 @@ from sliplens.errors import RecordingError
 from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.models import load_checkpoint
 from sliplens.results.explanation import Strip
-from sliplens.study.workspace import explain_trial
+from sliplens.study.explaining import make_strip
 
 from ..conftest import make_recording
 
@@ -19,7 +19,7 @@ def run(difference_run):
 @pytest.fixture(scope="module")
 def strip(run) -> Strip:
     levels = (10 / 11, 6 / 11, 0.0)
-    return explain_trial(run, make_recording("t"), source="simulated", levels=levels)
+    return make_strip(run, make_recording("t"), source="simulated", levels=levels)
 
 
 def test_a_strip_shows_the_frames_nearest_to_its_levels(strip):
@@ -53,4 +53,4 @@ def test_a_trial_without_labels_is_refused(run):
     recording = make_recording("t")
     recording.safety_margin[:] = np.nan
     with pytest.raises(RecordingError, match="no labelled frame"):
-        explain_trial(run, recording, source="real")
+        make_strip(run, recording, source="real")

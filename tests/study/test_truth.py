@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import CheckpointError, InputError
+from sliplens.explainers.explain import explain_frames, network_inputs
+from sliplens.explainers.frames import FrameSelection, frames_from_dataset
 from sliplens.faithfulness.controls import control_maps
 from sliplens.faithfulness.removal import SHARES, unit_means
 from sliplens.files import output_folder
@@ -22,8 +24,6 @@ from sliplens.results.explanation import MethodNotes
 from sliplens.results.study import Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
 from sliplens.simulation.intervention import draw_with_markers_back, marker_readings, visible_markers
-from sliplens.study import explain_frames, frames_from_dataset
-from sliplens.study.explaining import network_inputs
 from sliplens.study.truth import (
     FrameEffects,
     JudgingByTruth,
@@ -100,12 +100,12 @@ def explained(trained: Network, data: Dataset) -> Explanation:
 
 
 def explain(trained: Network, data: Dataset) -> Explanation:
-    chosen = frames_from_dataset(trained, data, levels=LEVELS)
+    chosen = frames_from_dataset(trained, data, FrameSelection(levels=LEVELS))
     inputs = trained.encoding.normalise(chosen.images)
     assert isinstance(trained.model, Linear)
     # what each pixel adds to the answer
     attribution = (inputs * trained.model.weight).sum(dim=1).detach().numpy()
-    answers, empty = trained.predict(inputs), trained.predict(chosen.references)
+    answers, empty = trained.predict(inputs), trained.predict(trained.encoding.normalise(chosen.references))
     return Explanation(
         input="amplitude",
         source=chosen.source,
@@ -122,9 +122,9 @@ def explain(trained: Network, data: Dataset) -> Explanation:
         ),
         methods={"attribution": MethodNotes(seconds_per_frame=0.0, warnings=())},
         images=chosen.images.numpy(),
+        references=chosen.references.numpy(),
         pictures=(255 * inputs).byte().permute(0, 2, 3, 1).numpy(),
         relevance={"attribution": attribution},
-        saliency={"attribution": np.abs(attribution)},
         weights_sha256="of these weights",
     )
 
@@ -194,7 +194,7 @@ def test_effects_are_what_putting_one_marker_back_changes(trained, explained, da
 
 def test_markers_of_the_frame_are_put_back_and_the_reference_beside_it_stays(data):
     trained = run_of(nn.Sequential(nn.AdaptiveAvgPool3d(1), nn.Flatten()), input="pair")
-    explained = explain_frames(trained, frames_from_dataset(trained, data, levels=LEVELS[1:]), methods=())
+    explained = explain_frames(trained, frames_from_dataset(trained, data, FrameSelection(levels=LEVELS[1:])), {})
     (frame,) = frames = stage_frames(trained, explained, data)
     empty = trained.encoding.empty(frame.reference, image_size=SIZE)
     drawn = redrawing(trained, frames)(0, np.array([[False] * len(frame.markers), [True] * len(frame.markers)]))
@@ -407,7 +407,8 @@ def test_curves_under_the_true_fill_know_the_oracle(trained, explained, data, ma
     for name in noise:
         assert np.all(found["oracle"].symmetric_gain > found[name].symmetric_gain)
     # where all are put back, no order matters
-    assert np.ptp([one.curves[:, :, -1] for one in found.values()], axis=0) == pytest.approx(0, abs=1e-12)
+    ends = [[curve.most_first[:, -1], curve.least_first[:, -1], curve.random[:, -1]] for curve in found.values()]
+    assert np.ptp(ends, axis=0) == pytest.approx(0, abs=1e-12)
 
 
 def test_redrawn_inputs_are_those_that_were_explained(trained, explained, data):

@@ -18,9 +18,11 @@ from PIL import Image
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from sliplens.errors import SliplensError
-from sliplens.explainers.attribution import CLOSE, Attribution
+from sliplens.explainers.attribution import CLOSE
+from sliplens.explainers.explain import choose_explainers, explain_frames
+from sliplens.explainers.frames import frames_from_arrays
 from sliplens.explainers.occlusion import marker_regions, to_network_px
-from sliplens.explainers.table import RECOMMENDED_METHOD, explain
+from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.files import to_builtins
 from sliplens.grip.source import GripSource, GripStatus
 from sliplens.images import encode_jpeg
@@ -350,36 +352,39 @@ class Feed:
 
     def _explain(self, picture: Picture, method: str) -> Map:
         assert self._network is not None
-        frames, chosen = picture.frame.image[None], None if method == RECOMMENDED_METHOD else method
-        explanation = explain(self._network, frames, reference=picture.reference, method=chosen)
-        relevance = explanation.relevance[0].cpu().numpy()
+        chosen = frames_from_arrays(self._network, picture.frame.image[None], picture.reference)
+        methods = None if method == RECOMMENDED_METHOD else method
+        explainers, warnings = choose_explainers(self._network, chosen, methods)
+        explanation = explain_frames(self._network, chosen, explainers)
+        method, relevance = explanation.method, explanation.relevance[explanation.method][0]
+        [frame] = explanation.frames
         full = full_colour(relevance)
         # where both margins are the same but for the network's error, the strongest of nothing is not shown in colour
-        alike = abs(float(explanation.change[0])) < CLOSE
+        alike = abs(frame.prediction - frame.reference_prediction) < CLOSE
         rows, columns = relevance.shape
         return Map(
             facts=MapFacts(
                 number=picture.frame.number,
-                method=chosen or explanation.method,  # tiles where no markers are found
-                prediction=float(explanation.prediction[0]),
-                reference_prediction=float(explanation.reference_prediction[0]),
+                method=method,  # tiles where no markers are found
+                prediction=frame.prediction,
+                reference_prediction=frame.reference_prediction,
                 rows=rows,
                 columns=columns,
                 full=full,
                 alike=alike,
-                markers=() if alike else _sum_by_marker(explanation, picture),
-                warnings=tuple(warning.removeprefix("image 0: ") for warning in explanation.warnings),
+                markers=() if alike else _sum_by_marker(relevance, picture),
+                warnings=(*warnings, *(one.partition("): ")[2] for one in explanation.methods[method].warnings)),
             ),
             cells=np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8).tobytes(),
         )
 
 
-def _sum_by_marker(explanation: Attribution, picture: Picture) -> tuple[MarkerRelevance, ...]:
+def _sum_by_marker(values: np.ndarray, picture: Picture) -> tuple[MarkerRelevance, ...]:
     """Sum the relevance around each marker."""
     if len(picture.arrows) < 2:
         return ()
     places = np.array([arrow.end_px for arrow in picture.arrows])
-    relevance = explanation.relevance[0].cpu().double()
+    relevance = torch.from_numpy(values).double()
     centres = to_network_px(places, picture.frame.size, image_size=len(relevance))
     regions = marker_regions((relevance.shape[0], relevance.shape[1]), centres)
     sums = torch.bincount(regions.flatten(), weights=relevance.flatten(), minlength=len(places) + 1)

@@ -17,7 +17,7 @@ from sliplens.grip.source import GripSource
 from sliplens.live.reading import NO_NETWORK, TARGET
 from sliplens.live.sources import SimulatedSource
 from sliplens.plots.saliency import LOWERS, RAISES
-from sliplens.plots.style import BLUE, METHOD_NAMES
+from sliplens.plots.style import BLUE, method_name
 
 if TYPE_CHECKING:
     from sliplens.app.server import LivePage
@@ -37,7 +37,7 @@ class LiveView(ui.element, component="live_view.js"):
             "target": TARGET,
             "lowers": LOWERS,
             "raises": RAISES,
-            "methods": METHOD_NAMES,
+            "methods": {name: row.title for name, row in EXPLAINERS.items()},
             "recommended": RECOMMENDED_METHOD,
             "grips": isinstance(page.reader.source, GripSource),
         })  # fmt: skip
@@ -89,7 +89,7 @@ class _Actions:
         picture = client.freeze()
         if picture is None or client.waiting:
             return
-        client.waiting = f"explaining frame {picture.frame.number} by {METHOD_NAMES.get(method, method)}"
+        client.waiting = f"explaining frame {picture.frame.number} by {method_name(method)}"
         client.wake()
         try:
             explained = await self._feed.explain(picture, method)
@@ -180,7 +180,7 @@ def _build_overlays(acts: _Actions, *, network: bool) -> None:
         map_switch.set_enabled(network)
         arrow_switch = ui.switch("Markers", value=True, on_change=show)
         if network:
-            names = {method: METHOD_NAMES.get(method, method) for method in EXPLAINERS}
+            names = {method: row.title for method, row in EXPLAINERS.items()}
             ui.select(names, label="explain by").props("dense outlined options-dense").bind_value(acts, "method")
             ui.button("Explain (E)", on_click=_with_notice(acts.explain)).tooltip(
                 "why, of this picture, by the method beside"

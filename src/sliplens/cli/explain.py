@@ -85,58 +85,76 @@ class Explain(Command):
             source = self.frames
         else:
             raise InputError("name either a data set or --frames FOLDER, to say which frames to explain")
-        from sliplens.study.workspace import explain_source
+        from sliplens.explainers.frames import FrameSelection
+        from sliplens.study.explaining import explain
 
-        self.call(explain_source, run=self.model, source=source, methods=self.method, out=self.output)
+        select = FrameSelection(
+            split=self.split, condition=self.condition, trials=self.trials, levels=tuple(self.levels)
+        )
+        self.call(explain, run=self.model, source=source, select=select, out=self.output)
 
 
 def _print_methods() -> None:
     from sliplens.explainers.table import EXPLAINERS
 
-    said = {name: (type(explainer).__doc__ or "").strip() for name, explainer in EXPLAINERS.items()}
-    as_published = "as published, the way the thesis ran it"
-    rows = [
-        (name, as_published if name.endswith("-thesis") else text.splitlines()[0].rstrip("."))
-        for name, text in said.items()
-    ]
-    print_table("Explainers", ("method", "what it does"), rows)
+    print_table("Explainers", ("method", "name"), [(name, row.title) for name, row in EXPLAINERS.items()])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Score(Command):
-    """Score explanations by deletion: remove the most salient pixels first and watch the answer.
+    """Score explanations: remove what they call influential first, and last, against random orders and controls.
 
-    D = (1 - |y_base - y_mask|)^2 at each step, averaged over the steps (thesis, eq. 2): lower is more faithful. A
-    random order is scored beside every method; one that does not beat it has shown nothing.
+    The score is the symmetric gain in margin units: 0 is no better than chance, and a method that does not beat the
+    controls, which use nothing the network learned, shows nothing. The deletion score of the thesis (D_AUC, grey fill,
+    lower is more faithful) stands beside it.
     """
 
     model: NetworkPath
     explanations: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="EXPLANATIONS")]
     """Folder that `sliplens explain` made."""
     output: Output
-    """Folder to make: curves and table."""
-    fill: str = "grey"
-    """What removed pixels become: grey, black, white, background, blur or noisy-linear."""
-    steps: int | None = None
-    """Steps until every pixel is gone; the image's height if not given."""
+    """Folder to make: curves and scores."""
+    fill: str = "reference"
+    """Content of removed pixels: reference (the untouched sensor), grey, black, white, background, blur or
+    noisy-linear."""
+    unit: Literal["pixel", "tile"] = "pixel"
+    """What is removed at once: pixels, or tiles of a fourteenth of the image."""
+    random_orders: int = 20
+    """Number of random orders."""
+    steps: int = 28
+    """Steps of the deletion score until every pixel is removed; 224 as in the thesis, 0 to leave it out."""
     device: Device = "cpu"
     on: On = "serial"
     retry_failed: RetryFailed = False
     seed: int = 0
-    """Seed of the random order."""
+    """Seed of the random orders."""
 
     def run(self) -> None:
         """Score and write the curves."""
-        from sliplens.study.workspace import score_explained
+        from sliplens.study.scoring import score
 
-        scores = self.call(score_explained, run=self.model, out=self.output)
+        faithfulness = self.call(score, run=self.model, frames=self.explanations, out=self.output)
+        rows = []
+        for found in faithfulness.scores:
+            gap, lead = found.srg, found.lead_over_controls
+            ends = "" if gap.low is None or gap.high is None else f"{gap.low:+.3f} to {gap.high:+.3f}"
+            lead_words = "" if lead is None else f"{lead.gap.estimate:+.3f}"
+            rows.append((found.method, f"{gap.estimate:+.3f}", ends, lead_words))
+        where = f"{faithfulness.input} images ({faithfulness.source})"
         print_table(
-            f"deletion score, {scores.input} images ({scores.source}), fill {self.fill}: lower is more faithful",
-            ("method", "D_AUC", "+-", "last step", "frames"),
-            [
-                (name, f"{method.mean:.3f}", f"{method.sd:.3f}", f"{method.last_step_mean:.3f}", str(method.frames))
-                for name, method in scores.methods.items()
-            ],
+            f"symmetric gain, {where}, fill {self.fill}: higher is more faithful",
+            ("method", "gain", "95 % interval", "less the best control"),
+            rows,
         )
-        for alarm in scores.alarms:
+        if faithfulness.deletion is not None:
+            print_table(
+                f"deletion score of the thesis, {where}, fill grey: lower is more faithful",
+                ("method", "D_AUC", "+-", "last step", "frames"),
+                [
+                    (name, f"{method.mean:.3f}", f"{method.sd:.3f}", f"{method.last_step_mean:.3f}", str(method.frames))
+                    for name, method in faithfulness.deletion.methods.items()
+                ],
+            )
+        alarms = faithfulness.alarms + (() if faithfulness.deletion is None else faithfulness.deletion.alarms)
+        for alarm in dict.fromkeys(alarms):
             say(f"  alarm: {alarm}")

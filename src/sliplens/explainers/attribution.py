@@ -1,9 +1,8 @@
-"""An explanation, when its maps should not be trusted, and arithmetic on maps."""
+"""Attribution maps of a batch, their checks, and arithmetic on maps."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-import pyarrow as pa
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -148,18 +147,18 @@ def pearson_r(first: Float[Tensor, "height width"], second: Float[Tensor, "heigh
 
 
 def top_overlap(
-    one: Float[Tensor, "height width"], other: Float[Tensor, "height width"], *, share: float = 0.1
+    first: Float[Tensor, "height width"], second: Float[Tensor, "height width"], *, share: float = 0.1
 ) -> float:
-    """Share of the strongest pixels of one map, such as a tenth of all, that are among the strongest of another."""
-    count = max(1, round(share * one.numel()))
-    strongest = torch.zeros(one.numel(), dtype=torch.bool, device=one.device)
-    strongest[one.flatten().topk(count).indices] = True
-    return float(strongest[other.flatten().topk(count).indices].double().mean())
+    """Return the share of the strongest pixels of a map that are among the strongest of another."""
+    count = max(1, round(share * first.numel()))
+    strongest = torch.zeros(first.numel(), dtype=torch.bool, device=first.device)
+    strongest[first.flatten().topk(count).indices] = True
+    return float(strongest[second.flatten().topk(count).indices].double().mean())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """What one layer contributed to a map that is built layer by layer."""
+    """Contribution of one layer to a map that is built layer by layer."""
 
     layer: str
     """Name of the layer in the network."""
@@ -171,7 +170,7 @@ class Level:
 
 @dataclass(frozen=True, kw_only=True)
 class Approximation:
-    """What an approximate map has in common with the exact one, as far as its own measurements tell."""
+    """Likeness of an approximate map to the exact one, estimated from its measurements."""
 
     measured: int
     """Channels whose effect was measured."""
@@ -185,39 +184,34 @@ class Approximation:
 
 @dataclass(frozen=True, kw_only=True)
 class Attribution:
-    """Why a network predicts f(x) rather than f(reference), for a batch of images."""
+    """Maps of a batch of images by one method: why a network predicts f(x) rather than f(reference)."""
 
     images: Float[Tensor, "batch colours height width"]
-    """Images x as the network saw them, in [0, 1]."""
+    """Images x, in [0, 1]."""
     relevance: Float[Tensor, "batch height width"]
     """Signed contribution of each pixel in margin units (float32): above zero where it raises the prediction."""
-    method: str
-    """Key of the explainer in `EXPLAINERS`."""
     target: str
-    """What the relevance adds up to, in words."""
+    """Quantity that the relevance adds up to, in words."""
     prediction: Float[Tensor, " batch"]
     """f(x), the safety margin of each image."""
     reference_prediction: Float[Tensor, " batch"]
     """f(reference), the safety margin of what each image is compared with."""
     completeness_gap: Float[Tensor, " batch"] | None = None
     """|sum of the relevance - (f(x) - f(reference))| in margin units; None where the sum is not promised."""
-    seconds: float
-    """Wall-clock time of the whole call, every image together, the device waited for."""
+    method: str = ""
+    """Name of the method; set when the call ends."""
+    seconds: float = 0.0
+    """Wall-clock time of the call for all images, device work included."""
     warnings: tuple[str, ...] = ()
-    """What a reader should know before trusting the maps, one sentence each."""
+    """Reasons not to trust a map, one sentence each."""
     levels: tuple[Level, ...] = ()
-    """The map layer by layer, fine to coarse, where the method has levels and was asked to keep them."""
+    """Map layer by layer, fine to coarse; empty unless the method has levels and its option `levels` is set."""
     approximations: tuple[Approximation, ...] = ()
-    """For each image what its map has in common with the exact one; empty where the map is exact."""
+    """Likeness of each image's map to the exact one; empty where the maps are exact."""
     engine: str = "torch"
     """Engine that ran the network, one of `models.engines.ENGINES`."""
     raises_only: bool = False
-    """Whether the method tells only what raises the prediction, as a published map with a ReLU does of f itself."""
-
-    @property
-    def frames(self) -> Float[Tensor, "batch 3 height width"]:
-        """What of the images is explained: the frames, without the reference that some networks see beside them."""
-        return frame_of(self.images)
+    """True if the maps only hold what raises the prediction, such as published maps with a ReLU."""
 
     @property
     def change(self) -> Float[Tensor, " batch"]:
@@ -226,7 +220,7 @@ class Attribution:
 
     @property
     def influence(self) -> Float[Tensor, "batch height width"]:
-        """What the method ranks pixels by: relevance that works towards the target, by sign(f(x) - f(reference)).
+        """Relevance along the change of the prediction, which ranks pixels: sign(f(x) - f(reference)) relevance.
 
         In margin units. A map that `raises_only` is ranked as it was published, whichever way the prediction went.
         """
@@ -236,7 +230,7 @@ class Attribution:
 
     @property
     def saliency(self) -> Float[Tensor, "batch height width"]:
-        """The supporting evidence in [0, 1], for viewing: 1 at the strongest pixel of each image.
+        """Supporting evidence in [0, 1], for viewing: 1 at the strongest pixel of each image.
 
         The map is relu(sign(f(x) - f(reference)) relevance) over its largest value: where the margin falls below the
         reference's, the pixels that lower it; of a map that `raises_only` always those that raise it. A map without
@@ -246,18 +240,12 @@ class Attribution:
         peak = supporting.amax(dim=(1, 2), keepdim=True)
         return supporting / torch.where(peak > 0, peak, torch.ones_like(peak))
 
-    def frame(self) -> pa.Table:
-        """Arrow table of the predictions, a row an image, in margin units; a gap that is not promised is NaN."""
-        gap = torch.full_like(self.change, torch.nan) if self.completeness_gap is None else self.completeness_gap
-        columns = {name: getattr(self, name) for name in ("prediction", "reference_prediction", "change")}
-        return pa.table({name: values.cpu().numpy() for name, values in (columns | {"completeness_gap": gap}).items()})
 
-
-CLOSE = 0.02  # margin units; a difference below the regressor's own error explains nothing
+CLOSE = 0.02  # margin units; a difference below the regressor's error explains nothing
 GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
-LOWEST, HIGHEST = -0.1, 1.1  # margins that a regressor tells of data like its own, with its error
-ALIKE_R, ALIKE_TOP = 0.99, 0.9  # what an approximate map should have in common with the exact one
-EXACT = 1e-4  # what two engines' maps in [0, 1] may differ by
+LOWEST, HIGHEST = -0.1, 1.1  # predictions of a regressor on data like its training data
+ALIKE_R, ALIKE_TOP = 0.99, 0.9  # required likeness of an approximate map to the exact one
+EXACT = 1e-4  # allowed difference of two engines' maps in [0, 1]
 _ULPS = 16  # of four predictions that differ, measured at 2 to 9
 FLAT = 0.1  # share of |f(x) - f(reference)| that gradients at the image must make up, all of one sign
 
@@ -269,7 +257,7 @@ def check_maps(
     reference_prediction: Float[Tensor, " batch"],
     completeness_gap: Float[Tensor, " batch"] | None,
 ) -> Iterator[str]:
-    """What is wrong with each map, one sentence a finding, in the order of the images; all in margin units."""
+    """Describe the faults of each map, a sentence a fault, in the order of the images; all in margin units."""
     gaps = torch.zeros_like(prediction) if completeness_gap is None else completeness_gap
     numbers = (values.tolist() for values in (prediction, reference_prediction, gaps))
     for index, (image_map, high, low, gap) in enumerate(zip(relevance, *numbers, strict=True)):
@@ -291,7 +279,7 @@ def check_maps(
 def check_weights(
     layers: Sequence[str], weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, change: Sequence[float]
 ) -> Iterator[str]:
-    """What is wrong with the weights of the channels, one sentence for each image and layer."""
+    """Describe the faults of the channel weights, a sentence for each image and layer."""
     for index, (shares, difference) in enumerate(zip(weights, change, strict=True)):
         for layer, weight in zip(layers, shares, strict=True):
             if bad := int((~weight.isfinite()).sum()):
@@ -318,13 +306,14 @@ def effect_rounding(
     """
     change, size = abs(prediction - reference_prediction), max(1.0, abs(prediction), abs(reference_prediction))
     largest = [change * float(shares.abs().max()) for shares in weights if len(shares) and shares.any()]
-    return max((_ULPS * torch.finfo(weights[0].dtype).eps * size / one for one in largest if one > 0), default=0.0)
+    rounding = _ULPS * torch.finfo(weights[0].dtype).eps * size
+    return max((rounding / effect for effect in largest if effect > 0), default=0.0)
 
 
 def check_rounding(
     weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, predictions: Iterable[tuple[float, float]]
 ) -> Iterator[str]:
-    """Where so little changes that a map depends on the order of sums; predictions are f(x) and f(b) of each image."""
+    """Warn of images whose change is so small that rounding shows in the map; predictions are f(x) and f(b)."""
     for index, (shares, (high, low)) in enumerate(zip(weights, predictions, strict=True)):
         if (share := effect_rounding(shares, prediction=high, reference_prediction=low)) > EXACT:
             yield (
@@ -334,7 +323,7 @@ def check_rounding(
 
 
 def check_approximations(approximations: Sequence[Approximation]) -> Iterator[str]:
-    """Where an approximate map is not expected to be like the exact one."""
+    """Warn of approximate maps that may differ from the exact ones."""
     for index, map_ in enumerate(approximations):
         if not (map_.pearson_r >= ALIKE_R and map_.top_overlap >= ALIKE_TOP):
             yield (
@@ -345,7 +334,7 @@ def check_approximations(approximations: Sequence[Approximation]) -> Iterator[st
 
 
 def check_slopes(sizes: Sequence[float], *, change: Sequence[float]) -> Iterator[str]:
-    """Where the gradients at an image, were they all of one sign, make next to nothing of what there is to explain."""
+    """Warn of images at which the gradients, even if all of one sign, make up next to none of the change."""
     for index, (size, difference) in enumerate(zip(sizes, change, strict=True)):
         if abs(difference) >= CLOSE and size < FLAT * abs(difference):
             yield (

@@ -4,7 +4,7 @@ import weakref
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import partial
 from itertools import groupby, pairwise
@@ -17,23 +17,23 @@ from torch import Tensor, nn
 from sliplens.errors import ModelError
 from sliplens.explainers.attribution import Attribution, check_slopes, scale_to, spread
 from sliplens.explainers.contract import Comparison, Method, frozen, require_at_least_one
-from sliplens.progress import OnProgress
+from sliplens.progress import track
 
 
 @contextmanager
 def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = False) -> Iterator[dict[str, Tensor]]:
-    """Keep the output of each named module of every forward pass made inside, by name, and always take the hooks off.
+    """Record the output of each named module in every forward pass made inside, by name.
 
-    Names are those of `model.named_modules()`; of a module called twice the last output is kept. `differentiable`
-    starts the graph anew at each kept output, so that the gradient of the prediction in it can be taken; with several
-    modules only the last one's gradient is whole.
+    Names are those of `model.named_modules()`; of a module called twice the last output counts. `differentiable`
+    starts the graph anew at each recorded output, so that its gradient can be taken; of several modules only the last
+    one's gradient is whole.
     """
     outputs: dict[str, Tensor] = {}
     modules = dict(model.named_modules())
 
     def keep(name: str, _module: nn.Module, _arguments: object, output: Tensor) -> Tensor:
         outputs[name] = output.detach().requires_grad_(differentiable)
-        # the rest of the network gets a copy: an in-place ReLU would overwrite what is kept
+        # the rest of the network gets a copy: an in-place ReLU would overwrite the record
         return outputs[name].clone()
 
     with ExitStack() as stack:
@@ -100,23 +100,23 @@ def find_layers(
     return layers
 
 
-def recall_layers(
+def cached_layers(
     model: nn.Module, images: Float[Tensor, "batch colours height width"], *, names: Sequence[str] | None = None
 ) -> tuple[Layer, ...]:
-    """As `find_layers`, whose pass costs as much as a whole Grad-CAM; made again only where its answer may change."""
+    """Return the layers that `find_layers` finds, cached per model, image size and names: its pass is expensive."""
     modules = tuple((name, weakref.ref(module)) for name, module in model.named_modules())
     key = (modules, tuple(images.shape[1:]), None if names is None else tuple(names))
-    known = _RECALLED.get(model)
-    if known is None or known[0] != key:
-        _RECALLED[model] = known = (key, find_layers(model, images, names=names))
-    return known[1]
+    entry = _LAYER_CACHE.get(model)
+    if entry is None or entry[0] != key:
+        _LAYER_CACHE[model] = entry = (key, find_layers(model, images, names=names))
+    return entry[1]
 
 
-_RECALLED: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
+_LAYER_CACHE: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
 
 
 def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> tuple[Layer, ...]:
-    """Layers as the public code finds them: every module that ends just before the size of the output changes.
+    """Find the layers of the public code: every module that ends just before the size of the output changes.
 
     Modules are listed as they end, insides before their block: the size goes down and up again inside a block with two
     branches, and the last layer is missed, since what follows it is no map.
@@ -200,14 +200,14 @@ def _distinct(steps: list[_Call]) -> tuple[Layer, ...]:
 
 
 def _named(model: nn.Module, root: _Call, names: Sequence[str], *, others: tuple[Layer, ...]) -> tuple[Layer, ...]:
-    known = [name for name, _ in model.named_modules() if name]
+    available = [name for name, _ in model.named_modules() if name]
     shapes: dict[str, Shape | None] = {}
     for call in _finished(root):
         shapes.pop(call.name, None)  # a module called twice counts where it ended last
         shapes[call.name] = call.output_shape
     for name in names:
-        if name not in known:
-            choices = [layer.name for layer in others] + get_close_matches(name, known, n=3)
+        if name not in available:
+            choices = [layer.name for layer in others] + get_close_matches(name, available, n=3)
             raise ModelError(
                 f"{type(model).__name__} has no layer {name!r}; choose among {', '.join(dict.fromkeys(choices))} "
                 "or another name of model.named_modules()"
@@ -239,7 +239,7 @@ class _Cam(Method):
     """
 
     layer: str | None = None
-    """Name of the layer; by default the last one with a map, as `find_layers` finds it."""
+    """Name of the layer; by default the last one with a map (`find_layers`)."""
     contrast: bool = True
     """Take the reference's activations off. False gives the published map, which does not depend on the reference and
     has no completeness gap; the reference then only decides what `saliency` shows."""
@@ -249,10 +249,9 @@ class _Cam(Method):
     its pixels are ranked and shown in the published order, where the prediction fell too."""
     batch_size: int = 32
 
-    method: ClassVar[str]
     one_sided: ClassVar[bool] = False
-    """Whether gradients count along the change of the prediction, where some are left out. If not, the contrast adds
-    up to f(x) - f(b) for a head linear in the mean over space."""
+    """True if only gradients along the change of the prediction count. Otherwise the contrast adds up to f(x) - f(b)
+    for a head linear in the mean over space."""
 
     @staticmethod
     @abstractmethod
@@ -262,12 +261,13 @@ class _Cam(Method):
     def __post_init__(self) -> None:
         require_at_least_one(type(self).__name__, batch_size=self.batch_size)
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
+    def _explain(self, comparison: Comparison) -> Attribution:
         layer = self._find_layer(comparison)
         maps, predictions, reference_predictions = [], [], []
         empty = reference_prediction = torch.empty(0)
-        for part in torch.arange(len(comparison.images)).split(self.batch_size):
-            # images and references in one pass; one reference for all is looked at once
+        parts = torch.arange(len(comparison.images)).split(self.batch_size)
+        for part in track(parts, sizes=[len(part) for part in parts]):
+            # images and references in one pass; a reference shared by all images passes once
             shared = comparison.references[: 0 if maps else 1]
             references = comparison.references[part] if len(comparison.references) > 1 else shared
             activations, gradients, prediction = _differentiate(
@@ -283,23 +283,20 @@ class _Cam(Method):
             maps.append(spread(cells, (comparison.images.shape[-2], comparison.images.shape[-1])))
             predictions.append(prediction)
             reference_predictions.append(reference_prediction.expand_as(prediction))
-            if on_progress is not None:
-                on_progress(sum(map(len, maps)), len(comparison.images))
-        comparison = comparison.knowing(torch.cat(predictions), torch.cat(reference_predictions))
+        comparison = comparison.with_predictions(torch.cat(predictions), torch.cat(reference_predictions))
         relevance = scale_to(torch.cat(maps), total=comparison.change.abs()) if self.relu else torch.cat(maps)
-        return comparison.explanation(
+        attribution = comparison.attribution(
             relevance,
-            method=self.method,
             complete=self.contrast and not self.one_sided and not self.relu,
-            raises_only=self.relu,
             target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
             warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist()),
         )
+        return replace(attribution, raises_only=self.relu)
 
     def _find_layer(self, comparison: Comparison) -> Layer:
         names = None if self.layer is None else (self.layer,)
         try:
-            return recall_layers(comparison.model, comparison.images[:1], names=names)[-1]
+            return cached_layers(comparison.model, comparison.images[:1], names=names)[-1]
         except ModelError:
             _ = comparison.change  # a model that gives no number has a greater fault than one without layers
             raise

@@ -1,4 +1,4 @@
-"""The call that all explainers share: checks, a frozen network, the clock, the record."""
+"""Base of the explainers: checks of the images, a frozen network, the clock, the record."""
 
 import time
 from abc import ABC, abstractmethod
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, TypeAlias, runtime_checkable
+from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from jaxtyping import Float, Shaped
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from sliplens.errors import ImageError, InputError, ModelError
 from sliplens.explainers.attribution import Attribution, check_maps, frame_of
 from sliplens.models.engines import Engine, prepare
-from sliplens.progress import OnProgress, counted
+from sliplens.progress import track
 
 Batch: TypeAlias = Shaped[Tensor, "..."]
 """Images or a reference as a caller gave them, before they are checked."""
@@ -25,7 +25,7 @@ _FORWARD_BATCH = 32  # bounds the memory of the plain predictions, whatever the 
 
 @contextmanager
 def frozen(model: nn.Module) -> Iterator[None]:
-    """Put a network into evaluation mode without parameter gradients, and give it back as it was.
+    """Put a network into evaluation mode without parameter gradients, and restore it afterwards.
 
     Two threads must not freeze one network at the same time.
     """
@@ -48,7 +48,7 @@ def frozen(model: nn.Module) -> Iterator[None]:
 class Comparison:
     """Images compared with their references by a frozen network: f(x) less f(b), in margin units, which is explained.
 
-    Made by `freeze` and valid inside it only; predictions are made when they are first asked for.
+    Made by `freeze` and valid inside it only; predictions are computed at the first access.
     """
 
     model: nn.Module
@@ -75,20 +75,20 @@ class Comparison:
     @cached_property
     def prediction(self) -> Float[Tensor, " batch"]:
         """f(x), without gradients."""
-        return self._answers(self.images, "image")
+        return self._predict_all(self.images, "image")
 
     @cached_property
     def reference_prediction(self) -> Float[Tensor, " batch"]:
         """f(b) of each image, without gradients."""
-        prediction = self.prediction  # whose faults are told first
-        return self._answers(self.references, "reference").expand_as(prediction)
+        prediction = self.prediction  # its errors are reported first
+        return self._predict_all(self.references, "reference").expand_as(prediction)
 
     @torch.no_grad()
-    def _answers(self, images: Tensor, what: str) -> Tensor:
+    def _predict_all(self, images: Tensor, what: str) -> Tensor:
         return _require_finite(torch.cat([self.predict(part) for part in images.split(_FORWARD_BATCH)]), what)
 
-    def knowing(self, prediction: Tensor, reference_prediction: Tensor) -> "Comparison":
-        """The same with predictions that are known already, checked."""
+    def with_predictions(self, prediction: Tensor, reference_prediction: Tensor) -> "Comparison":
+        """Return a comparison with predictions that were made elsewhere, after checking them."""
         comparison = replace(self)
         vars(comparison)["prediction"] = _require_finite(prediction, "image")
         vars(comparison)["reference_prediction"] = _require_finite(reference_prediction, "reference")
@@ -101,43 +101,46 @@ class Comparison:
 
     @property
     def change(self) -> Float[Tensor, " batch"]:
-        """What is explained."""
+        """f(x) - f(b), the difference that is explained."""
         return self.prediction - self.reference_prediction
 
     def prepare(self, passes: int, *, engine: str = "auto", batch_size: int | None = None) -> Engine:
-        """Make an engine ready for so many passes of the network (`models.engines.prepare`)."""
+        """Prepare an engine for a number of passes of the network (`models.engines.prepare`)."""
         images = torch.cat([self.images[:1], self.reference[:1]])
         predictions = torch.stack([self.prediction[0], self.reference_prediction[0]])
         return prepare(self.model, images, predictions, passes=passes, engine=engine, batch_size=batch_size)
 
     def map_each(
-        self, relevance: Callable[[int], Float[Tensor, "height width"]], *, on_progress: OnProgress | None
+        self, relevance: Callable[[int], Float[Tensor, "height width"]]
     ) -> Float[Tensor, "batch height width"]:
-        """Maps of all images, made one after another, each from its place in the batch."""
-        return torch.stack([relevance(index) for index in counted(range(len(self.images)), on_progress)])
+        """Compute the maps of all images one after another, each from its index in the batch."""
+        return torch.stack([relevance(index) for index in track(range(len(self.images)))])
 
-    def explanation(
+    def attribution(
         self,
         relevance: Float[Tensor, "batch height width"],
         *,
         complete: bool,
         target: str = "f(x) - f(reference)",
         warnings: Iterable[str] = (),
-        **others: Any,
     ) -> Attribution:
-        """Record of an explanation, with its warnings; the others are its fields as they are."""
+        """Return maps with predictions and warnings; if `complete`, the relevance should add up to the change."""
         gap = (relevance.sum(dim=(1, 2)) - self.change).abs().float() if complete else None
         single = relevance.float()
-        predictions = {"prediction": self.prediction, "reference_prediction": self.reference_prediction}
+        checks = check_maps(
+            single,
+            prediction=self.prediction,
+            reference_prediction=self.reference_prediction,
+            completeness_gap=gap,
+        )
         return Attribution(
             images=self.images.float(),
             relevance=single,
             target=target,
-            **{name: values.float() for name, values in predictions.items()},
+            prediction=self.prediction.float(),
+            reference_prediction=self.reference_prediction.float(),
             completeness_gap=gap,
-            seconds=0.0,  # known when the call ends
-            warnings=(*check_maps(single, **predictions, completeness_gap=gap), *warnings),
-            **others,
+            warnings=(*checks, *warnings),
         )
 
 
@@ -185,9 +188,9 @@ def _require_images(images: Batch) -> None:
 
 
 def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
-    """The reference with a batch axis of one (shared) or of the batch's length; that of the images if None."""
+    """Return the reference with a batch axis of one (shared) or of the batch's length; that of the images if None."""
     if reference is None:
-        # the untouched sensor: no difference, or the reference that is seen beside the frame
+        # the untouched sensor: no difference, or the reference beside the frame
         return torch.zeros_like(images[:1]) if images.shape[1] == 3 else torch.cat([images[:, 3:]] * 2, dim=1)
     shared = tuple(reference.shape) == tuple(images.shape[1:])
     if not shared and reference.shape != images.shape:
@@ -201,7 +204,7 @@ def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
 
 
 def black_frames(images: Float[Tensor, "*batch colours height width"]) -> Float[Tensor, "*batch colours height width"]:
-    """Images whose frame is black; the reference beside it, where the network sees one, stays."""
+    """Return images whose frame is black; the reference beside it, if any, stays."""
     black = images.clone()
     frame_of(black).zero_()
     return black
@@ -234,16 +237,14 @@ def _like_model(model: nn.Module, images: Tensor) -> Tensor:
 class Explainer(Protocol):
     """A frozen dataclass whose fields are the options of a method and whose call explains a batch."""
 
-    def __call__(
-        self, model: nn.Module, images: Batch, *, reference: Batch | None = None, on_progress: OnProgress | None = None
-    ) -> Attribution:
+    def __call__(self, model: nn.Module, images: Batch, *, reference: Batch | None = None) -> Attribution:
         """Explain f(x) - f(reference) of a regressor with one output.
 
         Parameters
         ----------
         model
             Network from images (batch, 3, height, width) to one safety margin each, (batch,) or (batch, 1).
-            It is put into evaluation mode for the call and given back as it was.
+            It is put into evaluation mode for the call and restored afterwards.
         images
             Images x, float in [0, 1], shape (batch, 3, height, width).
         reference
@@ -262,26 +263,27 @@ class Explainer(Protocol):
 
 
 class Method(ABC):
-    """An explainer whose own work is one function of checked images and a frozen network."""
+    """Base of explainers: a subclass computes the maps of checked images with a frozen network."""
 
-    def __call__(
-        self, model: nn.Module, images: Batch, *, reference: Batch | None = None, on_progress: OnProgress | None = None
-    ) -> Attribution:
+    method: ClassVar[str]
+    """Name of the method in the records of its maps."""
+
+    def __call__(self, model: nn.Module, images: Batch, *, reference: Batch | None = None) -> Attribution:
         """Explain a batch; see `Explainer` for the arguments and errors."""
         start = time.perf_counter()
         with freeze(model, images, reference=reference) as comparison:
-            explanation = self._explain(comparison, on_progress=on_progress)
-        if explanation.relevance.is_cuda:
-            torch.cuda.synchronize(explanation.relevance.device)
-        return replace(explanation, seconds=time.perf_counter() - start)
+            attribution = self._explain(comparison)
+        if attribution.relevance.is_cuda:
+            torch.cuda.synchronize(attribution.relevance.device)
+        return replace(attribution, method=self.method, seconds=time.perf_counter() - start)
 
     @abstractmethod
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
-        """Explain the images (`Comparison.explanation`); gradients are on."""
+    def _explain(self, comparison: Comparison) -> Attribution:
+        """Compute the maps (`Comparison.attribution`); gradients are on."""
 
 
 def require_at_least_one(name: str, **options: int) -> None:
-    """Refuse options that count something and are below 1."""
+    """Raise an error for options below 1."""
     for option, value in options.items():
         if value < 1:
             raise InputError(f"{name}'s {option} is {value}; give at least 1")

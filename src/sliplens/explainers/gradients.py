@@ -1,8 +1,8 @@
-"""Integrated and Expected Gradients, SmoothGrad, and layer-wise relevance propagation through zennit, an extra."""
+"""Integrated and Expected Gradients, SmoothGrad, and layer-wise relevance propagation by zennit (an extra)."""
 
 import operator
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from captum import attr
@@ -15,18 +15,18 @@ from sliplens.explainers.contract import Comparison, Method, black_frames, freez
 from sliplens.explainers.folding import fold_batch_norm
 from sliplens.extras import require_packages
 from sliplens.models.backbones import HistogramRegressor
-from sliplens.progress import OnProgress
+from sliplens.progress import track
 
 _NODES = 4  # of a piece; the slope along the path has kinks, on which more nodes to a piece are wasted
 _ROUNDING = 1e-6  # of |f|: a gap that float32 predictions cannot resolve is no gap
 
 
-class Line(NamedTuple):
+class LineIntegral(NamedTuple):
     """Integral of the gradients from a reference to an image."""
 
     relevance: Float[Tensor, "height width"]
     slope: float
-    """Sum of the sizes of the relevance, were the last piece of the line, next to the image, the whole of it."""
+    """Sum of |relevance| if the slope of the last piece, next to the image, held along the whole line."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +58,7 @@ class IntegratedGradients(Method):
              [0.0000, 0.0000]]])
     """
 
+    method: ClassVar[str] = "integrated-gradients"
     steps: int = 32
     """Steps (Gauss-Legendre nodes) to start with, four to a piece."""
     max_steps: int = 1024
@@ -81,7 +82,7 @@ class IntegratedGradients(Method):
         if not self.tolerance > 0:
             raise InputError(f"integrated gradients' tolerance is {self.tolerance}; give a share above 0")
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
+    def _explain(self, comparison: Comparison) -> Attribution:
         black, slopes = comparison, []
         if self.black:
             black = replace(comparison, references=black_frames(comparison.references))
@@ -92,9 +93,8 @@ class IntegratedGradients(Method):
             slopes.append(slope)
             return relevance
 
-        return comparison.explanation(
-            comparison.map_each(integral, on_progress=on_progress),
-            method="integrated-gradients",
+        return comparison.attribution(
+            comparison.map_each(integral),
             complete=not self.black,
             target=f"f(x) - f({'black' if self.black else 'reference'})",
             warnings=check_slopes(slopes, change=black.change.tolist()),
@@ -107,8 +107,8 @@ class IntegratedGradients(Method):
         reference: Float[Tensor, "colours height width"],
         prediction: Float[Tensor, ""],
         reference_prediction: Float[Tensor, ""],
-    ) -> Line:
-        """Relevance of one image x against one reference b, whose predictions are f(x) and f(b)."""
+    ) -> LineIntegral:
+        """Integrate from one reference b to one image x, whose predictions are f(b) and f(x)."""
         ends = reference_prediction, prediction
         change = float(prediction - reference_prediction)
         allowed = max(self.tolerance * abs(change), _ROUNDING * max(abs(float(end)) for end in ends))
@@ -146,17 +146,17 @@ class IntegratedGradients(Method):
             if abs(float(gaps.sum())) <= allowed or rooms == 0:
                 last = int(stops.argmax())
                 slope = parts[last].abs().sum() / (stops[last] - starts[last])
-                return Line(relevance=parts.sum(dim=0), slope=float(slope))
+                return LineIntegral(relevance=parts.sum(dim=0), slope=float(slope))
             shares, order = gaps.abs().sort(descending=True)
             # the fewest pieces that hold half of all gaps
             count = min(int((shares.cumsum(0) < shares.sum() / 2).sum()) + 1, rooms)
-            split, kept = order[:count], order[count:]
+            split, rest = order[:count], order[count:]
             middles = (starts[split] + stops[split]) / 2
             rise = predict(middles).double() - predict(starts[split]).double()
             new_starts, new_stops = torch.cat([starts[split], middles]), torch.cat([middles, stops[split]])
-            starts, stops = torch.cat([starts[kept], new_starts]), torch.cat([stops[kept], new_stops])
-            rises = torch.cat([rises[kept], rise, rises[split] - rise])
-            parts = torch.cat([parts[kept], integrals(new_starts, new_stops)])
+            starts, stops = torch.cat([starts[rest], new_starts]), torch.cat([stops[rest], new_stops])
+            rises = torch.cat([rises[rest], rise, rises[split] - rise])
+            parts = torch.cat([parts[rest], integrals(new_starts, new_stops)])
             used += 2 * nodes * count
 
 
@@ -174,6 +174,7 @@ class ExpectedGradients(Method):
     gradients*, Nature Machine Intelligence 2021, eq. 3.
     """
 
+    method: ClassVar[str] = "expected-gradients"
     background: Float[Tensor, "frames colours height width"] | None = None
     """Frames without slip as the network takes them, float in [0, 1], shape (frames, 3, height, width); the call's
     reference is then not used, but that beside each image stays where the network sees one. Without a background the
@@ -181,33 +182,32 @@ class ExpectedGradients(Method):
     integrated: IntegratedGradients = field(default_factory=IntegratedGradients)
     """How each line is integrated."""
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
-        def behind(index: int) -> Comparison:
-            """What an image is compared with, checked as images are, and brought to the network's type."""
+    def _explain(self, comparison: Comparison) -> Attribution:
+        def background_of(index: int) -> Comparison:
+            """Return the background of an image as images of the network's type, after checking them."""
             image = comparison.images[index]
             if self.background is None:
-                own = comparison.reference_prediction[index, None]
-                return replace(comparison, images=comparison.reference[index, None]).knowing(own, own)
+                alone = replace(comparison, images=comparison.reference[index, None])
+                return alone.with_predictions(*[comparison.reference_prediction[index, None]] * 2)
             with freeze(comparison.model, self.background, reference=None) as background:
                 return replace(background, images=with_reference_of(background.images, image))
 
-        predictions = comparison.prediction  # whose faults are told first
-        heights = torch.stack([behind(index).prediction for index in range(len(predictions))])
-        comparison = comparison.knowing(predictions, heights.mean(dim=1))
+        predictions = comparison.prediction  # its errors are reported first
+        heights = torch.stack([background_of(index).prediction for index in range(len(predictions))])
+        comparison = comparison.with_predictions(predictions, heights.mean(dim=1))
 
         def mean_over(index: int) -> Tensor:
             image, prediction = comparison.images[index], comparison.prediction[index]
-            pairs = zip(behind(index).images, heights[index], strict=True)
+            pairs = zip(background_of(index).images, heights[index], strict=True)
             lines = [self.integrated.integrate(comparison, image, frame, prediction, height) for frame, height in pairs]
             return torch.stack([relevance for relevance, _ in lines]).mean(dim=0)
 
-        only = ("no background was given, so the reference alone stands for it, as in integrated gradients",)
-        return comparison.explanation(
-            comparison.map_each(mean_over, on_progress=on_progress),
-            method="expected-gradients",
+        alone = "no background was given, so the reference alone stands for it, as in integrated gradients"
+        return comparison.attribution(
+            comparison.map_each(mean_over),
             complete=True,
             target="f(x) - f(reference)" if self.background is None else "f(x) - mean of f over the background",
-            warnings=only if self.background is None else (),
+            warnings=(alone,) if self.background is None else (),
         )
 
 
@@ -224,6 +224,7 @@ class SmoothGrad(Method):
     Smilkov et al., *SmoothGrad: removing noise by adding noise*, 2017, section 3; computed by Captum.
     """
 
+    method: ClassVar[str] = "smooth-grad"
     samples: int = 32
     noise: float = 0.1
     """Standard deviation of the noise, in units of the input's range [0, 1]; the same draws for each image."""
@@ -235,13 +236,13 @@ class SmoothGrad(Method):
         if not self.noise >= 0:
             raise InputError(f"SmoothGrad's noise is {self.noise}; give a standard deviation of at least 0")
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
+    def _explain(self, comparison: Comparison) -> Attribution:
         change = comparison.change.tolist()
 
         def smoothed(index: int) -> Tensor:
             image, frame = comparison.images[index], frame_of(comparison.images[index, None])
             tunnel = attr.NoiseTunnel(attr.Saliency(lambda noisy: comparison.predict(with_reference_of(noisy, image))))
-            # Captum draws from the global state, which is given back as it was
+            # Captum draws from the global state, which is restored
             with torch.random.fork_rng(devices=[image.device] if image.is_cuda else []):
                 torch.manual_seed(self.seed)
                 gradient: Any = tunnel.attribute(
@@ -254,17 +255,16 @@ class SmoothGrad(Method):
                 )
             return (gradient.detach() * (frame - frame_of(comparison.reference[index]))).sum(dim=1)[0]
 
-        relevance = comparison.map_each(smoothed, on_progress=on_progress)
-        return comparison.explanation(
+        relevance = comparison.map_each(smoothed)
+        return comparison.attribution(
             relevance,
-            method="smooth-grad",
             complete=False,
             target="the linear model of f at x",
             warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=change),
         )
 
 
-_KEPT = 0.1  # share of f(x) by which the relevance may miss it without a warning
+_TOLERANCE = 0.1  # share of f(x) by which the relevance may miss it without a warning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,31 +286,27 @@ class Lrp(Method):
     PLOS ONE 2015, eqs. 58 and 60; the composite as in Anders et al., *Software for dataset-wide XAI*, 2021 (zennit).
     """
 
+    method: ClassVar[str] = "lrp"
     batch_size: int = 32
 
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
+    def _explain(self, comparison: Comparison) -> Attribution:
         require_packages("zennit", extra="lrp", purpose="LRP")
         prediction = comparison.prediction
         copy = fold_batch_norm(comparison.model)
         for module in copy.modules():
             if isinstance(module, fx.GraphModule):
                 _name_functions(module)
-        parts = []
-        for part in comparison.images.split(self.batch_size):
-            parts.append(_propagate(copy, part))
-            if on_progress is not None:
-                on_progress(sum(map(len, parts)), len(comparison.images))
-        handed_back = torch.cat(parts)
-        shares = (handed_back.sum(dim=(1, 2, 3)) / prediction).tolist()
-        return comparison.explanation(
-            frame_of(handed_back).sum(dim=1),
-            method="lrp",
+        parts = comparison.images.split(self.batch_size)
+        relevance = torch.cat([_propagate(copy, part) for part in track(parts, sizes=[len(part) for part in parts])])
+        shares = (relevance.sum(dim=(1, 2, 3)) / prediction).tolist()
+        return comparison.attribution(
+            frame_of(relevance).sum(dim=1),
             complete=False,
             target="f(x)",
             warnings=[
                 f"image {index}: LRP hands back {share:.3g} times f(x); biases keep some of it, products make more"
                 for index, share in enumerate(shares)
-                if not abs(share - 1) <= _KEPT
+                if not abs(share - 1) <= _TOLERANCE
             ],
         )
 
@@ -322,8 +318,8 @@ class _Sum(nn.Module):
         super().__init__()
         self.inner = inner
 
-    def forward(self, left: Tensor, right: Tensor) -> Tensor:
-        return self.inner(torch.stack(torch.broadcast_tensors(left, right), dim=-1))
+    def forward(self, first: Tensor, second: Tensor) -> Tensor:
+        return self.inner(torch.stack(torch.broadcast_tensors(first, second), dim=-1))
 
 
 def _name_functions(module: fx.GraphModule) -> None:
@@ -342,8 +338,8 @@ def _name_functions(module: fx.GraphModule) -> None:
         if replacement is not None:
             module.add_submodule(name := f"lrp_{place}", replacement)
             with module.graph.inserting_after(node):
-                named = module.graph.call_module(name, tuple(branches))
-            node.replace_all_uses_with(named)
+                call = module.graph.call_module(name, tuple(branches))
+            node.replace_all_uses_with(call)
             module.graph.erase_node(node)
     module.recompile()
 

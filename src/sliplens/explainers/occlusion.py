@@ -1,7 +1,7 @@
 """Occlusion: what the prediction loses when a part of the image is replaced by the reference."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -14,7 +14,6 @@ from sliplens.errors import InputError
 from sliplens.explainers.attribution import Attribution, frame_of
 from sliplens.explainers.contract import Comparison, Method, require_at_least_one
 from sliplens.markers import detect_markers
-from sliplens.progress import OnProgress
 from sliplens.recordings import Recording
 
 
@@ -35,7 +34,7 @@ def find_markers(
         # a uniform reference is that of differences, in which a marker shows twice or, at rest, not at all
         raise InputError(
             "markers do not show in difference images; give their places (markers_px), or explain camera frames "
-            "or a data set, where they are found in the raw frames"
+            "or a data set, where they are found in the camera's frames"
         )
     pixels = (255 * image).round().clamp(0, 255).to(torch.uint8)
     return torch.from_numpy(detect_markers(pixels.permute(1, 2, 0).cpu().numpy()).centre_px)
@@ -43,10 +42,10 @@ def find_markers(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KnownMarkers:
-    """What tells the markers of images in which they do not show: those of the image it knows that is most alike."""
+    """Finder of markers that do not show in an image: those of the most similar image of a list."""
 
     images: Float[Tensor, "frames colours height width"]
-    """As the network gets them, in [0, 1]."""
+    """Inputs of the network, in [0, 1]."""
     places: tuple[Float[Tensor, "_markers 2"], ...]
     """x and y of the markers of each, in pixels of these images."""
 
@@ -54,7 +53,7 @@ class KnownMarkers:
         self, image: Float[Tensor, "colours height width"], _reference: Float[Tensor, "colours height width"]
     ) -> Float[Tensor, "_markers 2"]:
         """Places of the markers of the nearest image: noise, or the next frame, leaves it the nearest."""
-        unlike = [(image.to(known) - known).abs().mean() for known in self.images]
+        unlike = [(image.to(listed) - listed).abs().mean() for listed in self.images]
         return self.places[int(torch.stack(unlike).argmin())]
 
 
@@ -109,7 +108,7 @@ def marker_regions(
 
 @dataclass(frozen=True, kw_only=True)
 class RegionMethod(Method):
-    """A method that takes an image apart into tiles, or into markers where their places are given."""
+    """Base of methods whose regions are tiles, or markers where their places are set."""
 
     tile_px: int = 16
     """Side of a tile, in pixels."""
@@ -126,6 +125,11 @@ class RegionMethod(Method):
             self._require_reach(self.markers_px)
         if self.radius_px is not None and not self.radius_px > 0:
             raise InputError(f"{self._name}'s radius_px is {self.radius_px}; give a radius above 0 pixels")
+
+    @property
+    def method(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Name of the method, with `-marker` where the regions are markers."""
+        return self._name + ("" if self.markers_px is None else "-marker")
 
     @property
     def _name(self) -> str:
@@ -166,7 +170,7 @@ class Occlusion(RegionMethod):
         require_at_least_one(self._name, batch_size=self.batch_size)
 
     @torch.no_grad()
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
+    def _explain(self, comparison: Comparison) -> Attribution:
         tiles = -(-comparison.images.shape[-2] // self.tile_px) * -(-comparison.images.shape[-1] // self.tile_px)
         engine = comparison.prepare(len(comparison.images) * tiles)  # markers are about as many
 
@@ -175,7 +179,7 @@ class Occlusion(RegionMethod):
 
         captum = attr.FeatureAblation(predict)
 
-        def lost(index: int) -> Tensor:
+        def effect(index: int) -> Tensor:
             image, empty = comparison.images[index], comparison.reference[index]
             regions = self._regions(image, empty).to(image.device)
             effects = captum.attribute(
@@ -187,12 +191,10 @@ class Occlusion(RegionMethod):
             # Captum gives every pixel and channel the whole effect of its region
             return effects[0, 0] / regions.flatten().bincount()[regions]
 
-        by_tile = self.markers_px is None
-        return comparison.explanation(
-            comparison.map_each(lost, on_progress=on_progress),
-            method="occlusion" if by_tile else "occlusion-marker",
+        attribution = comparison.attribution(
+            comparison.map_each(effect),
             complete=False,
             target="f(x) - f(x with one region as in the reference), "
-            + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
-            engine=engine.name,
+            + (f"tiles of {self.tile_px} px" if self.markers_px is None else "markers"),
         )
+        return replace(attribution, engine=engine.name)

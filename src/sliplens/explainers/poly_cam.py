@@ -1,9 +1,9 @@
 """Poly-CAM for a regressor: channel masks, scored by what they keep and what they remove."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import TypeAlias, TypeVar
+from typing import ClassVar, TypeAlias, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -28,7 +28,7 @@ from sliplens.explainers.cam import Layer, capture, find_layers, find_published_
 from sliplens.explainers.contract import Comparison, Method, black_frames
 from sliplens.explainers.poly_cam_budget import ChannelSearch, GaussianProcess, Likeness, mask_kernel
 from sliplens.models.engines import Engine
-from sliplens.progress import OnProgress
+from sliplens.progress import report_progress
 
 VARIANTS = {"+": 1, "-": 1, "+/-": 2}
 """Passes a channel that a variant measures: of the image with only the region kept, with it removed, or both."""
@@ -38,8 +38,8 @@ as far as the variant has them."""
 Item = TypeVar("Item")
 
 
-def _measured(variant: str, kept: Item, removed: Item) -> list[Item]:
-    return [kept] * ("+" in variant) + [removed] * ("-" in variant)
+def _measured(variant: str, inside: Item, outside: Item) -> list[Item]:
+    return [inside] * ("+" in variant) + [outside] * ("-" in variant)
 
 
 def regression_support(image: Tensor, empty: Tensor, points: Points, *, variant: str) -> Tensor:
@@ -54,7 +54,7 @@ def regression_support(image: Tensor, empty: Tensor, points: Points, *, variant:
 
 
 def thesis_support(image: Tensor, _empty: Tensor, points: Points, *, variant: str) -> Tensor:
-    """What the public code makes the weights of, for a network with one output: of a sigmoid of the percentage.
+    """Compute the score of the public code for a network with one output: the sigmoid of the percentage.
 
     In float32 it is 1 from 17 % on, so that there the weights of PCAM+/- are all 1 and those of PCAM- all 0.
 
@@ -91,7 +91,7 @@ class _Regions:
     image: Float[Tensor, "colours height width"]
     """Image x."""
     empty: Float[Tensor, "colours height width"]
-    """What is shown outside a region, b."""
+    """Image outside a region, b."""
     masks: list[Float[Tensor, "_channels _rows _columns"]]
     """Masks M in [0, 1] at the resolution of each layer; see `to_masks`."""
     variant: str
@@ -156,11 +156,12 @@ class PolyCam(Method):
     networks*, ICPR 2022. The regression score and the budget are ours.
     """
 
+    method: ClassVar[str] = "poly-cam"
     variant: str = "+/-"
     """One of "+", "-" and "+/-"; the last costs two passes a channel, the others one."""
     score: str = "regression"
-    """What the masked predictions are turned into, a key of `SCORES`: `thesis` is what the public code did to a network
-    with one output, for comparison with old figures; it takes no reference, and explains nothing."""
+    """Score of the masked predictions, a key of `SCORES`: `thesis` is that of the public code for a network with one
+    output, for comparison with old figures; it takes no reference, and explains nothing."""
     layers: tuple[str, ...] | None = None
     """Names of the layers; by default those that belong to the score."""
     level: int = 0
@@ -170,7 +171,7 @@ class PolyCam(Method):
     """Share of the channels to measure at first, in (0, 1]; 1 for the exact map. The other channels' weights are
     estimated, and `Attribution.approximations` says what the map is expected to have in common with the exact one."""
     likeness: Likeness | None = Likeness()  # noqa: RUF009 (frozen)
-    """What that should be: channels are measured until it is expected. None to stop at the budget."""
+    """Likeness to the exact map until whose expectation channels are measured. None to stop at the budget."""
     engine: str = "auto"
     batch_size: int | None = None
     """Masked images in one pass; None for what suits the engine."""
@@ -189,8 +190,7 @@ class PolyCam(Method):
             raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
 
     @torch.no_grad()
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
-        """Progress counts the channels of every image."""
+    def _explain(self, comparison: Comparison) -> Attribution:
         change = comparison.change.tolist()
         layers = self._find_layers(comparison)
         channels = sum(layer.channels for layer in layers)
@@ -199,8 +199,7 @@ class PolyCam(Method):
         def count(channels_done: int) -> None:
             nonlocal done
             done += channels_done
-            if on_progress is not None and channels_done:
-                on_progress(done, len(comparison.images) * channels)
+            report_progress(done, len(comparison.images) * channels)
 
         # one engine for all rounds and images
         engine = comparison.prepare(
@@ -209,21 +208,21 @@ class PolyCam(Method):
             batch_size=self.batch_size,
         )
         names = [layer.name for layer in layers]
-        weights, saliencies, shown, approximations = [], [], [], []
+        weights, saliencies, maps, approximations = [], [], [], []
         for index in range(len(comparison.images)):
             with capture(comparison.model, names) as outputs:
                 comparison.predict(comparison.images[index, None])
             activations = [outputs[name][0] for name in names]
-            shown_at = self._shown_at(comparison, index)
-            shares, estimated = self._weights(comparison, index, activations, shown_at, engine=engine, count=count)
+            visible = self._visible(comparison, index)
+            shares, estimated = self._weights(comparison, index, activations, visible, engine=engine, count=count)
             weights.append(shares)
             approximations += estimated
-            saliencies.append(combine(activations, shares, size=_size(shown_at)))
-            shown.append(saliencies[-1][self._place] * shown_at)
+            saliencies.append(combine(activations, shares, size=_size(visible)))
+            maps.append(saliencies[-1][self._place] * visible)
         levels = tuple(
             Level(
                 layer=layer.name,
-                saliency=torch.stack([maps[depth] for maps in saliencies]).float(),
+                saliency=torch.stack([saliency[depth] for saliency in saliencies]).float(),
                 weights=torch.stack([shares[depth] for shares in weights]).float(),
             )
             for depth, layer in enumerate(layers if self.levels else ())
@@ -231,23 +230,20 @@ class PolyCam(Method):
         predictions = zip(comparison.prediction.tolist(), comparison.reference_prediction.tolist(), strict=True)
         # weights as published are no effects
         rounding = () if SCORES[self.score].as_published else check_rounding(weights, predictions=predictions)
-        return comparison.explanation(
-            scale_to(torch.stack(shown), total=comparison.change),
-            method="poly-cam",
+        attribution = comparison.attribution(
+            scale_to(torch.stack(maps), total=comparison.change),
             complete=True,
             warnings=(*check_weights(names, weights, change=change), *check_approximations(approximations), *rounding),
-            levels=levels,
-            approximations=tuple(approximations),
-            engine=engine.name,
         )
+        return replace(attribution, levels=levels, approximations=tuple(approximations), engine=engine.name)
 
     @property
     def _place(self) -> int:
         """Place of the level that is shown among those that are measured."""
         return self.level if self.levels else 0
 
-    def _shown_at(self, comparison: Comparison, index: int) -> Tensor:
-        """Where the image shows something: where x = b no mask has an effect."""
+    def _visible(self, comparison: Comparison, index: int) -> Tensor:
+        """Return where the image differs from the reference: where x = b no mask has an effect."""
         if SCORES[self.score].as_published:
             return torch.ones_like(comparison.images[index, 0])
         return local_change(comparison.images[index], comparison.reference[index])
@@ -268,7 +264,7 @@ class PolyCam(Method):
         comparison: Comparison,
         index: int,
         activations: list[Tensor],
-        shown_at: Tensor,
+        visible: Tensor,
         *,
         engine: Engine,
         count: Callable[[int], None],
@@ -302,7 +298,7 @@ class PolyCam(Method):
                 active=active,
                 at_empty=supports(at_empty)[0],
                 measure=lambda channels: supports(measure(channels)),
-                to_map=lambda weights: combine(activations, weights, size=_size(shown_at))[self._place] * shown_at,
+                to_map=lambda weights: combine(activations, weights, size=_size(visible))[self._place] * visible,
                 seed=self.seed,
             )
             weights, approximation = search.run(budget=self.budget, likeness=self.likeness)

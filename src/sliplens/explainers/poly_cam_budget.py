@@ -13,7 +13,7 @@ from torch.nn import functional
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import ALIKE_R, ALIKE_TOP, FLOOR, Approximation, layer_map, pearson_r, top_overlap
 
-_GRID = 14  # cells a side on which masks are compared; more cells told nothing more
+_GRID = 14  # cells a side on which masks are compared; more cells change nothing
 _LENGTH = 3.0  # of the kernel, in median distances between masks
 _NUGGET = 1e-3  # share of the variance that masks alike may still differ by
 _JITTER = 1e-6
@@ -40,7 +40,7 @@ def mask_kernel(
 
 
 class GaussianProcess:
-    """The effects of all channels as a Gaussian process, of which some are measured one after another.
+    """Gaussian process of the effects of all channels, some of which are measured one after another.
 
     The factor L of the covariance is built column by column (a pivoted Cholesky decomposition), so that the variance
     that is left after each choice is known before anything is measured.
@@ -75,7 +75,7 @@ class GaussianProcess:
         return torch.tensor(chosen, device=self._kernel.device)
 
     def learn(self, effects: Float[Tensor, " count"]) -> None:
-        """Take in the effects of the channels chosen last, in their order."""
+        """Add the measured effects of the channels chosen last, in their order."""
         self._effects = torch.cat([self._effects, effects.to(self._effects)])
 
     def estimate(self) -> tuple[Float[Tensor, " channels"], Float[Tensor, " channels"]]:
@@ -90,22 +90,22 @@ class GaussianProcess:
         return estimate, deviation
 
     def draws(self, count: int, *, generator: torch.Generator) -> Float[Tensor, "count channels"]:
-        """Effects of every channel as they may be, given those measured."""
+        """Draw effects of every channel from the distribution conditional on those measured."""
         estimate, deviation = self.estimate()
-        left = torch.nonzero(deviation > 0).flatten()
-        if not len(left):
+        open_ = torch.nonzero(deviation > 0).flatten()
+        if not len(open_):
             return estimate.repeat(count, 1)
-        factor = self._factor[left, : len(self.chosen)]
-        covariance = self._kernel[left][:, left] - factor @ factor.T
+        factor = self._factor[open_, : len(self.chosen)]
+        covariance = self._kernel[open_][:, open_] - factor @ factor.T
         covariance.diagonal().add_(_JITTER)
         root, _ = torch.linalg.cholesky_ex(covariance)
-        noise = torch.randn(count, len(left), generator=generator, dtype=root.dtype).to(root.device)
+        noise = torch.randn(count, len(open_), generator=generator, dtype=root.dtype).to(root.device)
         draws = estimate.repeat(count, 1)
-        draws[:, left] += deviation[left[0]] / self._variance[left[0]].sqrt() * (noise @ root.T)
+        draws[:, open_] += deviation[open_[0]] / self._variance[open_[0]].sqrt() * (noise @ root.T)
         return draws
 
 
-_FIRST = 0.3  # share of the budget spent before anything is known of the effects
+_FIRST = 0.3  # share of the budget spent before any effect is estimated
 _ROUNDS = 6
 _DRAWS = 16
 _GROWTH = 1.25  # channels measured after a further round, over those before it
@@ -115,7 +115,7 @@ _NEARLY_ALL = 0.75  # where so many would be measured, the rest costs little and
 
 @dataclass(frozen=True, kw_only=True)
 class Likeness:
-    """What a map from some of the channels should have in common with the exact one."""
+    """Required likeness of a map from some of the channels to the exact one."""
 
     pearson_r: float = ALIKE_R
     """Correlation over the pixels."""
@@ -125,7 +125,7 @@ class Likeness:
     def __post_init__(self) -> None:
         for name in ("pearson_r", "top_overlap"):
             if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"the likeness asks for a {name} of {getattr(self, name)}; give a number from 0 to 1")
+                raise InputError(f"the likeness requires a {name} of {getattr(self, name)}; give a number from 0 to 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +179,7 @@ class ChannelSearch:
         self.process.learn(self.measure(self.active[chosen[order]])[order.argsort()])
 
     def _judge(self) -> Approximation:
-        """What the map is expected to have in common with the exact one."""
+        """Estimate the likeness of the map to the exact one."""
         estimate, _ = self.process.estimate()
         result = self.to_map(self._weights(estimate))
         generator = torch.Generator().manual_seed(self.seed)
@@ -192,7 +192,7 @@ class ChannelSearch:
         )
 
     def _importance(self) -> Tensor:
-        """What an error of each support costs the map."""
+        """Return how much an error of each support changes the map."""
         norms = [maps.flatten(1).norm(dim=1) for maps in self.activations]
         if not self.process.chosen:
             return torch.cat([norm / norm.norm().clamp_min(FLOOR) for norm in norms])[self.active]

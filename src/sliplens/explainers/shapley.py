@@ -1,7 +1,7 @@
-"""Shapley values: what each marker or tile adds to the answer, averaged over all the company it may keep."""
+"""Shapley values: contribution of each marker or tile to the prediction, averaged over all coalitions."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,14 +15,13 @@ from sliplens.explainers.attribution import Attribution
 from sliplens.explainers.contract import Comparison
 from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import RegionMethod
-from sliplens.progress import OnProgress
 
 _FEW = 20
 """Players of which all coalitions can be counted."""
 _RANK = 1e-9
 """Singular value over the largest below which it is rounding: players that all count for more count for nothing."""
 Value = Callable[[Bool[np.ndarray, "coalitions players"]], Float64[np.ndarray, " coalitions"]]
-"""What each coalition is worth; True for players that take part."""
+"""Worth of each coalition; True for players that take part."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +30,7 @@ class ShapleyValues:
 
     values: Float64[np.ndarray, " players"]
     standard_errors: Float64[np.ndarray, " players"]
-    """Of the values, as far as the sampled coalitions tell; 0 where all coalitions were asked."""
+    """Standard errors of the values from the sampled coalitions; 0 where all coalitions were evaluated."""
 
 
 def shapley_values(
@@ -45,14 +44,14 @@ def shapley_values(
     """Estimate the Shapley values of a game from pairs of coalitions, each with its complement.
 
     Values are those of the weighted least squares whose solution over all coalitions is the Shapley value, on sampled
-    ones. With its complement, each coalition tells of the odd part of the game alone, on which the values depend: games
-    of pairs that help or hinder each other are told exactly. Errors are the sandwich estimate from the residuals.
+    ones. With its complement, each coalition measures the odd part of the game alone, on which the values depend: games
+    of pairs that help or hinder each other are solved exactly. Errors are the sandwich estimate from the residuals.
 
     With a first guess the values are drawn towards a multiple of it, and no farther than the noise of the coalitions
     asks for (empirical Bayes): a good guess saves most of the pairs, a poor one costs little, and both fade as pairs
     are added. Errors are then those of the best linear prediction, that of the multiple included.
 
-    `pairs` are asked, or all, exactly, where the players have no more; at least twice as many as the players.
+    `pairs` are sampled, or all of them where there are no more, which is exact; at least twice as many as the players.
 
     Lundberg and Lee, *A Unified Approach to Interpreting Model Predictions* (2017), Theorem 2; Covert and Lee,
     *Improving KernelSHAP: Practical Shapley Value Estimation via Linear Regression* (2021), section 4.2, pairs.
@@ -65,25 +64,27 @@ def shapley_values(
         return ShapleyValues(values=np.array([whole - empty]), standard_errors=np.zeros(1))
     exact = players <= _FEW and 2 ** (players - 1) - 1 <= pairs
     if not exact and pairs < 2 * players:
-        raise InputError(f"{pairs} pairs of coalitions cannot tell {players} players apart; ask for {2 * players}")
+        raise InputError(
+            f"{pairs} pairs of coalitions cannot distinguish {players} players; use at least {2 * players}"
+        )
     members, weights = _all_pairs(players) if exact else _sample(players, pairs, rng)
     worth = value(np.concatenate([members, ~members])).reshape(2, -1)
     odd = (worth[0] - worth[1]) / 2
     # even shares first, so that the values add up to the worth of the whole; the members tell how they differ from that
     share = members.mean(axis=1)
-    left = odd - (share - 0.5) * (whole - empty)
+    rest = odd - (share - 0.5) * (whole - empty)
     # the last column takes what the mere number of players does, a cubic that vanishes at both ends: its own Shapley
     # values are 0, and where an answer tips between few and many it is most of the noise
     number = (2 * share - 1) ** 3 - (2 * share - 1)
     root, centred = np.sqrt(weights), members - share[:, None]
     if guess is not None and not exact and np.ptp(guess):
         fixed = root[:, None] * np.column_stack([centred @ guess, number])
-        differing, errors = _shrink(root[:, None] * centred, fixed, root * left, guess)
+        differing, errors = _shrink(root[:, None] * centred, fixed, root * rest, guess)
     else:
         columns = np.column_stack([centred, number])
         solve = np.linalg.pinv(root[:, None] * columns, rcond=_RANK) * root
-        differing = solve @ left
-        spread = (solve * (left - columns @ differing)) ** 2 * len(odd) / max(len(odd) - players, 1)
+        differing = solve @ rest
+        spread = (solve * (rest - columns @ differing)) ** 2 * len(odd) / max(len(odd) - players, 1)
         errors = np.zeros(players + 1) if exact else np.sqrt(spread.sum(axis=1))
     return ShapleyValues(values=differing[:players] + (whole - empty) / players, standard_errors=errors[:players])
 
@@ -91,19 +92,19 @@ def shapley_values(
 def _shrink(
     columns: Float64[np.ndarray, "pairs players"],
     fixed: Float64[np.ndarray, "pairs 2"],
-    left: Float64[np.ndarray, " pairs"],
+    worth: Float64[np.ndarray, " pairs"],
     guess: Float64[np.ndarray, " players"],
 ) -> tuple[Float64[np.ndarray, " players"], Float64[np.ndarray, " players"]]:
     """Coefficients, a multiple of the guess plus a ridge as wide as restricted likelihood says, and their errors."""
-    known = np.linalg.qr(fixed)[0]
-    rest, inside = (values - known @ (known.T @ values) for values in (left, columns))
+    basis = np.linalg.qr(fixed)[0]
+    rest, inside = (values - basis @ (basis.T @ values) for values in (worth, columns))
     along, sizes, _ = np.linalg.svd(inside, full_matrices=False)
-    seen = along.T @ rest
-    freedom = len(left) - fixed.shape[1]
-    unexplained = max(float(rest @ rest - seen @ seen), 0.0)
+    projected = along.T @ rest
+    freedom = len(worth) - fixed.shape[1]
+    unexplained = max(float(rest @ rest - projected @ projected), 0.0)
 
     def variance(ridge: float) -> float:
-        return float((unexplained + (seen**2 / (1 + sizes**2 / ridge)).sum()) / freedom)
+        return float((unexplained + (projected**2 / (1 + sizes**2 / ridge)).sum()) / freedom)
 
     def doubt(log_ridge: float) -> float:
         ridge = np.exp(log_ridge)
@@ -117,10 +118,10 @@ def _shrink(
     of_players = np.column_stack([guess, np.zeros(players), np.eye(players)])
     of_players -= of_players.mean(axis=0)
     solve = of_players @ fit
-    # noise, and what the drawing leaves of each player's own part
-    noise = (solve * (left - design @ (fit @ left))) ** 2 * len(left) / (len(left) - np.trace(design @ fit))
+    # noise, and the part of each player that the shrinkage leaves
+    noise = (solve * (worth - design @ (fit @ worth))) ** 2 * len(worth) / (len(worth) - np.trace(design @ fit))
     drawn = variance(ridge) / ridge * (solve @ columns - of_players[:, fixed.shape[1] :]) ** 2
-    return solve @ left, np.sqrt(noise.sum(axis=1) + drawn.sum(axis=1))
+    return solve @ worth, np.sqrt(noise.sum(axis=1) + drawn.sum(axis=1))
 
 
 def _all_pairs(players: int) -> tuple[Bool[np.ndarray, "pairs players"], Float64[np.ndarray, " pairs"]]:
@@ -146,7 +147,7 @@ def _sample(
 
 
 _GUESS = IntegratedGradients(steps=16, max_steps=16)
-"""As good a guess as one that goes on until it is complete, at a quarter of its cost; on differences 8 are too few."""
+"""First guess, as good as complete Integrated Gradients at a quarter of the cost; 8 steps are too few."""
 _UNSURE = 0.5
 """Standard error over the spread of the contributions, above which their order means little."""
 
@@ -166,18 +167,19 @@ class Shapley(RegionMethod):
 
     tile_px: int = 28
     pairs: int = 200
-    """Pairs of coalitions that are asked for each image, two passes of the network each."""
+    """Pairs of coalitions for each image, two passes of the network each."""
     seed: int = 0
 
     @torch.no_grad()
-    def _explain(self, comparison: Comparison, *, on_progress: OnProgress | None) -> Attribution:
-        with torch.enable_grad():
-            gradients = _GUESS._explain(comparison, on_progress=None).relevance.double().cpu()
+    def _explain(self, comparison: Comparison) -> Attribution:
         engine = comparison.prepare(2 * self.pairs * len(comparison.images))
         unsure = []
 
         def contribute(index: int) -> Float[Tensor, "height width"]:
             image, empty = comparison.images[index], comparison.reference[index]
+            with torch.enable_grad():
+                predictions = comparison.prediction[index], comparison.reference_prediction[index]
+                gradients = _GUESS.integrate(comparison, image, empty, *predictions).relevance.float().double().cpu()
             regions = self._regions(image, empty).to(image.device)
             # a number that no pixel has, such as that of what lies between markers which cover the image, is no player
             numbers, players = regions.unique(return_inverse=True)
@@ -188,23 +190,22 @@ class Shapley(RegionMethod):
                 return torch.cat(list(engine.run(batches))).double().cpu().numpy()
 
             rng = np.random.default_rng((self.seed, index))
-            guess = players.cpu().flatten().bincount(weights=gradients[index].flatten()).numpy()
+            guess = players.cpu().flatten().bincount(weights=gradients.flatten()).numpy()
             pairs = max(self.pairs, 2 * len(numbers))
-            found = shapley_values(worth, len(numbers), pairs=pairs, rng=rng, guess=guess)
-            unsure.append(float(np.sqrt((found.standard_errors**2).mean())) > _UNSURE * float(found.values.std()))
-            shares = torch.from_numpy(found.values).to(image) / players.flatten().bincount()
+            estimate = shapley_values(worth, len(numbers), pairs=pairs, rng=rng, guess=guess)
+            unsure.append(float(np.sqrt((estimate.standard_errors**2).mean())) > _UNSURE * float(estimate.values.std()))
+            shares = torch.from_numpy(estimate.values).to(image) / players.flatten().bincount()
             return shares[players]
 
-        relevance = comparison.map_each(contribute, on_progress=on_progress)
+        relevance = comparison.map_each(contribute)
         warning = (
-            f"contributions hardly surer than they differ in {sum(unsure)} of {len(unsure)} frames; ask for more pairs"
+            f"contributions hardly surer than they differ in {sum(unsure)} of {len(unsure)} frames; set more pairs"
         )
-        by_tile = self.markers_px is None
-        return comparison.explanation(
+        attribution = comparison.attribution(
             relevance,
-            method="shapley" if by_tile else "shapley-marker",
             complete=True,
-            target="f(x) - f(reference), shared out among " + (f"tiles of {self.tile_px} px" if by_tile else "markers"),
+            target="f(x) - f(reference), shared out among "
+            + (f"tiles of {self.tile_px} px" if self.markers_px is None else "markers"),
             warnings=[warning] if any(unsure) else [],
-            engine=engine.name,
         )
+        return replace(attribution, engine=engine.name)

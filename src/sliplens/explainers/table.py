@@ -1,123 +1,104 @@
-"""Explainers by name, and the call that explains frames with one of them."""
+"""Table of the explainers by name, with the title, colour and line of each in figures; importing it loads no torch."""
 
-from dataclasses import fields, is_dataclass, replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass, replace
+from importlib import import_module
+from typing import TYPE_CHECKING, TypeAlias
 
-import numpy as np
-import torch
-from jaxtyping import Float, UInt8
-from torch import Tensor
-
-from sliplens.errors import ImageError, InputError, SliplensError
-from sliplens.explainers.attribution import Attribution
-from sliplens.explainers.cam import GradCam, HiResCam, LayerCam
-from sliplens.explainers.contract import Explainer
-from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, Lrp, SmoothGrad
-from sliplens.explainers.occlusion import KnownMarkers, Occlusion, RegionMethod, find_markers, markers_in_frame
-from sliplens.explainers.poly_cam import PolyCam
-from sliplens.explainers.shapley import Shapley
+from sliplens.errors import InputError
 from sliplens.extras import Table
-from sliplens.models import Network
-from sliplens.models.checkpoint import open_run
-from sliplens.progress import OnProgress
 
-_ROWS: dict[str, Explainer] = {
-    "grad-cam": GradCam(),
-    "integrated-gradients": IntegratedGradients(),
-    "poly-cam": PolyCam(),
-    "hires-cam": HiResCam(),
-    "layer-cam": LayerCam(),
-    "expected-gradients": ExpectedGradients(),
-    "smooth-grad": SmoothGrad(),
-    "occlusion": Occlusion(),
-    "occlusion-marker": Occlusion(markers_px=find_markers),
-    "shapley": Shapley(),
-    "shapley-marker": Shapley(markers_px=find_markers),
-    "lrp": Lrp(),
-    "grad-cam-thesis": GradCam(contrast=False, relu=True),
-    "integrated-gradients-thesis": IntegratedGradients(black=True, steps=50, max_steps=50),
-    "poly-cam-thesis": PolyCam(score="thesis", level=5),
+if TYPE_CHECKING:
+    from sliplens.explainers.contract import Explainer
+
+Line: TypeAlias = str | tuple[int, tuple[int, ...]]
+"""Line style of Matplotlib."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExplainerRow:
+    """An explainer with its presentation."""
+
+    title: str
+    """Name in figures, tables and pages."""
+    load: "Callable[[], Explainer]"
+    """Function that imports and makes the explainer with its default options; its class, for example."""
+    colour: str = "#CC79A7"
+    line: Line = "-"
+
+
+def _method(module: str, name: str, **options: bool | int | str) -> "Callable[[], Explainer]":
+    return lambda: getattr(import_module(f"sliplens.explainers.{module}"), name)(**options)
+
+
+def _by_marker(module: str, name: str) -> "Callable[[], Explainer]":
+    def load() -> "Explainer":
+        from sliplens.explainers.occlusion import find_markers  # noqa: PLC0415 (loads torch)
+
+        return replace(_method(module, name)(), markers_px=find_markers)  # pyright: ignore[reportArgumentType]
+
+    return load
+
+
+_ROWS = {
+    "grad-cam": ExplainerRow(title="Grad-CAM", load=_method("cam", "GradCam"), colour="#D55E00"),
+    "integrated-gradients": ExplainerRow(
+        title="Integrated Gradients", load=_method("gradients", "IntegratedGradients"), colour="#56B4E9", line="--"
+    ),
+    "poly-cam": ExplainerRow(title="Poly-CAM", load=_method("poly_cam", "PolyCam"), colour="#009E73", line="-."),
+    "grad-cam-thesis": ExplainerRow(
+        title="Grad-CAM as in the thesis",
+        load=_method("cam", "GradCam", contrast=False, relu=True),
+        colour="#F2A37E",
+        line=(0, (5, 1)),
+    ),
+    "integrated-gradients-thesis": ExplainerRow(
+        title="Integrated Gradients as in the thesis",
+        load=_method("gradients", "IntegratedGradients", black=True, steps=50, max_steps=50),
+        colour="#A9A9A9",
+        line=(0, (5, 3)),
+    ),
+    "poly-cam-thesis": ExplainerRow(
+        title="Poly-CAM as in the thesis",
+        load=_method("poly_cam", "PolyCam", score="thesis", level=5),
+        colour="#E69F00",
+        line=(0, (5, 1)),
+    ),
+    "hires-cam": ExplainerRow(title="HiResCAM", load=_method("cam", "HiResCam")),
+    "layer-cam": ExplainerRow(title="LayerCAM", load=_method("cam", "LayerCam")),
+    "expected-gradients": ExplainerRow(title="Expected Gradients", load=_method("gradients", "ExpectedGradients")),
+    "smooth-grad": ExplainerRow(title="SmoothGrad", load=_method("gradients", "SmoothGrad")),
+    "occlusion": ExplainerRow(
+        title="Occlusion", load=_method("occlusion", "Occlusion"), colour="#0072B2", line=(0, (3, 1, 1, 1))
+    ),
+    "occlusion-marker": ExplainerRow(
+        title="Occlusion by marker", load=_by_marker("occlusion", "Occlusion"), line=(0, (1, 2))
+    ),
+    "shapley": ExplainerRow(
+        title="Shapley values of tiles", load=_method("shapley", "Shapley"), line=(0, (3, 1, 1, 1, 1, 1))
+    ),
+    "shapley-marker": ExplainerRow(
+        title="Shapley values of markers", load=_by_marker("shapley", "Shapley"), line=(0, (3, 1, 1, 1, 1, 1))
+    ),
+    "lrp": ExplainerRow(title="LRP", load=_method("gradients", "Lrp"), colour="#6B7280", line=(0, (1, 1))),
 }
 EXPLAINERS = Table("method", "sliplens.explainers", _ROWS)
-"""The explainers by name, with their default options; use `dataclasses.replace` for others. `lrp` needs an extra.
+"""Explainers by name. `lrp` needs an extra.
 
-The last three are the thesis's methods as they were published and run, of f itself; the thesis does not say whether it
-ranked the pixels of Integrated Gradients by sign or by size, and here their sign counts as that of all methods does.
+Those that end in `-thesis` are the thesis's methods as they were published and run, of f itself. The thesis does not
+say whether it ranked the pixels of Integrated Gradients by sign or by size; here their sign counts.
 
-An installed package adds its own by the entry point `sliplens.explainers`.
+An installed package adds an `ExplainerRow` by the entry point `sliplens.explainers`.
 """
 RECOMMENDED_METHOD = "shapley-marker"
-"""What explains where no method is named: its maps rank the markers most like the truth in simulation.
+"""Default method: its maps rank the markers most like the truth in simulation. Without markers, tiles (`shapley`)."""
 
-Where the markers of a frame are not known the players are tiles (`shapley`).
-"""
-
-
-def explain(
-    run: Network | Path | str,
-    frames: UInt8[np.ndarray, "batch height width 3"],
-    *,
-    reference: UInt8[np.ndarray, "height width 3"] | None = None,
-    method: str | Explainer | None = None,
-    on_progress: OnProgress | None = None,
-    **options: Any,
-) -> Attribution:
-    """Explain why a network reads these safety margins rather than that of the untouched sensor.
-
-    Parameters
-    ----------
-    run
-        The network, its folder, or the name of one that comes with sliplens.
-    frames
-        Camera frames T_n, 8-bit RGB; without a reference, absolute difference images |T_n - T_0|.
-    reference
-        Frame of the untouched sensor, T_0. A network on difference images needs none.
-    method
-        Row of `EXPLAINERS`, or an explainer. If None, Shapley values of the markers (`RECOMMENDED_METHOD`); where they
-        are not found, as in difference images, of tiles, and a warning says why.
-    options
-        Options of the method, such as `budget=0.25` of `poly-cam`: the fields of its class.
-
-    Raises
-    ------
-    InputError
-        If there is no such method or option, or the network needs a reference.
-    ImageError
-        If the frames are not of the size the network's sensor has.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sliplens.explainers.table import explain
-    >>> touched = np.zeros((1, 224, 224, 3), dtype=np.uint8)
-    >>> touched[:, 80:120, 90:150] = 90
-    >>> explanation = explain("chromatouch-difference", touched, method="grad-cam")
-    >>> explanation.relevance.shape, explanation.frame().num_rows
-    (torch.Size([1, 224, 224]), 1)
-    """
-    trained = open_run(run)
-    named = RECOMMENDED_METHOD if method is None else method
-    explainer = get_explainer(named, **options) if isinstance(named, str) else named
-    inputs, empty = network_inputs(trained, frames, reference)
-    warnings = ()
-    if isinstance(explainer, RegionMethod) and explainer.markers_px is find_markers:
-        try:
-            if reference is None:
-                find_markers(inputs[0], empty)  # which tells why there are none
-            # they show in the camera's frames, at their full size, whatever the network is shown
-            places = tuple(markers_in_frame(frame, image_size=trained.manifest.image_size) for frame in frames)
-            explainer = replace(explainer, markers_px=KnownMarkers(images=inputs, places=places))
-        except SliplensError as error:
-            if method is not None:
-                raise
-            explainer, warnings = replace(explainer, markers_px=None), (f"tiles, not markers: {error}",)
-    explanation = explainer(trained.model, inputs, reference=empty, on_progress=on_progress)
-    return replace(explanation, warnings=(*warnings, *explanation.warnings))
+Option: TypeAlias = object
+"""Value of a field of an explainer."""
 
 
-def get_explainer(method: str, **options: Any) -> Explainer:
-    """Look up a row of `EXPLAINERS`, with other options than it has: the fields of its class.
+def get_explainer(method: str, **options: Option) -> "Explainer":
+    """Make the explainer of a row of `EXPLAINERS`, with some of its options (the fields of its class) changed.
 
     Raises
     ------
@@ -130,38 +111,9 @@ def get_explainer(method: str, **options: Any) -> Explainer:
     >>> get_explainer("occlusion", tile_px=8).tile_px
     8
     """
-    explainer = EXPLAINERS.pick(method)
-    known = [field.name for field in fields(explainer)] if is_dataclass(explainer) else []
+    explainer = EXPLAINERS.pick(method).load()
+    available = [field.name for field in fields(explainer)] if is_dataclass(explainer) else []
     for name in options:
-        if name not in known:
-            raise InputError(f"{method} has no option {name!r}; it has {', '.join(known) or 'none'}")
+        if name not in available:
+            raise InputError(f"{method} has no option {name!r}; it has {', '.join(available) or 'none'}")
     return replace(explainer, **options) if options else explainer  # pyright: ignore[reportArgumentType]
-
-
-def network_images(
-    trained: Network,
-    frames: UInt8[np.ndarray, "batch height width 3"],
-    reference: UInt8[np.ndarray, "height width 3"] | None,
-) -> tuple[UInt8[Tensor, "batch colours size size"], Float[Tensor, "colours size size"]]:
-    """Images of a network before they are normalised, 8 bits, and the input of the untouched sensor, in [0, 1]."""
-    if not len(frames):
-        raise ImageError("there is no frame to explain; give one at least")
-    trained.require_frame_size(frames.shape[1:3])
-    encoding, image_size = trained.encoding, trained.manifest.image_size
-    if reference is not None:
-        images = encoding.compare_small(frames, reference, image_size=image_size)
-        return images, encoding.empty(reference, image_size=image_size)
-    if not encoding.empty_is_black:
-        raise InputError(
-            f"a network on {encoding.name} images needs the untouched sensor; give it as reference, on the command "
-            "line with --reference IMAGE"
-        )
-    return encoding.resize(frames, image_size=image_size), torch.zeros(3, image_size, image_size)
-
-
-def network_inputs(
-    trained: Network, frames: UInt8[np.ndarray, "batch _ _ 3"], reference: UInt8[np.ndarray, "_ _ 3"] | None
-) -> tuple[Float[Tensor, "batch colours size size"], Float[Tensor, "colours size size"]]:
-    """Inputs of a network and that of the untouched sensor, in [0, 1] on its device."""
-    images, empty = network_images(trained, frames, reference)
-    return trained.encoding.normalise(images).to(trained.device), empty.to(trained.device)

@@ -1,4 +1,4 @@
-"""Maps that know nothing of the network, networks that know nothing, and what the eye judges of a map, as numbers."""
+"""Control maps that use nothing the network learned, randomised networks, and measures of how maps look."""
 
 import copy
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers.attribution import change_of, combine, frame_of, local_change, pearson_r
-from sliplens.explainers.cam import capture, recall_layers
+from sliplens.explainers.cam import cached_layers, capture
 from sliplens.intervals import paired_difference
 from sliplens.results.explanation import require_saliency
 from sliplens.results.faithfulness import CHANCE, Lead
@@ -140,8 +140,8 @@ def relative_change(images: Images, references: Images) -> ControlMaps:
 
 @torch.no_grad()
 def even_channels(model: nn.Module, images: Images, references: Images) -> ControlMaps:
-    """Poly-CAM's map with the weight of every channel 1: what the layers show, whatever it does to the answer."""
-    names, size = [layer.name for layer in recall_layers(model, images)], (images.shape[-2], images.shape[-1])
+    """Compute Poly-CAM's map with every channel's weight 1, whatever its effect on the prediction."""
+    names, size = [layer.name for layer in cached_layers(model, images)], (images.shape[-2], images.shape[-1])
     with capture(model, names) as outputs:
         model(images)
     maps = []
@@ -161,7 +161,7 @@ def centre(images: Images) -> ControlMaps:
 
 
 def control_maps(model: nn.Module, images: Images, references: Images) -> dict[str, Maps]:
-    """Maps that know nothing of what a network learned, by name, of images and of their untouched sensors.
+    """Compute maps that use nothing the network learned, by name, of images and their untouched sensors.
 
     Beside these stand random orders, and each explainer on networks whose weights were drawn anew. A network without
     layers that have a map has no `weights-1`.
@@ -180,13 +180,13 @@ def control_maps(model: nn.Module, images: Images, references: Images) -> dict[s
 
 
 def lead_over_controls(
-    own: Float[np.ndarray, " frames"],
+    scores: Float[np.ndarray, " frames"],
     controls: Mapping[str, Float[np.ndarray, " frames"]],
     *,
     clusters: Iterable[Shaped[np.ndarray, " frames"]],
     rng: np.random.Generator,
 ) -> Lead:
-    """Mean of a score of frames less that of the strongest control, with a 95 % interval (`paired_difference`).
+    """Compute the mean of a score of frames less that of the strongest control, with a 95 % interval.
 
     No control is chosen beforehand: each end is the lowest of those over all of them. A lead is sure only where the
     method is ahead of each for sure, whichever would be the strongest in other trials, which needs no correction. To be
@@ -196,10 +196,10 @@ def lead_over_controls(
     Berger, *Multiparameter hypothesis testing and acceptance sampling* (1982): intersection-union tests, and the
     union-intersection tests that Bonferroni's inequality bounds.
     """
-    others = {**controls, CHANCE: np.zeros(len(own))}
+    others = {**controls, CHANCE: np.zeros(len(scores))}
     levels = list(clusters)
     gaps = {
-        name: paired_difference(own, other, clusters=levels, rng=rng, comparisons=(1, len(others)))
+        name: paired_difference(scores, other, clusters=levels, rng=rng, comparisons=(1, len(others)))
         for name, other in others.items()
     }
     control = min(gaps, key=lambda name: gaps[name].estimate)
@@ -223,13 +223,13 @@ def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iter
         for module in changed.modules()
         if hasattr(module, "reset_parameters") and next(module.parameters(recurse=False), None) is not None
     ][::-1]
-    shown = {round((stage + 1) * len(weighted) / stages) for stage in range(stages)}
+    ends = {round((stage + 1) * len(weighted) / stages) for stage in range(stages)}
     for count, module in enumerate(weighted, start=1):
         with torch.random.fork_rng(devices=[]):
             # by its place, so that a layer gets the same weights whatever came before it
             torch.manual_seed(_SEEDS_APART * seed + count - 1)
             module.reset_parameters()  # pyright: ignore[reportCallIssue]
-        if count in shown:
+        if count in ends:
             _settle(changed, weighted[:count], images)
             yield count, changed
 
@@ -251,13 +251,13 @@ def _settle(model: nn.Module, changed: list[nn.Module], images: Tensor) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RandomisationScores:
-    """What becomes of the maps of one method as a network loses what it has learned."""
+    """Change of the maps of one method as the weights of the network are drawn anew."""
 
     layers: tuple[int, ...]
     """Layers with new weights, by stage."""
     similarity: Float[np.ndarray, "stages images"]
-    """Pearson's correlation with the maps of the trained network; an explanation that does not fall towards 0 does not
-    look at the network."""
+    """Pearson's correlation with the maps of the trained network; if it does not fall towards 0, the maps do not
+    depend on the network."""
     complexity_rise: Float[np.ndarray, " images"]
     """Rise of the entropy of the map's histogram from the trained to the wholly random network, over that of the
     trained one. A faithful map gets more complex."""

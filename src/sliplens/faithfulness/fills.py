@@ -1,4 +1,4 @@
-"""Fills: what a removed pixel becomes."""
+"""Fills: the content of removed pixels."""
 
 from collections.abc import Callable
 
@@ -54,24 +54,24 @@ def _solve(
     """
     kernel = _KERNEL.to(images).expand(3, 1, 3, 3)
     hole = gone.to(images.dtype)
-    left = 1 - hole
+    rest = 1 - hole
 
     def gather(values: Tensor) -> Tensor:
         return functional.conv2d(values, kernel, padding=1, groups=3)
 
     # less than one at the border, where neighbours are missing
     weights = gather(torch.ones_like(images[:1]))
-    known = left.sum(dim=(2, 3), keepdim=True)
-    filled = (images * left).addcmul_(_begin(images, left, tolerance=tolerance), hole)
+    count = rest.sum(dim=(2, 3), keepdim=True)
+    filled = (images * rest).addcmul_(_begin(images, rest, tolerance=tolerance), hole)
 
     # in place wherever it can be: fresh memory of this size costs more than the arithmetic
     scratch = torch.empty_like(filled)
 
-    def dot(left_values: Tensor, right_values: Tensor) -> Tensor:
-        return torch.mul(left_values, right_values, out=scratch).sum(dim=(1, 2, 3), keepdim=True)
+    def dot(first: Tensor, second: Tensor) -> Tensor:
+        return torch.mul(first, second, out=scratch).sum(dim=(1, 2, 3), keepdim=True)
 
     # a whole image that is gone has its mean for a solution, and a matrix that is singular
-    inside = hole * (known > 0)
+    inside = hole * (count > 0)
     residual = gather(filled).addcmul_(weights, filled, value=-1).mul_(inside)
     direction, square = residual.clone(), dot(residual, residual)
     for _ in range(4 * max(images.shape[-2:])):
@@ -90,17 +90,17 @@ def _solve(
 
 
 def _begin(
-    images: Float[Tensor, "batch 3 height width"], left: Float[Tensor, "batch 3 height width"], *, tolerance: float
+    images: Float[Tensor, "batch 3 height width"], rest: Float[Tensor, "batch 3 height width"], *, tolerance: float
 ) -> Float[Tensor, "batch 3 height width"]:
-    """A first guess: the solution at half the size, or the mean of what is left of a small or whole image."""
-    known = left.sum(dim=(2, 3), keepdim=True)
+    """Return a first guess: the solution at half the size, or the mean of the rest of a small or whole image."""
+    count = rest.sum(dim=(2, 3), keepdim=True)
     whole = images.mean((2, 3), keepdim=True)
-    mean = torch.where(known > 0, (images * left).sum(dim=(2, 3), keepdim=True) / known.clamp_min(1), whole)
-    if min(images.shape[-2:]) < _SMALL or bool((known == 0).any()) or bool((left == 1).all()):
+    mean = torch.where(count > 0, (images * rest).sum(dim=(2, 3), keepdim=True) / count.clamp_min(1), whole)
+    if min(images.shape[-2:]) < _SMALL or bool((count == 0).any()) or bool((rest == 1).all()):
         return mean.expand_as(images)
-    share = functional.avg_pool2d(left, 2, ceil_mode=True, count_include_pad=False)
-    seen = functional.avg_pool2d(images * left, 2, ceil_mode=True, count_include_pad=False) / share.clamp_min(0.1)
-    half = _solve(torch.where(share > 0, seen, mean), share == 0, tolerance=tolerance)
+    share = functional.avg_pool2d(rest, 2, ceil_mode=True, count_include_pad=False)
+    half = functional.avg_pool2d(images * rest, 2, ceil_mode=True, count_include_pad=False) / share.clamp_min(0.1)
+    half = _solve(torch.where(share > 0, half, mean), share == 0, tolerance=tolerance)
     return functional.interpolate(half, size=images.shape[-2:], mode="bilinear", align_corners=False)
 
 
@@ -114,7 +114,7 @@ Fill = Callable[[Images, Images | None, int], Painter]
 
 
 def _static(fill: Callable[[Images], Images]) -> Fill:
-    """The same filled image whatever is removed."""
+    """Make a fill whose filled image does not depend on what is removed."""
 
     def prepare(images: Images, _references: Images | None, _seed: int) -> Painter:
         filled = fill(images)
@@ -175,7 +175,7 @@ less.
 
 
 def get_fill(name: str) -> Fill:
-    """Fill of a name, for the frame: the reference beside it, where the network sees one, stays.
+    """Look up a fill for the frame; the reference beside it, if any, stays.
 
     Raises
     ------

@@ -1,12 +1,11 @@
-"""Removal: how far the answer moves as the most, the least, and random parts of an image are removed."""
+"""Removal curves: change of the prediction while the most, the least and random parts of an image are removed."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
 
 import numpy as np
-import pyarrow as pa
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
@@ -14,10 +13,10 @@ from torch import Tensor
 from sliplens.errors import InputError
 from sliplens.explainers.occlusion import marker_regions, tile_regions
 from sliplens.faithfulness.fills import Fill, Painter
-from sliplens.intervals import Difference, mean_interval
 from sliplens.models.engines import Engine
-from sliplens.progress import OnProgress, counted
+from sliplens.progress import report_progress, track
 from sliplens.results.explanation import require_saliency
+from sliplens.results.faithfulness import RemovalCurve
 
 Units = Int[np.ndarray, "height width"]
 """Number of what is removed at once, a pixel, a tile or a marker, that each pixel belongs to, from 0."""
@@ -96,7 +95,7 @@ class RemovalCurves:
         return np.abs(self.answers - self.answers[..., :1])
 
     def lost(self, towards: Float[np.ndarray, " images"]) -> Float64[np.ndarray, "orders images steps"]:
-        """How much of what speaks for the target is gone: changes along the sign of f(x) - f(untouched sensor)."""
+        """Changes along the sign of f(x) - f(untouched sensor): how much of the supporting evidence is removed."""
         return towards[:, None] * (self.answers[..., :1] - self.answers)
 
     @property
@@ -105,101 +104,19 @@ class RemovalCurves:
         return np.trapezoid(self.changes, self.areas, axis=-1)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Faithfulness:
-    """What the removal of parts says of the maps of one method, image by image, in margin units.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sliplens.faithfulness.removal import Faithfulness
-    >>> first, last, random = [[0, 0.4, 0.4]], [[0, 0.0, 0.4]], [[0, 0.2, 0.4]]
-    >>> faithfulness = Faithfulness(areas=np.array([0, 0.5, 1.0]), curves=np.array([first, last, random]))
-    >>> faithfulness.symmetric_gain, faithfulness.at(0.5)[0]
-    (array([0.2]), array([0.4]))
-    """
-
-    areas: Float64[np.ndarray, " steps"]
-    """Share of the image that is gone at each step, from 0 to 1."""
-    curves: Float64[np.ndarray, "3 images steps"]
-    """Change of the answer at each step: the most, the least influential parts, and random ones removed first (the mean
-    over the random orders). Along the target where it was given, else its size."""
-    method: str = ""
-    """Name of what was scored, where it has one."""
-    fill: str = ""
-    """Name of what removed pixels became, where it has one."""
-    controls: Mapping[str, "Faithfulness"] = field(default_factory=dict)
-    """The same of maps that know nothing of the network, by name (`control_maps`), where they were scored too."""
-    alarms: tuple[str, ...] = ()
-    """Why the score may not measure the maps, a sentence each."""
-
-    @classmethod
-    def of_orders(
-        cls, curves: RemovalCurves, names: Iterable[str], *, towards: Float[np.ndarray, " images"] | None
-    ) -> "dict[str, Faithfulness]":
-        """Scores by method from curves whose orders are most and least first of each method, then the random ones."""
-        names = list(names)
-        changes = curves.changes if towards is None else curves.lost(towards)
-        random = changes[2 * len(names) :].mean(axis=0)
-        return {
-            name: cls(areas=curves.areas, curves=np.stack([changes[2 * row], changes[2 * row + 1], random]))
-            for row, name in enumerate(names)
-        }
-
-    @property
-    def most_first(self) -> Float64[np.ndarray, " images"]:
-        """Mean change over all shares of the image, the most influential parts first."""
-        return np.trapezoid(self.curves[0], self.areas, axis=-1)
-
-    @property
-    def least_first(self) -> Float64[np.ndarray, " images"]:
-        """The same, the least influential parts first."""
-        return np.trapezoid(self.curves[1], self.areas, axis=-1)
-
-    @property
-    def random(self) -> Float64[np.ndarray, " images"]:
-        """The same, mean over the random orders."""
-        return np.trapezoid(self.curves[2], self.areas, axis=-1)
-
-    @property
-    def symmetric_gain(self) -> Float64[np.ndarray, " images"]:
-        """Symmetric relevance gain: most less least influential first; 0 for a map that tells nothing.
-
-        References
-        ----------
-        Bluecher, Vielhaben and Strodthoff, *Decoupling Pixel Flipping and Occlusion Strategy* (2024): SRG.
-        """
-        return self.most_first - self.least_first
-
-    @property
-    def gain_over_random(self) -> Float64[np.ndarray, " images"]:
-        """Most influential first less random orders."""
-        return self.most_first - self.random
-
-    def interval(self, *, clusters: Sequence[np.ndarray] = (), seed: int = 0) -> Difference:
-        """Mean symmetric gain over the images in margin units, with its 95 % interval.
-
-        `clusters` are labels of the images, such as `[days, trials]`: frames of one trial resemble one another.
-        """
-        return mean_interval(self.symmetric_gain, clusters=clusters, rng=np.random.default_rng(seed))
-
-    def frame(self) -> pa.Table:
-        """Arrow table of the curves, a row for each image and share of it removed, in margin units."""
-        images, steps = self.curves.shape[1:]
-        return pa.table(
-            {
-                "image": np.repeat(np.arange(images), steps),
-                "area": np.tile(self.areas, images),
-                **dict(zip(("most_first", "least_first", "random"), self.curves.reshape(3, -1), strict=True)),
-            }
+def order_curves(
+    curves: RemovalCurves, names: Iterable[str], *, towards: Float[np.ndarray, " images"] | None = None
+) -> dict[str, RemovalCurve]:
+    """Name the curves of orders: most, then least influential first for each method, then the random ones."""
+    names = list(names)
+    changes = curves.changes if towards is None else curves.lost(towards)
+    random = changes[2 * len(names) :].mean(axis=0)
+    return {
+        name: RemovalCurve(
+            areas=curves.areas, most_first=changes[2 * row], least_first=changes[2 * row + 1], random=random
         )
-
-    def at(self, area: float) -> Float64[np.ndarray, "3 images"]:
-        """Changes where a share of the image, one of `areas`, is gone: most first, least first, random."""
-        step = np.flatnonzero(np.isclose(self.areas, area))
-        if not len(step):
-            raise InputError(f"there is no step at {area:g} of the image; choose one of {self.areas.tolist()}")
-        return self.curves[:, :, step[0]]
+        for row, name in enumerate(names)
+    }
 
 
 def _made_ready(predict: Predict, batch_size: int) -> Engine:
@@ -220,7 +137,7 @@ def _answer(
 
 
 def answer_whole(predict: Predict, images: Tensor, *, batch_size: int = 64) -> Float64[np.ndarray, " images"]:
-    """Answers on whole images."""
+    """Predict whole images."""
     engine = _made_ready(predict, batch_size)
     return _answer(engine, images.split(engine.batch_size))
 
@@ -253,9 +170,8 @@ def removal_curves(
     areas: Sequence[float] = AREAS,
     seed: int = 0,
     batch_size: int = 64,
-    on_progress: OnProgress | None = None,
 ) -> RemovalCurves:
-    """Answers of a network while parts of its input are removed, in several orders each.
+    """Predict inputs while parts of them are removed, in several orders each.
 
     Inputs are in [0, 1], as the references, those of the untouched sensor, where the fill needs them. Orders are flat
     pixel indices, first to be removed first (`unit_order`); areas are shares of the image, rising from 0 to 1.
@@ -280,8 +196,7 @@ def removal_curves(
     def count(batch: Tensor) -> None:
         nonlocal done
         done += len(batch)
-        if on_progress is not None:
-            on_progress(done * len(images) // len(jobs), len(images))
+        report_progress(done * len(images) // len(jobs), len(images))
 
     batches = _paint(
         fill(images, references, seed),
@@ -311,8 +226,7 @@ def score_maps(
     random_orders: int = RANDOM_ORDERS,
     areas: Sequence[float] = AREAS,
     seed: int = 0,
-    on_progress: OnProgress | None = None,
-) -> dict[str, Faithfulness]:
+) -> dict[str, RemovalCurve]:
     """Score the maps of several methods on the same images, against the same random orders.
 
     Of signed relevance give the part that works towards the target, and `towards`, the sign of f(x) - f(untouched
@@ -337,9 +251,8 @@ def score_maps(
         references=references,
         areas=areas,
         seed=seed,
-        on_progress=on_progress,
     )
-    return Faithfulness.of_orders(curves, influence, towards=towards)
+    return order_curves(curves, influence, towards=towards)
 
 
 def answer_scenes(
@@ -348,17 +261,17 @@ def answer_scenes(
     *,
     batch_size: int = 64,
 ) -> Callable[[Bool[np.ndarray, "variants markers"]], Float64[np.ndarray, " variants"]]:
-    """Answers to one scene with markers put back; what was asked before is neither drawn nor answered again."""
-    known: dict[bytes, float] = {}
+    """Return a function that predicts one scene with markers put back, and caches what it drew."""
+    cache: dict[bytes, float] = {}
 
     def answer(back: Bool[np.ndarray, "variants markers"]) -> Float64[np.ndarray, " variants"]:
-        asked = [row.tobytes() for row in back]
-        new = {key: row for key, row in zip(asked, back, strict=True) if key not in known}
+        keys_of_rows = [row.tobytes() for row in back]
+        new = {key: row for key, row in zip(keys_of_rows, back, strict=True) if key not in cache}
         keys, drawn = list(new), list(new.values())
         for start in range(0, len(new), batch_size):
             part = slice(start, start + batch_size)
-            known.update(zip(keys[part], answer_whole(predict, redraw(np.stack(drawn[part]))), strict=True))
-        return np.array([known[key] for key in asked])
+            cache.update(zip(keys[part], answer_whole(predict, redraw(np.stack(drawn[part]))), strict=True))
+        return np.array([cache[key] for key in keys_of_rows])
 
     return answer
 
@@ -369,16 +282,15 @@ def marker_curves(
     orders: Int[np.ndarray, "orders images markers"],
     *,
     batch_size: int = 64,
-    on_progress: OnProgress | None = None,
 ) -> RemovalCurves:
-    """Answers of a network while `SHARES` of the markers are put back, in several orders of their places each.
+    """Predict frames while `SHARES` of their markers are put back, in several orders each.
 
-    What several orders ask for is drawn once, `batch_size` images at a time, which bounds the memory.
+    Scenes that several orders share are drawn once, `batch_size` images at a time, which bounds the memory.
     """
     areas, (_, images, markers) = np.asarray(SHARES), orders.shape
     counts = np.round(areas * markers).astype(np.int64)
     answers = np.empty((len(orders), images, len(areas)))
-    for image in counted(range(images), on_progress):
+    for image in track(range(images)):
         rank = np.argsort(orders[:, image], axis=-1)
         back = rank[:, None] < counts[:, None]
         answer = answer_scenes(predict, partial(redraw, image), batch_size=batch_size)
@@ -395,8 +307,7 @@ def score_maps_by_marker(
     towards: Float[np.ndarray, " images"] | None = None,
     random_orders: int = RANDOM_ORDERS,
     batch_size: int = 64,
-    on_progress: OnProgress | None = None,
-) -> dict[str, Faithfulness]:
+) -> dict[str, RemovalCurve]:
     """Score how much each marker matters to several methods (`unit_means`) by putting them back; see `score_maps`."""
     for name, values in influence.items():
         if not np.isfinite(values).all():
@@ -404,6 +315,5 @@ def score_maps_by_marker(
     orders = [influence_orders(values) for values in influence.values()]
     images, markers = orders[0].shape[1:]
     by_chance = [[rng.permutation(markers) for _ in range(images)] for _ in range(random_orders)]
-    asked = np.concatenate([*orders, np.array(by_chance)])
-    curves = marker_curves(predict, redraw, asked, batch_size=batch_size, on_progress=on_progress)
-    return Faithfulness.of_orders(curves, influence, towards=towards)
+    curves = marker_curves(predict, redraw, np.concatenate([*orders, np.array(by_chance)]), batch_size=batch_size)
+    return order_curves(curves, influence, towards=towards)

@@ -1,73 +1,295 @@
-"""Scores of explanations: the sound one in one call, the deletion score of the thesis, and where neither measures."""
+"""Scores of explanations: removal under several fills, the deletion score of the thesis, and alarms."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
-from pathlib import Path
-from typing import Literal, TypeAlias
 
 import numpy as np
-import pyarrow as pa
 import torch
-from jaxtyping import Float, Float64, Int, UInt8
+from jaxtyping import Float, Float64, Int, Shaped, UInt8
 from scipy.stats import kendalltau
 from torch import Tensor
 
-from sliplens.errors import InputError, SaliencyError
-from sliplens.explainers.attribution import CLOSE, Attribution
-from sliplens.explainers.table import network_inputs
-from sliplens.faithfulness.controls import control_maps
-from sliplens.faithfulness.fills import Fill, get_fill
-from sliplens.faithfulness.removal import (
-    AREAS,
-    RANDOM_ORDERS,
-    Faithfulness,
-    Predict,
-    removal_curves,
-    score_maps,
-    tile_units,
-)
+from sliplens.errors import CheckpointError, InputError, SaliencyError
+from sliplens.explainers.attribution import CLOSE
+from sliplens.explainers.explain import join_maps, network_inputs, network_references
+from sliplens.explainers.frames import frames_from_arrays
+from sliplens.faithfulness.controls import control_maps, lead_over_controls
+from sliplens.faithfulness.fills import get_fill
+from sliplens.faithfulness.removal import Predict, Units, answer_whole, removal_curves, score_maps
+from sliplens.intervals import mean_interval, paired_difference
 from sliplens.models import Network
-from sliplens.models.checkpoint import open_run
 from sliplens.models.engines import Engine, prepare
-from sliplens.progress import OnProgress
-from sliplens.results.explanation import require_saliency
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes, require_saliency
+from sliplens.results.faithfulness import (
+    CHANCE,
+    Agreement,
+    Comparison,
+    Deletion,
+    DeletionScores,
+    DeletionTable,
+    Faithfulness,
+    MethodScore,
+    RemovalCurve,
+    RemovalScore,
+    RemovalTable,
+    is_control,
+)
+from sliplens.results.study import Setting
+
+Frames = UInt8[np.ndarray, "images height width 3"]
+Maps = Float[np.ndarray, "images height width"]
+_CHECKED_IMAGES = 4
+
+
+def explanation_of_maps(
+    network: Network,
+    frames: Frames,
+    maps: Float[np.ndarray, "maps rows columns"],
+    reference: UInt8[np.ndarray, "_ _ 3"] | None,
+    *,
+    signed: bool,
+) -> Explanation:
+    """Make the record of maps that another tool computed; see `sliplens.score` for `signed`.
+
+    Raises
+    ------
+    SaliencyError
+        If there is not a map a frame, or one has another size than the network's input, or holds NaN; or if a signed
+        array has no number below zero for a frame whose prediction fell.
+    """
+    explanation = join_maps(network, frames_from_arrays(network, frames, reference), {})
+    if len(maps) != len(frames):
+        raise SaliencyError(f"there are {len(maps)} maps of {len(frames)} frames; explain the frames that are scored")
+    for index, values in enumerate(maps):
+        require_saliency(values, explanation.images.shape[-2:], where=f"map {index}")
+    positive = (maps.min(axis=(1, 2)) >= 0) & (maps.max(axis=(1, 2)) > 0)
+    for index in np.flatnonzero((explanation.towards < 0) & positive) if signed else ():
+        raise SaliencyError(
+            f"map {index} has no number below 0, but the prediction of its frame is lower than that of the untouched "
+            "sensor, which a signed map must explain by pixels that lower it; if its numbers say how much a pixel "
+            "matters whichever way, give signed=False"
+        )
+    notes = MethodNotes(seconds_per_frame=0.0, warnings=(), raises_only=not signed)
+    return replace(explanation, methods={"maps": notes}, relevance={"maps": maps.astype(np.float32)})
+
+
+def require_same_network(network: Network, explanation: Explanation) -> None:
+    """Raise an error for explanations of another network."""
+    if explanation.weights_sha256 != network.manifest.weights_sha256:
+        raise CheckpointError(
+            "these explanations were made with another network; explain the frames again with this run"
+        )
+
+
+def prepare_passes(network: Network, inputs: Float[Tensor, "images colours size size"], passes: int) -> Engine:
+    """Prepare an engine for a number of passes of a network, checked on a few of its inputs, on its device."""
+    some = inputs[:_CHECKED_IMAGES].to(network.device)
+    return prepare(network.model, some, network.predict(some).to(network.device), passes=passes)
+
+
+def influences(network: Network, explanation: Explanation) -> dict[str, Maps]:
+    """Compute the maps that rank parts of frames, of each method (`Explanation.influence`) and of the controls."""
+    maps = {name: explanation.influence(name) for name in explanation.relevance}
+    inputs, references = network_inputs(network, explanation), network_references(network, explanation)
+    return maps | control_maps(network.model, inputs, references)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeletionCurves:
-    """Answers of a network while pixels are removed, for several images."""
+class SettingCurves:
+    """Curves of every map of some frames under one setting: most first, least first, random."""
 
-    pixels_removed: Int[np.ndarray, " steps"]
-    """Pixels that are gone at each step."""
-    base: Float64[np.ndarray, " images"]
-    """Answer on the whole image, in margin units."""
-    predictions: Float64[np.ndarray, "images steps"]
-    """Answer at each step, in margin units."""
-    control: "DeletionCurves | None" = None
-    """The same in random order, where it was asked for: a method that does not beat it has shown nothing."""
+    areas: Float64[np.ndarray, " areas"]
+    curves: dict[str, Float64[np.ndarray, "3 frames areas"]]
+    whole: Float64[np.ndarray, " frames"]
+    """Predictions of the whole frames."""
+    blank: Float64[np.ndarray, " frames"]
+    """Predictions where all of the frame is removed; NaN where the setting has no fill."""
 
-    @property
-    def scores(self) -> Float64[np.ndarray, "images steps"]:
-        """Deletion score D at each step."""
-        return deletion_score(self.base[:, None], self.predictions)
 
-    @property
-    def auc(self) -> Float64[np.ndarray, " images"]:
-        """D_AUC of each image: the mean of D over the steps."""
-        return self.scores.mean(axis=1)
+def stack_curves(curves: Mapping[str, RemovalCurve]) -> dict[str, Float64[np.ndarray, "3 frames areas"]]:
+    """Stack the curves of each method: most influential first, least first, random."""
+    return {name: np.stack([curve.most_first, curve.least_first, curve.random]) for name, curve in curves.items()}
 
-    def frame(self) -> pa.Table:
-        """Arrow table, a row for each image and step: pixels removed, prediction in margin units, score D."""
-        images, steps = self.predictions.shape
-        return pa.table(
-            {
-                "image": np.repeat(np.arange(images), steps),
-                "pixels_removed": np.tile(self.pixels_removed, images),
-                "prediction": self.predictions.ravel(),
-                "score": self.scores.ravel(),
-            }
-        )
+
+def curves_of_frames(
+    predict: Predict,
+    network: Network,
+    explanation: Explanation,
+    maps: Mapping[str, Maps],
+    units: Sequence[Units],
+    *,
+    fill: str,
+    areas: Sequence[float],
+    random_orders: int,
+    seed: int,
+) -> SettingCurves:
+    """Remove parts of explained frames in the order of every map, and in random orders."""
+    inputs, references = network_inputs(network, explanation), network_references(network, explanation)
+    paint = get_fill(fill)(inputs, references, seed)
+    gone = torch.ones((len(inputs), *inputs.shape[-2:]), dtype=torch.bool, device=inputs.device)
+    batches = torch.arange(len(inputs), device=inputs.device).split(16)
+    blank = answer_whole(predict, torch.cat([paint(rows, gone[rows]) for rows in batches]))
+    curves = score_maps(
+        predict,
+        inputs,
+        maps,
+        units,
+        fill=get_fill(fill),
+        references=references,
+        towards=explanation.towards,
+        # the same random orders under every fill
+        rng=np.random.default_rng(seed),
+        random_orders=random_orders,
+        areas=areas,
+        seed=seed,
+    )
+    return SettingCurves(
+        areas=np.asarray(areas, dtype=np.float64),
+        curves=stack_curves(curves),
+        whole=answer_whole(predict, inputs),
+        blank=blank,
+    )
+
+
+def score_curves(
+    explanation: Explanation,
+    curves: Mapping[Setting, SettingCurves],
+    *,
+    random_orders: int,
+    seed: int,
+) -> Faithfulness:
+    """Make the scores of the curves of all frames, by setting, with intervals over days and trials."""
+    by_method = {
+        setting: {
+            name: RemovalCurve(areas=part.areas, most_first=most, least_first=least, random=random)
+            for name, (most, least, random) in part.curves.items()
+        }
+        for setting, part in curves.items()
+    }
+    whole = next(iter(curves.values())).whole
+    scores, comparisons = judge_curves(by_method, clusters=explanation.clusters, seed=seed)
+    change = np.array([frame.prediction - frame.reference_prediction for frame in explanation.frames])
+    blank = {setting.fill: part.blank for setting, part in curves.items() if np.isfinite(part.blank).all()}
+    return Faithfulness(
+        input=explanation.input,
+        source=explanation.source,
+        frames=len(explanation.frames),
+        trials=len(explanation.trials),
+        random_orders=random_orders,
+        fills=tuple(dict.fromkeys(setting.fill for setting in curves)),
+        units=tuple(dict.fromkeys(setting.unit for setting in curves)),
+        areas=tuple(next(iter(curves.values())).areas.tolist()),
+        scores=scores,
+        comparisons=comparisons,
+        agreement=compare_fills(by_method),
+        alarms=(
+            *little_to_explain(change),
+            *saturated(whole),
+            *flat_maps({name: explanation.influence(name) for name in explanation.relevance}),
+            *(alarm for fill, gone in blank.items() for alarm in fill_decides(whole, gone, fill=fill)),
+            *ranking_alarms(by_method),
+        ),
+        table=_table(by_method, explanation),
+    )
+
+
+EQUAL_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
+"""Shares of the image at which methods are compared."""
+
+
+def judge_curves(
+    curves: Mapping[Setting, Mapping[str, RemovalCurve]], *, clusters: Shaped[np.ndarray, "2 frames"], seed: int
+) -> tuple[tuple[RemovalScore, ...], tuple[Comparison, ...]]:
+    """Score methods and controls with intervals over days and trials, and compare the methods with each other."""
+    rng = np.random.default_rng(seed)
+    scores, comparisons = [], []
+    for setting, by_method in curves.items():
+        gains = {name: curve.symmetric_gain for name, curve in by_method.items()}
+        controls = {name: gain for name, gain in gains.items() if is_control(name)}
+        for name, curve in by_method.items():
+            mean = partial(mean_interval, clusters=clusters, rng=rng)
+            area = partial(np.trapezoid, x=curve.areas, axis=-1)
+            steps = {share: np.flatnonzero(np.isclose(curve.areas, share)) for share in EQUAL_AREAS}
+            score = RemovalScore(
+                fill=setting.fill,
+                unit=setting.unit,
+                method=name,
+                control=is_control(name),
+                srg=mean(gains[name]),
+                gain_over_random=mean(curve.gain_over_random),
+                lead_over_controls=None
+                if is_control(name)
+                else lead_over_controls(gains[name], controls, clusters=clusters, rng=rng),
+                most_first=float(area(curve.most_first).mean()),
+                least_first=float(area(curve.least_first).mean()),
+                random=float(area(curve.random).mean()),
+                at={share: float(curve.most_first[:, at[0]].mean()) for share, at in steps.items() if len(at)},
+            )
+            scores.append(score)
+        for first, second in combinations([name for name in by_method if not is_control(name)], 2):
+            gap = paired_difference(gains[first], gains[second], clusters=clusters, rng=rng)
+            comparisons.append(Comparison(fill=setting.fill, unit=setting.unit, first=first, second=second, gap=gap))
+    return tuple(scores), tuple(comparisons)
+
+
+def compare_fills(curves: Mapping[Setting, Mapping[str, RemovalCurve]]) -> tuple[Agreement, ...]:
+    """Compute how far the rankings of the methods agree between fills of the same unit."""
+    agreement = []
+    for first, second in combinations(curves, 2):
+        if first.unit != second.unit:
+            continue
+        names = [name for name in curves[first] if not is_control(name)]
+        ranks = [[float(curves[setting][name].symmetric_gain.mean()) for name in names] for setting in (first, second)]
+        tau = float(np.asarray(kendalltau(*ranks))[0]) if len(names) > 1 else float("nan")
+        defined = tau if np.isfinite(tau) else None
+        agreement.append(Agreement(unit=first.unit, first=first.fill, second=second.fill, tau=defined))
+    return tuple(agreement)
+
+
+def ranking_alarms(curves: Mapping[Setting, Mapping[str, RemovalCurve]]) -> list[str]:
+    """Warn where a control wins, and of fills that rank the methods differently."""
+    by_fill: dict[str, dict[str, float]] = {}
+    alarms = []
+    for setting, of_setting in curves.items():
+        gains = {name: float(curve.symmetric_gain.mean()) for name, curve in of_setting.items()}
+        methods = {name: gain for name, gain in gains.items() if not is_control(name)}
+        best = max(gains.keys() - methods.keys(), key=lambda name: gains[name], default=None)
+        where = f"under {setting.fill}, {setting.unit} by {setting.unit}"
+        for name, gain in methods.items():
+            if gain <= 0:
+                alarms.append(f"{where}: {name} does not beat a random order: its symmetric gain is {gain:.3f}")
+            elif best is not None and gain <= gains[best]:
+                alarms.append(f"{where}: {name} gains {gain:.3f}, no more than the control {best} ({gains[best]:.3f})")
+        if setting.unit == "pixel":
+            by_fill[setting.fill] = methods
+    return [*rankings_disagree(by_fill), *alarms]
+
+
+def _table(curves: Mapping[Setting, Mapping[str, RemovalCurve]], explanation: Explanation) -> RemovalTable:
+    frames, tables = explanation.frames, []
+    for setting, by_method in curves.items():
+        for name, curve in by_method.items():
+            count, steps = curve.most_first.shape
+            if count != len(frames):
+                raise InputError(f"{count} curves of {name} for {len(frames)} frames; make the study again")
+            labels = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
+            table = RemovalTable(
+                fill=np.repeat(setting.fill, count * steps),
+                unit=np.repeat(setting.unit, count * steps),
+                method=np.repeat(name, count * steps),
+                frame_id=np.repeat([frame.id for frame in frames], steps),
+                day=np.repeat([frame.day for frame in frames], steps),
+                trial=np.repeat([frame.trial for frame in frames], steps),
+                safety_margin=np.repeat(labels, steps),
+                area=np.tile(curve.areas, count),
+                most_first=curve.most_first.ravel(),
+                least_first=curve.least_first.ravel(),
+                random=curve.random.ravel(),
+            )
+            tables.append(table)
+    return RemovalTable.joined(tables)
 
 
 def deletion_score(
@@ -90,7 +312,7 @@ def deletion_score(
 
 
 def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarray, " pixels"]:
-    """Flat pixel indices from most to least salient; of ties the later pixel first, as in the thesis's masks.
+    """Return flat pixel indices from most to least salient; of ties the later pixel first, as in the thesis's masks.
 
     Examples
     --------
@@ -103,12 +325,12 @@ def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarra
 
 
 def random_order(shape: tuple[int, int], *, rng: np.random.Generator) -> Int[np.ndarray, " pixels"]:
-    """Flat pixel indices in random order: the control that every explanation has to beat."""
+    """Return flat pixel indices in random order: the control that every explanation has to beat."""
     return rng.permutation(shape[0] * shape[1])
 
 
 def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[np.ndarray, " steps"]:
-    """Pixels removed at each step: as many steps as the image is high, the last of which removes all.
+    """Return the pixels removed at each step: by default as many steps as the image is high; the last removes all.
 
     Polak, section 4 (n_masks = 224 for a 224 x 224 image: 224 steps of 224 pixels).
     """
@@ -119,59 +341,143 @@ def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[n
     return np.round(np.linspace(0, pixels, count + 1)[1:]).astype(np.int64)
 
 
-def deletion_curves(
+def delete_pixels(
     predict: Predict,
     images: Float[Tensor, "images colours height width"],
     orders: Int[np.ndarray, "images pixels"],
     *,
-    fill: Fill,
-    references: Float[Tensor, "images colours height width"] | None = None,
+    fill: str,
     steps: int | None = None,
+    references: Float[Tensor, "images colours height width"] | None = None,
     seed: int = 0,
     batch_size: int = 128,
-    on_progress: OnProgress | None = None,
-) -> DeletionCurves:
-    """Answers of a network while pixels are removed in one order an image (`deletion_order`, `random_order`).
-
-    So many `steps`, the image's height if None, as in the thesis; all else is as for `removal_curves`.
+) -> Float64[np.ndarray, "images answers"]:
+    """Predict whole images, and then after each step while pixels are removed in an order (`deletion_order`).
 
     Examples
     --------
-    A network that reads the mean brightness: bright pixels on black, removed one by one.
+    A network that computes the mean brightness: bright pixels on black, removed one by one.
 
-    >>> import numpy as np
     >>> import torch
-    >>> from sliplens.faithfulness.fills import get_fill
-    >>> from sliplens.faithfulness.scoring import deletion_curves, deletion_order
+    >>> from sliplens.faithfulness.scoring import delete_pixels, deletion_order
     >>> image = torch.zeros(1, 3, 2, 2)
     >>> image[0, :, 0] = 1.0
     >>> order = deletion_order(image[0, 0].numpy())[None]
-    >>> curves = deletion_curves(
-    ...     lambda inputs: inputs.mean(dim=(1, 2, 3)), image, order, fill=get_fill("black"), steps=4
-    ... )
-    >>> curves.predictions
-    array([[0.25, 0.  , 0.  , 0.  ]])
+    >>> delete_pixels(lambda inputs: inputs.mean(dim=(1, 2, 3)), image, order, fill="black", steps=4)
+    array([[0.5 , 0.25, 0.  , 0.  , 0.  ]])
     """
     removed = deletion_steps((images.shape[-2], images.shape[-1]), steps=steps)
     curves = removal_curves(
         predict,
         images,
         orders[None],
-        fill=fill,
+        fill=get_fill(fill),
         references=references,
         areas=[0.0, *removed / removed[-1]],
         seed=seed,
         batch_size=batch_size,
-        on_progress=on_progress,
     )
-    answers = curves.answers[0]
-    return DeletionCurves(pixels_removed=removed, base=answers[:, 0], predictions=answers[:, 1:])
+    return curves.answers[0]
 
 
-def saliency_orders(saliency: Float[np.ndarray, "images height width"], shape: tuple[int, int]) -> np.ndarray:
-    """Deletion orders of several maps."""
-    maps = [require_saliency(each, shape, where=f"saliency map {index}") for index, each in enumerate(saliency)]
-    return np.stack([deletion_order(each) for each in maps])
+def deletion_orders(explanation: Explanation, *, seed: int) -> dict[str, Int[np.ndarray, "frames pixels"]]:
+    """Compute the order of the pixels of each frame by method, most salient first, and a random one."""
+    rng, shape = np.random.default_rng(seed), (explanation.image_size, explanation.image_size)
+    orders = {
+        name: np.stack([deletion_order(values) for values in maps]) for name, maps in explanation.saliency.items()
+    }
+    return orders | {CHANCE: np.stack([random_order(shape, rng=rng) for _ in explanation.frames])}
+
+
+def score_deletion(
+    explanation: Explanation, answers: Mapping[str, Float64[np.ndarray, "frames answers"]], *, fill: str
+) -> DeletionScores:
+    """Make the thesis's deletion scores of the predictions of all frames by method (`delete_pixels`)."""
+    shape = (explanation.image_size, explanation.image_size)
+    chance = answers[CHANCE]
+    removed = deletion_steps(shape, steps=chance.shape[1] - 1)
+    tables = {name: deletion_tables(name, removed, values, explanation) for name, values in answers.items()}
+    return DeletionScores(
+        input=explanation.input,
+        source=explanation.source,
+        fill=fill,
+        steps=len(removed),
+        pixels_per_step=int(removed[0]),
+        methods={name: score_tables(curves) for name, curves in tables.items()},
+        alarms=(
+            *flat_maps(explanation.saliency),
+            # the fill decides where the filled image is predicted like the whole one
+            *fill_decides(chance[:, 0], chance[:, -1], fill=fill),
+            *saturated(chance[:, 0]),
+            *deletion_alarms(tables),
+        ),
+        table=DeletionTable.joined([curve for curves in tables.values() for curve in curves]),
+    )
+
+
+def deletion_table(
+    method: str, frame: ExplainedFrame, removed: np.ndarray, answers: np.ndarray, base: float
+) -> DeletionTable:
+    """Make the rows of one frame and method."""
+    rows = len(answers)
+    return DeletionTable(
+        method=np.repeat(method, rows),
+        frame_id=np.repeat(frame.id, rows),
+        day=np.repeat(frame.day, rows),
+        trial=np.repeat(frame.trial, rows),
+        step=np.arange(rows),
+        pixels_removed=removed,
+        prediction=answers,
+        score=deletion_score(np.full(rows, base), answers),
+    )
+
+
+def deletion_tables(
+    method: str,
+    removed: Int[np.ndarray, " steps"],
+    answers: Float64[np.ndarray, "frames answers"],
+    explanation: Explanation,
+) -> list[DeletionTable]:
+    """Make the rows of a method, a table a frame."""
+    rows = zip(explanation.frames, answers, strict=True)
+    return [deletion_table(method, frame, removed, values[1:], values[0]) for frame, values in rows]
+
+
+def score_tables(curves: Sequence[DeletionTable]) -> MethodScore:
+    """Compute the score of a method from the rows of each frame."""
+    auc, last = np.array([(curve.score.mean(), curve.score[-1]) for curve in curves]).T
+    return MethodScore(
+        mean=float(auc.mean()), sd=float(auc.std()), last_step_mean=float(last.mean()), frames=len(curves)
+    )
+
+
+def deletion_alarms(curves: Mapping[str, Sequence[DeletionTable]]) -> Iterator[str]:
+    """Warn where the score does not measure the map: one that does not beat a random order shows nothing."""
+    chance = float(np.mean([curve.score.mean() for curve in curves[CHANCE]]))
+    for name, tables in curves.items():
+        if name == CHANCE:
+            continue
+        means, last = (
+            np.array(values) for values in zip(*((c.score.mean(), c.score[-1]) for c in tables), strict=True)
+        )
+        if len({len(curve) for curve in tables}) == 1:  # where curves stop early, the last step depends on the map
+            yield from follows_last_step(means, last, name=f"D of {name}")
+        if means.mean() >= chance:
+            yield f"{name} does not beat a random order ({means.mean():.3f} against {chance:.3f})"
+
+
+def with_deletion(faithfulness: Faithfulness, scores: DeletionScores | None = None) -> Faithfulness:
+    """Add the thesis's deletion score to the record, if it was computed."""
+    if scores is None:
+        return faithfulness
+    part = Deletion(
+        fill=scores.fill,
+        steps=scores.steps,
+        pixels_per_step=scores.pixels_per_step,
+        methods=scores.methods,
+        alarms=scores.alarms,
+    )
+    return replace(faithfulness, deletion=part, deletion_table=scores.table)
 
 
 FILL_DECIDES = 0.05
@@ -183,7 +489,7 @@ _FEWEST = 3
 
 
 def fill_decides(whole: Float[np.ndarray, " images"], filled: Float[np.ndarray, " images"], *, fill: str) -> list[str]:
-    """Say in how many images the fill alone is answered like the whole image: there no map can move the answer."""
+    """Warn of images whose fill alone is predicted like the whole image: there no map can change the prediction."""
     near = int(np.sum(np.abs(whole - filled) < FILL_DECIDES))
     sentence = (
         f"the fill decides in {near} of {len(whole)} frames: an image of nothing but {fill} is answered within "
@@ -195,7 +501,7 @@ def fill_decides(whole: Float[np.ndarray, " images"], filled: Float[np.ndarray, 
 def follows_last_step(
     score: Float[np.ndarray, " images"], last: Float[np.ndarray, " images"], *, name: str
 ) -> list[str]:
-    """Say whether a score follows its own last step, where all is filled and no map has a part."""
+    """Warn of a score that follows its last step, where all is filled and no map matters."""
     if len(score) < _FEWEST or np.std(score) == 0 or np.std(last) == 0:
         return []
     tied = float(np.corrcoef(score, last)[0, 1])
@@ -205,7 +511,7 @@ def follows_last_step(
 
 
 def little_to_explain(change: Float[np.ndarray, " images"]) -> list[str]:
-    """Say in how many images the answer is nearly that on the untouched sensor, so that its direction is chance."""
+    """Warn of frames predicted nearly like the untouched sensor, whose direction is chance."""
     few = int(np.sum(np.abs(change) < CLOSE))
     sentence = (
         f"next to nothing to explain in {few} of {len(change)} frames: the answer lies within {CLOSE} of that on the "
@@ -216,13 +522,13 @@ def little_to_explain(change: Float[np.ndarray, " images"]) -> list[str]:
 
 
 def saturated(answers: Float[np.ndarray, " images"]) -> list[str]:
-    """Say how many answers lie at an end of [0, 1] or outside: they move one way only."""
+    """Warn of predictions at an end of [0, 1] or outside: they can move one way only."""
     ends = int(np.sum((answers < _SATURATED) | (answers > 1 - _SATURATED)))
     return [f"{ends} of {len(answers)} answers lie at an end of the margin: they can move one way only"] if ends else []
 
 
 def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> list[str]:
-    """Say which methods gave maps that are constant, or hold NaN: they rank nothing."""
+    """Warn of constant maps and maps with NaN, which rank nothing."""
     alarms = []
     for method, values in maps.items():
         bad = int(np.sum(~np.isfinite(values).all(axis=(1, 2))))
@@ -233,7 +539,7 @@ def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> l
 
 
 def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Say which fills rank the methods differently, by Kendall's tau; scores by fill, then by method.
+    """Warn of fills that rank the methods differently, by Kendall's tau; scores by fill, then by method.
 
     Kendall, *A new measure of rank correlation* (1938).
     """
@@ -250,179 +556,3 @@ def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
                 "on what removed pixels become"
             )
     return alarms
-
-
-def controls_win(scores: Mapping[str, Faithfulness], controls: Mapping[str, Faithfulness]) -> list[str]:
-    """Say which methods gain no more than a map that knows nothing of the network, or than random orders."""
-    alarms = []
-    best = max(controls, key=lambda name: float(controls[name].symmetric_gain.mean()), default=None)
-    for method, score in scores.items():
-        gain = float(score.symmetric_gain.mean())
-        if gain <= 0:
-            alarms.append(f"{method} does not beat a random order: its symmetric gain is {gain:.3f}")
-        elif best is not None and gain <= (control := float(controls[best].symmetric_gain.mean())):
-            alarms.append(f"{method} gains {gain:.3f}, no more than the control {best} ({control:.3f})")
-    return alarms
-
-
-Frames: TypeAlias = UInt8[np.ndarray, "images height width 3"]
-Maps: TypeAlias = Attribution | Float[np.ndarray, "maps rows columns"]
-"""Attribution of the frames, or a number for each pixel of the network's input, whose meaning `signed` names."""
-_CHECKED_IMAGES = 4
-_TILES_ACROSS = 14
-
-
-def score(
-    run: Network | Path | str,
-    frames: Frames,
-    maps: Maps,
-    *,
-    signed: bool = True,
-    reference: UInt8[np.ndarray, "height width 3"] | None = None,
-    fill: str = "reference",
-    unit: Literal["pixel", "tile"] = "pixel",
-    random_orders: int = RANDOM_ORDERS,
-    seed: int = 0,
-    on_progress: OnProgress | None = None,
-) -> Faithfulness:
-    """Score maps by removing what they call influential first, and last, against random orders and controls.
-
-    The score is the symmetric gain, in margin units: how much further the answer moves towards that on the untouched
-    sensor with the most influential parts removed first rather than the least. A map that gains no more than the
-    controls, which know nothing of the network, has shown nothing. Every frame that is given counts; an alarm says of
-    how many the answer is nearly that on the untouched sensor, which a study leaves out (`worth_scoring`).
-
-    Parameters
-    ----------
-    run
-        The network that was explained, its folder, or the name of one that comes with sliplens.
-    frames, reference
-        As `explain` took them.
-    maps
-        What `explain` gave; or an array (frames, size, size) of one number a pixel of the network's input.
-    signed
-        Meaning of an array. True: above zero where a pixel raises the prediction, as `Attribution.relevance` and the
-        attributions of Captum, summed over the colours. Pixels then rank by sign(f(x) - f(reference)) times the map,
-        as those of an `Attribution` do. False: larger where a pixel matters more, whichever way the prediction went,
-        as a saliency in [0, 1].
-    fill
-        What removed pixels become, a row of `FILLS`; `reference`, the untouched sensor, is the one that networks know.
-    unit
-        What is removed at once: pixels, or square tiles of a fourteenth of the image.
-    random_orders
-        How many random orders are removed beside.
-
-    Raises
-    ------
-    InputError
-        If there is no such fill, or the network needs a reference.
-    SaliencyError
-        If there is not a map a frame, or one has another size than the network's input, or holds NaN; or if a signed
-        array has no number below zero for a frame whose prediction fell.
-    """
-    fill_of_name, trained = get_fill(fill), open_run(run)
-    inputs, empty = network_inputs(trained, frames, reference)
-    method = maps.method if isinstance(maps, Attribution) else "maps"
-    whole, untouched = (trained.predict(images).double().numpy() for images in (inputs, empty[None]))
-    towards = np.sign(whole - untouched)
-    influence = {method: _influence(maps, inputs, towards=towards, signed=signed)}
-    influence |= control_maps(trained.model, inputs, empty.expand_as(inputs))
-    shape = (inputs.shape[-2], inputs.shape[-1])
-    units = tile_units(shape, size=1 if unit == "pixel" else max(1, shape[0] // _TILES_ACROSS))
-    orders = 2 * len(influence) + random_orders
-    scores = score_maps(
-        prepare_passes(trained, inputs, len(inputs) * orders * (len(AREAS) - 2)),
-        inputs,
-        influence,
-        [units] * len(inputs),
-        fill=fill_of_name,
-        rng=np.random.default_rng(seed),
-        references=empty.expand_as(inputs),
-        towards=towards,
-        random_orders=random_orders,
-        seed=seed,
-        on_progress=on_progress,
-    )
-    named = {name: replace(each, method=name, fill=fill) for name, each in scores.items()}
-    own = named.pop(method)
-    filled = whole - towards * own.curves[0, :, -1]
-    alarms = (
-        *little_to_explain(whole - untouched),
-        *saturated(whole),
-        *flat_maps({method: influence[method]}),
-        *fill_decides(whole, filled, fill=fill),
-        *controls_win({method: own}, named),
-    )
-    return replace(own, controls=named, alarms=alarms)
-
-
-def score_by_deletion(
-    run: Network | Path | str,
-    frames: Frames,
-    maps: Maps,
-    *,
-    signed: bool = True,
-    reference: UInt8[np.ndarray, "height width 3"] | None = None,
-    fill: str = "grey",
-    steps: int | None = None,
-    seed: int = 0,
-    on_progress: OnProgress | None = None,
-) -> DeletionCurves:
-    """Score maps as the thesis does: remove the most salient pixels step by step, beside a random order (`control`).
-
-    Kept to compare with published figures; `score` is the one to rely on (docs/deletion.md). Arguments are those of
-    `score`, and `steps` until every pixel is gone; the image's height if None, as in the thesis.
-
-    References
-    ----------
-    Polak, section 4 and eq. 2.
-    """
-    fill_of_name, trained = get_fill(fill), open_run(run)
-    inputs, empty = network_inputs(trained, frames, reference)
-    shape = (inputs.shape[-2], inputs.shape[-1])
-    whole, untouched = (trained.predict(images).double().numpy() for images in (inputs, empty[None]))
-    salient = np.maximum(_influence(maps, inputs, towards=np.sign(whole - untouched), signed=signed), 0)
-    rng = np.random.default_rng(seed)
-    orders = np.concatenate([saliency_orders(salient, shape), [random_order(shape, rng=rng) for _ in salient]])
-    curves = deletion_curves(
-        prepare_passes(trained, inputs, len(orders) * len(deletion_steps(shape, steps=steps))),
-        torch.cat([inputs, inputs]),
-        orders,
-        fill=fill_of_name,
-        references=empty.expand(len(orders), -1, -1, -1),
-        steps=steps,
-        seed=seed,
-        on_progress=on_progress,
-    )
-    own, control = (
-        DeletionCurves(pixels_removed=curves.pixels_removed, base=base, predictions=predictions)
-        for base, predictions in zip(np.split(curves.base, 2), np.split(curves.predictions, 2), strict=True)
-    )
-    return replace(own, control=control)
-
-
-def prepare_passes(trained: Network, inputs: Float[Tensor, "images colours size size"], passes: int) -> Engine:
-    """Make an engine ready for so many passes of a network, checked on a few of its inputs, on the network's device."""
-    some = inputs[:_CHECKED_IMAGES].to(trained.device)
-    return prepare(trained.model, some, trained.predict(some).to(trained.device), passes=passes)
-
-
-def _influence(
-    maps: Maps, inputs: Tensor, *, towards: Float[np.ndarray, " images"], signed: bool
-) -> Float64[np.ndarray, "images height width"]:
-    """Rank the pixels by what works towards the prediction, `towards` the sign of f(x) - f(reference)."""
-    of_record = isinstance(maps, Attribution)
-    values = maps.influence.double().cpu().numpy() if of_record else maps.astype(np.float64)
-    if len(values) != len(inputs):
-        raise SaliencyError(f"there are {len(values)} maps of {len(inputs)} frames; explain the frames that are scored")
-    for index, each in enumerate(values):
-        require_saliency(each, inputs.shape[-2:], where=f"map {index}")
-    if of_record or not signed:
-        return values
-    for index in np.flatnonzero((towards < 0) & (values.min(axis=(1, 2)) >= 0) & (values.max(axis=(1, 2)) > 0)):
-        raise SaliencyError(
-            f"map {index} has no number below 0, but the prediction of its frame is lower than that of the untouched "
-            "sensor, which a signed map must explain by pixels that lower it; if its numbers say how much a pixel "
-            "matters whichever way, give signed=False"
-        )
-    return towards[:, None, None] * values

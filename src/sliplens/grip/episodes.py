@@ -13,7 +13,9 @@ from jaxtyping import Float, Float32, UInt8
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
-from sliplens.explainers.table import explain, get_explainer
+from sliplens.explainers.explain import choose_explainers, explain_frames
+from sliplens.explainers.frames import frames_from_arrays
+from sliplens.explainers.table import get_explainer
 from sliplens.files import DEFAULT_NETWORK, output_folder, remove, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import Controller, make_controller
@@ -304,10 +306,9 @@ class _Job:
                         _save_trials(folder, sensor, ticks, frames, condition=setup.condition, number=number)
                     if self.options.method is not None and number == 0:
                         pictures = np.ascontiguousarray(frames[[round(at / PERIOD_S) for at in MOMENTS_S], 0])
-                        explanation = explain(
-                            self.network, pictures, reference=sensor.references[0], method=self.options.method
-                        )
-                        maps = explanation.relevance.cpu().numpy()
+                        explained = frames_from_arrays(self.network, pictures, sensor.references[0])
+                        explainers, _ = choose_explainers(self.network, explained, self.options.method, budget=1.0)
+                        [maps] = explain_frames(self.network, explained, explainers).relevance.values()
             order = np.argsort(np.concatenate([rows for rows, _ in parts]))
             tables.append(EpisodeTable.joined([table for _, table in parts]).where(order))
             for learner in learners:

@@ -15,7 +15,6 @@ from matplotlib.patheffects import Normal, Stroke
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
-from sliplens.plots.saliency import NOMINAL_MARGINS
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -35,6 +34,7 @@ from sliplens.plots.style import (
 from sliplens.progress import number_of
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
+from sliplens.results.explanation import MARGIN_LEVELS
 
 STATE_COLOURS = dict(zip(ContactState, (GREY, BLUE, ORANGE, VERMILLION, "white"), strict=True))
 # full slip is darker, so that lightness too separates it from incipient slip
@@ -95,7 +95,7 @@ _ALIKE = 0.005  # margins that are equal in whole percents
 
 # inches, from left to right: facts of the trial, pictures, charts
 _WIDTH, _EDGE, _INFO, _GAP, _AXIS, _CHART = 16.0, 0.2, 1.9, 0.07, 0.62, 2.9
-_PICTURE = (_WIDTH - 2 * _EDGE - _INFO - _AXIS - _CHART) / (1 + len(NOMINAL_MARGINS)) - _GAP
+_PICTURE = (_WIDTH - 2 * _EDGE - _INFO - _AXIS - _CHART) / (1 + len(MARGIN_LEVELS)) - _GAP
 # from top to bottom; charts need some height, and very long or very high pictures are reduced
 _HEAD, _TIME, _FOOT, _LEGEND, _LEAST, _PICTURE_HEIGHT = 0.42, 0.42, 0.18, 0.75, 2.6, (0.8, 2.4)
 
@@ -152,7 +152,7 @@ def choose_margins(recording: Recording) -> list[int | None]:
     sliding = states == ContactState.FULL_SLIP
     wanted = {1.0: states == ContactState.CONTACT, 0.0: sliding}
     chosen: list[int | None] = []
-    for nominal in NOMINAL_MARGINS:
+    for nominal in MARGIN_LEVELS:
         nearest = None
         for fitting in (labelled, labelled & wanted.get(nominal, ~np.logical_or.accumulate(sliding))):
             distance = np.where(fitting, np.abs(recording.safety_margin - nominal), np.inf)
@@ -184,7 +184,7 @@ def _draw_pictures(
             ax.spines[:].set_visible(False)
         if index is None and column:
             camera.spines[:].set(visible=True, color="#E5E7EB")
-            write_over(camera, f"no frame\nnear {percent(NOMINAL_MARGINS[column - 1])}")
+            write_over(camera, f"no frame\nnear {percent(MARGIN_LEVELS[column - 1])}")
             continue
         frame = recording.reference if index is None else recording.frames[index]
         camera.imshow(frame)
@@ -240,7 +240,7 @@ def _range(values: Float[np.ndarray, " frames"]) -> str:
 def _explain(figure: Figure, recordings: Sequence[Recording], factor: float) -> None:
     bottom = float(figure.get_size_inches()[1])
     words = (
-        f"Frames nearest to Γ = {', '.join(f'{100 * nominal:.0f}' for nominal in NOMINAL_MARGINS)} %; at the left the "
+        f"Frames nearest to Γ = {', '.join(f'{100 * nominal:.0f}' for nominal in MARGIN_LEVELS)} %; at the left the "
         "ranges of their $F_n$ and $\\mu$. Differences are $|T_n - T_0|$ against the untouched sensor, brightened "
         f"{TIMES} {factor:g}: one factor for the whole sheet, so pictures compare."
     )

@@ -16,13 +16,13 @@ from sliplens.plots.style import (
     GREEN,
     GREY,
     INPUT_COLOURS,
-    METHOD_COLOURS,
-    METHOD_LINES,
     PURPLE,
     VERMILLION,
     conditions_in_order,
     drawing_style,
     inputs_in_order,
+    method_colour,
+    method_line,
     method_name,
     methods_in_order,
     place_axes,
@@ -102,11 +102,11 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
     The band holds the middle half of the frames.
     """
     for name in methods_in_order(curves):
-        curve, colour = curves[name], METHOD_COLOURS.get(name, PURPLE)
+        curve, colour = curves[name], method_colour(name)
         share = 100 * curve.pixels_removed / pixels
         low, high = np.quantile(curve.scores, [0.25, 0.75], axis=0)
         ax.fill_between(share, low, high, color=colour, alpha=0.12, linewidth=0)
-        line = {"linestyle": METHOD_LINES.get(name, "-"), "linewidth": 2.2 if name != CHANCE else 2.4}
+        line = {"linestyle": method_line(name), "linewidth": 2.2 if name != CHANCE else 2.4}
         ax.plot(share, curve.scores.mean(axis=0), color=colour, label=method_name(name), **line)
     ax.set(xlabel="Pixels removed (%)", ylabel="Deletion score D (no unit)", xlim=(0, 100), ylim=(0, 1.03))
     ax.legend()

@@ -18,7 +18,7 @@ from sliplens.intervals import Difference
 from sliplens.markers.gel import SensorProposal
 from sliplens.plots.errors import plot_answers, plot_faithfulness, plot_learning_curves
 from sliplens.plots.margins import column, plot_grip_force, plot_hold, plot_margins, plot_readings
-from sliplens.plots.saliency import full_colour, overlay_relevance, overlay_saliency, stretch_saliency
+from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -30,12 +30,11 @@ from sliplens.plots.style import (
     method_name,
     methods_in_order,
     percent,
-    reading_words,
     written_whole,
 )
 from sliplens.results.evaluation import Diagnosis
 from sliplens.results.explanation import Explanation
-from sliplens.results.faithfulness import DeletionScores, RemovalScores, is_control
+from sliplens.results.faithfulness import DeletionScores, Faithfulness, is_control
 from sliplens.results.study import Study, Truth
 
 __all__ = ["draw_proposal", "plot", "write_proposal"]
@@ -73,11 +72,11 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     --------
     >>> import numpy as np
     >>> import sliplens as sl
-    >>> from sliplens.faithfulness.removal import Faithfulness
-    >>> curves = np.array([[[0, 0.4, 0.4]], [[0, 0.0, 0.4]], [[0, 0.2, 0.4]]])
-    >>> figure = sl.plot(Faithfulness(areas=np.array([0, 0.5, 1.0]), curves=curves))
-    >>> [line.get_label() for line in figure.axes[0].lines]
-    ['most influential first', 'least influential first', 'random orders']
+    >>> touched = np.zeros((1, 224, 224, 3), dtype=np.uint8)
+    >>> touched[:, 80:120, 90:150] = 90
+    >>> figure = sl.plot(sl.explain("chromatouch-difference", touched, method="grad-cam"))
+    >>> figure.axes[0].get_title().splitlines()[1]
+    'orange lowers, blue raises'
     """
     # by the names of the classes: some records live on higher floors, and drawing them needs no torch
     drawer = next((DRAWERS[kind.__name__] for kind in type(result).__mro__ if kind.__name__ in DRAWERS), None)
@@ -90,38 +89,14 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     return figure
 
 
-def _attribution(explanation: Any, ax: Axes, index: int) -> None:
-    # tensors answer NumPy's protocol once they are on the CPU and carry no gradient
-    image, relevance = (
-        _array(values)[_of(len(values), index)] for values in (explanation.frames, explanation.relevance)
-    )
-    picture = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8).transpose(1, 2, 0)
-    read, compared = (
-        percent(float(_array(values)[index])) for values in (explanation.prediction, explanation.reference_prediction)
-    )
-    ax.imshow(overlay_relevance(picture, relevance / full_colour(relevance)))
+def _explanation(explanation: Explanation, ax: Axes, index: int) -> None:
+    row = _of(len(explanation.frames), index)
+    frame, relevance = explanation.frames[row], explanation.relevance[explanation.method][row]
+    ax.imshow(overlay_relevance(explanation.pictures[row], relevance / full_colour(relevance)))
     ax.set_axis_off()
-    ax.set_title(f"{method_name(explanation.method)}: why {read} rather than {compared}\norange lowers, blue raises")
-
-
-def _explanation(explained: Explanation, ax: Axes, index: int) -> None:
-    method, place = methods_in_order(explained.saliency)[0], _of(len(explained.frames), index)
-    ax.imshow(overlay_saliency(explained.pictures[place], stretch_saliency(explained.saliency[method][place])))
-    ax.set_axis_off()
-    frame = explained.frames[place]
-    ax.set_title(
-        f"{method_name(method)}: true {percent(frame.safety_margin)}, {reading_words(frame.prediction, frame.withheld)}"
-    )
-
-
-def _faithfulness(faithfulness: Any, ax: Axes, _: int) -> None:
-    names = ("most influential first", "least influential first", "random orders")
-    lines = ((BLUE, "-"), (BLUE, "--"), (BLACK, ":"))
-    for values, name, (colour, line) in zip(faithfulness.curves, names, lines, strict=True):
-        ax.plot(100 * faithfulness.areas, values.mean(axis=0), color=colour, linestyle=line, label=name)
-    ax.set(xlabel="Removed (% of the image)", ylabel="Change of the prediction (margin units)", xlim=(0, 100))
-    ax.set_title(" ".join([method_name(faithfulness.method), f"({faithfulness.fill})" if faithfulness.fill else ""]))
-    ax.legend()
+    predicted = "withheld" if frame.withheld else percent(frame.prediction)
+    why = f"why {predicted} rather than {percent(frame.reference_prediction)}"
+    ax.set_title(f"{method_name(explanation.method)}: {why}\norange lowers, blue raises")
 
 
 def _deletion(scores: DeletionScores, ax: Axes, _: int) -> None:
@@ -129,14 +104,28 @@ def _deletion(scores: DeletionScores, ax: Axes, _: int) -> None:
     plot_faithfulness(scores.curves, pixels=pixels, ax=ax).set_title(input_name(scores.input))
 
 
-def _removal(scores: RemovalScores, ax: Axes, _: int) -> None:
-    if not scores.scores:
+def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int) -> None:
+    if not faithfulness.scores:
         raise InputError("these scores hold no method; score some explanations first")
-    fill, unit = scores.scores[0].fill, scores.scores[0].unit
-    gains = {score.method: score.srg for score in scores.scores if (score.fill, score.unit) == (fill, unit)}
+    fill, unit = faithfulness.scores[0].fill, faithfulness.scores[0].unit
+    gains = {score.method: score.srg for score in faithfulness.scores if (score.fill, score.unit) == (fill, unit)}
+    methods = [name for name in gains if not is_control(name)]
+    if len(methods) == 1:
+        curve = faithfulness.curves[fill, unit, methods[0]]
+        lines = (
+            (curve.most_first, "most influential first", BLUE, "-"),
+            (curve.least_first, "least influential first", BLUE, "--"),
+            (curve.random, "random orders", BLACK, ":"),
+        )
+        for values, name, colour, line in lines:
+            ax.plot(100 * curve.areas, values.mean(axis=0), color=colour, linestyle=line, label=name)
+        ax.set(xlabel="Removed (% of the image)", ylabel="Change of the prediction (margin units)", xlim=(0, 100))
+        ax.set_title(f"{method_name(methods[0])} ({fill_name(fill, unit)})")
+        ax.legend()
+        return
     _plot_methods(gains, ax)
     ax.set(xlabel=f"Symmetric gain, {fill_name(fill, unit)} (margin units, 95 % interval)")
-    ax.set_title(input_name(scores.input))
+    ax.set_title(input_name(faithfulness.input))
 
 
 def _truth(truth: Truth, ax: Axes, _: int) -> None:
@@ -179,7 +168,7 @@ def _plot_gaps(rows: Sequence[tuple[str, Difference, str]], ax: Axes) -> None:
 def _study(study: Study, ax: Axes, index: int) -> None:
     if not study.faithfulness:
         raise InputError("this study holds no scores; run `sliplens study` on")
-    _removal(study.faithfulness[sorted(study.faithfulness)[0]], ax, index)
+    _faithfulness(study.faithfulness[sorted(study.faithfulness)[0]], ax, index)
 
 
 def _margins(predictions: pa.Table, ax: Axes, index: int) -> None:
@@ -206,12 +195,6 @@ def _rows_of_trial(table: pa.Table, index: int) -> pa.Table:
     return table.filter(pc.field("trial") == names[_of(len(names), index)])
 
 
-def _array(values: Any) -> np.ndarray:
-    # a tensor answers NumPy's protocol once it is on the CPU and carries no gradient
-    detached = values.detach().cpu() if hasattr(values, "detach") else values
-    return np.asarray(detached, dtype=np.float64)
-
-
 def _of(count: int, index: int) -> int:
     if not -count <= index < count:
         raise InputError(f"there is no number {index} among {count}; count from 0")
@@ -221,11 +204,9 @@ def _of(count: int, index: int) -> int:
 DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Evaluation": lambda result, ax, _: plot_answers(result.predictions, sorted(result.conditions), ax=ax),
     "Training": lambda result, ax, _: plot_learning_curves({result.input: result}, ax=ax),
-    "Attribution": _attribution,
     "Explanation": _explanation,
-    "Faithfulness": _faithfulness,
     "DeletionScores": _deletion,
-    "RemovalScores": _removal,
+    "Faithfulness": _faithfulness,
     "Study": _study,
     "Truth": _truth,
     "Diagnosis": _diagnosis,

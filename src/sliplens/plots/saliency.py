@@ -1,18 +1,21 @@
 """Saliency over what the network saw, and the frames to show it on."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Literal, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LinearSegmentedColormap, to_rgb
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from sliplens.plots.style import ORANGE, SKY, in_order
-from sliplens.results.explanation import ExplainedFrame, require_saliency
+from sliplens.images import write_png
+from sliplens.plots.style import ORANGE, SKY, drawing_style, in_order, method_name, percent, reading_words
+from sliplens.results.explanation import MARGIN_LEVELS, ExplainedFrame, Explanation, require_saliency
 
 # perceptually uniform, rises in lightness, and read alike under every common colour blindness
 COLORMAP = "inferno"
@@ -87,10 +90,6 @@ def _blend(
     return (1 - alpha) * grey[..., None] + alpha * colormaps[COLORMAP](saliency)[..., :3]
 
 
-_CELL_IN = 1.6
-_BAR_IN = 3.6  # as wide as what is said below the colour bar
-
-
 def overlay_jet(
     picture: UInt8[np.ndarray, "height width 3"], saliency: Float[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
@@ -104,14 +103,73 @@ def overlay_jet(
     return np.round(255 * mixed / max(mixed.max(), 1e-12)).astype(np.uint8)
 
 
-def draw_panel(
-    rows: Mapping[str, Sequence[UInt8[np.ndarray, "height width 3"] | None]],
-    *,
-    titles: Sequence[str],
-    bar: ScalarMappable,
-    bar_label: str,
+Colours: TypeAlias = Literal["signed", "jet"]
+"""Colours of overlays: `signed`, what raises and what lowers, on one scale; `jet`, what supports, as in the thesis."""
+_CELL_IN = 1.6
+_BAR_IN = 3.6  # as wide as the label of the colour bar
+_WIDEST = 12
+"""Frames of a panel at most, which can still be seen on a screen."""
+_LEAST = 0.2
+"""Least full colour, in points of margin per 1 % of the image: 2 points, which is nothing to explain, on a tenth."""
+
+
+def full_points(relevance: Float[np.ndarray, "frames height width"]) -> float:
+    """Return the relevance that gets the full colour in all frames, in points of margin per 1 % of the image."""
+    return max(full_colour(relevance * relevance[0].size), _LEAST)
+
+
+def overlay_points(
+    pictures: UInt8[np.ndarray, "frames height width 3"], relevance: Float[np.ndarray, "frames height width"]
+) -> list[UInt8[np.ndarray, "height width 3"]]:
+    """Overlay pictures with signed maps on one scale (`full_points`)."""
+    limit = full_points(relevance)
+    return [
+        overlay_relevance(picture, values * values.size / limit)
+        for picture, values in zip(pictures, relevance, strict=True)
+    ]
+
+
+def draw_explanation(explanation: Explanation, folder: Path, *, colours: Colours = "signed") -> None:
+    """Write an overlay of every map (`overlays/METHOD/FRAME.png`), and up to 12 frames side by side (`panel.png`)."""
+    count = len(explanation.frames)
+    columns = np.linspace(0, count - 1, min(count, _WIDEST)).round().astype(int).tolist()
+    rows = {"Network input": [explanation.pictures[column] for column in columns]}
+    for method, relevance in explanation.relevance.items():
+        (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
+        if colours == "jet":
+            pictures = list(map(overlay_jet, explanation.pictures, explanation.saliency[method]))
+            scale = ""
+        else:
+            pictures = overlay_points(explanation.pictures, relevance)
+            scale = f"\nfull colour: {full_points(relevance):.2g} points"
+        for frame, picture in zip(explanation.frames, pictures, strict=True):
+            write_png(overlays / f"{frame.id}.png", picture)
+        rows[f"{method_name(method)}{scale}"] = [pictures[column] for column in columns]
+    titles = []
+    for frame in (explanation.frames[column] for column in columns):
+        name = frame.id if len(frame.id) <= 22 else f"\N{HORIZONTAL ELLIPSIS}{frame.id[-21:]}"
+        true = "" if frame.safety_margin is None else f", true {percent(frame.safety_margin)}"
+        titles.append(f"{name}\n{reading_words(frame.prediction, frame.withheld)}{true}")
+    if colours == "jet":
+        bar, words = (
+            ScalarMappable(Normalize(0, 1), "jet"),
+            "supports the answer (share of its own picture's strongest)",
+        )
+    else:
+        bar = ScalarMappable(Normalize(-1, 1), SIGN_COLOURS)
+        words = "lowers the margin  |  raises it, in shares of the full colour\n"
+        words += "(which is in points of margin per 1 % of the image)"
+    if len(columns) < count:
+        words += f"\n{len(columns)} of {count} frames, evenly spread; overlays/ has them all"
+    with drawing_style():
+        figure = _draw_panel(rows, titles, bar)
+        figure.axes[-1].set_xlabel(words, fontsize=8)
+        figure.savefig(folder / "panel.png", bbox_inches="tight")
+
+
+def _draw_panel(
+    rows: Mapping[str, Sequence[UInt8[np.ndarray, "height width 3"]]], titles: Sequence[str], bar: ScalarMappable
 ) -> Figure:
-    """Draw a table of pictures, each row under its name, and one colour bar; None leaves a cell empty."""
     size = (max(_CELL_IN * len(titles) + 0.6, _BAR_IN), _CELL_IN * len(rows) + 1.2)
     figure = Figure(figsize=size, dpi=120, layout="constrained")
     axes = figure.subplots(len(rows), len(titles), squeeze=False)
@@ -120,18 +178,15 @@ def draw_panel(
         for ax, picture in zip(line, pictures, strict=True):
             ax.set(xticks=[], yticks=[])
             ax.spines[:].set_visible(False)
-            if picture is not None:
-                ax.imshow(picture, interpolation="nearest")
+            ax.imshow(picture, interpolation="nearest")
     for ax, title in zip(axes[0], titles, strict=True):
         ax.set_title(title, fontsize=7, loc="center", fontweight="normal", parse_math=False)
-    drawn = figure.colorbar(bar, ax=list(axes.flat), location="bottom", fraction=0.05, aspect=50, pad=0.02)
-    drawn.set_label(bar_label, fontsize=8)
-    drawn.ax.tick_params(labelsize=7)
-    drawn.ax.xaxis.set_major_formatter(PercentFormatter(1))
+    colour_bar = figure.colorbar(bar, ax=list(axes.flat), location="bottom", fraction=0.05, aspect=50, pad=0.02)
+    colour_bar.ax.tick_params(labelsize=7)
+    colour_bar.ax.xaxis.set_major_formatter(PercentFormatter(1))
     return figure
 
 
-NOMINAL_MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 _TOLERANCE = 0.1  # half the distance between two columns
 
 
@@ -145,11 +200,11 @@ def choose_columns(frames: tuple[ExplainedFrame, ...]) -> tuple[str, list[tuple[
     rows = [index for index, frame in enumerate(frames) if frame.condition == condition]
     labels = {index: margin for index in rows if (margin := frames[index].safety_margin) is not None}
     if not labels:
-        return condition, [(None, index) for index in rows[: len(NOMINAL_MARGINS)]]
-    if len(labels) == len(rows) <= len(NOMINAL_MARGINS):
+        return condition, [(None, index) for index in rows[: len(MARGIN_LEVELS)]]
+    if len(labels) == len(rows) <= len(MARGIN_LEVELS):
         return condition, [(labels[index], index) for index in sorted(rows, key=lambda index: -labels[index])]
     chosen = []
-    for nominal in NOMINAL_MARGINS:
+    for nominal in MARGIN_LEVELS:
         nearest = min(labels, key=lambda index: abs(labels[index] - nominal))
         near = abs(labels[nearest] - nominal) < _TOLERANCE
         chosen.append((nominal, nearest if near else None))

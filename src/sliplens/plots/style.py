@@ -21,9 +21,10 @@ from matplotlib.ticker import FixedFormatter
 from PIL import Image
 
 from sliplens.errors import InputError
+from sliplens.explainers.table import EXPLAINERS
 from sliplens.intervals import Difference
 from sliplens.progress import visible
-from sliplens.results.faithfulness import CHANCE, CONTROLS, NEW_WEIGHTS, is_control
+from sliplens.results.faithfulness import CHANCE, NEW_WEIGHTS, is_control
 
 # Okabe and Ito's palette, distinct under every common colour blindness
 BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
@@ -38,22 +39,7 @@ INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE, "pair": GREEN}
 CONDITION_COLOURS = {"dry": ORANGE, "wet": BLUE}
 SOURCE_NAMES = {"simulated": "simulated touch", "real": "real touch"}
 
-METHOD_NAMES = {
-    "grad-cam": "Grad-CAM",
-    "integrated-gradients": "Integrated Gradients",
-    "poly-cam": "Poly-CAM",
-    "grad-cam-thesis": "Grad-CAM as in the thesis",
-    "integrated-gradients-thesis": "Integrated Gradients as in the thesis",
-    "poly-cam-thesis": "Poly-CAM as in the thesis",
-    "hires-cam": "HiResCAM",
-    "layer-cam": "LayerCAM",
-    "expected-gradients": "Expected Gradients",
-    "smooth-grad": "SmoothGrad",
-    "occlusion": "Occlusion",
-    "occlusion-marker": "Occlusion by marker",
-    "shapley": "Shapley values of tiles",
-    "shapley-marker": "Shapley values of markers",
-    "lrp": "LRP",
+CONTROL_NAMES = {
     "edges": "Edge filter (control)",
     "change": "The change itself (control)",
     "local-change": "Local change (control)",
@@ -63,34 +49,7 @@ METHOD_NAMES = {
     "oracle": "The truth itself",
     "degraded-oracle": "The truth, damaged",
 }
-METHOD_COLOURS = {
-    "grad-cam": VERMILLION,
-    "integrated-gradients": SKY,
-    "poly-cam": GREEN,
-    "poly-cam-thesis": ORANGE,
-    "occlusion": BLUE,
-    "occlusion-marker": PURPLE,
-    "shapley": PURPLE,
-    "shapley-marker": PURPLE,
-    "grad-cam-thesis": "#F2A37E",
-    "integrated-gradients-thesis": "#A9A9A9",
-    "lrp": GREY,
-    CHANCE: BLACK,
-}
-METHOD_LINES: dict[str, Any] = {
-    "grad-cam": "-",
-    "integrated-gradients": "--",
-    "poly-cam": "-.",
-    "poly-cam-thesis": (0, (5, 1)),
-    "occlusion": (0, (3, 1, 1, 1)),
-    "occlusion-marker": (0, (1, 2)),
-    "shapley": (0, (3, 1, 1, 1, 1, 1)),
-    "shapley-marker": (0, (3, 1, 1, 1, 1, 1)),
-    "grad-cam-thesis": (0, (5, 1)),
-    "integrated-gradients-thesis": (0, (5, 3)),
-    "lrp": (0, (1, 1)),
-    CHANCE: ":",
-}
+"""Names of maps that no explainer makes; those of explainers are in their rows of `EXPLAINERS`."""
 FILL_NAMES = {
     "reference": "untouched frame",
     "grey": "grey",
@@ -151,9 +110,21 @@ def short_input_name(name: str) -> str:
 
 
 def method_name(name: str) -> str:
-    """Return the display name of a method."""
+    """Return the display name of a method or control."""
     of_method = name.removesuffix(NEW_WEIGHTS)
-    return METHOD_NAMES.get(name, name) if of_method == name else f"{method_name(of_method)}, new weights (control)"
+    if of_method != name:
+        return f"{method_name(of_method)}, new weights (control)"
+    return CONTROL_NAMES.get(name) or (EXPLAINERS[name].title if name in EXPLAINERS else name)
+
+
+def method_colour(name: str) -> str:
+    """Return the colour of a method in figures."""
+    return BLACK if name == CHANCE else EXPLAINERS[name].colour if name in EXPLAINERS else PURPLE
+
+
+def method_line(name: str) -> Any:
+    """Return the line style of a method in figures."""
+    return ":" if name == CHANCE else EXPLAINERS[name].line if name in EXPLAINERS else "-"
 
 
 def source_name(name: str) -> str:
@@ -174,14 +145,15 @@ def inputs_in_order(names: Iterable[str]) -> list[str]:
 
 def methods_in_order(names: Iterable[str]) -> list[str]:
     """Sort methods as in the thesis, the controls last."""
-    order = [*METHOD_NAMES, *(name + NEW_WEIGHTS for name in METHOD_NAMES)]
+    methods = [*EXPLAINERS, *CONTROL_NAMES]
+    order = [*methods, *(name + NEW_WEIGHTS for name in methods)]
     return sorted(in_order(set(names), order), key=is_control)
 
 
 def name_methods(text: str) -> str:
     """Replace the keys of methods in a text by display names, except of controls, whose keys are common words."""
-    keys = sorted(METHOD_NAMES.keys() - {*CONTROLS, "oracle", "degraded-oracle"}, key=len, reverse=True)
-    return re.sub(rf"(?<![\w-])(?:{'|'.join(keys)})(?![\w-])", lambda key: METHOD_NAMES[key[0]], text)
+    keys = sorted(EXPLAINERS, key=len, reverse=True)
+    return re.sub(rf"(?<![\w-])(?:{'|'.join(keys)})(?![\w-])", lambda key: EXPLAINERS[key[0]].title, text)
 
 
 def fill_name(fill: str, unit: str = "pixel") -> str:

@@ -14,7 +14,7 @@ from sliplens.progress import number_of
 from sliplens.report.comparisons import settings
 from sliplens.report.plates import Plate, named_columns, rows_of
 from sliplens.report.results import Results
-from sliplens.results.faithfulness import DeletionScores, RemovalCurve, RemovalScores, is_control
+from sliplens.results.faithfulness import DeletionScores, Faithfulness, RemovalCurve, is_control
 
 _EACH_FIGURES = {"difference": "fig-17-faithfulness-difference", "raw": "fig-18-faithfulness-raw"}
 _FEW = 4  # charts in a row
@@ -176,7 +176,7 @@ def plate_each_frame(scored: DeletionScores) -> Plate:
     text = []
     with style.drawing_style():
         for ax, method in zip(axes, methods, strict=True):
-            curve, colour = scored.curves[method], style.METHOD_COLOURS.get(method, style.PURPLE)
+            curve, colour = scored.curves[method], style.method_colour(method)
             share = 100 * curve.pixels_removed / _pixels(scored)
             # dozens of curves as vectors would swell the page
             ax.plot(share, curve.scores.T, color=colour, alpha=0.3, linewidth=0.7, rasterized=True)
@@ -196,7 +196,7 @@ def plate_each_frame(scored: DeletionScores) -> Plate:
     )
 
 
-def plate_removal_curves(faithful: RemovalScores) -> Plate | None:
+def plate_removal_curves(faithful: Faithfulness) -> Plate | None:
     """Draw change against area, most and least influential first and at random, by method and fill; None without."""
     methods = style.methods_in_order({method for _, _, method in faithful.curves if not is_control(method)})
     fills = settings(faithful)
@@ -255,7 +255,7 @@ def plate_randomisation(results: Results) -> Plate:
         for ax, name in zip(axes, names, strict=True):
             for method in style.methods_in_order(records[name].methods):
                 record = records[name].methods[method]
-                colour, line = style.METHOD_COLOURS.get(method, style.PURPLE), style.METHOD_LINES.get(method, "-")
+                colour, line = style.method_colour(method), style.method_line(method)
                 dots = {"marker": "o", "markersize": 3.5, "label": style.method_name(method)}
                 similarity = np.array(record.similarity, dtype=np.float64)
                 ax.plot(record.layers, similarity, color=colour, linestyle=line, **dots)
@@ -333,7 +333,7 @@ def _deletion_numbers(scores: Mapping[str, DeletionScores]) -> dict[str, list]:
 
 
 def _plot_removal(curve: RemovalCurve, method: str, *, ax: Axes) -> None:
-    share, colour = 100 * curve.areas, style.METHOD_COLOURS.get(method, style.PURPLE)
+    share, colour = 100 * curve.areas, style.method_colour(method)
     low, high = np.quantile(curve.most_first, [0.25, 0.75], axis=0)
     ax.fill_between(share, low, high, color=colour, alpha=0.15, linewidth=0)
     ax.plot(share, curve.most_first.mean(axis=0), color=colour, linewidth=1.6)
@@ -342,10 +342,10 @@ def _plot_removal(curve: RemovalCurve, method: str, *, ax: Axes) -> None:
     ax.tick_params(labelsize=7.5)
 
 
-def _tell_gains(faithful: RemovalScores, methods: list[str]) -> str:
+def _tell_gains(faithful: Faithfulness, methods: list[str]) -> str:
     fill, unit = settings(faithful)[0]
     curves = {method: faithful.curves.get((fill, unit, method)) for method in methods}
-    gains = {method: float(curve.srg.mean()) for method, curve in curves.items() if curve is not None}
+    gains = {method: float(curve.symmetric_gain.mean()) for method, curve in curves.items() if curve is not None}
     ranked = sorted(gains, key=lambda one: -gains[one])
     text = ", ".join(f"{style.method_name(record)} {style.signed(gains[record], 3)}" for record in ranked)
     return f"Under {style.fill_name(fill, unit)} it is {text}."

@@ -37,7 +37,7 @@ from sliplens.report.comparisons import (
 )
 from sliplens.report.results import Results
 from sliplens.report.verdict import OPPOSITE, Finding, Outcome, Row, Verdict, all_of, judge_gap, most_of, write_ends
-from sliplens.results.faithfulness import DeletionCurve, RemovalScores
+from sliplens.results.faithfulness import DeletionCurve, Faithfulness
 from sliplens.results.study import MapQuality, Truth
 
 Record = TypeVar("Record")
@@ -154,7 +154,7 @@ def _by_thesis_score(
     ]
 
 
-def _beats_rivals(faithful: RemovalScores, *, results: Results, rng: np.random.Generator) -> Row:
+def _beats_rivals(faithful: Faithfulness, *, results: Results, rng: np.random.Generator) -> Row:
     findings, subject, name = [], input_name(faithful.input), method_name(POLY_CAM)
     by_setting: dict[str, Outcome] = {}
     for where, curves in removal_by_setting(faithful):
@@ -208,7 +208,7 @@ def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Row:
     return _decide(subject, by_setting, findings, voting_settings(difference, *results.study.truth.values()))
 
 
-def _no_better(faithful: RemovalScores, *, results: Results, rng: np.random.Generator) -> Row:
+def _no_better(faithful: Faithfulness, *, results: Results, rng: np.random.Generator) -> Row:
     findings, by_setting, subject, name = [], {}, input_name(faithful.input), method_name(GRAD_CAM)
     leads = {
         fill_name(*score.key[:2]): score.lead_over_controls for score in faithful.scores if score.method == GRAD_CAM
@@ -217,7 +217,8 @@ def _no_better(faithful: RemovalScores, *, results: Results, rng: np.random.Gene
         curve = curves.get(GRAD_CAM)
         if curve is None:
             continue
-        gaps = {"chance": mean_interval(curve.srg, clusters=curve.clusters, rng=rng)}
+        assert curve.clusters is not None  # of a saved table
+        gaps = {"chance": mean_interval(curve.symmetric_gain, clusters=curve.clusters, rng=rng)}
         if (lead := leads.get(where)) is not None:
             gaps[method_name(lead.control)] = lead.gap
         # not faithful is what is claimed: a gain for sure speaks against it

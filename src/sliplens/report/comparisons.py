@@ -19,7 +19,7 @@ from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots import style
 from sliplens.progress import number_of
 from sliplens.results.evaluation import ScoredFrames
-from sliplens.results.faithfulness import CHANCE, Comparison, DeletionCurve, DeletionScores, RemovalCurve, RemovalScores
+from sliplens.results.faithfulness import CHANCE, Comparison, DeletionCurve, DeletionScores, Faithfulness, RemovalCurve
 from sliplens.results.study import Choice, MarkerEffects, Roughness, Truth
 
 CITATION = (
@@ -99,9 +99,10 @@ def compare_gain(*pairs: tuple[RemovalCurve, RemovalCurve], rng: np.random.Gener
     if not shared:
         return None
     first, second = (
-        np.mean([curve.srg[np.searchsorted(curve.frame_ids, shared)] for curve in curves], axis=0)
+        np.mean([curve.symmetric_gain[np.searchsorted(curve.frame_ids, shared)] for curve in curves], axis=0)
         for curves in zip(*pairs, strict=True)
     )
+    assert pairs[0][0].clusters is not None  # of a saved table
     clusters = pairs[0][0].clusters[:, np.searchsorted(pairs[0][0].frame_ids, shared)]
     return paired_difference(first, second, clusters=clusters, rng=rng)
 
@@ -131,7 +132,7 @@ def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Gen
     return mean_interval(np.array(shares), clusters=np.array(clusters).T, rng=rng, limits=(0.0, 1.0))
 
 
-def settings(faithful: RemovalScores) -> list[tuple[str, str]]:
+def settings(faithful: Faithfulness) -> list[tuple[str, str]]:
     """Fills and units that were scored, in the order they are read."""
     records = {(fill, unit) for fill, unit, _ in faithful.curves}
     fills = style.in_order({fill for fill, _ in records}, style.FILL_NAMES)
@@ -139,7 +140,7 @@ def settings(faithful: RemovalScores) -> list[tuple[str, str]]:
     return [(fill, unit) for unit in units for fill in fills if (fill, unit) in records]
 
 
-def voting_settings(faithful: RemovalScores, *truths: Truth | None) -> list[tuple[str, str]]:
+def voting_settings(faithful: Faithfulness, *truths: Truth | None) -> list[tuple[str, str]]:
     """One setting of each fill, or a fill tried with several units would vote as often: that by pixels where it is.
 
     Fills under which a map made from one of the truths does not win for sure have no vote.
@@ -154,7 +155,7 @@ def unfit_fills(truth: Truth | None) -> list[str]:
     return [] if truth is None else [test.fill for test in truth.meta if not test.holds]
 
 
-def removal_by_setting(faithful: RemovalScores) -> list[tuple[str, dict[str, RemovalCurve]]]:
+def removal_by_setting(faithful: Faithfulness) -> list[tuple[str, dict[str, RemovalCurve]]]:
     """Name of each fill and unit, and its curves by method, in the order they are read."""
     return [
         (style.fill_name(*setting), {key[2]: curve for key, curve in faithful.curves.items() if key[:2] == setting})

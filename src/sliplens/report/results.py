@@ -24,7 +24,7 @@ _OF_A_COMMAND: dict[str, type] = {
 }
 
 
-_BY_SOURCE = ("explain", "score")
+_BY_SOURCE = ("explain", "score", "faithfulness")
 """Stages of which a workspace may hold two, of simulated and of real touch."""
 
 
@@ -125,7 +125,7 @@ def load_results(workspace: Path) -> Results:
         diagnoses=of("diagnose"),
         grip=of("grip").get(""),
         explanations={key[1:]: value for key, value in records.items() if key[0] == "explain"},
-        scores={key[1:]: value for key, value in records.items() if key[0] == "score"},
+        scores=_scores(records),
         strip=next(iter(of("strip").values()), None),
         study=Study(
             folder=workspace,
@@ -136,3 +136,10 @@ def load_results(workspace: Path) -> Results:
         ),
         notes=tuple(notes),
     )
+
+
+def _scores(found: dict[tuple[str, str, str], Any]) -> dict[tuple[str, str], DeletionScores]:
+    """Deletion scores by input and source: of a study's stage, else of `sliplens score`."""
+    parts = {key[1:]: value.deletion_scores for key, value in found.items() if key[0] == "faithfulness"}
+    stages = {key[1:]: value for key, value in found.items() if key[0] == "score"}
+    return {key: value for key, value in parts.items() if value is not None} | stages

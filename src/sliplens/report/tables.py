@@ -44,11 +44,11 @@ from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import (
     CHANCE,
     DeletionScores,
+    Faithfulness,
     Lead,
     MethodScore,
     Remedies,
     RemovalScore,
-    RemovalScores,
     is_control,
 )
 from sliplens.results.study import MAP_MEASURES, REGIONS, Choice, MapQuality, Randomisation, Timing, Truth
@@ -234,7 +234,7 @@ def table_training(results: Results) -> Table:
     return make_table("How each network was trained.", ("", *(input_name(run.input) for run in runs)), rows)
 
 
-def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Table:
+def table_scores(faithful: Faithfulness, scored: DeletionScores | None) -> Table:
     """Tabulate the thesis's deletion score (its Table 2) beside the symmetric gain under every fill."""
     fills = settings(faithful)
     scores = {score.key: score for score in faithful.scores}
@@ -263,7 +263,7 @@ def table_scores(faithful: RemovalScores, scored: DeletionScores | None) -> Tabl
     )
 
 
-def table_leads(faithful: RemovalScores) -> Table:
+def table_leads(faithful: Faithfulness) -> Table:
     """Tabulate the symmetric gain of each method less that of the strongest control, under every fill."""
     fills = settings(faithful)
     leads = {score.key: lead for score in faithful.scores if (lead := score.lead_over_controls) is not None}
@@ -287,7 +287,7 @@ def table_leads(faithful: RemovalScores) -> Table:
     )
 
 
-def table_equal_areas(faithful: RemovalScores) -> Table | None:
+def table_equal_areas(faithful: Faithfulness) -> Table | None:
     """Tabulate the change where equal areas are gone, under the most natural fill; None without scores."""
     fills = settings(faithful)
     if not fills:
@@ -316,7 +316,7 @@ def table_equal_areas(faithful: RemovalScores) -> Table | None:
     )
 
 
-def table_agreement(faithful: RemovalScores) -> Table | None:
+def table_agreement(faithful: Faithfulness) -> Table | None:
     """Tabulate Kendall's tau between the fills' rankings of the methods as a map of heat; None where it is unknown."""
     rows = [record for record in faithful.agreement if record.unit == "pixel"] or list(faithful.agreement)
     if not rows:

@@ -35,7 +35,7 @@ from sliplens.report.comparisons import (
     voting_settings,
 )
 from sliplens.report.results import Results
-from sliplens.results.faithfulness import CHANCE, Lead, RemovalScores
+from sliplens.results.faithfulness import CHANCE, Faithfulness, Lead
 from sliplens.results.study import Localisation, Truth
 
 Outcome = Literal["holds", "does not hold", "undecided"]
@@ -308,7 +308,7 @@ class Standing:
         return 2 * len(self.beaten) > len(self.tested)
 
 
-def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[Standing]:
+def rank_methods(faithful: Faithfulness, truth: Truth | None = None) -> list[Standing]:
     """Rank the methods: those that beat the best control in most settings first, by their gain.
 
     A fill counts once. Fills under which a map made from the truth does not win for sure are left out.
@@ -333,7 +333,7 @@ def rank_methods(faithful: RemovalScores, truth: Truth | None = None) -> list[St
     return sorted(standings, key=lambda standing: (not standing.qualifies, -standing.mean_gain))
 
 
-def _judge_by_removal(name: str, faithful: RemovalScores, truth: Truth | None) -> list[Row]:
+def _judge_by_removal(name: str, faithful: Faithfulness, truth: Truth | None) -> list[Row]:
     ranked, rows = rank_methods(faithful, truth), []
     for place, standing in enumerate(ranked):
         outcome: Outcome = "undecided"
@@ -363,7 +363,7 @@ def _judge_by_removal(name: str, faithful: RemovalScores, truth: Truth | None) -
     return rows
 
 
-def _compare_with_first(faithful: RemovalScores, first: Standing, method: str) -> str:
+def _compare_with_first(faithful: Faithfulness, first: Standing, method: str) -> str:
     gaps = {
         (pair.fill, pair.unit): gap_from(pair, first.method)
         for pair in faithful.comparisons

@@ -18,7 +18,7 @@ from sliplens.results.evaluation import (
     describe_simulation,
 )
 from sliplens.results.explanation import ExplainedFrame, Explanation, load_explanation
-from sliplens.results.faithfulness import DeletionCurve, DeletionScores, Remedies, RemovalCurve, RemovalScores
+from sliplens.results.faithfulness import DeletionCurve, DeletionScores, Faithfulness, Remedies, RemovalCurve
 from sliplens.results.study import Choice, MapQuality, Randomisation, Setting, States, Study, StudyConfig, Timing, Truth
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "Evaluation",
     "ExplainedFrame",
     "Explanation",
+    "Faithfulness",
     "LeadTimes",
     "LearningCurve",
     "MapQuality",
@@ -41,7 +42,6 @@ __all__ = [
     "Reliability",
     "Remedies",
     "RemovalCurve",
-    "RemovalScores",
     "ScoredFrames",
     "Setting",
     "Simulation",

@@ -1,22 +1,27 @@
-"""Saved explanations: frames, what was answered on them, and a map of each by every method; a trial at a glance."""
+"""Explanations of frames by one or several methods, and a strip of one trial."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Float, Float32, Float64, Shaped, UInt8
 
 from sliplens.codec import UNKNOWN, Columns, load_record, load_result
 from sliplens.errors import InputError, SaliencyError
 from sliplens.files import RUN_FILE, Provenance, require_folder
-from sliplens.results.evaluation import ANSWER, MARGIN, SHARE, TIME, OfNetwork
+from sliplens.results.evaluation import ANSWER, MARGIN, TIME, OfNetwork
+
+MARGIN_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
+"""Safety margins at which the thesis explains frames (section 4)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainedFrame:
-    """Frame that was explained: label (None if unknown), answer, and the answer on its reference, in margin units."""
+    """An explained frame: label (None if unknown), prediction, and prediction of its reference, in margin units."""
 
     id: str
     trial: str
@@ -26,43 +31,88 @@ class ExplainedFrame:
     reference_prediction: Annotated[float, ANSWER]
     day: int = 1
     withheld: str | None = None
-    """Reason for which the prediction is not to be believed as a margin; None where it is."""
+    """Reason not to trust the prediction as a margin; None if it can be trusted."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MethodNotes:
-    """Cost of a method in seconds a frame, and what it complained about."""
+    """Cost, meaning and warnings of one method's maps."""
 
     seconds_per_frame: float
     warnings: tuple[str, ...]
+    target: str = "f(x) - f(reference)"
+    """Quantity that the relevance adds up to, in words."""
+    raises_only: bool = False
+    """True if the maps only hold what raises the prediction, such as published maps with a ReLU."""
+    completeness_gap: tuple[float, ...] | None = None
+    """|sum of the relevance - (f(x) - f(reference))| of each frame; None where the sum is not promised."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation(OfNetwork):
-    """Explanations of some frames by several methods."""
+    """Explanations of some frames by one or several methods: why the network predicts f(x) rather than f(reference)."""
 
     weights_sha256: str
     """Hash of the network that was explained."""
     frames: tuple[ExplainedFrame, ...]
     methods: dict[str, MethodNotes]
     images: UInt8[np.ndarray, "frames colours size size"]
-    """Inputs of the network before normalisation, 8 bits."""
+    """Network inputs before normalisation, 8 bits."""
+    references: UInt8[np.ndarray, "frames colours size size"]
+    """Network inputs of the untouched sensor, which each frame is compared with; as `images`."""
     pictures: UInt8[np.ndarray, "frames size size 3"]
-    """The normalised inputs, 8 bits, for people to look at."""
+    """Normalised inputs, 8 bits, for viewing."""
     relevance: dict[str, Annotated[Float32[np.ndarray, "frames size size"], ANSWER]]
-    saliency: dict[str, Annotated[Float32[np.ndarray, "frames size size"], SHARE]]
-    """By method: signed maps in margin units, and the same in [0, 1] for viewing and for ranking pixels."""
+    """Maps by method: signed contribution of each pixel in margin units, above zero where it raises the prediction."""
 
     def __post_init__(self) -> None:
-        """Hold the arrays against the frames that they are of."""
+        """Check that the arrays are of the frames."""
         if not self.frames:
             raise ValueError("names no frame")
-        if len(self.images) != len(self.frames):
+        if not len(self.images) == len(self.references) == len(self.frames):
             raise ValueError(f"holds {len(self.images)} images of {len(self.frames)} frames")
-        for kind, maps in (("relevance", self.relevance), ("saliency", self.saliency)):
-            absent = [name for name in self.methods if name not in maps]
-            if absent:
-                raise ValueError(f"holds no {kind} of {', '.join(absent)}")
+        absent = [name for name in self.methods if name not in self.relevance]
+        if absent:
+            raise ValueError(f"holds no relevance of {', '.join(absent)}")
+
+    def influence(self, method: str) -> Float64[np.ndarray, "frames size size"]:
+        """Return the relevance along the change of the prediction, which ranks pixels.
+
+        Maps that hold only what raises the prediction are ranked as they were published, whichever way it went.
+        """
+        relevance = self.relevance[method].astype(np.float64)
+        return relevance if self.methods[method].raises_only else relevance * self.towards[:, None, None]
+
+    @cached_property
+    def saliency(self) -> dict[str, Float32[np.ndarray, "frames size size"]]:
+        """Supporting evidence in [0, 1] by method, for viewing: 1 at the strongest pixel of each frame."""
+        maps = {}
+        for method in self.relevance:
+            supporting = np.maximum(self.influence(method).astype(np.float32), 0)
+            peak = supporting.max(axis=(1, 2), keepdims=True)
+            maps[method] = supporting / np.where(peak > 0, peak, np.float32(1))
+        return maps
+
+    def frame(self) -> pa.Table:
+        """Arrow table, a row a frame and method: predictions and completeness gap (NaN if not promised)."""
+        change = [frame.prediction - frame.reference_prediction for frame in self.frames]
+        gaps = [notes.completeness_gap or (np.nan,) * len(change) for notes in self.methods.values()]
+        count = len(self.methods)
+        return pa.table(
+            {
+                "method": np.repeat(list(self.methods), len(change)),
+                "id": [frame.id for frame in self.frames] * count,
+                "prediction": [frame.prediction for frame in self.frames] * count,
+                "reference_prediction": [frame.reference_prediction for frame in self.frames] * count,
+                "change": change * count,
+                "completeness_gap": np.concatenate([*gaps, []]),
+            }
+        )
+
+    @property
+    def method(self) -> str:
+        """Name of the first method."""
+        return next(iter(self.methods))
 
     @property
     def image_size(self) -> int:
@@ -71,12 +121,12 @@ class Explanation(OfNetwork):
 
     @property
     def towards(self) -> Float64[np.ndarray, " frames"]:
-        """Sign of each answer's change from that on the untouched sensor, which the maps explain."""
+        """Sign of f(x) - f(reference) of each frame."""
         return np.array([np.sign(frame.prediction - frame.reference_prediction) for frame in self.frames])
 
     @property
     def clusters(self) -> Shaped[np.ndarray, "2 frames"]:
-        """Day and trial of each frame, which an interval resamples."""
+        """Day and trial of each frame, the units that an interval resamples."""
         return np.array([[str(frame.day) for frame in self.frames], [frame.trial for frame in self.frames]])
 
     @property
@@ -94,9 +144,15 @@ class Explanation(OfNetwork):
             self,
             frames=tuple(self.frames[row] for row in chosen),
             images=self.images[chosen],
+            references=self.references[chosen],
             pictures=self.pictures[chosen],
+            methods={
+                name: notes
+                if notes.completeness_gap is None
+                else replace(notes, completeness_gap=tuple(notes.completeness_gap[row] for row in chosen))
+                for name, notes in self.methods.items()
+            },
             relevance={name: maps[chosen] for name, maps in self.relevance.items()},
-            saliency={name: maps[chosen] for name, maps in self.saliency.items()},
         )
 
 
@@ -130,7 +186,7 @@ def require_saliency(
 
 
 def is_explanation(folder: Path) -> bool:
-    """Whether a folder is one that `sliplens explain` wrote."""
+    """Return True if `sliplens explain` wrote the folder."""
     path = folder / RUN_FILE
     return path.is_file() and load_record(path, Provenance, command="sliplens explain").stage == "explain"
 
@@ -152,26 +208,26 @@ def load_explanation(folder: Path) -> Explanation:
 
 @dataclass(frozen=True, kw_only=True)
 class StripReadings(Columns):
-    """True and read safety margin of every frame of a trial; NaN where the sensor touches nothing."""
+    """True and predicted safety margin of every frame of a trial; NaN where the sensor touches nothing."""
 
     time_s: Annotated[Float64[np.ndarray, " frames"], TIME]
     contact_state: np.ndarray
     safety_margin: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Margin of the label."""
     prediction: Annotated[Float64[np.ndarray, " frames"], ANSWER, UNKNOWN]
-    """Margin that the network reads."""
+    """Predicted margin."""
     low: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Lower end of its 90 % interval; NaN for a network that was never calibrated."""
     high: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Upper end of its 90 % interval."""
     withheld: Shaped[np.ndarray, " frames"]
-    """Reason for which the margin is not to be believed, with the cure; empty where it is. Margin and interval of such
-    a frame are NaN."""
+    """Reason not to trust the predicted margin, with the cure; empty if it can be trusted. Otherwise margin and
+    interval are NaN."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Strip:
-    """One trial from stick to slip: true margin, read margin, and the map of a few frames."""
+    """One trial from stick to slip: true and predicted margin, and the maps of a few frames."""
 
     trial: str
     condition: str

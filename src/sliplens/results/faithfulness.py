@@ -6,9 +6,11 @@ from functools import cached_property
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Float64, Int, Int64, Shaped
 
 from sliplens.codec import UNKNOWN, Columns
+from sliplens.errors import InputError
 from sliplens.intervals import Difference
 from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, SHARE, OfNetwork
 
@@ -22,7 +24,7 @@ CONTROLS = ("change", "local-change", "weights-1", "centre", "edges", CHANCE)
 
 
 def is_control(name: str) -> bool:
-    """Whether a name stands for maps that know nothing of what a network learned: what an explanation has to beat."""
+    """Return True for the name of maps that use nothing the network learned, which explanations have to beat."""
     return name in CONTROLS or name.endswith(NEW_WEIGHTS)
 
 
@@ -36,7 +38,7 @@ class Lead:
 
     @property
     def shows_something(self) -> bool:
-        """Whether the method beats every control for sure; otherwise it has shown nothing about this network."""
+        """True if the method certainly beats every control; otherwise it shows nothing about this network."""
         return self.gap.above_zero
 
 
@@ -52,7 +54,7 @@ class MethodScore:
 
 @dataclass(frozen=True, kw_only=True)
 class DeletionTable(Columns):
-    """Deletion score D and answer (in margin units) of each frame, method and step."""
+    """Deletion score D and prediction (in margin units) of each frame, method and step."""
 
     method: Shaped[np.ndarray, " rows"]
     frame_id: Shaped[np.ndarray, " rows"]
@@ -66,7 +68,7 @@ class DeletionTable(Columns):
 
 @dataclass(frozen=True, kw_only=True)
 class DeletionCurve:
-    """Deletion score D of each frame while pixels are removed, and the answers it comes from, in margin units."""
+    """Deletion score D of each frame while pixels are removed, and the predictions behind it, in margin units."""
 
     frame_ids: tuple[str, ...]
     clusters: Shaped[np.ndarray, "2 frames"]
@@ -77,18 +79,24 @@ class DeletionCurve:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DeletionScores(OfNetwork):
-    """Deletion score of the thesis of one network's explanations, a random order among the methods."""
+class Deletion:
+    """Deletion score of the thesis by method, a random order among the methods."""
 
     fill: str
     steps: int
     pixels_per_step: int
     methods: dict[str, MethodScore]
     alarms: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeletionScores(Deletion, OfNetwork):
+    """Deletion score of the thesis of one network's explanations, with its curves."""
+
     table: DeletionTable
 
     def __post_init__(self) -> None:
-        """Hold the scores against the curves."""
+        """Check that every score has its curves."""
         _require_curves(self.methods, self.curves)
 
     @cached_property
@@ -99,7 +107,7 @@ class DeletionScores(OfNetwork):
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """Change of the thesis's score: what removed pixels become, which way it goes, where it stops."""
+    """Variant of the thesis's score: fill, direction, and where it stops."""
 
     summary: str
     fill: str
@@ -130,14 +138,16 @@ class Remedies(OfNetwork):
         """Curves by variant and method, then by frame: one that stops at a saliency has as many steps as it needs."""
         groups = self.table.groups("variant", "method").items()
         return {
-            (variant, name): {frame: _deletion_curve(own, name) for (frame,), own in rows.groups("frame_id").items()}
+            (variant, name): {
+                frame: _deletion_curve(steps, name) for (frame,), steps in rows.groups("frame_id").items()
+            }
             for (variant, name), rows in groups
         }
 
 
 @dataclass(frozen=True, kw_only=True)
 class RemovalScore:
-    """What removal says of one method under one fill and unit, in margin units."""
+    """Score of one method under one fill and unit, in margin units."""
 
     fill: str
     unit: str
@@ -182,25 +192,50 @@ class Agreement:
 
 @dataclass(frozen=True, kw_only=True)
 class RemovalCurve:
-    """Changes of the answers of one method under one fill and unit, in margin units."""
+    """Change of a network's predictions while parts of frames are removed, by one method, fill and unit.
 
-    frame_ids: tuple[str, ...]
-    clusters: Shaped[np.ndarray, "2 frames"]
-    """Day and trial of each."""
+    Changes are in margin units, along the sign of f(x) - f(untouched sensor) where it is known, else by size.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.results.faithfulness import RemovalCurve
+    >>> most, least, random = (np.array([[0, middle, 0.4]]) for middle in (0.4, 0.0, 0.2))
+    >>> curve = RemovalCurve(areas=np.array([0, 0.5, 1.0]), most_first=most, least_first=least, random=random)
+    >>> curve.symmetric_gain, curve.gain_over_random
+    (array([0.2]), array([0.1]))
+    """
+
+    frame_ids: tuple[str, ...] = ()
+    clusters: Shaped[np.ndarray, "2 frames"] | None = None
+    """Day and trial of each frame."""
     areas: Float64[np.ndarray, " areas"]
+    """Share of the image that is removed at each step, from 0 to 1."""
     most_first: Float64[np.ndarray, "frames areas"]
+    """Most influential parts first."""
     least_first: Float64[np.ndarray, "frames areas"]
     random: Float64[np.ndarray, "frames areas"]
+    """Mean over random orders."""
 
     @property
-    def srg(self) -> Float64[np.ndarray, " frames"]:
-        """Symmetric relevance gain of each frame: area between the most and the least influential first."""
-        return np.trapezoid(self.most_first - self.least_first, self.areas, axis=-1)
+    def symmetric_gain(self) -> Float64[np.ndarray, " frames"]:
+        """Symmetric relevance gain of each frame: area between the most and the least influential first, 0 by chance.
+
+        References
+        ----------
+        Bluecher, Vielhaben and Strodthoff, *Decoupling Pixel Flipping and Occlusion Strategy* (2024): SRG.
+        """
+        return np.trapezoid(self.most_first, self.areas, axis=-1) - np.trapezoid(self.least_first, self.areas, axis=-1)
+
+    @property
+    def gain_over_random(self) -> Float64[np.ndarray, " frames"]:
+        """Area between the most influential first and random orders."""
+        return np.trapezoid(self.most_first, self.areas, axis=-1) - np.trapezoid(self.random, self.areas, axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RemovalTable(Columns):
-    """Change of the answer (in margin units) of each frame, fill, unit, method and share of the image removed."""
+    """Change of the prediction (in margin units) of each frame, fill, unit, method and share of the image removed."""
 
     fill: Shaped[np.ndarray, " rows"]
     unit: Shaped[np.ndarray, " rows"]
@@ -216,8 +251,8 @@ class RemovalTable(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RemovalScores(OfNetwork):
-    """Sound scores of one network's explanations: what is lost by removal, against controls."""
+class Faithfulness(OfNetwork):
+    """Scores of one network's explanations: removal of parts against controls, and the thesis's deletion score."""
 
     frames: int
     trials: int
@@ -226,13 +261,18 @@ class RemovalScores(OfNetwork):
     units: tuple[str, ...]
     areas: tuple[float, ...]
     scores: tuple[RemovalScore, ...]
+    """Scores by fill, unit and method, controls included, with intervals over days and trials."""
     comparisons: tuple[Comparison, ...]
     agreement: tuple[Agreement, ...]
     alarms: tuple[str, ...]
+    """Reasons why a score may not measure the maps."""
     table: RemovalTable
+    deletion: Deletion | None = None
+    """Deletion score of the thesis; None if it was not computed."""
+    deletion_table: DeletionTable | None = None
 
     def __post_init__(self) -> None:
-        """Hold the scores against the curves."""
+        """Check that every score has its curves."""
         _require_curves([score.key for score in self.scores], self.curves)
 
     @cached_property
@@ -241,14 +281,37 @@ class RemovalScores(OfNetwork):
         by_key = self.table.groups("fill", "unit", "method")
         return {(key[0], key[1], key[2]): _removal_curve(rows, " / ".join(key)) for key, rows in by_key.items()}
 
+    @property
+    def deletion_scores(self) -> DeletionScores | None:
+        """Deletion score of the thesis with its curves; None if it was not computed."""
+        if self.deletion is None or self.deletion_table is None:
+            return None
+        return DeletionScores(input=self.input, source=self.source, table=self.deletion_table, **vars(self.deletion))
+
+    def score(self, method: str) -> RemovalScore:
+        """Return the score of a method or control under the first fill and unit."""
+        for score in self.scores:
+            if score.method == method:
+                return score
+        raise InputError(f"no method {method!r} was scored; choose one of {', '.join(s.method for s in self.scores)}")
+
+    def frame(self) -> pa.Table:
+        """Arrow table of the removal curves, in margin units."""
+        return self.table.table()
+
 
 def _deletion_curve(rows: DeletionTable, name: str) -> DeletionCurve:
     ids, ordered = _sort_by_frame(rows, rows.step, f"lacks steps of some frames under {name!r}")
     pixels, scores, predictions = (
         values.reshape(len(ids), -1) for values in (ordered.pixels_removed, ordered.score, ordered.prediction)
     )
-    about: dict[str, Any] = {"frame_ids": ids, "clusters": _clusters(ordered, len(ids))}
-    return DeletionCurve(**about, pixels_removed=pixels[0], scores=scores, predictions=predictions)
+    return DeletionCurve(
+        frame_ids=ids,
+        clusters=_clusters(ordered, len(ids)),
+        pixels_removed=pixels[0],
+        scores=scores,
+        predictions=predictions,
+    )
 
 
 def _removal_curve(rows: RemovalTable, name: str) -> RemovalCurve:

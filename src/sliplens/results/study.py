@@ -13,7 +13,7 @@ from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
 from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, PIXEL, Evaluation, OfNetwork
 from sliplens.results.explanation import Explanation
-from sliplens.results.faithfulness import DeletionScores, Lead, Remedies, RemovalScores
+from sliplens.results.faithfulness import DeletionScores, Faithfulness, Lead, Remedies
 
 REGIONS = ("markers", "slip_annulus", "edges")
 """Areas in which a map may lie."""
@@ -364,7 +364,7 @@ class Truth(OfNetwork):
         return tuple(dict.fromkeys(self.effects.frame_id.tolist()))
 
 
-_Test = Remedies | RemovalScores | Randomisation | MapQuality | Timing | Truth
+_Test = Remedies | Faithfulness | Randomisation | MapQuality | Timing | Truth
 
 
 RECORDS: dict[str, type] = {
@@ -374,7 +374,7 @@ RECORDS: dict[str, type] = {
     "score": DeletionScores,
     "remedies": Remedies,
     "control": UntrainedMaps,
-    "faithfulness": RemovalScores,
+    "faithfulness": Faithfulness,
     "randomisation": Randomisation,
     "map-quality": MapQuality,
     "truth": Truth,
@@ -479,7 +479,7 @@ class Study:
     explanations: dict[str, Explanation] = field(default_factory=dict)
     deletion: dict[str, DeletionScores] = field(default_factory=dict)
     remedies: dict[str, Remedies] = field(default_factory=dict)
-    faithfulness: dict[str, RemovalScores] = field(default_factory=dict)
+    faithfulness: dict[str, Faithfulness] = field(default_factory=dict)
     randomisation: dict[str, Randomisation] = field(default_factory=dict)
     map_quality: dict[str, MapQuality] = field(default_factory=dict)
     timing: dict[str, Timing] = field(default_factory=dict)

@@ -30,7 +30,7 @@ from sliplens.faithfulness.controls import (
 )
 from sliplens.intervals import paired_difference
 from sliplens.models import Network
-from sliplens.progress import OnProgress, counted, track
+from sliplens.progress import OnProgress, track
 from sliplens.recordings import Dataset
 from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.results.study import (
@@ -46,8 +46,7 @@ from sliplens.results.study import (
 )
 from sliplens.runner import Part
 from sliplens.study.choice import Material, MaterialStage, MethodStage, as_the_thesis_ran, trial_seed
-from sliplens.study.explaining import mean_of_known
-from sliplens.study.stages import Find, join_trials, trial_shards
+from sliplens.study.stages import Find, join_trials, mean_of_known, trial_shards
 
 _NORMAL_QUARTILE = 0.6745
 """Median size of a standard normal number."""
@@ -241,7 +240,7 @@ class Randomising(MethodStage[Randomisation]):
             def explain(model: nn.Module, images: Tensor) -> Maps:
                 return _influence(explainer(model, images, reference=references))
 
-            before = material.influence(name)[:_REDRAWN]
+            before = material.explained.influence(name)[:_REDRAWN]
             model = material.trained.model
             scores = randomisation_scores(explain, model, inputs, seed=seed, stages=CASCADE, before=before)
             return RandomisedMethod(
@@ -339,13 +338,13 @@ class Untrained(MaterialStage[UntrainedMaps]):
         controls = {name: _shortened(explainer, passes_matter=True) for name, explainer in material.explainers.items()}
         trials = material.explained.trials
 
-        def find(item: tuple[str], on_map: OnProgress) -> _TrialMaps:
+        def find(item: tuple[str], _: OnProgress) -> _TrialMaps:
             frames, number = trials[item[-1]], list(trials).index(item[-1])
             model = _untrained(material.trained.model, inputs, seed=trial_seed(self.seed, number))
             maps: dict[str, list[np.ndarray]] = {}
             with suppress(ModelError):  # without layers that have a map
                 maps["weights-1"] = list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())
-            for name, frame in counted(list(product(material.explainers, frames)), on_map):
+            for name, frame in track(list(product(material.explainers, frames))):
                 record, empty = inputs[frame, None], references[frame, None]
                 records = _influence(controls[name](model, record, reference=empty))
                 maps.setdefault(name, []).append(records[0].astype(np.float32))

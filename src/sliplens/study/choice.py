@@ -1,8 +1,7 @@
 """Trials, frames, markers and methods of a study."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
-from functools import cache
 from itertools import groupby
 from typing import TypeAlias
 
@@ -13,7 +12,10 @@ from torch import Tensor
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.explainers.attribution import CLOSE
 from sliplens.explainers.contract import Explainer
-from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, to_network_px
+from sliplens.explainers.explain import network_inputs, network_references, with_markers
+from sliplens.explainers.frames import MARGIN_LEVELS as LEVELS
+from sliplens.explainers.frames import nearest_frame
+from sliplens.explainers.occlusion import RegionMethod, to_network_px
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.poly_cam_budget import Likeness
 from sliplens.explainers.table import EXPLAINERS, get_explainer
@@ -37,8 +39,6 @@ from sliplens.results.study import (
     States,
 )
 from sliplens.runner import Part, part
-from sliplens.study.explaining import DEFAULT_LEVELS as LEVELS
-from sliplens.study.explaining import frames_at, nearest_frame, network_inputs, require_methods
 from sliplens.study.stages import Result, Stage
 
 SCORED_LEVELS = (0.4, 0.2, 0.0)
@@ -253,35 +253,19 @@ _AS_PUBLISHED = Likeness(pearson_r=0.999, top_overlap=0.97)
 
 def study_explainers(methods: Sequence[str] = STUDY_METHODS, *, budget: float = STUDY_BUDGET) -> dict[str, Explainer]:
     """Explainers of a study: rows of `EXPLAINERS`, Poly-CAM with some of the channels measured at first."""
-    require_methods(methods)
+    for name in methods:
+        EXPLAINERS.pick(name)
     rows: dict[str, Explainer] = {
         "poly-cam": get_explainer("poly-cam", budget=budget),
         THESIS_POLY_CAM: get_explainer(THESIS_POLY_CAM, budget=budget, likeness=_AS_PUBLISHED),
     }
-    return {name: rows.get(name) or EXPLAINERS[name] for name in methods}
-
-
-def with_markers(
-    explainers: Mapping[str, Explainer],
-    images: Float[Tensor, "frames colours size size"],
-    places: Callable[[], Sequence[Float[Tensor, "_markers 2"]]],
-) -> dict[str, Explainer]:
-    """Give explainers that look for markers the places in each image; `places` is called only for those."""
-    find = cache(lambda: KnownMarkers(images=images, places=tuple(places())))
-    return {
-        name: replace(explainer, markers_px=find())
-        if isinstance(explainer, RegionMethod) and callable(explainer.markers_px)
-        else explainer
-        for name, explainer in explainers.items()
-    }
+    return {name: rows.get(name) or get_explainer(name) for name in methods}
 
 
 def without_markers(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]:
     """Replace explainers of markers, where these are unknown, by explainers of tiles."""
-    names_used = {name.removesuffix("-marker"): explainer for name, explainer in explainers.items()}
-    return {
-        name: EXPLAINERS[name] if isinstance(record, RegionMethod) else record for name, record in names_used.items()
-    }
+    by_tile = {name.removesuffix("-marker"): explainer for name, explainer in explainers.items()}
+    return {name: get_explainer(name) if isinstance(row, RegionMethod) else row for name, row in by_tile.items()}
 
 
 def as_the_thesis_ran(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]:
@@ -340,15 +324,6 @@ class Material:
             references=self.references[chosen],
             chosen=tuple(self.chosen[row] for row in chosen),
         )
-
-    def raises_only(self, method: str) -> bool:
-        """Return True where a method shows only what raises the prediction, as one with the published ReLU does."""
-        return getattr(self.explainers.get(method), "relu", False)
-
-    def influence(self, method: str) -> Float[np.ndarray, "frames size size"]:
-        """Return the map that a method ranks pixels by (`Attribution.influence`)."""
-        relevance = self.explained.relevance[method]
-        return relevance if self.raises_only(method) else relevance * self.explained.towards[:, None, None]
 
     def units(self) -> dict[str, list[Units]]:
         """Units of removal of each frame: pixels, tiles, and markers where they are known in every frame."""
@@ -413,7 +388,6 @@ def trial_seed(seed: int, number: int) -> int:
 def gather(
     trained: Network,
     explained: Explanation,
-    data: Dataset,
     chosen: tuple[ChosenFrame, ...],
     *,
     markers: Mapping[str, MarkerPlaces],
@@ -422,13 +396,12 @@ def gather(
     """Gather what the scores need of the chosen frames, each of which is explained."""
     places = {frame.id: at for at, frame in enumerate(explained.frames)}
     counted = explained.take([places[frame.id] for frame in chosen])
-    frames = frames_at(trained, data, [(frame.trial, frame.frame) for frame in chosen])
     inputs = network_inputs(trained, counted)
     return Material(
         trained=trained,
         explained=counted,
         inputs=inputs,
-        references=frames.references.to(trained.device),
+        references=network_references(trained, counted),
         chosen=chosen,
         markers=markers,
         explainers=with_markers(explainers, inputs, lambda: marker_places(trained, chosen, markers)),

@@ -14,7 +14,10 @@ from torch.nn.functional import adaptive_avg_pool2d
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import frame_of
+from sliplens.explainers.explain import join_maps, network_inputs
+from sliplens.explainers.frames import frames_at
 from sliplens.explainers.shapley import shapley_values
+from sliplens.explainers.table import get_explainer
 from sliplens.extras import require_packages
 from sliplens.faithfulness.removal import answer_whole
 from sliplens.faithfulness.scoring import prepare_passes
@@ -37,7 +40,7 @@ from sliplens.results.evaluation import (
 )
 from sliplens.results.explanation import Explanation
 from sliplens.simulation.intervention import film_with_friction, marker_readings, reading_limit, reading_slope
-from sliplens.study.explaining import explain_frames, frames_at, network_inputs
+from sliplens.study.explaining import Explaining
 from sliplens.study.truth import StagedFrame, find_places, rank_correlation, redrawing, reliability_of, stage_frames
 from sliplens.training import evaluate
 
@@ -136,7 +139,7 @@ def _diagnose(
     slices, errors = find_slices(errors, seed=seed)
     values = errors.where(_spread_rows(errors, trials))
     chosen = frames_at(run, data, list(zip(values.trial.tolist(), values.frame.tolist(), strict=True)))
-    explained, left_out = explain_frames(run, chosen, methods=()), ""
+    explained, left_out = join_maps(run, chosen, {}), ""
     try:
         frames = stage_frames(run, explained, data)
     except InputError as error:
@@ -144,7 +147,10 @@ def _diagnose(
         note(on_progress, left_out)
         with stage(on_progress, "Explaining frames") as count:
             ig, method = "integrated-gradients", "Integrated Gradients"
-            maps = explain_frames(run, chosen, methods=(ig,), parts=parts, on_progress=count).relevance[ig]
+            work = Explaining(
+                trained=run, chosen=replace(chosen, find_markers=None), explainers={ig: get_explainer(ig)}
+            )
+            maps = work.make(parts, on_progress=count).relevance[ig]
         rows = adaptive_avg_pool2d(torch.from_numpy(maps)[:, None], _BLOCKS).flatten(1).double().numpy()
         measured = dict.fromkeys((*_LOOKED, "limit"), np.full(len(values), np.nan))
         frictions, pictures, drawn = as_frictions([]), explained.pictures[:0], ""

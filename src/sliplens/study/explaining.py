@@ -1,380 +1,336 @@
-"""Frames to explain, and their explanations, made one map at a time."""
+"""Public call that explains frames, its folder, and the strip of one trial."""
 
 import hashlib
-import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, islice
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import TypedDict, Unpack
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float32, UInt8
-from torch import Tensor
+from jaxtyping import UInt8
 
-from sliplens.errors import InputError, RecordingError
-from sliplens.explainers.attribution import frame_of
+from sliplens.codec import save_result
+from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.contract import Explainer
-from sliplens.explainers.table import EXPLAINERS, network_images
+from sliplens.explainers.explain import (
+    MethodMaps,
+    Methods,
+    choose_explainers,
+    explain_frames,
+    explain_rows,
+    input_pictures,
+    join_maps,
+    with_markers,
+)
+from sliplens.explainers.frames import (
+    MARGIN_LEVELS,
+    ChosenFrames,
+    FrameSelection,
+    frames_from_arrays,
+    frames_from_dataset,
+    frames_from_folder,
+    nearest_frame,
+    require_labels,
+)
+from sliplens.explainers.occlusion import markers_in_recording
+from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
+from sliplens.files import output_folder, remove
+from sliplens.images import read_image, write_png
 from sliplens.models import Network
-from sliplens.models.engines import expecting
-from sliplens.plots.saliency import NOMINAL_MARGINS
-from sliplens.progress import OnProgress, number_of
-from sliplens.recordings import Dataset
-from sliplens.recordings.capture import Capture
-from sliplens.recordings.sensor import SensorProfile
-from sliplens.recordings.source import open_source
-from sliplens.results.evaluation import ANSWER, SHARE
-from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes, require_saliency
+from sliplens.models.checkpoint import open_run
+from sliplens.plots.saliency import Colours, draw_explanation, overlay_points
+from sliplens.progress import (
+    OnProgress,
+    add_note,
+    ignore,
+    number_of,
+    open_stage,
+    report_file,
+    reporting,
+)
+from sliplens.recordings import Dataset, Recording
+from sliplens.recordings.sensor import SensorProfile, load_profile
+from sliplens.results.explanation import Explanation, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, part
+from sliplens.study.choice import study_explainers, without_markers
 from sliplens.study.stages import Find, Stage
 
-DEFAULT_LEVELS = NOMINAL_MARGINS
-"""Safety margins at which the thesis explains frames (section 4)."""
 
-_LABEL = re.compile(r"_(0|[1-9]\d?|100)$")
+class Running(TypedDict, total=False):
+    """Options of where and how a public call runs."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class ChosenFrames:
-    """Frames to explain, compared and resized but still in 8 bits, so that they can be stored exactly."""
-
-    ids: tuple[str, ...]
-    day: tuple[int, ...]
-    trial: tuple[str, ...]
-    condition: tuple[str, ...]
-    safety_margin: Float32[np.ndarray, " frames"]
-    """Labels; NaN where a frame has none."""
-    images: UInt8[Tensor, "frames colours size size"]
-    """Resized network inputs before normalisation."""
-    references: Float32[Tensor, "frames colours size size"]
-    """What each explanation is measured against: the untouched sensor, in [0, 1]."""
-    source: str
-    """Either "simulated" or "real": a recorded data set or a folder of images."""
+    device: str
+    """Device of the network: `cpu`, `cuda` or `cuda:1`; `cpu` by default."""
+    on: str
+    """Row of `runner.EXECUTORS`: `serial` (default), `processes`, `processes=4`."""
+    retry_failed: bool
+    """If True, parts that failed three times before are tried again."""
+    overwrite: bool
+    """If True, replace the folder `out`."""
+    on_progress: OnProgress | None
+    """Callback for progress: number of items done, and of all items."""
 
 
-def frames_from_dataset(
-    trained: Network,
-    data: Dataset,
+def explain(
+    run: Network | Path | str,
+    source: UInt8[np.ndarray, "batch height width 3"] | Dataset | Path | str,
     *,
-    split: str = "test",
-    condition: str = "dry",
-    trials: int = 1,
-    levels: Sequence[float] = DEFAULT_LEVELS,
-) -> ChosenFrames:
-    """Frames of the first trials of a split, in the order of the data set's table, at given safety margins.
-
-    For each trial and level the frame whose label is nearest is taken; at a level of 0 the first frame of full slip, at
-    1 the last frame that is still fully stuck, so that each is next to the change.
-
-    Raises
-    ------
-    RecordingError
-        If there is no such trial, or a trial has no labelled frame.
-    InputError
-        If a level is outside [0, 1].
-    """
-    rows: list[tuple[str, int]] = []
-    for info in data.select(split=split, condition=condition)[:trials]:
-        (opened,) = open_source(data, trial=info.trial)
-        margin = known_margin(opened.name, opened.safety_margin)
-        rows += [(info.trial, nearest_frame(margin, level)) for level in require_levels(levels)]
-    return frames_at(trained, data, rows)
-
-
-def require_levels(levels: Sequence[float]) -> Sequence[float]:
-    """Safety margins that are looked for, each of which must lie in [0, 1]."""
-    if any(not 0 <= level <= 1 for level in levels):
-        raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
-    return levels
-
-
-def known_margin(trial: str, margin: Float[np.ndarray, " frames"] | None) -> Float[np.ndarray, " frames"]:
-    """Labels of a trial, of which one at least is known."""
-    if margin is None or not np.isfinite(margin).any():
-        raise RecordingError(f"trial {trial} has no labelled frame; label it first")
-    return margin
-
-
-def frames_at(trained: Network, data: Dataset, frames: Sequence[tuple[str, int]]) -> ChosenFrames:
-    """Frames of a data set by trial and number, those of a trial one after another."""
-    infos = {info.trial: info for info in data.trials}
-    parts = []
-    for trial, own in groupby(frames, key=lambda frame: frame[0]):
-        if trial not in infos:
-            raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
-        (opened,) = open_source(data, trial=trial)
-        numbers = [number for _, number in own]
-        info = infos[trial]
-        parts.append(
-            _take(trained, opened, numbers, trial=trial, day=info.day, source=data.source, condition=info.condition)
-        )
-    return _join(parts)
-
-
-def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
-    """Frame whose margin is nearest to a level, next to the change where many are: the last above, the first below."""
-    distance = np.abs(margin - level)
-    nearest = np.flatnonzero(distance == np.nanmin(distance))
-    return int(nearest[-1] if level >= 0.5 else nearest[0])
-
-
-def frames_from_folder(
-    trained: Network,
-    folder: Path,
-    *,
-    reference: Path | None = None,
-    labels_in_names: bool = False,
+    reference: UInt8[np.ndarray, "height width 3"] | Path | str | None = None,
+    method: Methods | None = None,
+    budget: float | None = None,
+    select: FrameSelection | None = None,
     sensor: SensorProfile | Path | str | None = None,
-) -> ChosenFrames:
-    """Images of a folder, in natural order, or the frames of whatever recording `open_source` opens.
+    labels_in_names: bool = False,
+    out: Path | str | None = None,
+    colours: Colours = "signed",
+    **running: Unpack[Running],
+) -> Explanation:
+    """Explain why a network predicts these safety margins rather than that of the untouched sensor.
 
-    They have the size of the network's sensor: camera frames if `reference` is given or the source brings one, else
-    absolute difference images |T_n - T_0|. `labels_in_names` reads the safety margin in percent from names that end in
-    `_GG`, as in `image_433_20.png`; `sensor` as `open_source` takes it.
+    Parameters
+    ----------
+    run
+        The network, its folder, or the name of one that comes with sliplens.
+    source, reference
+        Camera frames T_n, 8-bit RGB, with the frame of the untouched sensor T_0; or a folder of images or a recording
+        with the image of the untouched sensor, where it holds none. Without a reference they are absolute difference
+        images |T_n - T_0|. Or a data set, of which frames along the safety margin are taken.
+    method
+        Row of `EXPLAINERS`, an explainer such as `get_explainer("occlusion", tile_px=8)`, or several of them. If None,
+        Shapley values of the markers (`RECOMMENDED_METHOD`), or of tiles where no markers are found.
+    budget
+        Share of the channels that `poly-cam` measures at first; below 1 it is faster. If None, 1 for one frame and 0.15
+        for several.
+    select
+        Frames of a data set; by default one dry test trial at six safety margins.
+    sensor
+        Profile of the sensor of a folder or recording, its file, or the name of one that comes with sliplens.
+    labels_in_names
+        If True, names of images such as `image_433_20.png` hold the safety margin in percent.
+    out
+        Folder to write: the record, overlays of every map, and a panel of them; nothing is written if None. An
+        interrupted call continues after its last map.
+    colours
+        Colours of the overlays: `signed`, what raises the prediction and what lowers it, on one scale for all frames;
+        or `jet`, what supports it, each frame on a scale of its own, as in the thesis's figures.
+    running
+        Options of `Running`.
 
     Raises
     ------
     InputError
-        If the folder is missing or empty, a name has no label though labels are asked for, or a network that reads raw
-        frames got no reference image.
+        If there is no such method or option, the source has no such frames, the network needs a reference, or the
+        folder holds something else.
     ImageError
-        If an image cannot be read, or has another size or kind of pixels.
+        If the frames are not of the size of the network's sensor.
+    PartError
+        If some of many maps failed three times, when all others are done.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sliplens as sl
+    >>> touched = np.zeros((1, 224, 224, 3), dtype=np.uint8)
+    >>> touched[:, 80:120, 90:150] = 90
+    >>> explanation = sl.explain("chromatouch-difference", touched, method="grad-cam")
+    >>> explanation.relevance["grad-cam"].shape
+    (1, 224, 224)
     """
-    parts = []
-    for opened in open_source(folder, reference=reference, sensor=sensor):
-        name = folder.name if opened.files else opened.name
-        part = _take(trained, opened, range(opened.frames), trial=name, day=1, source="real", condition="unknown")
-        if labels_in_names:
-            margin = np.array([_label(folder / name) for name in opened.files or part.ids], dtype=np.float32)
-            part = replace(part, safety_margin=margin)
-        parts.append(part)
-    return _join(parts)
+    for name in [method] if isinstance(method, str) else method if isinstance(method, Sequence) else ():
+        if isinstance(name, str):
+            EXPLAINERS.pick(name)
+    network = open_run(run, device=running.get("device", "cpu"))
+    chosen = _choose(network, source, reference, select, sensor=sensor, labels_in_names=labels_in_names)
+    explainers, warnings = choose_explainers(network, chosen, method, budget=budget)
+    frames = number_of(len(chosen.ids), "frame")
+    title = f"Explaining {frames} ({network.manifest.input}, {chosen.source})"
+    with reporting(running.get("on_progress")):
+        if out is None:
+            with open_stage(title):
+                return explain_frames(network, chosen, explainers, warnings=warnings)
+        images = hashlib.sha256(chosen.images.numpy().tobytes())
+        images.update(chosen.references.numpy().tobytes())
+        recipe = {"weights_sha256": network.manifest.weights_sha256, "input": network.manifest.input}
+        recipe |= {"source": chosen.source, "ids": chosen.ids, "images_sha256": images.hexdigest()}
+        recipe |= {"method": tuple(explainers), "budget": budget, "colours": colours}
+        maps = "a map" if len(explainers) == 1 else number_of(len(explainers), "map")
+        what = f"{maps} of {frames if len(chosen.ids) == 1 else f'each of {frames}'}, panel.png"
+        overwrite = running.get("overwrite", False)
+        with output_folder(Path(out), stage="explain", config=recipe, overwrite=overwrite) as output:
+            if not output.complete:
+                work = Explaining(
+                    trained=network,
+                    chosen=replace(chosen, find_markers=None),
+                    explainers=explainers,
+                    warnings=warnings,
+                )
+                with open_stage(title):
+                    explanation = work.make(
+                        output.folder / "parts",
+                        on=running.get("on", "serial"),
+                        retry_failed=running.get("retry_failed", False),
+                        on_piece=_draw_first(output.folder, network, chosen) if colours == "signed" else None,
+                    )
+                    _note_warnings(explanation)
+                draw_explanation(explanation, output.folder, colours=colours)
+                save_result(explanation, output.folder)
+                remove(output.folder / "parts")  # not before: if drawing or saving fails, the next call continues
+        report_file(Path(out), what, kept=output.complete)
+    return load_explanation(Path(out))
 
 
-def _take(
-    trained: Network, opened: Capture, numbers: Sequence[int], *, trial: str, day: int, source: str, condition: str
+def _choose(
+    network: Network,
+    source: np.ndarray | Dataset | Path | str,
+    reference: np.ndarray | Path | str | None,
+    select: FrameSelection | None,
+    *,
+    sensor: SensorProfile | Path | str | None,
+    labels_in_names: bool,
 ) -> ChosenFrames:
-    names = opened.files or [f"{opened.name}-f{number:04d}" for number in range(opened.frames)]
-    trained.require_frame_size(opened.frame_size, what=f"frames such as {names[numbers[0]]}")
-    untouched = None if opened.read_reference is None else opened.read_reference()
-    first = islice(opened.read_frames(), max(numbers) + 1)
-    frames = {number: frame for number, frame in enumerate(first) if number in numbers}
-    if untouched is None and source == "real":
-        trained.require_kind(frames[numbers[0]], what=names[numbers[0]])
-    images, empty = network_images(trained, np.stack([frames[number] for number in numbers]), untouched)
-    margin = np.full(opened.frames, np.nan) if opened.safety_margin is None else opened.safety_margin
-    return ChosenFrames(
-        ids=tuple(Path(names[number]).stem if opened.files else names[number] for number in numbers),
-        day=(day,) * len(numbers),
-        trial=(trial,) * len(numbers),
-        condition=(condition,) * len(numbers),
-        safety_margin=margin[list(numbers)].astype(np.float32),
-        images=images,
-        references=empty.expand(len(numbers), -1, -1, -1),
-        source=source,
+    if isinstance(source, Dataset):
+        if sensor is not None:
+            raise InputError("a data set's frames went through their profile on import; leave out --sensor")
+        return frames_from_dataset(network, source, select or FrameSelection())
+    if isinstance(source, np.ndarray):
+        image = read_image(Path(reference)) if isinstance(reference, str | Path) else reference
+        return frames_from_arrays(network, source, image)
+    if isinstance(reference, np.ndarray):
+        raise InputError("the reference of a folder is an array; give the path of its image")
+    return frames_from_folder(
+        network,
+        Path(source),
+        reference=None if reference is None else Path(reference),
+        labels_in_names=labels_in_names,
+        sensor=None if sensor is None else load_profile(sensor),
     )
 
 
-def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
-    told: dict[str, Any] = {
-        name: sum((getattr(part, name) for part in parts), ()) for name in ("ids", "day", "trial", "condition")
-    }
-    told |= {name: torch.cat([getattr(part, name) for part in parts]) for name in ("images", "references")}
-    margin = np.concatenate([part.safety_margin for part in parts])
-    return ChosenFrames(**told, safety_margin=margin, source=parts[0].source)
+def _note_warnings(explanation: Explanation) -> None:
+    # inside the stage: warnings that differ in numbers alone are then shown once
+    for warning in dict.fromkeys(warning for notes in explanation.methods.values() for warning in notes.warnings):
+        methods = [method for method, notes in explanation.methods.items() if warning in notes.warnings]
+        add_note(f"{', '.join(methods)}: {warning}")
 
 
-def _label(path: Path) -> float:
-    found = _LABEL.search(path.stem)
-    if found is None:
-        raise InputError(f"{path} carries no label; its name must end in the safety margin in percent, as in _20.png")
-    return int(found.group(1)) / 100
+def _draw_first(folder: Path, network: Network, chosen: ChosenFrames) -> Callable[[tuple[str, int], MethodMaps], None]:
+    """Return a function that draws the first map as soon as it exists, on a scale of its own."""
+    drawn = []
 
+    def draw(item: tuple[str, int], maps: MethodMaps) -> None:
+        if drawn:
+            return
+        method, batch = item
+        row = chosen.batches[batch][0]
+        path = folder / "overlays" / method / f"{chosen.ids[row]}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_png(path, overlay_points(input_pictures(network, chosen)[row : row + 1], maps.relevance[:1])[0])
+        drawn.append(path)
+        report_file(path, "a first picture; the folder takes its name when all are there")
 
-DEFAULT_METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
-"""The three methods the thesis compares."""
-
-
-def require_methods(methods: Sequence[str], explainers: Collection[str] = EXPLAINERS) -> None:
-    """Refuse a method that is not in the table."""
-    for name in methods:
-        if name not in explainers:
-            raise InputError(f"there is no explainer named {name!r}; choose from {', '.join(explainers)}")
-
-
-OnMap: TypeAlias = Callable[[str, int, UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]], None]
-"""Takes the method, the number of the frame, its picture, and its map."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Map:
-    """Explanation of one frame by one method."""
-
-    relevance: Annotated[Float32[np.ndarray, "height width"], ANSWER]
-    saliency: Annotated[Float32[np.ndarray, "height width"], SHARE]
-    seconds: float
-    warnings: tuple[str, ...]
-
-
-_PASSES_A_MAP = 300
-"""Of a map by Poly-CAM on a budget, or by Shapley values."""
-_FEW_MAPS = 20
+    return draw
 
 
 @dataclass(frozen=True, kw_only=True)
 class Explaining(Stage[Explanation]):
-    """Maps of chosen frames, a shard of (method, frame) each."""
+    """Maps of chosen frames; a part is a method and the number of a batch of frames."""
 
-    piece = _Map
+    piece = MethodMaps
     title = "Explaining frames"
 
     trained: Network
     chosen: ChosenFrames
     explainers: Mapping[str, Explainer]
+    warnings: tuple[str, ...] = ()
 
     def prepare(self) -> Find:
-        """Explain one frame with one method."""
-        run, references = self.trained, self.chosen.references
+        """Return the function that explains a batch of frames with one method."""
+        maps = len(self.chosen.ids) * len(self.explainers)
 
-        def find(item: tuple[str, int], _: OnProgress) -> _Map:
-            method, frame = item[0], slice(item[1], item[1] + 1)
-            inputs = run.encoding.normalise(self.chosen.images[frame]).to(run.device)
-            maps = len(self.chosen.ids) * len(self.explainers)
-            # of few maps the first is waited for: each then takes the engine that its own passes pay for
-            with expecting(_PASSES_A_MAP * maps if maps > _FEW_MAPS else 0):
-                explanation = self.explainers[method](run.model, inputs, reference=references[frame].to(run.device))
-            relevance = explanation.relevance[0].cpu().numpy()
-            where = f"the map of {self.chosen.ids[item[1]]} by {method}"
-            return _Map(
-                relevance=require_saliency(relevance, inputs.shape[-2:], where=where),
-                saliency=explanation.saliency[0].cpu().numpy(),
-                seconds=explanation.seconds,
-                warnings=explanation.warnings,
-            )
+        def explain_batch(item: tuple[str, int], _: OnProgress) -> MethodMaps:
+            method, batch = item
+            rows = self.chosen.batches[batch]
+            with reporting(ignore):  # a whole part counts, not its passes
+                return explain_rows(self.trained, self.chosen, self.explainers[method], rows, maps=maps)
 
-        return find
+        return explain_batch
 
     def shards(self) -> Iterator[Part]:
-        """Every frame with the first method, then with the next."""
-        weights = self.trained.manifest.weights_sha256
+        """Yield all batches with the first method, then with the next."""
+        chosen = self.chosen
         for method in self.explainers:
             # the folder of the parts is one of these options alone (`files.output_folder`)
-            recipe = {"weights_sha256": weights, "method": method}
-            for index, trial in enumerate(self.chosen.trial):
-                shown = self.chosen.images[index].numpy().tobytes() + self.chosen.references[index].numpy().tobytes()
-                known = {"recipe": recipe, "content": hashlib.sha256(shown).hexdigest(), "first": index, "frames": 1}
-                yield part((method, index), trial=trial, name=f"{method} of {self.chosen.ids[index]}", **known)
-
-    @property
-    def inputs(self) -> Float[Tensor, "frames colours size size"]:
-        """What the network gets of the frames, in [0, 1], on its device."""
-        return self.trained.encoding.normalise(self.chosen.images).to(self.trained.device)
-
-    def pictures(self) -> UInt8[np.ndarray, "frames size size 3"]:
-        """What of that a person sees."""
-        shown = (255 * frame_of(self.inputs)).round().to(torch.uint8).permute(0, 2, 3, 1)
-        return shown.contiguous().cpu().numpy()
-
-    def join(self, pieces: Sequence[_Map]) -> Explanation:
-        """Maps of all frames, with what the network reads from them."""
-        trained, chosen, frames = self.trained, self.chosen, len(self.chosen.ids)
-        maps = {method: pieces[at * frames : (at + 1) * frames] for at, method in enumerate(self.explainers)}
-        # the same answers for every method: asked once, on all frames
-        estimate, untouched = trained.estimate(self.inputs), trained.predict(chosen.references).tolist()
-        withheld = estimate.withheld(np.ones(frames, dtype=bool))  # who explains a frame holds it to touch something
-        return Explanation(
-            input=trained.encoding.name,
-            source=chosen.source,
-            weights_sha256=trained.manifest.weights_sha256,
-            frames=tuple(
-                ExplainedFrame(
-                    id=chosen.ids[index],
-                    trial=chosen.trial[index],
-                    day=chosen.day[index],
-                    condition=chosen.condition[index],
-                    safety_margin=float(margin) if np.isfinite(margin) else None,
-                    prediction=float(estimate.margin[index]),
-                    withheld=withheld[index],
-                    reference_prediction=untouched[index],
+            recipe = {"weights_sha256": self.trained.manifest.weights_sha256, "method": method}
+            for batch, rows in enumerate(chosen.batches):
+                content = hashlib.sha256(chosen.images[rows].numpy().tobytes())
+                content.update(chosen.references[rows].numpy().tobytes())
+                yield part(
+                    (method, batch),
+                    trial=chosen.trial[rows[0]],
+                    name=f"{method} of {chosen.ids[rows[0]]}",
+                    recipe=recipe,
+                    content=content.hexdigest(),
+                    first=rows[0],
+                    frames=len(rows),
                 )
-                for index, margin in enumerate(chosen.safety_margin)
-            ),
-            methods={method: _note(own, chosen.ids) for method, own in maps.items()},
-            images=chosen.images.numpy(),
-            pictures=self.pictures(),
-            relevance={method: np.stack([one.relevance for one in own]) for method, own in maps.items()},
-            saliency={method: np.stack([one.saliency for one in own]) for method, own in maps.items()},
-        )
+
+    def join(self, pieces: Sequence[MethodMaps]) -> Explanation:
+        """Make the record of all maps."""
+        count = len(self.chosen.batches)
+        maps = {method: pieces[at * count : (at + 1) * count] for at, method in enumerate(self.explainers)}
+        return join_maps(self.trained, self.chosen, maps, warnings=self.warnings)
 
 
-def explain_frames(
-    trained: Network,
-    chosen: ChosenFrames,
+_CONFIDENCE = 0.9
+
+
+def make_strip(
+    network: Network,
+    recording: Recording,
     *,
-    methods: Sequence[str] = DEFAULT_METHODS,
-    explainers: Mapping[str, Explainer] = EXPLAINERS,
-    parts: Path | None = None,
-    on: str = "serial",
-    retry_failed: bool = False,
-    on_map: OnMap | None = None,
-    on_progress: OnProgress | None = None,
-) -> Explanation:
-    """Explain frames with several methods.
+    source: str,
+    method: str = RECOMMENDED_METHOD,
+    levels: Sequence[float] = MARGIN_LEVELS,
+) -> Strip:
+    """Predict every frame of a trial, and explain those nearest to some safety margins in [0, 1].
 
-    `parts` is a folder that keeps each map as soon as it is there, so that an interrupted run loses at most one a
-    process. `on` says where maps are made, a row of `runner.EXECUTORS`; `retry_failed` tries those again that failed
-    before. `on_map` is called with each: method, number of the frame, its picture, and the map.
-
-    Raises
-    ------
-    InputError
-        If a method is unknown.
-    PartError
-        If some of many maps failed again and again, when all others are there.
+    `source` is `simulated` or `real`. A method by marker becomes one by tile where no markers are found.
     """
-    require_methods(methods, explainers)
-    work = Explaining(trained=trained, chosen=chosen, explainers={name: explainers[name] for name in methods})
-    pictures = work.pictures() if on_map is not None else None
-
-    def show(item: tuple[str, int], made: _Map) -> None:
-        if on_map is not None and pictures is not None:
-            method, index = item
-            on_map(method, index, pictures[index], made.relevance)
-
-    shown = None if on_map is None else show
-    return work.make(parts, on=on, retry_failed=retry_failed, on_piece=shown, on_progress=on_progress)
-
-
-def _note(maps: Sequence[_Map], ids: Sequence[str]) -> MethodNotes:
-    warnings: dict[str, list[str]] = {}
-    for name, own in zip(ids, maps, strict=True):
-        for warning in own.warnings:
-            # each frame was explained by itself: its place in that batch of one tells nothing
-            warnings.setdefault(warning.removeprefix("image 0: "), []).append(name)
-    return MethodNotes(
-        seconds_per_frame=float(np.mean([own.seconds for own in maps])),
-        warnings=tuple(f"{_of_all(names, len(ids))}: {warning}" for warning, names in warnings.items()),
+    margin = require_labels(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
+    rows = tuple(sorted({nearest_frame(margin, level) for level in levels}))
+    estimate = network.estimate(network.encode(recording.frames, recording.reference))
+    missing = np.full(len(margin), np.nan)
+    low, high = estimate.interval(_CONFIDENCE) or (missing, missing)
+    withheld = estimate.withheld(np.isfinite(margin))
+    trusted = np.array([reason is None for reason in withheld])
+    pictures, size = recording.frames[list(rows)], network.manifest.image_size
+    chosen, explainers = frames_from_arrays(network, pictures, recording.reference), study_explainers([method])
+    inputs = network.encoding.normalise(chosen.images)
+    try:
+        explainers = with_markers(
+            explainers, inputs, lambda: [markers_in_recording(recording, row, image_size=size) for row in rows]
+        )
+    except SliplensError:  # another sensor, or no OpenCV
+        explainers = without_markers(explainers)
+    [(name, maps)] = explain_frames(network, chosen, explainers).relevance.items()
+    predicted = (np.where(trusted, values, np.nan).astype(np.float64) for values in (estimate.margin, low, high))
+    prediction, low, high = predicted
+    return Strip(
+        trial=recording.trial,
+        condition=recording.condition,
+        source=source,
+        input=network.manifest.input,
+        method=name,
+        readings=StripReadings(
+            time_s=recording.time_s.astype(np.float64),
+            contact_state=np.array([str(state) for state in recording.contact_state]),
+            withheld=np.array([reason or "" for reason in withheld]),
+            safety_margin=margin.astype(np.float64),
+            prediction=prediction,
+            low=low,
+            high=high,
+        ),
+        shown=rows,
+        pictures=pictures,
+        relevance=maps,
     )
-
-
-_NAMED = 3
-"""Frames that a warning names."""
-
-
-def _of_all(names: Sequence[str], count: int) -> str:
-    """Frames that a warning is of, against how many were explained."""
-    more = ", \N{HORIZONTAL ELLIPSIS}" if len(names) > _NAMED else ""
-    return f"{len(names)} of {number_of(count, 'frame')} ({', '.join(names[:_NAMED])}{more})"
-
-
-def network_inputs(trained: Network, explained: Explanation) -> Float[Tensor, "frames colours size size"]:
-    """What the network got of explained frames, in [0, 1], on its device."""
-    return trained.encoding.normalise(torch.from_numpy(explained.images)).to(trained.device)
-
-
-def mean_of_known(values: Float[np.ndarray, " values"]) -> float | None:
-    """Mean of what is defined; None where nothing is, since JSON knows no NaN."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else None

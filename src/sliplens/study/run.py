@@ -12,7 +12,9 @@ from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import CLOSE
 from sliplens.explainers.contract import Explainer
-from sliplens.faithfulness.removal import Faithfulness
+from sliplens.explainers.explain import with_markers
+from sliplens.explainers.frames import frames_at
+from sliplens.faithfulness.scoring import influences
 from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Network
@@ -27,7 +29,8 @@ from sliplens.progress import (
     reporting,
 )
 from sliplens.recordings import Dataset, load_dataset
-from sliplens.results.faithfulness import NEW_WEIGHTS
+from sliplens.results.explanation import Explanation
+from sliplens.results.faithfulness import NEW_WEIGHTS, RemovalCurve
 from sliplens.results.study import (
     CONFIG_FILE,
     RECORDS,
@@ -51,12 +54,11 @@ from sliplens.study.choice import (
     method_options,
     show_states,
     study_explainers,
-    with_markers,
     without_markers,
     worth_scoring,
 )
-from sliplens.study.explaining import Explaining, frames_at
-from sliplens.study.scoring import STEPS, STUDY_AREAS, Deletion, Influence, RemedialDeletion, Removal, influences
+from sliplens.study.explaining import Explaining
+from sliplens.study.scoring import STEPS, STUDY_AREAS, Deletion, Influence, RemedialDeletion, Removal
 from sliplens.study.stages import Stage
 from sliplens.study.truth import TRUE_FILL, TRUTH_PAIRS, JudgingByTruth, true_curves
 from sliplens.training.evaluation import evaluate
@@ -225,12 +227,12 @@ class Records:
         explained = self["explain"]
         scored = worth_scoring(self["choice"].frames, explained)
         markers = self["states"].markers
-        return gather(self.run, explained, self.data, scored, markers=markers, explainers=self.explainers)
+        return gather(self.run, explained, scored, markers=markers, explainers=self.explainers)
 
     @cached_property
     def influence(self) -> Influence:
         """Maps to rank parts by, controls included."""
-        return {**influences(self.material), **self["control"].maps}
+        return {**influences(self.run, self.material.explained), **self["control"].maps}
 
 
 def _warn_of_few_trials(data: Dataset, config: StudyConfig) -> None:
@@ -286,7 +288,7 @@ def _explain(records: Records) -> Explaining:
     frames = frames_at(run, records.data, [(frame.trial, frame.frame) for frame in chosen])
     images = run.encoding.normalise(frames.images)
     explainers = with_markers(records.explainers, images, lambda: marker_places(run, chosen, markers))
-    return Explaining(trained=run, chosen=frames, explainers=explainers)
+    return Explaining(trained=run, chosen=replace(frames, find_markers=None), explainers=explainers)
 
 
 def _note_left_out(records: Records) -> Iterator[str]:
@@ -303,14 +305,14 @@ def _delete(records: Records) -> Deletion:
 def _remove(records: Records) -> Removal:
     config = records.config
 
-    def put_back(part: Material, maps: Influence, seed: int, count: OnProgress) -> Mapping[str, Faithfulness]:
+    def put_back(part: Explanation, maps: Influence, seed: int) -> Mapping[str, RemovalCurve]:
         orders = config.random_orders
-        return true_curves(
-            records.run, part.explained, records.data, maps=maps, random_orders=orders, seed=seed, on_progress=count
-        )
+        return true_curves(records.run, part, records.data, maps=maps, random_orders=orders, seed=seed)
 
     return Removal(
-        material=records.material,
+        trained=records.run,
+        explained=records.material.explained,
+        units=records.material.units(),
         maps=records.influence,
         settings=config.settings,
         random_orders=config.random_orders,
@@ -321,11 +323,12 @@ def _remove(records: Records) -> Removal:
 
 def judge_by_truth(records: Records) -> JudgingByTruth:
     """Compare maps along the prediction's change with the effects of markers that are put back."""
-    explained, raises_only = records.material.explained, records.material.raises_only
+    explained = records.material.explained
+    raises_only = {name for name, notes in explained.methods.items() if notes.raises_only}
     towards = explained.towards[:, None, None]
     maps = {
         # the order of such a method is the published one, but where the answer fell what raises it opposes that
-        name: towards * values if raises_only(name.removesuffix(NEW_WEIGHTS)) else values
+        name: towards * values if name.removesuffix(NEW_WEIGHTS) in raises_only else values
         for name, values in records.influence.items()
     }
     return JudgingByTruth(
@@ -428,7 +431,7 @@ STUDY = (
         name="remedies",
         title=RemedialDeletion.title,
         make=lambda records: RemedialDeletion(
-            material=records.material, grey=records["score"], seed=records.config.seed
+            trained=records.run, explained=records.material.explained, grey=records["score"], seed=records.config.seed
         ),
         needs=("explain", "score"),
         options=lambda _: {"steps": STEPS},

@@ -1,91 +1,316 @@
-"""Scores of a study: methods and controls under several fills and units; the deletion score and its remedies."""
+"""Public call that scores explanations, and the study's stages: removal, the thesis's deletion score, its remedies."""
 
+import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from itertools import combinations
-from typing import Any
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, TypeAlias, Unpack
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float64, Int, Shaped
-from scipy.stats import kendalltau
-from torch import Tensor
+from jaxtyping import Float, Float64, UInt8
 
-from sliplens.errors import CheckpointError, InputError
-from sliplens.faithfulness.controls import control_maps, lead_over_controls
+from sliplens.codec import load_result, save_result
+from sliplens.errors import InputError, SaliencyError
+from sliplens.explainers.explain import network_inputs
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import RANDOM_ORDERS, Faithfulness, Predict, Units, answer_whole, score_maps
+from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Units, answer_whole, tile_units
 from sliplens.faithfulness.scoring import (
-    controls_win,
-    deletion_curves,
-    deletion_score,
+    SettingCurves,
+    curves_of_frames,
+    delete_pixels,
+    deletion_alarms,
+    deletion_orders,
     deletion_steps,
-    fill_decides,
-    flat_maps,
-    follows_last_step,
+    deletion_table,
+    deletion_tables,
+    explanation_of_maps,
+    influences,
     prepare_passes,
-    random_order,
-    rankings_disagree,
-    saliency_orders,
-    saturated,
+    require_same_network,
+    score_curves,
+    score_deletion,
+    score_tables,
+    stack_curves,
+    with_deletion,
 )
-from sliplens.intervals import mean_interval, paired_difference
+from sliplens.files import output_folder, remove
 from sliplens.models import Network
-from sliplens.progress import OnProgress, continued
-from sliplens.results.explanation import ExplainedFrame, Explanation
+from sliplens.models.checkpoint import open_run
+from sliplens.progress import OnProgress, ignore, open_stage, report_file, reporting, track
+from sliplens.results.explanation import Explanation, load_explanation
 from sliplens.results.faithfulness import (
-    CHANCE,
-    Agreement,
-    Comparison,
     DeletionScores,
     DeletionTable,
-    MethodScore,
+    Faithfulness,
     Remedies,
-    RemovalScore,
-    RemovalScores,
-    RemovalTable,
+    RemovalCurve,
     Variant,
     VariantTable,
-    is_control,
 )
 from sliplens.results.study import SETTINGS, Setting
 from sliplens.runner import Part
-from sliplens.study.choice import Material, MaterialStage, trial_seed
-from sliplens.study.explaining import network_inputs
+from sliplens.study.choice import trial_seed
+from sliplens.study.explaining import Running
 from sliplens.study.stages import Find, Stage, join_trials, trial_shards
 
 STEPS = 28
 """An eighth of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""
-BACKGROUND = {"difference": "black", "raw": "white"}
-"""What the thesis proposes as the background of its two inputs."""
-_STOP = 0.5
+STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+"""Fewer shares than `AREAS`, so that many settings can be scored: the equal areas, and enough for trapezoids."""
+_TILES_ACROSS = 14
+Influence: TypeAlias = Mapping[str, Float[np.ndarray, "images height width"]]
+"""Maps that rank parts, of each method and control."""
+Scoring: TypeAlias = Callable[[Explanation, Influence, int], Mapping[str, RemovalCurve]]
+"""Function from explained frames, their maps and a seed to their curves."""
 
 
-_Curves = Mapping[str, Sequence[DeletionTable]]
-"""Curve of each frame, by method; random orders among the methods."""
+def score(
+    run: Network | Path | str,
+    frames: UInt8[np.ndarray, "images height width 3"] | Explanation | Path | str,
+    maps: Explanation | Float[np.ndarray, "maps rows columns"] | None = None,
+    *,
+    reference: UInt8[np.ndarray, "height width 3"] | None = None,
+    signed: bool = True,
+    fill: str = "reference",
+    unit: Literal["pixel", "tile"] = "pixel",
+    random_orders: int = RANDOM_ORDERS,
+    steps: int = STEPS,
+    seed: int = 0,
+    out: Path | str | None = None,
+    **running: Unpack[Running],
+) -> Faithfulness:
+    """Score maps by removing what they call influential first, and last, against random orders and controls.
+
+    The score is the symmetric gain, in margin units: how much further the prediction moves towards that on the
+    untouched sensor with the most influential parts removed first rather than the least. Maps that gain no more than
+    the controls, which use nothing the network learned, show nothing. Every frame counts; an alarm names how many are
+    predicted nearly like the untouched sensor, which a study leaves out (`worth_scoring`). The record also holds the
+    deletion score of the thesis, under its grey fill, to compare with published figures (docs/deletion.md).
+
+    Parameters
+    ----------
+    run
+        The network that was explained, its folder, or the name of one that comes with sliplens.
+    frames, reference
+        Explanation, or the folder of one, which holds its frames; or the frames and the reference of `explain`.
+    maps
+        Explanation of the frames; or an array (frames, size, size) of one number a pixel of the network's input, by
+        another tool. None where `frames` is an explanation.
+    signed
+        Meaning of an array. If True, above zero where a pixel raises the prediction, as `Explanation.relevance` and the
+        attributions of Captum, summed over the colours. Pixels then rank by sign(f(x) - f(reference)) times the map,
+        as those of an `Explanation` do. If False, larger where a pixel matters more, whichever way the prediction went,
+        as a saliency in [0, 1].
+    fill
+        Content of removed pixels, a row of `FILLS`; `reference`, the untouched sensor, is one that networks know.
+    unit
+        What is removed at once: pixels, or square tiles of a fourteenth of the image.
+    random_orders
+        Number of random orders.
+    steps
+        Steps of the deletion score until every pixel is removed; 224 as in the thesis, 0 to leave it out.
+    seed
+        Seed of the random orders.
+    out
+        Folder to write; nothing is written if None. An interrupted call continues after the last trial.
+    running
+        Options of `Running`.
+
+    Raises
+    ------
+    InputError
+        If there is no such fill, the network needs a reference, or the folder to write holds something else.
+    CheckpointError
+        If the explanation is of another network.
+    SaliencyError
+        If there is not a map a frame, or one has another size than the network's input, or holds NaN; or if a signed
+        array has no number below zero for a frame whose prediction fell.
+    PartError
+        If some of several trials failed three times, when all others are done.
+    """
+    get_fill(fill)
+    if random_orders < 1:
+        raise InputError(f"{random_orders} random orders are too few; --random-orders must be at least 1")
+    network = open_run(run, device=running.get("device", "cpu"))
+    explanation = _to_score(network, frames, maps, reference, signed=signed)
+    require_same_network(network, explanation)
+    shape = (explanation.image_size, explanation.image_size)
+    units = tile_units(shape, size=1 if unit == "pixel" else max(1, shape[0] // _TILES_ACROSS))
+    removal = Removal(
+        trained=network,
+        explained=explanation,
+        maps=influences(network, explanation),
+        units={unit: [units] * len(explanation.frames)},
+        settings=(Setting(fill=fill, unit=unit),),
+        areas=AREAS,
+        random_orders=random_orders,
+        seed=seed,
+    )
+    works: dict[str, Stage] = {"removal": removal}
+    if steps:
+        works["deletion"] = Deletion(trained=network, explained=explanation, steps=steps, seed=seed)
+    with reporting(running.get("on_progress")):
+        if out is None:
+            results = []
+            for work in works.values():
+                with open_stage(work.title):
+                    results.append(compute(work))
+            return with_deletion(*results)
+        hashes = hashlib.sha256()
+        for values in explanation.relevance.values():
+            hashes.update(values.tobytes())
+        config = {"weights_sha256": network.manifest.weights_sha256, "maps_sha256": hashes.hexdigest()}
+        config |= {"input": explanation.input, "source": explanation.source, "seed": seed, "steps": steps}
+        config |= {"fill": fill, "unit": unit, "random_orders": random_orders}
+        overwrite = running.get("overwrite", False)
+        with output_folder(Path(out), stage="faithfulness", config=config, overwrite=overwrite) as output:
+            if not output.complete:
+                results = []
+                for name, work in works.items():
+                    with open_stage(work.title):
+                        result = work.make(
+                            output.folder / "parts" / name,
+                            on=running.get("on", "serial"),
+                            retry_failed=running.get("retry_failed", False),
+                        )
+                    results.append(result)
+                save_result(with_deletion(*results), output.folder)
+                remove(output.folder / "parts")
+        report_file(Path(out), "curves and scores", kept=output.complete)
+    return load_result(Path(out), Faithfulness, command="sliplens score")
 
 
-def require_same_network(trained: Network, explained: Explanation) -> None:
-    """Refuse explanations of another network."""
-    if explained.weights_sha256 != trained.manifest.weights_sha256:
-        raise CheckpointError(
-            "these explanations were made with another network; explain the frames again with this run"
+def _to_score(
+    network: Network,
+    frames: np.ndarray | Explanation | Path | str,
+    maps: Explanation | np.ndarray | None,
+    reference: np.ndarray | None,
+    *,
+    signed: bool,
+) -> Explanation:
+    if isinstance(frames, Explanation):
+        return frames
+    if isinstance(frames, str | Path):
+        return load_explanation(Path(frames))
+    if maps is None:
+        raise InputError("the frames have no maps to score; give an explanation of them, or an array of maps")
+    if isinstance(maps, np.ndarray):
+        return explanation_of_maps(network, frames, maps, reference, signed=signed)
+    if len(maps.frames) != len(frames):
+        raise SaliencyError(
+            f"there are {len(maps.frames)} maps of {len(frames)} frames; explain the frames that are scored"
         )
+    return maps
+
+
+def compute(stage: Stage) -> Any:
+    """Compute the result of a stage in memory."""
+    shards = list(stage.shards())
+    find = stage.prepare()
+    records = [find(shard.item, ignore) for shard in track(shards, sizes=[shard.frames for shard in shards])]
+    return stage.join(records)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Answers:
-    """Answers on the frames of a trial while pixels go, by the order in which they go; the first with all of them."""
+class Removal(Stage[Faithfulness]):
+    """Removal of parts in the order of every map, under each setting; a part is a setting and a trial.
+
+    Curves that are computed in another way, such as by drawing the scene anew (`further`), are scored with the others.
+    """
+
+    piece = SettingCurves
+    title = "Removing parts"
+
+    trained: Network
+    explained: Explanation
+    maps: Influence
+    """Maps of the methods and controls (`influences`)."""
+    units: Mapping[str, Sequence[Units]]
+    """Units of each frame by name; settings of others are left out."""
+    settings: Sequence[Setting] = SETTINGS
+    areas: Sequence[float] = STUDY_AREAS
+    random_orders: int = RANDOM_ORDERS
+    further: Mapping[Setting, Scoring] = field(default_factory=dict)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for setting in self.settings:
+            get_fill(setting.fill)
+
+    @property
+    def _available(self) -> list[Setting]:
+        return [setting for setting in self.settings if setting.unit in self.units]
+
+    def shards(self) -> Iterator[Part]:
+        """Yield all trials under the first setting, then under the next."""
+        for setting in (*self._available, *self.further):
+            yield from trial_shards(self.explained, setting.fill, setting.unit)
+
+    def prepare(self) -> Find:
+        """Return the function that computes the curves of a trial under one setting."""
+        inputs, orders = network_inputs(self.trained, self.explained), 2 * len(self.maps) + self.random_orders
+        passes = len(self._available) * len(inputs) * orders * (len(self.areas) - 2)
+        predict, trials = prepare_passes(self.trained, inputs, passes), list(self.explained.trials)
+
+        def remove_parts(item: tuple[str, str, str], _: OnProgress) -> SettingCurves:
+            fill, unit, trial = item
+            setting, rows = Setting(fill=fill, unit=unit), self.explained.trials[trial]
+            part, maps = self.explained.take(rows), {name: values[rows] for name, values in self.maps.items()}
+            seed = trial_seed(self.seed, trials.index(trial))
+            if setting not in self.further:
+                return curves_of_frames(
+                    predict,
+                    self.trained,
+                    part,
+                    maps,
+                    [self.units[unit][row] for row in rows],
+                    fill=fill,
+                    areas=self.areas,
+                    random_orders=self.random_orders,
+                    seed=seed,
+                )
+            curves = self.further[setting](part, maps, seed)
+            return SettingCurves(
+                areas=next(iter(curves.values())).areas,
+                curves=stack_curves(curves),
+                whole=answer_whole(predict, network_inputs(self.trained, part)),
+                blank=np.full(len(rows), np.nan),
+            )
+
+        return remove_parts
+
+    def join(self, pieces: Sequence[SettingCurves]) -> Faithfulness:
+        """Score all curves."""
+        count = len(self.explained.trials)
+        curves = {}
+        for at, setting in enumerate((*self._available, *self.further)):
+            parts = pieces[at * count : (at + 1) * count]
+            answers = [{"whole": part.whole, "blank": part.blank} for part in parts]
+            curves[setting] = SettingCurves(
+                areas=parts[0].areas,
+                curves=join_trials(self.explained, [part.curves for part in parts], axis=1),
+                **join_trials(self.explained, answers),
+            )
+        return score_curves(self.explained, curves, random_orders=self.random_orders, seed=self.seed)
+
+
+Answers: TypeAlias = dict[str, Float64[np.ndarray, "frames answers"]]
+"""Predictions of frames while pixels are removed, by the order of removal; the first of the whole frames."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialAnswers:
+    """Predictions of the frames of a trial while pixels are removed."""
 
     answers: dict[str, Float64[np.ndarray, "frames answers"]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Deletion(Stage[DeletionScores]):
-    """Deletion of the most salient pixels by every method and in a random order, a trial a shard."""
+    """Deletion of the most salient pixels by every method and in a random order; a part is a trial."""
 
-    piece = _Answers
+    piece = TrialAnswers
     title = "Deleting pixels, as the thesis did"
 
     trained: Network
@@ -96,208 +321,155 @@ class Deletion(Stage[DeletionScores]):
     seed: int = 0
 
     def shards(self) -> Iterator[Part]:
-        """Trials, whose maps are counted with a random one."""
-        return trial_shards(self.explained, maps=len(self.explained.saliency) + 1)
-
-    @property
-    def _removed(self) -> Int[np.ndarray, " steps"]:
-        size = self.explained.image_size
-        return deletion_steps((size, size), steps=self.steps)
+        """Yield the trials, whose maps are counted with a random one."""
+        return trial_shards(self.explained, maps=len(self.explained.relevance) + 1)
 
     def prepare(self) -> Find:
-        """Delete the pixels of the frames of a trial."""
-        inputs, orders = network_inputs(self.trained, self.explained), _orders(self.explained, seed=self.seed)
-        predict = prepare_passes(self.trained, inputs, len(orders) * len(inputs) * len(self._removed))
+        """Return the function that deletes the pixels of the frames of a trial."""
+        inputs, orders = network_inputs(self.trained, self.explained), deletion_orders(self.explained, seed=self.seed)
+        removed = deletion_steps((self.explained.image_size, self.explained.image_size), steps=self.steps)
+        predict = prepare_passes(self.trained, inputs, len(orders) * len(inputs) * len(removed))
 
-        def find(item: tuple[str], on_progress: OnProgress) -> _Answers:
+        def delete(item: tuple[str], _: OnProgress) -> TrialAnswers:
             rows = self.explained.trials[item[-1]]
-            delete = partial(_delete, predict, inputs[rows], fill=self.fill, steps=self.steps)
-            return _Answers(answers=_each(delete, {name: own[rows] for name, own in orders.items()}, on_progress))
+            part = {name: order[rows] for name, order in orders.items()}
+            answers = {
+                name: delete_pixels(predict, inputs[rows], order, fill=self.fill, steps=self.steps)
+                for name, order in track(list(part.items()), sizes=[len(rows)] * len(part))
+            }
+            return TrialAnswers(answers=answers)
 
-        return find
+        return delete
 
-    def join(self, pieces: Sequence[_Answers]) -> DeletionScores:
-        """Scores of all curves."""
-        explained, removed = self.explained, self._removed
-        answers = join_trials(explained, [one.answers for one in pieces])
-        curves = {name: _split(name, removed, own, explained) for name, own in answers.items()}
-        control = answers[CHANCE]
-        return DeletionScores(
-            input=explained.input,
-            source=explained.source,
-            fill=self.fill,
-            steps=len(removed),
-            pixels_per_step=int(removed[0]),
-            methods={name: _score(own) for name, own in curves.items()},
-            alarms=(
-                *flat_maps(explained.saliency),
-                # the fill decides where the filled image is answered like the whole one
-                *fill_decides(control[:, 0], control[:, -1], fill=self.fill),
-                *saturated(control[:, 0]),
-                *_method_alarms(curves),
-            ),
-            table=DeletionTable.joined([curve for own in curves.values() for curve in own]),
-        )
-
-
-def _delete(
-    predict: Predict,
-    inputs: Float[Tensor, "frames colours size size"],
-    order: Int[np.ndarray, "frames pixels"],
-    *,
-    fill: str,
-    steps: int | None,
-    on_progress: OnProgress | None = None,
-) -> Float64[np.ndarray, "frames answers"]:
-    """Answers on the whole frames, and then while the pixels of an order go."""
-    deleted = deletion_curves(predict, inputs, order, fill=get_fill(fill), steps=steps, on_progress=on_progress)
-    return np.column_stack([deleted.base, deleted.predictions])
-
-
-def _each(
-    delete: Callable[..., Float64[np.ndarray, "frames answers"]],
-    orders: Mapping[str, Int[np.ndarray, "frames pixels"]],
-    on_progress: OnProgress,
-    *,
-    before: int = 0,
-) -> dict[str, Float64[np.ndarray, "frames answers"]]:
-    """Answers of each order; each frame of each counts."""
-    answers = {}
-    for name, order in orders.items():
-        answers[name] = delete(order, on_progress=continued(on_progress, before=before, total=0))
-        before += len(order)
-    return answers
+    def join(self, pieces: Sequence[TrialAnswers]) -> DeletionScores:
+        """Score all curves."""
+        answers = join_trials(self.explained, [piece.answers for piece in pieces])
+        return score_deletion(self.explained, answers, fill=self.fill)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Remedied:
-    """Answers on the frames of a trial while pixels become the background, and while the least salient become grey."""
+class RemedyAnswers:
+    """Predictions of the frames of a trial while pixels become background, and while the least salient become grey."""
 
     background: dict[str, Float64[np.ndarray, "frames answers"]]
     insertion: dict[str, Float64[np.ndarray, "frames answers"]]
 
 
-@dataclass(frozen=True, kw_only=True)
-class RemedialDeletion(MaterialStage[Remedies]):
-    """Deletion that stops at half of the saliency, deletion to the background, and insertion, a trial a shard.
+BACKGROUND = {"difference": "black", "raw": "white"}
+"""Background that the thesis proposes for its two inputs."""
+_STOP = 0.5
 
-    Stopping early needs no pass of its own: the same frames, scored by deletion to `grey`, are given.
+
+@dataclass(frozen=True, kw_only=True)
+class RemedialDeletion(Stage[Remedies]):
+    """Deletion that stops at half of the saliency, deletion to the background, and insertion; a part is a trial.
+
+    Stopping early needs no pass: it reuses `grey`, the same frames scored by deletion to grey.
 
     Polak, discussion of the faithfulness curves: stop once all pixels with saliency above 0.5 are gone; another fill.
     """
 
-    piece = _Remedied
+    piece = RemedyAnswers
     title = "Trying the thesis's remedies"
 
+    trained: Network
+    explained: Explanation
     grey: DeletionScores
     steps: int = STEPS
     seed: int = 0
 
     def shards(self) -> Iterator[Part]:
-        """Trials, whose maps are counted twice, and with a random one."""
-        explained = self.material.explained
-        return trial_shards(explained, maps=2 * (len(explained.saliency) + 1))
+        """Yield the trials, whose maps are counted twice, and with a random one."""
+        return trial_shards(self.explained, maps=2 * (len(self.explained.relevance) + 1))
 
     @property
     def _background(self) -> str:
-        return BACKGROUND.get(self.material.explained.input, "background")
+        return BACKGROUND.get(self.explained.input, "background")
 
     def prepare(self) -> Find:
-        """Delete the pixels of the frames of a trial both ways."""
-        material, inputs = self.material, self.material.inputs
-        orders = _orders(material.explained, seed=self.seed)
-        predict = prepare_passes(material.trained, inputs, 2 * len(orders) * len(inputs) * self.steps)
+        """Return the function that deletes the pixels of the frames of a trial both ways."""
+        inputs, orders = network_inputs(self.trained, self.explained), deletion_orders(self.explained, seed=self.seed)
+        predict = prepare_passes(self.trained, inputs, 2 * len(orders) * len(inputs) * self.steps)
 
-        def find(item: tuple[str], on_progress: OnProgress) -> _Remedied:
-            rows = material.explained.trials[item[-1]]
-            own = {name: order[rows] for name, order in orders.items()}
+        def delete(item: tuple[str], _: OnProgress) -> RemedyAnswers:
+            rows = self.explained.trials[item[-1]]
+            delete_rows = partial(delete_pixels, predict, inputs[rows], steps=self.steps)
             # inserting k pixels of an order is deleting all the others
-            turned = {name: order[:, ::-1].copy() for name, order in own.items()}
-            delete = partial(_delete, predict, inputs[rows], steps=self.steps)
-            return _Remedied(
-                background=_each(partial(delete, fill=self._background), own, on_progress),
-                insertion=_each(partial(delete, fill="grey"), turned, on_progress, before=len(own) * len(rows)),
-            )
+            jobs = [(name, order[rows], self._background) for name, order in orders.items()]
+            jobs += [(name, order[rows][:, ::-1].copy(), "grey") for name, order in orders.items()]
+            tracked = track(jobs, sizes=[len(rows)] * len(jobs))
+            answers = [(name, delete_rows(order, fill=fill)) for name, order, fill in tracked]
+            return RemedyAnswers(background=dict(answers[: len(orders)]), insertion=dict(answers[len(orders) :]))
 
-        return find
+        return delete
 
-    def join(self, pieces: Sequence[_Remedied]) -> Remedies:
-        """Scores of all remedies."""
-        explained, grey, background = self.material.explained, self.grey, self._background
+    def join(self, pieces: Sequence[RemedyAnswers]) -> Remedies:
+        """Score all remedies."""
+        explained, background = self.explained, self._background
         removed = deletion_steps((explained.image_size, explained.image_size), steps=self.steps)
         deleted, inserted = (
-            {name: _split(name, removed, own, explained) for name, own in join_trials(explained, answers).items()}
-            for answers in ([one.background for one in pieces], [one.insertion for one in pieces])
+            {name: deletion_tables(name, removed, values, explained) for name, values in joined.items()}
+            for joined in (
+                join_trials(explained, [piece.background for piece in pieces]),
+                join_trials(explained, [piece.insertion for piece in pieces]),
+            )
         )
-        curves: dict[str, _Curves] = {
-            "stop-at-half": _stopped(grey, explained),
+        curves = {
+            "stop-at-half": _stopped(self.grey, explained),
             "background": deleted,
-            "insertion": {name: _inserted(own, explained) for name, own in inserted.items()},
+            "insertion": {name: _inserted(tables, explained) for name, tables in inserted.items()},
         }
-        deletion: dict[str, Any] = {"fill": "grey", "mode": "deletion", "stop": None, "better": "lower"}
-        about = {
-            "stop-at-half": deletion | {"stop": _STOP},
-            "background": deletion | {"fill": background},
-            "insertion": deletion | {"mode": "insertion", "better": "higher"},
+        scores = {
+            name: {method: score_tables(tables) for method, tables in by_method.items()}
+            for name, by_method in curves.items()
         }
-        summaries = {
-            "stop-at-half": "Grey fill; ends once every pixel with a saliency above 0.5 is gone, so that frames and "
-            "methods end at different areas. Random orders end at the median area of the methods.",
-            "background": f"Removed pixels become {background}, and all of them go.",
-            "insertion": "From an image of nothing but grey, the most salient pixels come first; D against the answer "
-            "on the whole image, so that a faithful map rises early.",
+        variants = {
+            "stop-at-half": Variant(
+                summary="Grey fill; ends once every pixel with a saliency above 0.5 is gone, so that frames and "
+                "methods end at different areas. Random orders end at the median area of the methods.",
+                fill="grey",
+                mode="deletion",
+                stop=_STOP,
+                better="lower",
+                methods=scores["stop-at-half"],
+            ),
+            "background": Variant(
+                summary=f"Removed pixels become {background}, and all of them go.",
+                fill=background,
+                mode="deletion",
+                stop=None,
+                better="lower",
+                methods=scores["background"],
+            ),
+            "insertion": Variant(
+                summary="From an image of nothing but grey, the most salient pixels come first; D against the answer "
+                "on the whole image, so that a faithful map rises early.",
+                fill="grey",
+                mode="insertion",
+                stop=None,
+                better="higher",
+                methods=scores["insertion"],
+            ),
         }
-        each = [(name, curve) for name, by_method in curves.items() for own in by_method.values() for curve in own]
-        tables = [VariantTable(variant=np.repeat(name, len(curve)), **vars(curve)) for name, curve in each]
+        tables = [
+            VariantTable(variant=np.repeat(name, len(table)), **vars(table))
+            for name, by_method in curves.items()
+            for of_method in by_method.values()
+            for table in of_method
+        ]
         return Remedies(
             input=explained.input,
             source=explained.source,
             steps=self.steps,
-            variants={
-                name: Variant(
-                    **about[name], summary=summaries[name], methods={method: _score(one) for method, one in own.items()}
-                )
-                for name, own in curves.items()
-            },
+            variants=variants,
             alarms=tuple(
-                f"{name}: {alarm}" for name in ("stop-at-half", "background") for alarm in _method_alarms(curves[name])
+                f"{name}: {alarm}" for name in ("stop-at-half", "background") for alarm in deletion_alarms(curves[name])
             ),
             table=VariantTable.joined(tables),
         )
 
 
-def _orders(explained: Explanation, *, seed: int) -> dict[str, Int[np.ndarray, "frames pixels"]]:
-    """Pixels of each frame by method, most salient first, and a random order."""
-    rng, shape = np.random.default_rng(seed), (explained.image_size, explained.image_size)
-    orders = {name: saliency_orders(maps, shape) for name, maps in explained.saliency.items()}
-    return orders | {CHANCE: np.stack([random_order(shape, rng=rng) for _ in explained.frames])}
-
-
-def _curve(method: str, frame: ExplainedFrame, removed: np.ndarray, answers: np.ndarray, base: float) -> DeletionTable:
-    told = {"method": method, "frame_id": frame.id, "day": frame.day, "trial": frame.trial}
-    columns = {name: np.repeat(value, len(answers)) for name, value in told.items()}
-    step, score = np.arange(len(answers)), deletion_score(np.full(len(answers), base), answers)
-    return DeletionTable(**columns, step=step, pixels_removed=removed, prediction=answers, score=score)
-
-
-def _split(
-    method: str,
-    removed: Int[np.ndarray, " steps"],
-    answers: Float64[np.ndarray, "frames answers"],
-    explained: Explanation,
-) -> list[DeletionTable]:
-    rows = zip(explained.frames, answers, strict=True)
-    return [_curve(method, frame, removed, own[1:], own[0]) for frame, own in rows]
-
-
-def _score(curves: Sequence[DeletionTable]) -> MethodScore:
-    auc, last = np.array([(curve.score.mean(), curve.score[-1]) for curve in curves]).T
-    return MethodScore(
-        mean=float(auc.mean()), sd=float(auc.std()), last_step_mean=float(last.mean()), frames=len(curves)
-    )
-
-
-def _stopped(grey: DeletionScores, explained: Explanation) -> _Curves:
+def _stopped(grey: DeletionScores, explained: Explanation) -> dict[str, list[DeletionTable]]:
     """Cut each curve after the step at which all pixels above the threshold are gone, the first step at least."""
     counts = {name: (maps > _STOP).sum(axis=(1, 2)) for name, maps in explained.saliency.items()}
     median = np.median(np.stack(list(counts.values())), axis=0)
@@ -307,258 +479,17 @@ def _stopped(grey: DeletionScores, explained: Explanation) -> _Curves:
         for frame, pixels in zip(explained.frames, counts.get(name, median), strict=True):
             answers = curve.predictions[curve.frame_ids.index(frame.id)]
             end = int(np.searchsorted(curve.pixels_removed, int(pixels))) + 1
-            stopped[name].append(_curve(name, frame, curve.pixels_removed[:end], answers[:end], frame.prediction))
+            removed = curve.pixels_removed[:end]
+            stopped[name].append(deletion_table(name, frame, removed, answers[:end], frame.prediction))
     return stopped
 
 
 def _inserted(curves: Sequence[DeletionTable], explained: Explanation) -> list[DeletionTable]:
-    """Read deletion of the least salient pixels backwards, the whole image last."""
+    """Turn deletion of the least salient pixels into insertion, the whole image last."""
     turned = []
     for curve, frame in zip(curves, explained.frames, strict=True):
         removed = np.concatenate([[0], curve.pixels_removed[:-1]])[::-1]
         answers = np.concatenate([[frame.prediction], curve.prediction[:-1]])[::-1]
-        turned.append(_curve(str(curve.method[0]), frame, removed.copy(), answers.copy(), frame.prediction))
+        method = str(curve.method[0])
+        turned.append(deletion_table(method, frame, removed.copy(), answers.copy(), frame.prediction))
     return turned
-
-
-def _method_alarms(curves: _Curves) -> Iterator[str]:
-    """Say where the score does not measure the map: one that does not beat a random order has shown nothing."""
-    chance = float(np.mean([curve.score.mean() for curve in curves[CHANCE]]))
-    for name, own in curves.items():
-        if name == CHANCE:
-            continue
-        means, last = (np.array(values) for values in zip(*((c.score.mean(), c.score[-1]) for c in own), strict=True))
-        if len({len(curve) for curve in own}) == 1:  # where curves stop early, the last step is the map's doing
-            yield from follows_last_step(means, last, name=f"D of {name}")
-        if means.mean() >= chance:
-            yield f"{name} does not beat a random order ({means.mean():.3f} against {chance:.3f})"
-
-
-EQUAL_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
-STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Fewer than `removal.AREAS`, so that many settings can be scored: the equal areas, and enough for trapezoids."""
-
-
-Curves = Mapping[Setting, Mapping[str, Faithfulness]]
-"""Curves by setting and method, controls included."""
-Influence = Mapping[str, Float[np.ndarray, "images height width"]]
-"""Maps to rank parts by, of each method and control."""
-Scoring = Callable[[Material, Influence, int, OnProgress], Mapping[str, Faithfulness]]
-"""Finds the curves of some frames with their maps and a seed."""
-
-
-def influences(material: Material) -> dict[str, Float[np.ndarray, "frames size size"]]:
-    """Maps to rank parts by, of each method (`Material.influence`) and of the controls."""
-    maps = {name: material.influence(name) for name in material.explained.relevance}
-    return maps | control_maps(material.trained.model, material.inputs, material.references)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _SettingCurves:
-    """Curves of every map of a trial's frames under one setting (`Faithfulness.curves`)."""
-
-    areas: Float64[np.ndarray, " areas"]
-    curves: dict[str, Float64[np.ndarray, "3 frames areas"]]
-    whole: Float64[np.ndarray, " frames"]
-    """Answers on all of each frame."""
-    blank: Float64[np.ndarray, " frames"]
-    """Answers where all of it is gone; NaN where the setting has no fill."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Removal(MaterialStage[RemovalScores]):
-    """Removal of parts in the order of every map (`influences`), under each setting whose unit is known of every frame.
-
-    Each trial and setting is a shard. Curves that are found in another way, such as by drawing the scene anew
-    (`further`), are judged with the others.
-    """
-
-    piece = _SettingCurves
-    title = "Removing parts under every fill"
-
-    maps: Influence
-    settings: Sequence[Setting] = SETTINGS
-    random_orders: int = RANDOM_ORDERS
-    further: Mapping[Setting, Scoring] = field(default_factory=dict)
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for setting in self.settings:
-            get_fill(setting.fill)
-
-    @cached_property
-    def _units(self) -> dict[str, list[Units]]:
-        return self.material.units()
-
-    @property
-    def _known(self) -> list[Setting]:
-        return [setting for setting in self.settings if setting.unit in self._units]
-
-    def shards(self) -> Iterator[Part]:
-        """All trials under the first setting, then under the next."""
-        for setting in (*self._known, *self.further):
-            yield from trial_shards(self.material.explained, setting.fill, setting.unit)
-
-    def prepare(self) -> Find:
-        """Find the curves of a trial under one setting."""
-        inputs, orders = self.material.inputs, 2 * len(self.maps) + self.random_orders
-        passes = len(self._known) * len(inputs) * orders * (len(STUDY_AREAS) - 2)
-        predict, numbers = prepare_passes(self.material.trained, inputs, passes), list(self.material.explained.trials)
-
-        def find(item: tuple[str, str, str], on_progress: OnProgress) -> _SettingCurves:
-            fill, unit, trial = item
-            setting, rows = Setting(fill=fill, unit=unit), self.material.explained.trials[trial]
-            part, maps = self.material.take(rows), {name: values[rows] for name, values in self.maps.items()}
-            seed = trial_seed(self.seed, numbers.index(trial))
-            if setting in self.further:
-                scored, blank = self.further[setting](part, maps, seed, on_progress), np.full(len(rows), np.nan)
-            else:
-                blank = _answer_blank(predict, part, fill, seed)
-                scored = score_maps(
-                    predict,
-                    part.inputs,
-                    maps,
-                    [self._units[unit][row] for row in rows],
-                    fill=get_fill(fill),
-                    references=part.references,
-                    towards=part.explained.towards,
-                    # the same random orders under every fill
-                    rng=np.random.default_rng(seed),
-                    random_orders=self.random_orders,
-                    areas=STUDY_AREAS,
-                    seed=seed,
-                    on_progress=on_progress,
-                )
-            return _SettingCurves(
-                areas=next(iter(scored.values())).areas,
-                curves={name: own.curves for name, own in scored.items()},
-                whole=answer_whole(predict, part.inputs, batch_size=64),
-                blank=blank,
-            )
-
-        return find
-
-    def join(self, pieces: Sequence[_SettingCurves]) -> RemovalScores:
-        """Scores of all curves."""
-        explained, count = self.material.explained, len(self.material.explained.trials)
-        curves: dict[Setting, dict[str, Faithfulness]] = {}
-        answers: dict[Setting, dict[str, np.ndarray]] = {}
-        for at, setting in enumerate((*self._known, *self.further)):
-            own = pieces[at * count : (at + 1) * count]
-            joined = join_trials(explained, [one.curves for one in own], axis=1)
-            curves[setting] = {name: Faithfulness(areas=own[0].areas, curves=curve) for name, curve in joined.items()}
-            answers[setting] = join_trials(explained, [{"whole": one.whole, "blank": one.blank} for one in own])
-        whole = next(iter(answers.values()))["whole"]
-        blank = {setting.fill: answers[setting]["blank"] for setting in self._known}
-        scores, comparisons = judge_curves(curves, clusters=explained.clusters, seed=self.seed)
-        return RemovalScores(
-            input=explained.input,
-            source=explained.source,
-            frames=len(explained.frames),
-            trials=count,
-            random_orders=self.random_orders,
-            fills=tuple(dict.fromkeys(setting.fill for setting in curves)),
-            units=tuple(dict.fromkeys(setting.unit for setting in curves)),
-            areas=STUDY_AREAS,
-            scores=scores,
-            comparisons=comparisons,
-            agreement=compare_fills(curves),
-            alarms=(
-                *saturated(whole),
-                *flat_maps({name: self.maps[name] for name in explained.relevance}),
-                *(alarm for fill, gone in blank.items() for alarm in fill_decides(whole, gone, fill=fill)),
-                *ranking_alarms(curves),
-            ),
-            table=_table(curves, explained),
-        )
-
-
-def _answer_blank(predict: Predict, material: Material, fill: str, seed: int) -> Float64[np.ndarray, " frames"]:
-    """Answers on images of which everything is gone."""
-    inputs = material.inputs
-    paint = get_fill(fill)(inputs, material.references, seed)
-    gone = torch.ones((len(inputs), *inputs.shape[-2:]), dtype=torch.bool, device=inputs.device)
-    batches = torch.arange(len(inputs), device=inputs.device).split(16)
-    return answer_whole(predict, torch.cat([paint(rows, gone[rows]) for rows in batches]), batch_size=64)
-
-
-def judge_curves(
-    curves: Curves, *, clusters: Shaped[np.ndarray, "2 frames"], seed: int
-) -> tuple[tuple[RemovalScore, ...], tuple[Comparison, ...]]:
-    """Scores with intervals and leads over the controls, and methods compared with each other.
-
-    The curves are those of controls too; days and trials are resampled.
-    """
-    rng = np.random.default_rng(seed)
-    scores, comparisons = [], []
-    for setting, own in curves.items():
-        gains = {name: curve.symmetric_gain for name, curve in own.items()}
-        controls = {name: gain for name, gain in gains.items() if is_control(name)}
-        for name, curve in own.items():
-            mean = partial(mean_interval, clusters=clusters, rng=rng)
-            lead = partial(lead_over_controls, gains[name], controls, clusters=clusters, rng=rng)
-            orders: dict[str, Any] = {
-                order: float(getattr(curve, order).mean()) for order in ("most_first", "least_first", "random")
-            }
-            score = RemovalScore(
-                **vars(setting),
-                method=name,
-                control=is_control(name),
-                srg=mean(gains[name]),
-                gain_over_random=mean(curve.gain_over_random),
-                lead_over_controls=None if is_control(name) else lead(),
-                **orders,
-                at={area: float(curve.at(area)[0].mean()) for area in EQUAL_AREAS if area in curve.areas},
-            )
-            scores.append(score)
-        for first, second in combinations([name for name in own if not is_control(name)], 2):
-            gap = paired_difference(gains[first], gains[second], clusters=clusters, rng=rng)
-            comparisons.append(Comparison(**vars(setting), first=first, second=second, gap=gap))
-    return tuple(scores), tuple(comparisons)
-
-
-def compare_fills(curves: Curves) -> tuple[Agreement, ...]:
-    """How far the rankings of the methods agree between fills of the same unit."""
-    agreement = []
-    for first, second in combinations(curves, 2):
-        if first.unit != second.unit:
-            continue
-        names = [name for name in curves[first] if not is_control(name)]
-        ranks = [[float(curves[setting][name].symmetric_gain.mean()) for name in names] for setting in (first, second)]
-        tau = float(np.asarray(kendalltau(*ranks))[0]) if len(names) > 1 else float("nan")
-        known = tau if np.isfinite(tau) else None
-        agreement.append(Agreement(unit=first.unit, first=first.fill, second=second.fill, tau=known))
-    return tuple(agreement)
-
-
-def ranking_alarms(curves: Curves) -> list[str]:
-    """Say where a control wins, and which fills rank the methods differently."""
-    by_fill: dict[str, dict[str, float]] = {}
-    alarms = []
-    for setting, own in curves.items():
-        methods = {name: curve for name, curve in own.items() if not is_control(name)}
-        controls = {name: curve for name, curve in own.items() if is_control(name)}
-        where = f"under {setting.fill}, {setting.unit} by {setting.unit}"
-        alarms += [f"{where}: {alarm}" for alarm in controls_win(methods, controls)]
-        if setting.unit == "pixel":
-            by_fill[setting.fill] = {name: float(curve.symmetric_gain.mean()) for name, curve in methods.items()}
-    return [*rankings_disagree(by_fill), *alarms]
-
-
-def _table(curves: Curves, explained: Explanation) -> RemovalTable:
-    frames, tables = explained.frames, []
-    of_frames: dict[str, Any] = {"frame_id": [frame.id for frame in frames], "day": [frame.day for frame in frames]}
-    of_frames |= {"trial": [frame.trial for frame in frames]}
-    of_frames["safety_margin"] = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
-    for setting, own in curves.items():
-        for name, curve in own.items():
-            count, steps = curve.curves.shape[1:]
-            if count != len(frames):
-                raise InputError(f"{count} curves of {name} for {len(frames)} frames; make the study again")
-            most_first, least_first, random = curve.curves.reshape(3, -1)
-            known = {"fill": setting.fill, "unit": setting.unit, "method": name}
-            columns = {key: np.repeat(value, count * steps) for key, value in known.items()}
-            columns |= {key: np.repeat(values, steps) for key, values in of_frames.items()}
-            columns |= {"area": np.tile(curve.areas, count), "most_first": most_first, "least_first": least_first}
-            tables.append(RemovalTable(**columns, random=random))
-    return RemovalTable.joined(tables)

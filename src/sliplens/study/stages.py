@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
 import numpy as np
+from jaxtyping import Float
 
 from sliplens.codec import load_result, save_result
 from sliplens.files import scratch_folder
@@ -86,6 +87,12 @@ class Stage(Work, Generic[Result]):
             with reporting(on_progress):
                 run_parts(work or self, every, folder, title=self.title, on_part=show, **how)
             return self.join([read(each) for each in every])
+
+
+def mean_of_known(values: Float[np.ndarray, " values"]) -> float | None:
+    """Mean of the finite values; None without any, since JSON has no NaN."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else None
 
 
 def trial_shards(explained: Explanation, *about: str, maps: int = 1) -> Iterator[Part]:

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import change_of
+from sliplens.explainers.explain import network_inputs
 from sliplens.explainers.shapley import shapley_values
 from sliplens.faithfulness.controls import lead_over_controls, relevance_mass, relevance_rank
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import (
     RANDOM_ORDERS,
     SHARES,
-    Faithfulness,
     Redraw,
     RemovalCurves,
     Units,
@@ -34,11 +34,11 @@ from sliplens.faithfulness.scoring import prepare_passes
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.models import Network
 from sliplens.plots.style import tell_ends
-from sliplens.progress import OnProgress
+from sliplens.progress import OnProgress, ignore, reporting
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explanation
-from sliplens.results.faithfulness import CHANCE, is_control
+from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
 from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
 from sliplens.runner import Part, part
 from sliplens.simulation.intervention import (
@@ -49,9 +49,8 @@ from sliplens.simulation.intervention import (
     rebuild_trial,
     visible_markers,
 )
-from sliplens.study.explaining import mean_of_known, network_inputs
 from sliplens.study.scoring import require_same_network
-from sliplens.study.stages import Find, Stage
+from sliplens.study.stages import Find, Stage, mean_of_known
 
 _RIM_PX = 1.5
 """How far a marker's edge reaches on either side of its outline, in pixels of the network's input."""
@@ -405,22 +404,23 @@ class JudgingByTruth(Stage[Truth]):
                 for record in valid
                 for least in (False, True)
             ]
-            curves = {
-                name: removal_curves(
+            with reporting(ignore):  # a part is a frame, whatever its passes
+                curves = {
+                    name: removal_curves(
+                        predict,
+                        inputs[index : index + 1],
+                        np.stack(orders)[:, None],
+                        fill=get_fill(name),
+                        references=empty[None].to(trained.device),
+                        areas=SHARES,
+                    )
+                    for name in fills
+                }
+                curves[TRUE_FILL] = marker_curves(
                     predict,
-                    inputs[index : index + 1],
-                    np.stack(orders)[:, None],
-                    fill=get_fill(name),
-                    references=empty[None].to(trained.device),
-                    areas=SHARES,
+                    lambda _, back: redraw(index, back),
+                    np.concatenate([influence_orders(record[None]) for record in valid]),
                 )
-                for name in fills
-            }
-            curves[TRUE_FILL] = marker_curves(
-                predict,
-                lambda _, back: redraw(index, back),
-                np.concatenate([influence_orders(record[None]) for record in valid]),
-            )
             return FrameEffects(
                 shapley=records.values,
                 shapley_error=records.standard_errors,
@@ -537,8 +537,7 @@ def true_curves(
     maps: Mapping[str, Maps],
     random_orders: int = RANDOM_ORDERS,
     seed: int = 0,
-    on_progress: OnProgress | None = None,
-) -> dict[str, Faithfulness]:
+) -> dict[str, RemovalCurve]:
     """Removal curves under the true fill: markers put back, most or least influential first, or in random orders."""
     frames = stage_frames(trained, explained, data)
     places = [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
@@ -551,7 +550,6 @@ def true_curves(
         rng=np.random.default_rng(seed),
         towards=explained.towards,
         random_orders=random_orders,
-        on_progress=on_progress,
     )
 
 

@@ -6,10 +6,10 @@ import torch
 from PIL import Image
 
 from sliplens.errors import ImageError, InputError, RecordingError
+from sliplens.explainers.frames import FrameSelection, frames_from_dataset, frames_from_folder
 from sliplens.images import write_png
 from sliplens.models import Network, load_checkpoint
 from sliplens.recordings import Dataset
-from sliplens.study import frames_from_dataset, frames_from_folder
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def raw(raw_run: Path) -> Network:
 
 
 def test_frames_are_those_nearest_to_the_levels(difference: Network, small_dataset: Dataset):
-    chosen = frames_from_dataset(difference, small_dataset, levels=(1.0, 0.6, 0.0))
+    chosen = frames_from_dataset(difference, small_dataset, FrameSelection(levels=(1.0, 0.6, 0.0)))
     recording = small_dataset.load(small_dataset.select(split="test", condition="dry")[0])
     for level, label in zip((1.0, 0.6, 0.0), chosen.safety_margin, strict=True):
         assert abs(label - level) == pytest.approx(np.nanmin(np.abs(recording.safety_margin - level)), abs=1e-6)
@@ -32,19 +32,23 @@ def test_frames_are_those_nearest_to_the_levels(difference: Network, small_datas
 
 
 def test_a_raw_frame_is_compared_with_the_untouched_sensor(raw: Network, small_dataset: Dataset):
-    chosen = frames_from_dataset(raw, small_dataset, levels=(0.0,))
+    chosen = frames_from_dataset(raw, small_dataset, FrameSelection(levels=(0.0,)))
     recording = small_dataset.load(small_dataset.select(split="test", condition="dry")[0])
-    assert torch.equal(chosen.references[0], raw.encoding.empty(recording.reference, image_size=32))
+    assert torch.equal(
+        raw.encoding.normalise(chosen.references)[0], raw.encoding.empty(recording.reference, image_size=32)
+    )
 
 
-def test_levels_outside_the_unit_interval_are_refused(difference: Network, small_dataset: Dataset):
+def test_a_selection_that_cannot_be_is_refused():
     with pytest.raises(InputError, match=r"levels must lie in \[0, 1\], got 100, 80"):
-        frames_from_dataset(difference, small_dataset, levels=(100.0, 80.0))
+        FrameSelection(levels=(100.0, 80.0))
+    with pytest.raises(InputError, match="--trials must be at least 1, got 0"):
+        FrameSelection(trials=0)
 
 
 def test_a_condition_that_is_not_there_is_refused(difference: Network, small_dataset: Dataset):
     with pytest.raises(RecordingError, match="no trial with split test and condition oily"):
-        frames_from_dataset(difference, small_dataset, condition="oily")
+        frames_from_dataset(difference, small_dataset, FrameSelection(condition="oily"))
 
 
 def test_difference_images_of_a_folder_are_what_the_data_set_gives(

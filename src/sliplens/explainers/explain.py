@@ -1,0 +1,237 @@
+"""Explanation of chosen frames by one or several explainers, in memory."""
+
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+from typing import Annotated, TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor
+
+from sliplens.errors import InputError, SliplensError
+from sliplens.explainers.attribution import frame_of
+from sliplens.explainers.contract import Explainer
+from sliplens.explainers.frames import ChosenFrames, FindMarkers
+from sliplens.explainers.gradients import ExpectedGradients
+from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, find_markers
+from sliplens.explainers.table import RECOMMENDED_METHOD, get_explainer
+from sliplens.models import Network
+from sliplens.models.engines import expecting
+from sliplens.progress import number_of, track
+from sliplens.results.evaluation import ANSWER
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes, require_saliency
+from sliplens.results.study import STUDY_BUDGET
+
+_FULL_STICK = 0.9
+"""Safety margin from which a labelled frame counts as one without slip."""
+Methods: TypeAlias = str | Explainer | Sequence[str | Explainer]
+"""Row of `EXPLAINERS`, an explainer, or several of them."""
+
+
+def choose_explainers(
+    network: Network, chosen: ChosenFrames, methods: Methods | None = None, *, budget: float | None = None
+) -> tuple[dict[str, Explainer], tuple[str, ...]]:
+    """Make the explainers of frames by name, with the markers and background that the frames have, and warnings.
+
+    If `methods` is None, Shapley values of the markers, or of tiles where no markers are found, with a warning.
+    `budget` is the share of the channels that `poly-cam` measures at first; if None, 1 for one frame and
+    `STUDY_BUDGET` for several.
+
+    Raises
+    ------
+    InputError
+        If there is no such method, or it needs markers and the frames show none.
+    """
+    if budget is None:
+        budget = 1.0 if len(chosen.ids) == 1 else STUDY_BUDGET
+    poly_cam = get_explainer("poly-cam", budget=budget)  # refuses an impossible budget, whatever the method
+    if methods is None:
+        try:
+            return choose_explainers(network, chosen, RECOMMENDED_METHOD)
+        except SliplensError as error:  # difference images, another sensor, or no OpenCV
+            explainers, _ = choose_explainers(network, chosen, RECOMMENDED_METHOD.removesuffix("-marker"))
+            return explainers, (f"tiles, not markers: {error}",)
+    inputs, explainers = network.encoding.normalise(chosen.images), {}
+    for method in [methods] if isinstance(methods, str) or callable(methods) else methods:
+        if not isinstance(method, str):
+            explainers[getattr(method, "method", type(method).__name__)] = method
+        elif method == "poly-cam":
+            explainers[method] = poly_cam
+        elif method == "expected-gradients":
+            free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
+            explainers[method] = ExpectedGradients(background=inputs[free] if free else None)
+        else:
+            explainers[method] = get_explainer(method)
+
+    def find() -> Sequence[Float[Tensor, "_markers 2"]]:
+        if chosen.find_markers is None:
+            raise InputError(
+                "markers do not show in difference images; give camera frames with the untouched sensor as reference "
+                "(--reference), or a data set"
+            )
+        return chosen.find_markers()
+
+    return with_markers(explainers, inputs, find), ()
+
+
+def with_markers(
+    explainers: Mapping[str, Explainer], images: Float[Tensor, "frames colours size size"], find: FindMarkers
+) -> dict[str, Explainer]:
+    """Give the markers of each image to the explainers that need them; they are found for those alone."""
+    known_markers = cache(lambda: KnownMarkers(images=images, places=tuple(find())))
+    return {
+        name: replace(explainer, markers_px=known_markers())
+        if isinstance(explainer, RegionMethod) and explainer.markers_px is find_markers
+        else explainer
+        for name, explainer in explainers.items()
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodMaps:
+    """Maps of some frames by one method."""
+
+    relevance: Annotated[Float32[np.ndarray, "frames height width"], ANSWER]
+    seconds: float
+    warnings: tuple[str, ...]
+    target: str
+    raises_only: bool
+    completeness_gap: tuple[float, ...] | None
+
+
+_PASSES_A_MAP = 300
+"""Of a map by Poly-CAM on a budget, or by Shapley values."""
+_FEW_MAPS = 20
+
+
+def explain_rows(
+    network: Network, chosen: ChosenFrames, explainer: Explainer, rows: Sequence[int], *, maps: int
+) -> MethodMaps:
+    """Explain some of the frames, by their row numbers, with one explainer; engines are chosen for so many `maps`.
+
+    Raises
+    ------
+    SaliencyError
+        If a map is not finite.
+    """
+    inputs, references = (
+        network.encoding.normalise(values[list(rows)]).to(network.device)
+        for values in (chosen.images, chosen.references)
+    )
+    # the first of few maps is waited for: each then takes the engine that its passes pay for
+    passes = _PASSES_A_MAP * maps if maps > _FEW_MAPS else 0
+    with nullcontext() if chosen.together else expecting(passes):
+        # the reference of one call is the same for all its frames
+        attribution = explainer(network.model, inputs, reference=references[0])
+    relevance = attribution.relevance.cpu().numpy()
+    for row, values in zip(rows, relevance, strict=True):
+        require_saliency(values, inputs.shape[-2:], where=f"the map of {chosen.ids[row]} by {attribution.method}")
+    gap = attribution.completeness_gap
+    return MethodMaps(
+        relevance=relevance,
+        seconds=attribution.seconds,
+        warnings=attribution.warnings,
+        target=attribution.target,
+        raises_only=attribution.raises_only,
+        completeness_gap=None if gap is None else tuple(gap.tolist()),
+    )
+
+
+def explain_frames(
+    network: Network, chosen: ChosenFrames, explainers: Mapping[str, Explainer], *, warnings: Sequence[str] = ()
+) -> Explanation:
+    """Explain frames with several explainers; `warnings` are added to those of every method."""
+    jobs, maps = list(product(explainers, chosen.batches)), {}
+    for name, rows in track(jobs, sizes=[len(rows) for _, rows in jobs]):
+        count = len(chosen.ids) * len(explainers)
+        maps.setdefault(name, []).append(explain_rows(network, chosen, explainers[name], rows, maps=count))
+    return join_maps(network, chosen, maps, warnings=warnings)
+
+
+def join_maps(
+    network: Network,
+    chosen: ChosenFrames,
+    maps: Mapping[str, Sequence[MethodMaps]],
+    *,
+    warnings: Sequence[str] = (),
+) -> Explanation:
+    """Make the record of maps, with the predictions of the frames; those of a method are in the order of the frames."""
+    inputs = network.encoding.normalise(chosen.images).to(network.device)
+    references = network.encoding.normalise(chosen.references)
+    # predicted once for all methods, on all frames
+    estimate, untouched = network.estimate(inputs), network.predict(references).tolist()
+    withheld = estimate.withheld(np.ones(len(inputs), dtype=bool))  # frames to explain are taken for ones in contact
+    return Explanation(
+        input=network.encoding.name,
+        source=chosen.source,
+        weights_sha256=network.manifest.weights_sha256,
+        frames=tuple(
+            ExplainedFrame(
+                id=chosen.ids[index],
+                trial=chosen.trial[index],
+                day=chosen.day[index],
+                condition=chosen.condition[index],
+                safety_margin=float(margin) if np.isfinite(margin) else None,
+                prediction=float(estimate.margin[index]),
+                withheld=withheld[index],
+                reference_prediction=untouched[index],
+            )
+            for index, margin in enumerate(chosen.safety_margin)
+        ),
+        methods={method: _notes(pieces, chosen.ids, warnings) for method, pieces in maps.items()},
+        images=chosen.images.numpy(),
+        references=chosen.references.numpy(),
+        pictures=input_pictures(network, chosen),
+        relevance={method: np.concatenate([piece.relevance for piece in pieces]) for method, pieces in maps.items()},
+    )
+
+
+def input_pictures(network: Network, chosen: ChosenFrames) -> UInt8[np.ndarray, "frames size size 3"]:
+    """Draw the frames of the network's inputs, 8 bits, for viewing."""
+    pictures = (255 * frame_of(network.encoding.normalise(chosen.images))).round().to(torch.uint8)
+    return pictures.permute(0, 2, 3, 1).contiguous().numpy()
+
+
+def _notes(pieces: Sequence[MethodMaps], ids: Sequence[str], warnings: Sequence[str]) -> MethodNotes:
+    frames_of: dict[str, list[str]] = {}
+    first = 0
+    for piece in pieces:
+        names = ids[first : first + len(piece.relevance)]
+        for warning in piece.warnings:
+            match = re.match(r"image (\d+): ", warning)
+            text = warning if match is None else warning[match.end() :]
+            frames_of.setdefault(text, []).extend(names if match is None else [names[int(match[1])]])
+        first += len(piece.relevance)
+    gaps = [piece.completeness_gap for piece in pieces]
+    return MethodNotes(
+        seconds_per_frame=sum(piece.seconds for piece in pieces) / len(ids),
+        warnings=(*warnings, *(f"{_names(names, len(ids))}: {text}" for text, names in frames_of.items())),
+        target=pieces[0].target,
+        raises_only=pieces[0].raises_only,
+        completeness_gap=None if None in gaps else sum((gap for gap in gaps if gap is not None), ()),
+    )
+
+
+_MOST_NAMES = 3
+"""Frames that a warning names."""
+
+
+def _names(names: Sequence[str], count: int) -> str:
+    """Name the frames of a warning, and how many of all frames they are."""
+    more = ", \N{HORIZONTAL ELLIPSIS}" if len(names) > _MOST_NAMES else ""
+    return f"{len(names)} of {number_of(count, 'frame')} ({', '.join(names[:_MOST_NAMES])}{more})"
+
+
+def network_inputs(network: Network, explanation: Explanation) -> Float[Tensor, "frames colours size size"]:
+    """Return the network's inputs of explained frames, in [0, 1], on its device."""
+    return network.encoding.normalise(torch.from_numpy(explanation.images)).to(network.device)
+
+
+def network_references(network: Network, explanation: Explanation) -> Float[Tensor, "frames colours size size"]:
+    """Return the network's inputs of the untouched sensor of each explained frame, in [0, 1], on its device."""
+    return network.encoding.normalise(torch.from_numpy(explanation.references)).to(network.device)

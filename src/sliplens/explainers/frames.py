@@ -1,0 +1,262 @@
+"""Frames to explain: of arrays, of a data set along the safety margin, or of a folder or recording."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from itertools import groupby, islice
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor
+
+from sliplens.errors import ImageError, InputError, RecordingError
+from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
+from sliplens.models import Network
+from sliplens.recordings import Dataset
+from sliplens.recordings.capture import Capture
+from sliplens.recordings.sensor import SensorProfile
+from sliplens.recordings.source import open_source
+from sliplens.results.explanation import MARGIN_LEVELS
+
+_LABEL = re.compile(r"_(0|[1-9]\d?|100)$")
+FindMarkers: TypeAlias = Callable[[], Sequence[Float[Tensor, "_markers 2"]]]
+"""Function that finds the markers of all frames, x and y in the network's input."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSelection:
+    """Frames of a data set: those nearest to some safety margins in the first trials of a split and condition."""
+
+    split: str = "test"
+    condition: str = "dry"
+    trials: int = 1
+    """Number of trials."""
+    levels: tuple[float, ...] = MARGIN_LEVELS
+    """Safety margins in [0, 1]."""
+
+    def __post_init__(self) -> None:
+        if self.trials < 1:
+            raise InputError(f"--trials must be at least 1, got {self.trials}")
+        require_levels(self.levels)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChosenFrames:
+    """Frames to explain, compared and resized but still in 8 bits, so that they can be stored exactly."""
+
+    ids: tuple[str, ...]
+    day: tuple[int, ...]
+    trial: tuple[str, ...]
+    condition: tuple[str, ...]
+    safety_margin: Float32[np.ndarray, " frames"]
+    """Labels; NaN where a frame has none."""
+    images: UInt8[Tensor, "frames colours size size"]
+    """Resized network inputs before normalisation."""
+    references: UInt8[Tensor, "frames colours size size"]
+    """Network inputs of the untouched sensor, which each frame is compared with, before normalisation."""
+    source: str
+    """Either "simulated" or "real": a recorded data set or a folder of images."""
+    together: bool = False
+    """True if all frames are explained in one batch, not one by one."""
+    find_markers: FindMarkers | None = field(default=None, repr=False, compare=False)
+    """Function that finds the markers; None where they do not show."""
+
+    @property
+    def batches(self) -> list[Sequence[int]]:
+        """Row numbers of the frames that are explained in one call."""
+        rows = range(len(self.ids))
+        return [rows] if self.together else [[row] for row in rows]
+
+
+def network_images(
+    network: Network,
+    frames: UInt8[np.ndarray, "batch height width 3"],
+    reference: UInt8[np.ndarray, "height width 3"] | None,
+) -> tuple[UInt8[Tensor, "batch colours size size"], UInt8[Tensor, "colours size size"]]:
+    """Compute a network's inputs of frames and of the untouched sensor, in 8 bits before normalisation."""
+    if not len(frames):
+        raise ImageError("there is no frame to explain; give one at least")
+    network.require_frame_size(frames.shape[1:3])
+    encoding, image_size = network.encoding, network.manifest.image_size
+    if reference is not None:
+        compare = partial(encoding.compare_small, reference=reference, image_size=image_size)
+        return compare(frames), compare(reference[None])[0]
+    if not encoding.empty_is_black:
+        raise InputError(
+            f"a network on {encoding.name} images needs the untouched sensor; give it as reference, on the command "
+            "line with --reference IMAGE"
+        )
+    images = encoding.resize(frames, image_size=image_size)
+    return images, torch.zeros_like(images[0])
+
+
+def frames_from_arrays(
+    network: Network,
+    frames: UInt8[np.ndarray, "batch height width 3"],
+    reference: UInt8[np.ndarray, "height width 3"] | None,
+) -> ChosenFrames:
+    """Choose all of an array of camera frames, or without a reference of difference images."""
+    images, untouched = network_images(network, frames, reference)
+    find = partial(_markers_in_frames, frames, image_size=network.manifest.image_size)
+    return ChosenFrames(
+        ids=tuple(f"frame-{number:04d}" for number in range(len(frames))),
+        day=(1,) * len(frames),
+        trial=("frames",) * len(frames),
+        condition=("unknown",) * len(frames),
+        safety_margin=np.full(len(frames), np.nan, dtype=np.float32),
+        images=images,
+        references=untouched.expand(len(frames), -1, -1, -1),
+        source="real",
+        together=True,
+        find_markers=None if reference is None else find,
+    )
+
+
+def _markers_in_frames(frames: np.ndarray, *, image_size: int) -> list[Float[Tensor, "_markers 2"]]:
+    return [markers_in_frame(frame, image_size=image_size) for frame in frames]
+
+
+def frames_from_dataset(network: Network, data: Dataset, selection: FrameSelection) -> ChosenFrames:
+    """Choose frames of the first trials of a split, in the order of the data set's table, at given safety margins.
+
+    For each trial and level the frame whose label is nearest is taken; at a level of 0 the first frame of full slip, at
+    1 the last frame that is still fully stuck, so that each is next to the change.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such trial, or a trial has no labelled frame.
+    """
+    rows: list[tuple[str, int]] = []
+    for info in data.select(split=selection.split, condition=selection.condition)[: selection.trials]:
+        (opened,) = open_source(data, trial=info.trial)
+        margin = require_labels(opened.name, opened.safety_margin)
+        rows += [(info.trial, nearest_frame(margin, level)) for level in selection.levels]
+    return frames_at(network, data, rows)
+
+
+def require_levels(levels: Sequence[float]) -> Sequence[float]:
+    """Return safety margins unchanged if each lies in [0, 1]."""
+    if any(not 0 <= level <= 1 for level in levels):
+        raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
+    return levels
+
+
+def require_labels(trial: str, margin: Float[np.ndarray, " frames"] | None) -> Float[np.ndarray, " frames"]:
+    """Return the labels of a trial if it has any."""
+    if margin is None or not np.isfinite(margin).any():
+        raise RecordingError(f"trial {trial} has no labelled frame; label it first")
+    return margin
+
+
+def frames_at(network: Network, data: Dataset, frames: Sequence[tuple[str, int]]) -> ChosenFrames:
+    """Choose frames of a data set by trial and number, those of a trial one after another."""
+    infos = {info.trial: info for info in data.trials}
+    parts = []
+    for trial, group in groupby(frames, key=lambda frame: frame[0]):
+        if trial not in infos:
+            raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
+        (opened,) = open_source(data, trial=trial)
+        part = _take(network, opened, [number for _, number in group], source=data.source)
+        ids = len(part.ids)
+        info = infos[trial]
+        parts.append(replace(part, trial=(trial,) * ids, day=(info.day,) * ids, condition=(info.condition,) * ids))
+
+    def find_markers() -> list[Float[Tensor, "_markers 2"]]:
+        opened = {trial: data.load(infos[trial]) for trial in dict.fromkeys(trial for trial, _ in frames)}
+        size = network.manifest.image_size
+        return [markers_in_recording(opened[trial], number, image_size=size) for trial, number in frames]
+
+    return replace(_join(parts), find_markers=find_markers)
+
+
+def nearest_frame(margin: Float[np.ndarray, " frames"], level: float) -> int:
+    """Return the frame whose margin is nearest to a level, next to the change where many are equally near."""
+    distance = np.abs(margin - level)
+    nearest = np.flatnonzero(distance == np.nanmin(distance))
+    return int(nearest[-1] if level >= 0.5 else nearest[0])
+
+
+def frames_from_folder(
+    network: Network,
+    folder: Path,
+    *,
+    reference: Path | None = None,
+    labels_in_names: bool = False,
+    sensor: SensorProfile | Path | str | None = None,
+) -> ChosenFrames:
+    """Choose all images of a folder, in natural order, or all frames of another recording that `open_source` opens.
+
+    They have the size of the network's sensor: camera frames if `reference` is set or the source has one, else
+    absolute difference images |T_n - T_0|. If `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`,
+    hold the safety margin in percent; `sensor` is that of `open_source`.
+
+    Raises
+    ------
+    InputError
+        If the folder is missing or empty, a name has no label though `labels_in_names` is set, or a network on raw
+        frames has no reference image.
+    ImageError
+        If an image cannot be read, or has another size or kind of pixels.
+    """
+    parts = []
+    captures = open_source(folder, reference=reference, sensor=sensor)
+    for opened in captures:
+        part = _take(network, opened, range(opened.frames), source="real")
+        part = replace(part, trial=(folder.name if opened.files else opened.name,) * len(part.ids))
+        if labels_in_names:
+            margin = np.array([_label(folder / name) for name in opened.files or part.ids], dtype=np.float32)
+            part = replace(part, safety_margin=margin)
+        parts.append(part)
+
+    def find_markers() -> list[Float[Tensor, "_markers 2"]]:
+        size = network.manifest.image_size
+        captures = open_source(folder, reference=reference, sensor=sensor)
+        return [markers_in_frame(frame, image_size=size) for capture in captures for frame in capture.read_frames()]
+
+    show_markers = all(capture.read_reference is not None for capture in captures)
+    return replace(_join(parts), find_markers=find_markers if show_markers else None)
+
+
+def _take(network: Network, opened: Capture, numbers: Sequence[int], *, source: str) -> ChosenFrames:
+    names = opened.files or [f"{opened.name}-f{number:04d}" for number in range(opened.frames)]
+    network.require_frame_size(opened.frame_size, what=f"frames such as {names[numbers[0]]}")
+    untouched = None if opened.read_reference is None else opened.read_reference()
+    first = islice(opened.read_frames(), max(numbers) + 1)
+    frames = {number: frame for number, frame in enumerate(first) if number in numbers}
+    if untouched is None and source == "real":
+        network.require_kind(frames[numbers[0]], what=names[numbers[0]])
+    chosen = frames_from_arrays(network, np.stack([frames[number] for number in numbers]), untouched)
+    margin = np.full(opened.frames, np.nan) if opened.safety_margin is None else opened.safety_margin
+    return replace(
+        chosen,
+        ids=tuple(Path(names[number]).stem if opened.files else names[number] for number in numbers),
+        safety_margin=margin[list(numbers)].astype(np.float32),
+        source=source,
+        together=False,
+        find_markers=None,
+    )
+
+
+def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
+    return ChosenFrames(
+        ids=sum((part.ids for part in parts), ()),
+        day=sum((part.day for part in parts), ()),
+        trial=sum((part.trial for part in parts), ()),
+        condition=sum((part.condition for part in parts), ()),
+        safety_margin=np.concatenate([part.safety_margin for part in parts]),
+        images=torch.cat([part.images for part in parts]),
+        references=torch.cat([part.references for part in parts]),
+        source=parts[0].source,
+    )
+
+
+def _label(path: Path) -> float:
+    match = _LABEL.search(path.stem)
+    if match is None:
+        raise InputError(f"{path} carries no label; its name must end in the safety margin in percent, as in _20.png")
+    return int(match.group(1)) / 100
