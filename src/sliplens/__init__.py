@@ -6,17 +6,19 @@ from typing import TYPE_CHECKING, Any
 from sliplens._version import __version__
 
 if TYPE_CHECKING:
+    from sliplens.demo import run_demo
     from sliplens.doctor import examine_installation
     from sliplens.errors import SliplensError
     from sliplens.friction import Friction
     from sliplens.grip.episodes import run_episodes
     from sliplens.grip.hold import hold_grip
     from sliplens.live.loop import LiveReader, read_live
+    from sliplens.live.viewer import view
     from sliplens.markers.tracking import track
     from sliplens.models.checkpoint import load
     from sliplens.models.onnx import export_onnx
     from sliplens.models.predictions import predict
-    from sliplens.plots.figure import plot
+    from sliplens.plots.figure import make_profile, plot
     from sliplens.recordings.check import check_dataset
     from sliplens.recordings.corrections import draft_corrections
     from sliplens.recordings.dataset import load_dataset, recover_dataset
@@ -57,6 +59,7 @@ _MODULES = {
     "label_dataset": "sliplens.recordings.relabelling",
     "load": "sliplens.models.checkpoint",
     "load_dataset": "sliplens.recordings.dataset",
+    "make_profile": "sliplens.plots.figure",
     "plot": "sliplens.plots.figure",
     "predict": "sliplens.models.predictions",
     "read_live": "sliplens.live.loop",
@@ -65,10 +68,12 @@ _MODULES = {
     "run_episodes": "sliplens.grip.episodes",
     "run_study": "sliplens.study.run",
     "score": "sliplens.study.scoring",
+    "run_demo": "sliplens.demo",
     "simulate": "sliplens.simulation.trials",
     "split_dataset": "sliplens.recordings.splits",
     "track": "sliplens.markers.tracking",
     "train": "sliplens.training.fitting",
+    "view": "sliplens.live.viewer",
     "write_report": "sliplens.report.page",
 }
 
@@ -93,11 +98,13 @@ __all__ = [
     "label_dataset",
     "load",
     "load_dataset",
+    "make_profile",
     "plot",
     "predict",
     "read_live",
     "read_status",
     "recover_dataset",
+    "run_demo",
     "run_episodes",
     "run_study",
     "score",
@@ -105,6 +112,7 @@ __all__ = [
     "split_dataset",
     "track",
     "train",
+    "view",
     "write_report",
 ]
 

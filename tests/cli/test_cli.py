@@ -30,32 +30,6 @@ def test_a_reader_that_stops_reading_is_no_error():
     assert asked.returncode == 1
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "demo",
-        "simulate",
-        "import",
-        "label",
-        "split",
-        "check",
-        "view",
-        "train",
-        "evaluate",
-        "predict",
-        "export",
-        "explain",
-        "score",
-        "report",
-    ],
-)
-def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit) as exit_info:
-        run(command, "--help")
-    assert exit_info.value.code == 0
-    assert len(capsys.readouterr().out) > 300
-
-
 def test_the_stages_one_by_one(
     tmp_path: Path, small_dataset: Dataset, difference_folder: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -139,33 +113,17 @@ def test_a_demo_does_not_touch_a_folder_of_somebody_else(tmp_path: Path, capsys)
 
 
 def test_an_interruption_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
-    def interrupt(_: object) -> None:
+    def interrupt(workspace: Path) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sliplens.cli.report.Report.run", interrupt)
+    monkeypatch.setattr("sliplens.report.page.write_report", interrupt)
     assert run("report", tmp_path) == 130
-    assert "run the same command again and it goes on where it stopped" in capsys.readouterr().err
+    assert "run the same command again to continue" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_one_sentence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
-    def full(_: object) -> None:
+    def full(workspace: Path) -> None:
         raise OSError(28, "No space left on device", "maps.npz")
 
-    monkeypatch.setattr("sliplens.cli.report.Report.run", full)
+    monkeypatch.setattr("sliplens.report.page.write_report", full)
     assert "maps.npz could not be read or written (No space left on device)" in refused(capsys, "report", tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        ("prdict cup.mp4", "there is no command prdict; did you mean predict? `sliplens --help` tells all"),
-        ("predict a b --frction 0.7", "no option --frction of `sliplens predict`; did you mean --friction?"),
-        ("label a -o b --reference-fram 3", "did you mean --reference-frame?"),  # of a group of options
-        ("predict a b c", "'c' is one word too many for `sliplens predict`"),
-    ],
-)
-def test_a_slip_of_the_pen_is_told_in_one_line(words: str, told: str, capsys: pytest.CaptureFixture[str]):
-    assert run(*words.split()) == 2
-    said = capsys.readouterr().err
-    assert told in said
-    assert said.count("\n") == 1

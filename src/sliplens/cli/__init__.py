@@ -1,96 +1,95 @@
-"""The command line: one frozen dataclass a subcommand."""
+"""The command line: every command is a function of the library."""
 
 import errno
 import os
 import re
 import sys
 from collections.abc import Sequence
-from contextlib import redirect_stdout
-from typing import Any, get_args
+from difflib import get_close_matches
 
-import tyro
+import cyclopts
 
 from sliplens._version import __version__
-from sliplens.cli.check import Check
-from sliplens.cli.command import in_options, option_names
-from sliplens.cli.console import fail
-from sliplens.cli.demo import Demo
-from sliplens.cli.doctor import Doctor
-from sliplens.cli.evaluate import Evaluate
-from sliplens.cli.explain import Explain, Score
-from sliplens.cli.export import Export
-from sliplens.cli.grip import Grip
-from sliplens.cli.help import EXAMPLES, OPTIONAL, Help, HelpText, describe_options, overview, print_help, tell_unknown
-from sliplens.cli.hold import Hold
-from sliplens.cli.import_ import Import
-from sliplens.cli.label import Label
-from sliplens.cli.live import Live
-from sliplens.cli.predict import Predict
-from sliplens.cli.recover import Recover
-from sliplens.cli.report import Report
-from sliplens.cli.sensor import Sensor
-from sliplens.cli.simulate import Simulate
-from sliplens.cli.split import Split
-from sliplens.cli.status import Status
-from sliplens.cli.study import Diagnose, Study
-from sliplens.cli.track import Track
-from sliplens.cli.train import Train
-from sliplens.cli.view import View
+from sliplens.cli.app import adapt, name_options
+from sliplens.cli.commands import COMMANDS
+from sliplens.cli.console import OUT, fail, say
 from sliplens.errors import InputError, PartError, SliplensError
-from sliplens.recordings.options import LabelSettings, ReadOptions
 
-_Recordings = Sensor | Simulate | Import | Label | Recover | Split | Check | View | Track
-_Networks = Train | Evaluate | Predict | Export
-_Holds = Grip | Hold
-_Why = Explain | Score | Diagnose | Study
-Command = Demo | Live | _Recordings | _Networks | _Why | Status | _Holds | Report | Doctor | Help
-
-_DESCRIPTION = """sliplens tells how close a soft robotic fingertip is to losing its grip, from the images of the camera
-inside it, and shows why the network says so. Start with `sliplens demo runs/demo`; `sliplens help` tells which commands
-do what you came for, `sliplens COMMAND --help` every option of one."""
-
-
-def _parse(words: Sequence[str]) -> Any:
-    """Make the command that the words name; help is printed here, and ends the program."""
-    if words[0] in {"-h", "--help"}:
-        print(overview(_DESCRIPTION, get_args(Command)))
-        raise SystemExit(0)
-    if words[0] not in EXAMPLES and not words[0].startswith("-"):
-        raise InputError(tell_unknown(words[0], EXAMPLES, what="command", help_of="sliplens"))
-    help_text = HelpText()
-    describe_options(*get_args(Command), LabelSettings, ReadOptions)
-    try:
-        with redirect_stdout(help_text):
-            command, unknown = tyro.cli(
-                Command,  # pyright: ignore[reportArgumentType]
-                prog="sliplens",
-                args=words,
-                registry=OPTIONAL,
-                return_unknown_args=True,
-            )
-    except SystemExit:
-        if help_text.getvalue():
-            print_help(help_text.getvalue(), words)
-        raise
-    if unknown:
-        raise InputError(tell_unknown(unknown[0], option_names(command), what="option", help_of=f"sliplens {words[0]}"))
-    return command
-
-
+TASKS = {
+    "start": ("See what sliplens does, without any data", ("demo",)),
+    "predict": ("Predict the safety margin from images, a video or a bag", ("sensor new", "predict", "view")),
+    "explain": ("See which parts of an image a margin comes from", ("explain", "score")),
+    "train": ("Train a network for your own sensor", ("sensor new", "import", "check", "label", "train", "evaluate")),
+    "judge": ("Find out where a network fails, and which explanation can be trusted", ("diagnose", "study")),
+    "live": ("Predict from a running camera, and hold a grip", ("live", "grip", "hold")),
+}
+"""What users come for, and the commands that do it, in their order."""
+_DESCRIPTION = (
+    "Predict how close a soft robotic fingertip is to losing its grip, from the images of the camera inside it, and "
+    "show why the network says so. Start with `sliplens demo runs/demo`; `sliplens help` lists the commands by task."
+)
 _NO_MEMORY = "allocate memory|out of memory|bad_alloc|start new thread|failed to map segment|create a primitive"
-"""What torch, threads and libraries say where Python says MemoryError."""
+"""Messages of torch, threads and libraries where Python raises MemoryError."""
 
 
-def _sentence(error: Exception, command: object | None) -> str:
-    """What a mistake or a fault is called; whatever else it is goes on."""
+def _help(words: Sequence[str]) -> None:
+    """Print the commands of a task, or of all."""
+    if words and words[0] not in TASKS:
+        raise InputError(f"there is no help on {words[0]!r}; choose one of {', '.join(TASKS)}")
+    for name in words[:1] or TASKS:
+        title, commands = TASKS[name]
+        say(f"{title} ({name})")
+        for command in commands:
+            say(f"  {COMMANDS[command].example}")
+    say("`sliplens COMMAND --help` lists every option of a command.")
+
+
+def _overview() -> None:
+    """Print the commands with a line each."""
+    OUT.print(f"usage: sliplens COMMAND ...\n\n{_DESCRIPTION}\n", highlight=False)
+    from rich.table import Table
+
+    table = Table.grid(padding=(0, 2, 0, 2))
+    for name, command in COMMANDS.items():
+        table.add_row(name, command.summary)
+    table.add_row("help", "Show which commands do what you came for.")
+    OUT.print(table, highlight=False)
+
+
+def _call(words: list[str]) -> list[str]:
+    """Call the command that the words name; returns the names of its options for the messages of its errors."""
+    name = next((" ".join(words[:count]) for count in (2, 1) if " ".join(words[:count]) in COMMANDS), None)
+    if name is None:
+        names = [*COMMANDS, "help"]
+        under = [each for each in names if each.startswith(f"{words[0]} ")]
+        near = under or get_close_matches(" ".join(words[:2]), names, n=1) or get_close_matches(words[0], names, n=1)
+        meant = f"did you mean {' or '.join(near)}? " if near else ""
+        raise InputError(f"there is no command {words[0]}; {meant}`sliplens --help` lists all")
+    function, options = adapt(COMMANDS[name])
+    app = cyclopts.App(name=f"sliplens {name}", help_format="plaintext", version_flags=(), console=OUT, result_action="return_value")
+    app.default(function)
+    app["--help"].show = False
+    try:
+        app(words[len(name.split()) :], exit_on_error=False, print_error=False)
+    except cyclopts.CycloptsError as error:
+        text = " ".join(str(error).split()).rstrip(".")
+        raise InputError(f"{text[:1].lower()}{text[1:]}; `sliplens {name} --help` lists the options") from None
+    except (SliplensError, OSError, MemoryError, RuntimeError, ImportError) as error:
+        error.options = options  # pyright: ignore[reportAttributeAccessIssue]
+        raise
+    return options
+
+
+def _sentence(error: Exception) -> str:
+    """Return the message of a mistake or a fault; raise whatever else it is."""
     match error:
         case SliplensError():
-            return str(error) if command is None else in_options(str(error), command)
+            return name_options(str(error), getattr(error, "options", ()))
         case OSError() if error.errno != errno.ENOMEM:
             where, why = error.filename or "a file", error.strerror or error
             return f"{where} could not be read or written ({why}); check the path, its permissions and the space left"
         case _ if isinstance(error, MemoryError) or re.search(_NO_MEMORY, str(error)):
-            return "the memory is used up; end other programs, or name less at once, and give the same command again"
+            return "the memory is used up; end other programs, or give fewer files at once, and run the command again"
     raise error
 
 
@@ -105,30 +104,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0 on success, 1 where some of many parts failed, 2 for a mistake the user can mend, 130 when interrupted.
+        0 on success, 1 if some of many parts failed, 2 for a user's mistake, 130 if interrupted.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if words == ["--version"]:
-        print(f"sliplens {__version__}")
-        return 0
     # threads that spin while they wait take the cores from those that work; must be set before torch is imported
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    command = None
     try:
-        command = _parse(words or ["--help"])
-        getattr(command, "check", lambda: None)()
-        command.run()
+        if words[:1] == ["--version"]:
+            say(f"sliplens {__version__}")
+        elif not words or words[0] in {"-h", "--help"}:
+            _overview()
+        elif words[0] == "help":
+            _help(words[1:])
+        else:
+            _call(words)
     except BrokenPipeError:
-        # whoever read it has seen enough, as `| head` does; what is still to be written on the way out goes nowhere
+        # a reader such as `| head` has ended; what is still written goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except PartError as error:
-        fail(error.summary, *(f"{name}: {in_options(sentence, command)}" for name, sentence in error.errors.items()))
+        names = getattr(error, "options", ())
+        fail(error.summary, *(f"{part}: {name_options(text, names)}" for part, text in error.errors.items()))
         return 1
     except (SliplensError, OSError, MemoryError, RuntimeError, ImportError) as error:
-        fail(_sentence(error, command))
+        fail(_sentence(error))
         return 2
     except KeyboardInterrupt:
-        fail("interrupted; run the same command again and it goes on where it stopped")
+        fail("interrupted; run the same command again to continue")
         return 130
     return 0

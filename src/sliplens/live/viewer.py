@@ -14,7 +14,7 @@ from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import pyarrow as pa
@@ -25,6 +25,7 @@ from matplotlib.colors import to_rgba
 from sliplens.codec import open_parquet
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
+from sliplens.files import require_new_file
 from sliplens.images import absolute_difference
 from sliplens.live.reading import Reading
 from sliplens.live.sinks import RerunSink
@@ -32,13 +33,14 @@ from sliplens.plots.audit import Fact, audit_facts, end_of_ratio, force_ratio
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name, written_whole
-from sliplens.progress import OnProgress, reporting, track, visible
-from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo
+from sliplens.progress import OnProgress, open_stage, reporting, track, visible
+from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo, load_dataset
 from sliplens.recordings.capture import Capture, Forces, Frame
-from sliplens.recordings.dataset import trial_path
+from sliplens.recordings.dataset import DATASET_FILE, trial_path
+from sliplens.recordings.source import SourceOptions
 from sliplens.recordings.store import forces_path, load_forces, load_recording, read_header, stream_frames
 from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS, GroundTruth, Labels, labels_of_margins
-from sliplens.results.explanation import Explanation
+from sliplens.results.explanation import Explanation, is_explanation, load_explanation
 
 if TYPE_CHECKING:
     from rerun.blueprint import Blueprint
@@ -66,6 +68,93 @@ class Overlays:
     maps: Explanation | None = None
     tracks: Path | None = None
     """Table that `sliplens track` wrote."""
+
+
+def view(
+    source: Path | str | Explanation,
+    *,
+    predictions: Path | str | None = None,
+    maps: Path | str | Explanation | None = None,
+    tracks: Path | str | None = None,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+    **source_options: Unpack[SourceOptions],
+) -> ViewedTrial:
+    """Show a trial in the Rerun viewer: frames, differences, forces, labels, predictions and maps on one clock.
+
+    The viewer opens on this machine and listens to it alone. Needs the extra `view`.
+
+    Parameters
+    ----------
+    source
+        Any source of `open_source`, a table of `predict` (which names its source), or maps of `explain`.
+    predictions
+        Margins with their intervals, as `predict` or `evaluate` wrote them (Parquet).
+    maps
+        Maps of `explain`, or their folder.
+    tracks
+        Markers, as `track` wrote them (Parquet).
+    out
+        File to write (`.rrd`) instead of opening the viewer.
+    overwrite
+        Replace an existing file.
+    source_options
+        As `open_source` takes them; `trial` is the first if None.
+
+    Raises
+    ------
+    InputError
+        If something is missing, does not fit, or the extra is not installed.
+    """
+    require_rerun()
+    path = None if out is None else Path(out)
+    if path is not None:
+        require_rrd_path(path)
+        require_new_file(path, overwrite=overwrite)
+    table = None if predictions is None else Path(predictions)
+    if isinstance(source, Path | str):
+        source = Path(source)
+        if source.suffix == ".parquet":
+            table = source
+            source, first = _source_of(source)
+            source_options.setdefault("trial", first)
+        elif is_explanation(source):
+            source = load_explanation(source)
+    maps = source if isinstance(source, Explanation) else maps
+    explained = load_explanation(Path(maps)) if isinstance(maps, Path | str) else maps
+    viewed = view_explained(source) if isinstance(source, Explanation) else _open_trial(source, source_options)
+    overlays = Overlays(predictions=table, maps=explained, tracks=None if tracks is None else Path(tracks))
+    with reporting(on_progress), open_stage(f"Reading {viewed.trial.trial}"):
+        if path is None:
+            open_viewer(viewed, overlays=overlays)
+        else:
+            write_rrd(viewed, path, overlays=overlays)
+    return viewed
+
+
+def _open_trial(source: Path, options: SourceOptions) -> ViewedTrial:
+    trial = options.get("trial")
+    if (source / DATASET_FILE).is_file():
+        data = load_dataset(source)
+        infos = data.select(split=options.get("split"))
+        return view_stored(data, infos[0] if trial is None else data.find(trial))
+    from sliplens.recordings.source import open_source  # noqa: PLC0415 (readers of video come with it)
+
+    return view_capture(open_source(source, **options)[0])
+
+
+def _source_of(table: Path) -> tuple[Path, str | None]:
+    """Return the source of a table of predictions, and its first trial."""
+    with open_parquet(table, {"trial": "texts"}, cure="name a table that sliplens predict wrote") as file:
+        source = (file.schema_arrow.metadata or {}).get(b"sliplens.source", b"").decode()
+        trials = next(file.iter_batches(1, columns=["trial"]), None)
+    if not source or not Path(source).exists():
+        raise InputError(
+            f"{table} was predicted from {source or 'an unknown source'}, which does not exist; name the source first, "
+            f"and the table with --predictions {table}"
+        )
+    return Path(source), None if trials is None else trials["trial"][0].as_py()
 
 
 def view_stored(data: Dataset, info: TrialInfo) -> ViewedTrial:

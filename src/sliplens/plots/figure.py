@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from sliplens.errors import InputError
+from sliplens.files import DEFAULT_NETWORK, require_new_file, whole_file
 from sliplens.intervals import Difference
-from sliplens.markers.gel import SensorProposal
+from sliplens.markers.gel import SensorProposal, propose_profile
 from sliplens.plots.errors import plot_answers, plot_faithfulness, plot_learning_curves
 from sliplens.plots.margins import column, plot_grip_force, plot_hold, plot_margins, plot_readings
 from sliplens.plots.saliency import full_colour, overlay_relevance
@@ -32,6 +33,8 @@ from sliplens.plots.style import (
     percent,
     written_whole,
 )
+from sliplens.recordings.sensor import profile_text
+from sliplens.recordings.source import Frames
 from sliplens.results.evaluation import Diagnosis
 from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, is_control
@@ -253,6 +256,51 @@ def draw_proposal(proposal: SensorProposal) -> Figure:
         for axes in (camera, made):
             axes.grid(visible=False)
     return figure
+
+
+def make_profile(
+    source: Path | str | Frames,
+    out: Path | str,
+    *,
+    name: str | None = None,
+    network: str = DEFAULT_NETWORK,
+    keep_size: bool = False,
+    overwrite: bool = False,
+) -> SensorProposal:
+    """Make the profile of a sensor from a recording, and draw a picture of it beside the file.
+
+    Finds the gel's rectangle and the markers. Check the picture, and correct the file where it is wrong.
+
+    Parameters
+    ----------
+    source
+        Video, bag, folder of images or frames that begin with the sensor untouched.
+    out
+        Profile to write (TOML); the picture stands beside it as PNG.
+    name
+        Name of the sensor; that of the file if None.
+    network
+        Network for the frames, which are scaled to the size it was trained on.
+    keep_size
+        If True, keep the camera's resolution, to train a network of its own; the profile then names no network.
+    overwrite
+        Replace an existing file.
+
+    Raises
+    ------
+    InputError
+        If the source cannot be read, its frames show no gel, or the file exists.
+    """
+    from sliplens.models.checkpoint import read_manifest  # noqa: PLC0415 (torch takes seconds)
+
+    path = Path(out)
+    require_new_file(path, suffix=".toml", overwrite=overwrite)
+    size_px = None if keep_size else read_manifest(network).frame_size[::-1]
+    proposal = propose_profile(source, name=name or path.stem, network=None if keep_size else network, size_px=size_px)
+    with whole_file(path) as part:
+        part.write_text(profile_text(proposal.profile, notes=proposal.notes), encoding="utf-8")
+    write_proposal(proposal, path.with_suffix(".png"))
+    return proposal
 
 
 def write_proposal(proposal: SensorProposal, path: Path) -> None:

@@ -1,0 +1,259 @@
+"""Commands made of functions: options, defaults, types and help come from signature and docstring."""
+
+import re
+from ast import FunctionDef, get_docstring, parse
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
+from functools import partial
+from importlib import import_module
+from inspect import Parameter, Signature, signature
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, Unpack, get_args, get_origin, get_type_hints
+
+import cyclopts
+import docstring_parser
+
+from sliplens.cli.console import Terminal
+from sliplens.errors import InputError
+
+ALIASES = {"out": ("-o", "--output")}
+"""Further names of parameters on the command line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A function on the command line."""
+
+    function: str
+    """Function of the library, as `module:name`."""
+    run: Callable[..., object]
+    """Calls it and prints the result; its keyword-only parameters are further options."""
+    example: str
+    aliases: tuple[tuple[str, str], ...] = ()
+    """Parameters with a further name, such as `("source", "--from")`."""
+
+    @property
+    def summary(self) -> str:
+        """First line of the function's docstring, read from the source: importing all functions takes seconds."""
+        module, _, name = self.function.partition(":")
+        path = Path(__file__).parents[1].joinpath(*module.split(".")[1:])
+        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        tree = parse(path.read_text(encoding="utf-8"))
+        nodes = (node for node in tree.body if isinstance(node, FunctionDef) and node.name == name)
+        return (get_docstring(next(nodes)) or "").partition("\n")[0]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Option:
+    """A parameter on the command line."""
+
+    name: str
+    kind: Any
+    """Type of its value: text, numbers, paths, choices, or a tuple of these."""
+    default: Any
+    help: str
+    positional: bool = False
+    group: str = ""
+    """Parameter of the function that holds it as a field of a dataclass; empty if it is a parameter itself."""
+    further: bool = False
+    """True for an option of `Command.run`."""
+    aliases: tuple[str, ...] = ()
+
+    @property
+    def parameter(self) -> Parameter:
+        """Parameter of the function that cyclopts calls."""
+        several = get_origin(self.kind) is tuple
+        about = cyclopts.Parameter(
+            help=self.help,
+            alias=self.aliases,
+            negative=f"--no-{self.name.replace('_', '-')}" if self.default is True else (),
+            consume_multiple=several,
+            show_default=self.default not in (None, False, True, (), Parameter.empty),
+        )
+        optional = self.kind if self.default is not None else self.kind | None
+        return Parameter(
+            self.name,
+            Parameter.POSITIONAL_OR_KEYWORD if self.positional else Parameter.KEYWORD_ONLY,
+            default=self.default,
+            annotation=Annotated[optional, about],
+        )
+
+
+def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
+    """Return the function that cyclopts calls for a command, and the names of its options."""
+    module, _, name = command.function.partition(":")
+    function = getattr(import_module(module), name)
+    aliases = {**ALIASES, **{name: (alias,) for name, alias in command.aliases}}
+    found = sorted((*_options(function), *_further(command.run)), key=lambda option: not option.positional)
+    options = [replace(option, aliases=aliases.get(option.name, ())) for option in found]
+    by_name = {option.name: option for option in options}
+    reports = "on_progress" in signature(function).parameters
+    groups = {option.group: _group_type(function, option.group) for option in options if option.group}
+
+    def call(*positional: object, **given: object) -> None:
+        places = [option.name for option in options if option.positional]
+        values = dict(zip(places, positional, strict=False)) | given
+        further = {name: values.pop(name) for name in list(values) if by_name[name].further}
+        arguments: dict[str, Any] = {"on_progress": Terminal()} if reports else {}
+        for name, value in values.items():
+            group = by_name[name].group
+            if group:
+                arguments.setdefault(group, {})[name] = value
+            else:
+                arguments[name] = constants(value) if _is_constants(function, name) else value
+        for group, kind in groups.items():
+            if group in arguments:
+                arguments[group] = kind(**arguments[group])
+        command.run(partial(function, **arguments), **further)
+
+    parsed = docstring_parser.parse(function.__doc__ or "")
+    texts = [parsed.short_description, parsed.long_description, f"Example: {command.example}"]
+    call.__doc__ = "\n\n".join(filter(None, texts))
+    call.__signature__ = Signature([option.parameter for option in options])  # pyright: ignore[reportFunctionMemberAccess]
+    call.__annotations__ = {option.name: option.parameter.annotation for option in options}
+    return call, list(by_name)
+
+
+def _options(function: Callable[..., object]) -> list[_Option]:
+    """Return the parameters of a function that can be typed; fields of dataclasses are options of their own."""
+    helps, hints, found = _parameter_help(function), get_type_hints(function), []
+    for name, parameter in signature(function).parameters.items():
+        hint = hints.get(name, Any)
+        if parameter.kind is Parameter.VAR_KEYWORD:
+            found += _fields_of(get_args(hint)[0] if get_origin(hint) is Unpack else hint)
+            continue
+        group = _group_type(function, name)
+        if group is not None:
+            found += [option for option in _fields_of(group, group=name) if option.name not in {o.name for o in found}]
+            continue
+        kind = typed_kind(hint)
+        if kind is None:
+            if parameter.default is Parameter.empty:
+                raise TypeError(f"{function.__qualname__} needs {name}, which cannot be typed")
+            continue
+        default = parameter.default
+        found.append(
+            _Option(
+                name=name,
+                kind=kind,
+                default=() if isinstance(default, Mapping) else default,
+                help=helps.get(name, ""),
+                positional=parameter.kind is Parameter.POSITIONAL_OR_KEYWORD,
+            )
+        )
+    return found
+
+
+def _fields_of(kind: Any, *, group: str = "") -> list[_Option]:
+    """Return the fields of a dataclass or TypedDict as options."""
+    helps, hints = _parameter_help(kind), get_type_hints(kind)
+    defaults = {field.name: field.default for field in fields(kind)} if is_dataclass(kind) else {}
+    return [
+        _Option(name=name, kind=typed, default=defaults.get(name), help=helps.get(name, ""), group=group)
+        for name, hint in hints.items()
+        if (typed := typed_kind(hint)) is not None
+    ]
+
+
+def _further(run: Callable[..., object]) -> list[_Option]:
+    helps, hints = _parameter_help(run), get_type_hints(run)
+    return [
+        _Option(
+            name=name, kind=typed_kind(hints[name]), default=parameter.default, help=helps.get(name, ""), further=True
+        )
+        for name, parameter in signature(run).parameters.items()
+        if parameter.kind is Parameter.KEYWORD_ONLY
+    ]
+
+
+def _parameter_help(kind: Any) -> dict[str, str]:
+    """Return the description of each parameter or field, as one paragraph."""
+    helps = {}
+    for param in docstring_parser.parse_from_object(kind).params:
+        for name in param.arg_name.split(","):
+            helps[name.strip()] = " ".join((param.description or "").split())
+    return helps
+
+
+def _group_type(function: Callable[..., object], name: str) -> Any:
+    """Return the dataclass of options that a parameter takes; None for any other parameter."""
+    hint = get_type_hints(function).get(name)
+    kinds = [kind for kind in _members(hint) if is_dataclass(kind)] if typed_kind(hint) is None else []
+    return next((kind for kind in kinds if all(_has_default(field) for field in fields(kind))), None)
+
+
+def _has_default(field: Field) -> bool:
+    return field.default is not MISSING or field.default_factory is not MISSING
+
+
+def _members(hint: Any) -> list[Any]:
+    """Return the members of a union, of unions within it too, and of named types."""
+    if get_origin(hint) is Annotated:
+        return _members(get_args(hint)[0])
+    if get_origin(hint) in {Union, UnionType}:
+        return [member for each in get_args(hint) for member in _members(each)]
+    return [hint]
+
+
+def typed_kind(hint: Any) -> Any:
+    """Return the simplest type of a parameter that can be typed on the command line; None if there is none.
+
+    Examples
+    --------
+    >>> from collections.abc import Sequence
+    >>> from pathlib import Path
+    >>> from sliplens.cli.app import typed_kind
+    >>> typed_kind(bytes | Path | str | None), typed_kind(Sequence[str]), typed_kind(bytes)
+    (<class 'str'>, tuple[str, ...], None)
+    """
+    members = [member for member in _members(hint) if member is not NoneType]
+    for member in members:
+        origin, arguments = get_origin(member), get_args(member)
+        if origin in {Sequence, Collection, list} and (inner := typed_kind(arguments[0])) is not None:
+            return tuple[inner, ...]
+        if origin is Mapping and arguments == (str, float):
+            return tuple[str, ...]
+    for kind in (str, Path, bool, int, float):
+        if kind in members:
+            return kind
+    for member in members:
+        if get_origin(member) is Literal:
+            return member
+        if get_origin(member) is tuple and all(
+            argument is Ellipsis or typed_kind(argument) is not None for argument in get_args(member)
+        ):
+            return member
+    return None
+
+
+def _is_constants(function: Callable[..., object], name: str) -> bool:
+    members = _members(get_type_hints(function).get(name))
+    return any(get_origin(member) is Mapping and get_args(member) == (str, float) for member in members)
+
+
+def constants(texts: Any) -> dict[str, float]:
+    """Parse texts such as `target=0.3`.
+
+    Raises
+    ------
+    InputError
+        If a text is no name and number.
+    """
+    values = {}
+    for text in texts:
+        name, _, number = text.partition("=")
+        try:
+            values[name] = float(number)
+        except ValueError:
+            raise InputError(f"{text!r} sets no constant; write NAME=NUMBER, such as target=0.3") from None
+    return values
+
+
+def name_options(message: str, names: Sequence[str]) -> str:
+    """Write the parameters that a message names as options, as the user typed them."""
+    for name in sorted(names, key=len, reverse=True):
+        # within a sentence a single word may be just a word
+        place = rf"(?<![\w-]){name}(?![\w-])" if "_" in name else rf"^{name}(?= (?:must|is \d|is -))"
+        message = re.sub(place, f"--{name.replace('_', '-')}", message)
+    return message

@@ -1,0 +1,639 @@
+"""The commands: each calls a function of the library and prints its result."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
+from dataclasses import replace
+from pathlib import Path
+from threading import Event
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
+
+from sliplens.cli import output
+from sliplens.cli.app import Command
+from sliplens.cli.console import OUT, Terminal, print_table, say, wrote
+from sliplens.errors import InputError, RecordingError, SliplensError
+from sliplens.files import require_new_file, to_builtins
+from sliplens.progress import number_of, open_stage, report_file, reporting
+
+if TYPE_CHECKING:
+    from sliplens.grip.hold import HoldStep
+    from sliplens.live import LiveReader
+
+COMMANDS: dict[str, Command] = {}
+"""Commands by name; `sensor new` and the like have two words."""
+Run = Callable[..., None]
+
+
+def command(name: str, function: str, example: str, *aliases: tuple[str, str]) -> Callable[[Run], Run]:
+    """Register a function that calls a function of the library, given with its arguments, and prints the result."""
+
+    def register(run: Run) -> Run:
+        COMMANDS[name] = Command(function=f"sliplens.{function}", run=run, example=example, aliases=aliases)
+        return run
+
+    return register
+
+
+@command("demo", "demo:run_demo", "sliplens demo runs/demo")
+def demo(call: Any) -> None:
+    """Print where the page is as soon as it exists; its notes are on the page."""
+    started = time.perf_counter()
+    pages: list[Path] = []
+    notes: list[str] = []
+
+    def on_page(page: Path) -> None:
+        if not pages:
+            say(f"open {page.resolve()} now: it grows while the rest is made")
+        pages.append(page)
+
+    terminal = Terminal()
+    terminal.note = notes.append
+    page = call(on_page=on_page, on_progress=terminal)
+    if notes:
+        say(f"{number_of(len(notes), 'note')} on limitations: see the page")
+    say(f"the demo took {(time.perf_counter() - started) / 60:.1f} minutes")
+    say(f"open {page.resolve()}")
+
+
+@command("live", "live.loop:read_live", "sliplens live 0 --network chromatouch-pair --reference untouched.png")
+def live(
+    call: Any,
+    *,
+    list_sources: bool = False,
+    sink: tuple[str, ...] = (),
+    page: bool = True,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    record: Path | None = None,
+    object: str = "",
+    condition: str = "dry",
+    day: int = 1,
+) -> None:
+    """Show readings in a browser or on the terminal, send them elsewhere, and record frames.
+
+    Parameters
+    ----------
+    list_sources
+        List the cameras with their formats, sizes and rates, and the other sources, and end.
+    sink
+        Where readings go: json (lines on standard output), udp:HOST:PORT, mcap:FILE, foxglove:HOST:PORT, rerun:FILE,
+        zenoh:KEY (to ROS 2). Without one, a line a second is printed.
+    page
+        Serve a page with buttons to freeze, explain and record.
+    host
+        Address of the page; 0.0.0.0 for all machines, which then need the token that is printed.
+    port
+        Port of the page; 8090 if not given.
+    record
+        Data set to record every frame into; the button of the page records into `recorded` without it.
+    object
+        Name of the object, for the recording.
+    condition
+        dry or wet, for the recording.
+    day
+        Day of the recording.
+    """
+    from sliplens.grip.source import open_grip, usual_network
+    from sliplens.live import LiveReader
+    from sliplens.live.contract import SourceOptions
+    from sliplens.recordings import TrialFacts
+    from sliplens.recordings.sensor import is_profile, load_profile
+
+    if list_sources:
+        output.print_sources()
+        return
+    arguments = {"source": "simulated", "network": None, "options": SourceOptions(), "sensor": None} | call.keywords
+    sensor = arguments["sensor"] or ""
+    profile = arguments["sensor"] = load_profile(sensor) if is_profile(sensor) else None
+    if (grip := open_grip(arguments["source"], arguments["options"])) is not None:
+        arguments |= {"source": grip, "options": None}
+    facts = TrialFacts(trial="live", sensor=sensor, object=object, condition=condition, day=day)
+    arguments["network"] = arguments["network"] or usual_network(arguments["source"], profile)
+    with ExitStack() as stack:
+        reader = stack.enter_context(closing(LiveReader(**arguments)))
+        reader.send_to(*sink)
+        if record is not None:
+            reader.record(record, facts=facts)
+        stack.callback(lambda: [say(str(state), aside=True) for state in reader.outputs])
+        stack.callback(lambda: reader.lesson and say(reader.lesson, aside=True))
+        with suppress(KeyboardInterrupt), reader:
+            shown = nullcontext()
+            if page:
+                waits = "seconds" not in arguments and not sink
+                into = record or Path("recorded")
+                shown = _served(reader, facts=facts, host=host, port=port, record_into=into, waits=waits)
+            with shown:
+                _watch(reader, quiet=page, lines=not sink)
+
+
+@contextmanager
+def _served(reader: "LiveReader", *, waits: bool, **settings: Any):  # noqa: ANN202
+    """Serve the page of a reader; if it waits, the page stays after the source has ended."""
+    from sliplens.app import LivePage
+
+    with LivePage(reader, **settings) as page:
+        say(f"open {page.address}", aside=True)
+        yield
+        if waits:
+            say(f"{reader.source.name} has ended; the page stays until Ctrl-C", aside=True)
+            Event().wait()
+
+
+def _watch(reader: "LiveReader", *, quiet: bool, lines: bool) -> None:
+    """Print a line a second, and each warning once."""
+    printed_s, printed = -1.0, set[str]()
+    for reading in reader.readings():
+        if time.monotonic() - printed_s < 1:
+            continue
+        printed_s = time.monotonic()
+        if not quiet:
+            for sender in reader.senders:
+                if sender.error:
+                    raise sender.error
+        for warning in {*reader.doubts, *reader.troubles} - printed:
+            printed.add(warning)
+            say(warning, aside=True)
+        if lines:
+            say(str(reading))
+
+
+@command(
+    "sensor new", "plots.figure:make_profile", "sliplens sensor new --from tip.mp4 -o tip.toml", ("source", "--from")
+)
+def sensor_new(call: Any) -> None:
+    """Write the profile and its picture."""
+    proposal, path = call(), Path(call.keywords["out"])
+    for sentence in proposal.notes:
+        say(f"  {sentence}")
+    wrote(path, "correct it where the picture shows an error")
+    wrote(path.with_suffix(".png"), "what the profile does to a frame")
+
+
+@command("sensor list", "recordings.sensor:shipped_profiles", "sliplens sensor list")
+def sensor_list(call: Any) -> None:
+    """Print the profiles."""
+    from sliplens.recordings.sensor import load_profile
+
+    profiles = {name: load_profile(name) for name in call()}
+    rows = [
+        (name, profile.markers or "none", str(profile.camera_size_px or "any")) for name, profile in profiles.items()
+    ]
+    print_table("Sensor profiles", ("name", "markers", "camera, width x height"), rows)
+
+
+@command("simulate", "simulation.trials:simulate", "sliplens simulate runs/mine/data --preset small")
+def simulate(call: Any, *, preview: Path | None = None, video: Path | None = None) -> None:
+    """Print the splits.
+
+    Parameters
+    ----------
+    preview
+        Picture to write: a contact sheet of four trials (PNG, PDF or SVG). No data set is made without OUT.
+    video
+        Clip to write: one trial with its forces and margin beside it (MP4).
+    """
+    from sliplens.plots.clip import require_clip_path
+    from sliplens.plots.style import require_picture_path
+
+    if not (call.keywords.get("out") or preview or video):
+        raise InputError("nothing to do; name a folder to make, or a picture with --preview")
+    if preview is not None:
+        require_picture_path(preview, example="sheet.png")
+    if video is not None:
+        require_clip_path(video)
+    if preview or video:
+        output.draw_simulation(call.keywords, preview=preview, video=video)
+    if call.keywords.get("out"):
+        from sliplens.results.evaluation import describe_simulation
+
+        splits = describe_simulation(call()).by_split.items()
+        rows = [(name, str(row.trials), f"{row.frames:,}") for name, row in splits]
+        print_table("Simulated", ("split", "trials", "frames"), rows)
+
+
+@command(
+    "import",
+    "recordings.importing:import_recordings",
+    "sliplens import cup.mp4 --forces cup.csv --sensor tip.toml -o runs/mine/data",
+)
+def import_(call: Any, *, audit: bool = True) -> None:
+    """Print what the labels rest on.
+
+    Parameters
+    ----------
+    audit
+        Draw a page for each trial, in `audit/` of the folder, from which to judge its labels.
+    """
+    data = call()
+    if audit:
+        output.draw_audits(data, data.folder / "audit")
+    output.show_labelling("Imported", data)
+    output.write_trials_page(data)
+    if data.left_out:
+        print_table("Left out", ("trial", "why"), [(trial.trial, trial.why) for trial in data.left_out])
+        raise SystemExit(1)
+
+
+@command("label", "recordings.relabelling:label_dataset", "sliplens label runs/mine/data --draft corrections.csv")
+def label(call: Any, *, draft: Path | None = None, audit: bool = True, audit_only: bool = False) -> None:
+    """Print what the labels rest on.
+
+    Parameters
+    ----------
+    draft
+        Change no label: write a table of the present labels, to be edited and given to --corrections.
+    audit
+        Draw a page for each trial, in `audit/` of the folder, from which to judge its labels.
+    audit_only
+        Change no label: draw the audit pages of the present labels.
+    """
+    from sliplens.recordings.corrections import draft_corrections
+    from sliplens.recordings.dataset import load_dataset
+
+    arguments = call.keywords
+    if draft is not None and (arguments.keys() & {"out", "corrections"} or audit_only):
+        raise InputError("--draft changes no label; leave --out, --corrections and --audit-only out")
+    if audit_only and "corrections" in arguments:
+        raise InputError("--audit-only changes no label; leave --audit-only or --corrections out")
+    folder = arguments["data"]
+    data, out = load_dataset(folder), Path(arguments.get("out") or folder)
+    if draft is not None:
+        draft_corrections(data, draft)
+        wrote(draft, f"edit it, then: sliplens label {folder} --corrections {draft}")
+        return
+    if audit_only:
+        output.draw_audits(data, out / "audit")
+        return
+    labelled = call(data=data, out=out)
+    if audit:
+        output.draw_audits(labelled, out / "audit")
+    output.show_labelling("Labelled", labelled)
+    output.write_trials_page(labelled)
+
+
+@command("recover", "recordings.dataset:recover_dataset", "sliplens recover runs/mine/data")
+def recover(call: Any) -> None:
+    """Print what the data set holds."""
+    data = call()
+    say(f"{data.folder} holds {number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}")
+
+
+@command("split", "recordings.splits:split_dataset", "sliplens split runs/mine/data --splits object --dry-run")
+def split(call: Any) -> None:
+    """Print the splits, and the trials that move."""
+    from sliplens.recordings.dataset import load_dataset
+
+    data = load_dataset(call.keywords["data"])
+    result = call(data=data)
+    moves = [(info, split) for info, split in zip(data.trials, result.splits, strict=True) if info.split != split]
+    output.show_splits(data.trials, result.splits)
+    output.show_moves(moves)
+    for note in result.notes:
+        say(f"note: {note}")
+    if call.keywords.get("dry_run"):
+        say("nothing is written (--dry-run)")
+        return
+    wrote(data.folder, f"{len(moves)} of {len(data.trials)} trials moved")
+    if moves:
+        say("networks trained before had other splits: a trial of the test may have trained them; train again")
+
+
+@command("check", "recordings.check:check_dataset", "sliplens check runs/mine/data")
+def check(call: Any) -> None:
+    """Print the findings; exit code 2 if there are any."""
+    from sliplens.recordings.dataset import load_dataset, trial_path
+    from sliplens.recordings.store import read_header
+
+    data = load_dataset(call.keywords["data"])
+    findings = call(data=data)
+    if findings:
+        print_table("Findings", ("where", "what"), [(finding.where, finding.what) for finding in findings])
+        count = number_of(len(findings), "error")
+        raise RecordingError(f"{data.folder} has {count}, listed above; correct or make these trials again")
+    size = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
+    labellings = (read_header(trial_path(data.folder, info.trial)).labelling for info in data.trials)
+    bases = [labelling.basis for labelling in labellings if labelling and labelling.basis]
+    # frames at a fault of the force sensor are not valid, which puts no other frame in doubt
+    doubtful = sum(bool(basis.axes.notes or basis.friction.notes or basis.doubts) for basis in bases)
+    if doubtful:
+        about = f"the notes above put labels of {number_of(doubtful, 'trial')} in doubt"
+        say(f"{data.folder} is whole: {size}, every hash and law holds, but {about}")
+        return
+    say(f"{data.folder} is sound: {size}, every hash and law holds")
+
+
+@command("compare", "simulation.sharing:compare_datasets", "sliplens compare runs/mine/data runs/other/data")
+def compare(call: Any) -> None:
+    """Print what two data sets share, or which trials of a data set trained a network."""
+    from sliplens.recordings.dataset import DATASET_FILE
+
+    first, second = Path(call.keywords["first"]), Path(call.keywords["second"])
+    if not (second / DATASET_FILE).is_file():
+        output.print_known_trials(first, second)
+        return
+    shared = call()
+    pairs = {"trial": shared.trials, "day": shared.days, "sensor": shared.sensors}
+    for noun, names in pairs.items():
+        if names:
+            print_table(f"Shared {noun}s", (str(first), str(second)), list(names))
+    counts = ", ".join(number_of(len(names), noun) for noun, names in pairs.items())
+    basis = "seeds and frames" if shared.by_seeds else "names and frames"
+    say(f"{first} and {second} share {counts} (compared by {basis})")
+
+
+@command(
+    "view",
+    "live.viewer:view",
+    "sliplens view runs/mine/data --trial cup --predictions margins.parquet --maps runs/mine/explain",
+)
+def view(call: Any) -> None:
+    """Print what is shown."""
+    trial = call()
+    about = f"{trial.trial.trial}, {number_of(len(trial.trial), 'frame')}"
+    if (out := call.keywords.get("out")) is None:
+        say(f"{about}, are in the Rerun viewer")
+        say("the viewer reports its use to its makers, not what it shows: see `rerun analytics disable`")
+    else:
+        wrote(Path(out), f"{about}; open it with `rerun {out}`")
+
+
+@command("track", "markers.tracking:track", "sliplens track cup.mp4 --reference untouched.png -o markers.parquet")
+def track(call: Any, *, video: Path | None = None) -> None:
+    """Print how many markers were followed.
+
+    Parameters
+    ----------
+    video
+        Also write a clip with rings and arrows, of one trial (MP4).
+    """
+    from sliplens.plots.clip import clip_writer
+    from sliplens.recordings.sensor import load_profile
+    from sliplens.recordings.source import SourceOptions, open_source
+
+    arguments = call.keywords
+    if "out" not in arguments:
+        raise InputError("name the table to write with -o markers.parquet")
+    if "markers" not in arguments and "sensor" in arguments:
+        arguments["markers"] = load_profile(arguments["sensor"]).markers or "auto"
+    clip = nullcontext()
+    if video is not None:
+        names = SourceOptions.__annotations__
+        trials = open_source(arguments["source"], **{name: arguments[name] for name in names if name in arguments})
+        if len(trials) != 1:
+            raise InputError(f"a clip shows one trial, and the source has {len(trials)}; name one with --trial")
+        if arguments.get("on", "serial") != "serial":
+            raise InputError("a clip is drawn while its trial is tracked; leave out --on, or --video")
+        require_new_file(video, overwrite="overwrite" in arguments)
+        clip = clip_writer(video, size=trials[0].frame_size, frames_per_s=trials[0].frame_rate_hz)
+    with clip as draw:
+        tracking = call(on_tracked=draw)
+    for trial in tracking.trials:
+        say(str(trial))
+    wrote(tracking.path, f"{number_of(tracking.frames, 'frame')} of {number_of(len(tracking.trials), 'trial')}")
+    if video is not None:
+        wrote(video, "to look at: lossy video moves markers")
+
+
+@command(
+    "train",
+    "training.fitting:train",
+    "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-pair --epochs 5",
+)
+def train(call: Any) -> None:
+    """Draw the learning curve."""
+    from sliplens.plots.errors import draw_learning_curve
+
+    if "out" not in call.keywords:
+        raise InputError("name the folder of the network with -o FOLDER")
+    network, out = call(), Path(call.keywords["out"])
+    picture = out / "curves.png"
+    if network.training is not None and not picture.is_file():
+        title = f"{out.name}, {network.manifest.input} images of {Path(call.keywords['data']).name}"
+        draw_learning_curve(network.training, picture, title=title)
+
+
+@command(
+    "evaluate", "training.evaluation:evaluate", "sliplens evaluate runs/mine/train runs/mine/data -o runs/mine/evaluate"
+)
+def evaluate(call: Any, *, device: str = "cpu") -> None:
+    """Print the scores and draw them.
+
+    Parameters
+    ----------
+    device
+        Device of the network: cpu, cuda or cuda:1.
+    """
+    from sliplens.models.checkpoint import load
+    from sliplens.plots.errors import draw_evaluation
+
+    run = call.keywords["run"]
+    evaluation = call(run=load(run, device=device))
+    if (out := call.keywords.get("out")) is not None and not (picture := Path(out) / "evaluation.png").is_file():
+        title = f"{Path(run).name}, {evaluation.split} trials of {Path(call.keywords['data']).name}"
+        draw_evaluation(evaluation, picture, title=title)
+    output.print_scores(evaluation)
+    if evaluation.baselines is not None:
+        output.print_baselines(evaluation, evaluation.baselines)
+
+
+@command(
+    "predict",
+    "models.predictions:predict",
+    "sliplens predict cup.mp4 --sensor tip.toml --plot margin.png -o margins.csv",
+)
+def predict(call: Any, *, plot: Path | None = None) -> None:
+    """Print the margins.
+
+    Parameters
+    ----------
+    plot
+        Picture to draw: margin with its interval over time, and label and forces if they are known.
+    """
+    if plot is not None:
+        from sliplens.plots.style import require_picture_path
+
+        require_picture_path(plot, example="margins.png")
+        require_new_file(plot, overwrite=call.keywords.get("overwrite", False))
+    predictions = call()
+    predictions = replace(predictions, rows=predictions.frame())  # a file is loaded once
+    output.show_predictions(predictions)
+    for reason, frames in predictions.withheld.items():
+        say(f"withheld in {number_of(frames, 'frame')}: {reason}")
+    if "friction" in call.keywords:
+        say(f"margins for the given friction of {call.keywords['friction']}")
+    if plot is not None:
+        from sliplens.plots.margins import draw_margins
+
+        names = [call.keywords[name] for name in ("source", "run") if name in call.keywords]
+        title = ", predicted by ".join(Path(name).name for name in names)
+        wrote(plot, draw_margins(predictions.frame(), plot, title=title))
+
+
+@command("export onnx", "models.onnx:export_onnx", "sliplens export onnx runs/mine/train -o tip.onnx")
+def export_onnx(call: Any) -> None:
+    """Print what was written."""
+    from sliplens.models.checkpoint import load
+
+    network = load(call.keywords["run"])
+    with OUT.status("Exporting and comparing"):
+        path = call(run=network)
+    manifest = network.manifest
+    about = f"{manifest.backbone}, {manifest.head} head, {manifest.image_size} px, {manifest.input} images"
+    wrote(path, f"{about}; predicts as the network does")
+
+
+@command("export lerobot", "recordings.exporting:export_lerobot", "sliplens export lerobot runs/mine/data -o lerobot")
+@command("export mcap", "recordings.exporting:export_mcap", "sliplens export mcap runs/mine/data -o mcap")
+def export_dataset(call: Any) -> None:
+    """Write the data set."""
+    call()
+
+
+@command("status", "runner:read_status", "sliplens status runs/mine/margins")
+def status(call: Any) -> None:
+    """Print the progress."""
+    output.print_status(Path(call.keywords["out"]), call())
+
+
+@command("grip", "grip.episodes:run_episodes", "sliplens grip -o runs/grip --object egg")
+def grip(call: Any) -> None:
+    """Print what became of the episodes, and draw the page."""
+    if "out" not in call.keywords:
+        raise InputError("name the folder to make with -o FOLDER")
+    out = Path(call.keywords["out"])
+    output.print_grip(call(out=out / "grip"), call.keywords)
+    output.draw_report(out)
+
+
+@command("hold", "grip.hold:hold_grip", "sliplens hold grip:cup simulated")
+def hold(
+    call: Any,
+    *,
+    dry_run: bool = False,
+    messages: str = "gripper-command",
+    joint: str | None = None,
+    second: str | None = None,
+    reference: tuple[Path, ...] = (),
+    friction: str | None = None,
+    same_object: bool = False,
+    sequence: bool = False,
+    sensor: str | None = None,
+    engine: Literal["auto", "torch", "openvino"] = "auto",
+    device: str = "cpu",
+    json: bool = False,
+) -> None:
+    """Print the commands.
+
+    Parameters
+    ----------
+    dry_run
+        Send nothing: print what would be sent, as if it were obeyed at once.
+    messages
+        Messages of a ROS 2 gripper: gripper-command, numbers or controllers.
+    joint
+        Joint of a ROS 2 gripper that has width and force; the first if not given.
+    second
+        Source of a second fingertip.
+    reference
+        Image of each untouched sensor; taken when the picture is still at first if not given.
+    friction
+        Coefficient of friction of the object, if it is known: 0.62, 0.5..0.8 or 0.58+-0.05.
+    same_object
+        All grasps are of one object: friction measured in a slip holds for the next.
+    sequence
+        Predict frames in order, with those before; for a network of the recipe sequence.
+    sensor
+        Profile of the sensors, a file or a name such as digit.
+    engine
+        Library that runs the network; auto is the fastest.
+    device
+        Device of the network: cpu, cuda or cuda:1.
+    json
+        Print a line of JSON for each command; else a line a second.
+    """
+    from sliplens.grip.controllers import make_controller
+    from sliplens.grip.gripper import open_gripper
+    from sliplens.grip.hold import GRIPPERS
+    from sliplens.grip.source import open_grip, usual_network
+    from sliplens.live import LiveReader
+    from sliplens.live.contract import SourceOptions
+    from sliplens.models import load
+    from sliplens.recordings.sensor import load_profile
+
+    arguments = call.keywords
+    gripper = "dry-run" if dry_run else arguments.get("gripper")
+    if gripper is None:
+        raise InputError("no gripper is given; name one with --gripper, or see what would be sent with --dry-run")
+    make_controller(arguments.get("controller", "margin"), arguments.get("settings"))  # refused before a network loads
+    names = [source for source in (arguments["source"], second) if source is not None]
+    if reference and len(reference) != len(names):
+        raise InputError(f"--reference takes an image for each source, {len(names)}, got {len(reference)}")
+    profile = None if sensor is None else load_profile(sensor)
+    sources = [open_grip(source, SourceOptions()) or source for source in names]
+    networks = [arguments.get("network") or usual_network(source, profile) for source in sources]
+    loaded = {name: load(name, device=device) for name in dict.fromkeys(networks) if name is not None}
+    with ExitStack() as stack:
+        if gripper not in GRIPPERS:
+            gripper = stack.enter_context(closing(open_gripper(gripper, messages=messages, joint=joint)))
+        readers = [
+            stack.enter_context(
+                LiveReader(
+                    source,
+                    None if network is None else loaded[network],
+                    reference=image,
+                    sensor=profile,
+                    friction=friction,
+                    same_object=same_object,
+                    sequence=sequence,
+                    engine=engine,
+                )
+            )
+            for source, network, image in zip(sources, networks, reference or [None] * len(sources), strict=True)
+        ]
+        result = call(source=readers, gripper=gripper, network=None, on_step=_Steps(readers, json=json))
+    say(result.why, aside=True)
+    for name, reader in zip(names, readers, strict=True):
+        if reader.lesson is not None:
+            say(f"{name}: {reader.lesson}" if len(readers) > 1 else reader.lesson, aside=True)
+    if "out" in arguments:
+        wrote(Path(arguments["out"]), number_of(len(result.steps), "command"))
+    if result.ended == "failed":
+        raise SliplensError(result.why)
+
+
+class _Steps:
+    """Printer of commands: a line of JSON each, or one a second, and each warning once."""
+
+    def __init__(self, readers: "Sequence[LiveReader]", *, json: bool) -> None:
+        self._readers, self._json, self._printed_s, self._printed = readers, json, -1.0, set[str]()
+
+    def __call__(self, step: "HoldStep") -> None:
+        for warning in (step.trouble, *(doubt for reader in self._readers for doubt in reader.doubts)):
+            if warning is not None and warning not in self._printed:
+                self._printed.add(warning)
+                say(warning, aside=True)
+        if self._json:
+            print(msgspec.json.encode(to_builtins(step)).decode(), flush=True)
+        elif time.monotonic() - self._printed_s >= 1:
+            self._printed_s = time.monotonic()
+            say(str(step))
+
+
+@command("report", "report.page:write_report", "sliplens report runs/mine")
+def report(call: Any) -> None:
+    """Print what was written."""
+    output.print_written(call())
+
+
+@command("doctor", "doctor:examine_installation", "sliplens doctor")
+def doctor(call: Any) -> None:
+    """Print a line for each part; exit code 2 if something that is installed does not work."""
+    with reporting(Terminal()), open_stage("Trying what is installed"):
+        items = call()
+    output.print_items(items)
+
+
+__all__ = ["COMMANDS", "Counter", "report_file"]

@@ -1,0 +1,381 @@
+"""Results of the commands on the terminal."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import groupby
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sliplens.cli.console import Terminal, print_table, say, wrote
+from sliplens.errors import InputError
+from sliplens.files import RUN_FILE
+from sliplens.progress import fold_equal, number_of, open_stage, report_file, reporting
+
+if TYPE_CHECKING:
+    from sliplens.doctor import Item
+    from sliplens.models.predictions import Predictions, TrialMargins
+    from sliplens.recordings import Dataset, TrialInfo
+    from sliplens.recordings.labelling import Labelling
+    from sliplens.report.page import Written
+    from sliplens.results.evaluation import Baselines, Evaluation, RegressionScores
+    from sliplens.results.grip import Grip
+    from sliplens.runner import Status
+
+_MOST_ROWS = 24
+"""Number of frames or trials that are listed one by one."""
+_MOST_TRIALS = 40
+"""Number of trials with a line each."""
+_MOST_NAMES = 6
+"""Number of names in a cell."""
+_GAP = "\u00b7"
+_BARS = "\u2581\u2582\u2583\u2584\u2585\u2586\u2587\u2588"
+_CLIP_FRAMES_PER_S = 30.0
+
+
+def show_predictions(predictions: "Predictions") -> None:
+    """Print each frame if they are few, else the course of each trial."""
+    if predictions.frames <= _MOST_ROWS:
+        rows = predictions.frame().to_pylist()
+        columns = {"true": "safety_margin", "known": "known"}
+        columns = {head: name for head, name in columns.items() if any(row.get(name) is not None for row in rows)}
+        cells = [
+            (
+                row.get("file") or f"{row['trial']} {row['frame']}",
+                _percent(row["prediction"]) if row["withheld"] is None else "withheld",
+                _interval(row["low_90"], row["high_90"]),
+                *(_percent(row[name]) for name in columns.values()),
+            )
+            for row in rows
+        ]
+        print_table("Safety margins", ("frame", "safety margin", "90 % interval", *columns), cells)
+        return
+    trials = predictions.trials()
+    for trial in trials[:_MOST_TRIALS]:
+        say(_course(trial))
+    if len(trials) > _MOST_TRIALS:
+        say(f"and {number_of(len(trials) - _MOST_TRIALS, 'more trial')}; -o margins.csv writes every frame")
+    withheld = f", {_GAP} where it is withheld" if predictions.withheld else ""
+    say(f"bars: safety margin, 0 % to 100 %, the lowest of the frames that share one{withheld}")
+
+
+def _course(trial: "TrialMargins") -> str:
+    where = f"frame {trial.lowest}" if trial.time_s is None else f"{trial.time_s:.2f} s"
+    low, high = trial.interval or (None, None)
+    interval = "" if low is None else f" ({_interval(low, high)})"
+    touching = "" if trial.touching is None else f", {trial.touching:,} touch" if trial.touching else ", none touches"
+    lowest = "none" if trial.lowest is None else f"{_percent(float(trial.margin[trial.lowest]))}{interval} at {where}"
+    withheld = f", {trial.withheld:,} withheld" if trial.withheld else ""
+    return (
+        f"{trial.trial}  {_sparkline(trial.margin.tolist())}  lowest {lowest}, "
+        f"{number_of(len(trial.margin), 'frame')}{touching}{withheld}"
+    )
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.0f} %"
+
+
+def _interval(low: float | None, high: float | None) -> str:
+    return "-" if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
+
+
+def _sparkline(shares: Sequence[float], *, width: int = 40) -> str:
+    """Draw shares in [0, 1] as bars of a line, the lowest of the frames that share a bar; NaN has none."""
+    count = min(width, len(shares))
+    parts = (shares[at * len(shares) // count : (at + 1) * len(shares) // count] for at in range(count))
+    lowest = (min((share for share in part if not isnan(share)), default=None) for part in parts)
+    return "".join(
+        _GAP if share is None else _BARS[round(min(max(share, 0.0), 1.0) * (len(_BARS) - 1))] for share in lowest
+    )
+
+
+def draw_simulation(arguments: Mapping[str, Any], *, preview: Path | None, video: Path | None) -> None:
+    """Draw the contact sheet and the clip of a simulated data set."""
+    from sliplens.plots.clip import write_clip
+    from sliplens.plots.contact_sheet import write_contact_sheet
+    from sliplens.simulation import make_recipe, plan_trials, simulate_examples, simulate_trial
+    from sliplens.simulation.loading import TRIAL_S
+
+    settings = {name: value for name, value in arguments.items() if name not in {"out", "overwrite", "on_progress"}}
+    device = settings.pop("device", "cpu")
+    recipe = make_recipe(settings.pop("preset", "small"), **settings)
+    with reporting(Terminal()):
+        if preview is not None:
+            with open_stage("Simulating trials for the preview"):
+                recordings = simulate_examples(recipe, device=device)
+            title = f"Simulated {recipe.sensor.name}, {recipe.resolved_displacement} displacement, seed {recipe.seed}"
+            write_contact_sheet(recordings, preview, title=title)
+            report_file(preview, f"{len(recordings)} of the trials that this recipe makes")
+        if video is not None:
+            # sampled at the clip's rate: a data set may have few frames a second
+            plan = replace(plan_trials(recipe)[0], frames=round(TRIAL_S * _CLIP_FRAMES_PER_S))
+            with open_stage("Simulating the trial"):
+                recording = simulate_trial(plan, device=device)
+            with open_stage("Writing the clip"):
+                write_clip(recording, video, frames_per_s=_CLIP_FRAMES_PER_S)
+            rate = f"{_CLIP_FRAMES_PER_S:g} frames/s"
+            report_file(video, f"trial {plan.trial} at {rate}; to look at, not to train on: video is lossy")
+
+
+def draw_audits(data: "Dataset", folder: Path) -> None:
+    """Draw the audit pages that are missing."""
+    from sliplens.plots.audit import write_audits
+
+    if write_audits(data, folder, on_progress=Terminal()):
+        wrote(folder, "a page for each trial: look at them before you train")
+
+
+def write_trials_page(data: "Dataset") -> None:
+    """Write the page of all trials."""
+    from sliplens.report.trials import write_trials_page as write
+
+    wrote(write(data), "all trials at a glance: margins, friction, flags")
+
+
+def show_labelling(title: str, data: "Dataset") -> None:
+    """Print what the labels of each trial rest on, what was assumed, and which frames have none."""
+    rows, notes, invalid = [], [], {}
+    for info in data.trials:
+        labels = data.read_labels(info)
+        counts = labels.count()
+        rows.append((info.trial, f"{counts.get('valid', 0)} of {info.frames}", *_basis(labels.labelling, counts)))
+        notes += labels.labelling.notes if labels.labelling is not None else ()
+        invalid[info.trial] = Counter({reason: count for reason, count in counts.items() if reason != "valid"})
+    print_table(title, ("trial", "valid", "mu", "lag, ms", "reference"), rows[:_MOST_ROWS])
+    if len(rows) > _MOST_ROWS:
+        say(f"  and {number_of(len(rows) - _MOST_ROWS, 'more trial')}, which the page of all trials shows")
+        invalid = {f"all {len(rows)} trials": sum(invalid.values(), Counter())}
+    for line in fold_equal(dict.fromkeys(notes)):
+        say(f"  note: {line}")
+    for trial, counts in invalid.items():
+        reasons = ", ".join(f"{count:,} {reason}" for reason, count in counts.items())
+        say(f"  {trial}: frames without a valid label: {reasons or 'none'}")
+
+
+def _basis(labelling: "Labelling | None", counts: dict[str, int]) -> Sequence[str]:
+    """Return friction, lag and reference in words."""
+    friction, lag, reference = "came with it" if counts.get("valid") else "-", "-", "its own"
+    if labelling is not None and labelling.basis is not None:
+        basis = labelling.basis
+        mu, low, high = basis.friction.mu, basis.friction.low, basis.friction.high
+        friction = f"{mu:.3f} given" if low == high else f"{mu:.3f} [{low:.3f}, {high:.3f}]"
+        if basis.lag is not None:
+            estimate = f"{1e3 * basis.lag.lag_s:+.1f} +- {1e3 * basis.lag.sigma_s:.1f}"
+            lag = ("unknown" if basis.lag.doubt else estimate) + (" (applied)" if basis.lag_applied else "")
+    if labelling is not None and labelling.reference.index is not None:
+        reference = f"frame {labelling.reference.index}"
+    return friction, lag, reference
+
+
+def show_splits(trials: "Sequence[TrialInfo]", splits: Sequence[str]) -> None:
+    """Print the content of each split."""
+    rows, usual = [], ("train", "validation", "test")
+    for name in sorted(set(splits), key=lambda name: (usual.index(name) if name in usual else len(usual), name)):
+        infos = [info for info, split in zip(trials, splits, strict=True) if split == name]
+        rows.append(
+            (
+                name,
+                str(len(infos)),
+                f"{sum(info.frames for info in infos):,}",
+                _ranges(info.day for info in infos),
+                _names({info.object for info in infos} - {""}),
+                _names({info.condition for info in infos}),
+            )
+        )
+    print_table("Splits", ("split", "trials", "frames", "days", "objects", "conditions"), rows)
+
+
+def show_moves(moves: "Sequence[tuple[TrialInfo, str]]") -> None:
+    """Print the trials that change their split."""
+    if not moves:
+        say("every trial is in its split already")
+        return
+    names = defaultdict(list)
+    for info, split in moves:
+        names[info.split, split].append(info.trial)
+    rows = [(old, new, str(len(those)), _names(those)) for (old, new), those in sorted(names.items())]
+    print_table("Moves", ("from", "to", "trials", "which"), rows)
+
+
+def _names(names: Iterable[str]) -> str:
+    from sliplens.images import natural_key
+
+    ordered = sorted(names, key=natural_key)
+    rest = len(ordered) - _MOST_NAMES
+    return ", ".join(ordered if rest < 2 else [*ordered[:_MOST_NAMES], f"{rest} more"]) or "-"
+
+
+def _ranges(numbers: Iterable[int]) -> str:
+    """Return numbers with runs drawn together: 1, 3-5."""
+    runs = groupby(enumerate(sorted(set(numbers))), key=lambda pair: pair[1] - pair[0])
+    ends = [(run[0][1], run[-1][1]) for run in (list(run) for _, run in runs)]
+    return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in ends)
+
+
+def print_known_trials(folder: Path, network: Path) -> None:
+    """Print how many trials of each split trained a network."""
+    from sliplens.models.checkpoint import load
+    from sliplens.recordings.dataset import load_dataset
+    from sliplens.training.evaluation import find_known
+
+    trials = load_dataset(folder).trials
+    known = Counter(trial.split for trial in find_known(trials, load(network)))
+    for split, count in Counter(trial.split for trial in trials).items():
+        say(f"{network} was trained on {known[split]} of the {count} {split} trials of {folder}")
+
+
+def print_scores(evaluation: "Evaluation") -> None:
+    """Print the scores of a network by condition."""
+    trials = len(evaluation.trials)
+    if count := evaluation.known_trials:
+        say(
+            f"  note: {count} of the {trials} trials trained or validated this network, which makes its scores too good"
+        )
+    print_table(
+        f"{evaluation.input} images, {evaluation.split} trials",
+        # short enough for 80 columns
+        ("condition", "frames", "MSE", "R2", "MAE", "in 90 %", "warns\nbefore", "false\n/min"),
+        [_score_row(name, evaluation) for name in evaluation.conditions],
+    )
+    if evaluation.friction:
+        say(f"friction: {evaluation.friction}")
+    if evaluation.sequence:
+        say("sequence: each margin is predicted from the frames of its contact so far")
+    if evaluation.ratio_r2:
+        scores = (f"{name} {'none' if r2 is None else f'{r2:.3f}'}" for name, r2 in evaluation.ratio_r2.items())
+        say(f"F_t / F_n is predicted with R2 {', '.join(scores)}")
+    if evaluation.wet_auroc is not None:
+        say(f"the network's uncertainty separates wet from dry: AUROC {evaluation.wet_auroc:.2f}")
+    if evaluation.risk is not None:
+        say(str(evaluation.risk))
+
+
+def _score_row(condition: str, evaluation: "Evaluation") -> tuple[str, ...]:
+    scores, lead = evaluation.conditions[condition], evaluation.lead_times[condition]
+    coverage = evaluation.reliability[condition].coverage.get("0.9")
+    return (
+        condition,
+        f"{scores.frames:,}",
+        *_errors(scores),
+        "-" if coverage is None else f"{100 * coverage:.0f} %",
+        "-" if lead.median_ms is None else f"{lead.median_ms:.0f} ms {lead.warned}/{lead.trials}",
+        f"{lead.false_per_minute:.1f}",
+    )
+
+
+def print_baselines(evaluation: "Evaluation", baselines: "Baselines") -> None:
+    """Print the estimators beside the network, what they were fitted on, and what failed."""
+    conditions = list(evaluation.conditions)
+    rows = {"the network": evaluation.conditions}
+    rows |= {name: scores.conditions for name, scores in baselines.estimators.items()}
+    print_table(
+        f"estimators from {baselines.markers} markers",
+        # two lines a head: the table fits into 80 columns
+        ("estimator", *(f"{name}\n{error}" for name in conditions for error in ("MSE", "R2", "MAE"))),
+        [(name, *(error for each in conditions for error in _errors(scores[each]))) for name, scores in rows.items()],
+    )
+    say(
+        f"estimators were fitted on {baselines.training_frames:,} frames of {baselines.training_trials} of the "
+        f"{baselines.offered_trials} training trials, {baselines.known_trials} of which trained the network; "
+        f"{100 * baselines.followed:.1f} % of the markers were followed while in view"
+    )
+    say(
+        "  note: except for the causal ones they count motion from the last frame before the pull, found in each trial "
+        "as a whole; the network gets one frame"
+    )
+    if baselines.shared_trials:
+        say("  note: they were fitted on trials that they are scored on, which makes their scores too good")
+    if baselines.failed:
+        name, why = next(iter(baselines.failed.items()))
+        say(
+            f"  note: markers could not be followed in {number_of(len(baselines.failed), 'trial')}, for which the "
+            f"training mean stands, or which was left out of the fit; {name}: {why}"
+        )
+
+
+def _errors(scores: "RegressionScores") -> tuple[str, str, str]:
+    return f"{scores.mse:.4f}", "none" if scores.r2 is None else f"{scores.r2:.3f}", f"{scores.mae:.3f}"
+
+
+def print_status(out: Path, works: "Sequence[Status]") -> None:
+    """Print the progress of each work on a result."""
+    if not works:
+        whole = out.is_file() or (out / RUN_FILE).is_file()
+        say(f"{out} is complete" if whole else f"nothing in {out} is divided into parts now")
+    for work in works:
+        frames = f"{work.frames_done:,} of {work.frames:,} frames"
+        say(f"{work.title}, --on {work.on}: {work.done:,} of {work.parts:,} parts, {frames}")
+        if work.frames_per_s is not None:
+            say(f"  {work.frames_per_s:.3g} a second" + (f", done at {work.ends}" if work.ends else ""))
+        if not work.running:
+            say("  not running; give the same command again to continue")
+        for failure in work.failed[:_MOST_ROWS]:
+            times = "once" if len(failure.errors) == 1 else f"{len(failure.errors)} times"
+            say(f"  failed, {times}: {failure.name}: {failure.errors[-1]}")
+
+
+def print_grip(result: "Grip", arguments: Mapping[str, Any]) -> None:
+    """Print what became of the episodes."""
+    table = result.episodes
+    rows = [
+        ("dropped", f"{int(table.dropped.sum())} of {len(table)}"),
+        ("crushed", f"{int(table.crushed.sum())}"),
+        ("slip, median", f"{1e3 * float(sorted(table.slip_m)[len(table) // 2]):.1f} mm"),
+        ("mean force", f"{table.mean_force_n.mean():.2f} N"),
+        ("over the least force that holds", f"{100 * table.force_excess.mean():.0f} %"),
+        ("time with a margin under 20 %", f"{table.under_20_s.mean():.2f} s"),
+    ]
+    names = [arguments.get(name, default) for name, default in (("controller", "margin"), ("object", "cup"))]
+    print_table(f"{names[0]} on a {names[1]}, {arguments.get('condition', 'dry')}", ("", ""), rows)
+    if (grasps := arguments.get("grasps", 1)) > 1:
+        by_grasp = [table.where(table.grasp == number) for number in range(1, grasps + 1)]
+        rows = [
+            (
+                f"{number}",
+                f"{int(grasp.dropped.sum())} of {len(grasp)}",
+                f"{100 * grasp.force_excess.mean():.0f} %",
+                f"{int((grasp.known_friction > 0).sum())} of {len(grasp)}",
+            )
+            for number, grasp in enumerate(by_grasp, start=1)
+        ]
+        columns = ("grasp", "dropped", "over the least force that holds", "friction known")
+        print_table("Grasp after grasp", columns, rows)
+
+
+def print_sources() -> None:
+    """Print the cameras and the other live sources."""
+    from sliplens.live import SOURCES, list_cameras
+
+    rows = [(str(camera.path), camera.name, *mode.in_words()) for camera in list_cameras() for mode in camera.modes]
+    columns = ("device", "name", "format", "size", "frames/s")
+    print_table("Cameras", columns, rows) if rows else say("no camera was found")
+    for words in ("simulated gripper that holds (grip, or grip:egg)", *(kind.words for kind in SOURCES.values())):
+        say(f"  {words}")
+
+
+def draw_report(workspace: Path) -> None:
+    """Draw the page of a workspace."""
+    from sliplens.report import write_report
+
+    print_written(write_report(workspace))
+
+
+def print_written(written: "Written") -> None:
+    """Print the page and the figures of a report."""
+    if written.figures:
+        count = number_of(len(written.figures) // 2, "figure")
+        wrote(written.figures[0].parent, f"{count} as PDF, their numbers as CSV")
+    wrote(written.page, "open it in a browser")
+
+
+def print_items(items: "Sequence[Item]") -> None:
+    """Print whether each part of the installation works."""
+    words = {True: "works", False: "fails", None: "not there"}
+    width = max(len(item.name) for item in items)
+    for item in items:
+        say(f"{words[item.works]:9}  {item.name:{width}}  {item.told}")
+    if failed := [item.name for item in items if item.works is False]:
+        verb = "does" if len(failed) == 1 else "do"
+        raise InputError(f"{', '.join(failed)} {verb} not work; see the lines above")

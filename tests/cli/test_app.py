@@ -1,0 +1,132 @@
+"""Commands are functions: options, defaults and help come from their signatures and docstrings."""
+
+import inspect
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+import cyclopts
+import pytest
+from command_line import refused, run
+
+import sliplens
+from sliplens.cli import TASKS
+from sliplens.cli.app import adapt, constants, name_options, typed_kind
+from sliplens.cli.commands import COMMANDS
+from sliplens.errors import InputError
+
+NAMED = pytest.mark.parametrize("name", COMMANDS)
+
+
+def function_of(name: str) -> Callable[..., object]:
+    module, _, function = COMMANDS[name].function.partition(":")
+    return getattr(import_module(module), function)
+
+
+@NAMED
+def test_every_option_is_heeded_and_every_parameter_has_help(name: str):
+    call, options = adapt(COMMANDS[name])
+    function, further = function_of(name), inspect.signature(COMMANDS[name].run).parameters
+    parameters = inspect.signature(function).parameters
+    several = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    groups = {kind for text in parameters.values() for kind in str(text.annotation).split(" | ") if "Options" in kind}
+    for option in options:
+        assert option in parameters or option in further or several or groups or "Settings" in str(parameters), option
+    assert (call.__doc__ or "").endswith(COMMANDS[name].example)
+
+
+def test_every_command_has_a_call_and_every_call_a_command():
+    calls = {COMMANDS[name].function.rpartition(":")[2] for name in COMMANDS} - {"shipped_profiles"}
+    public = {name for name in sliplens.__all__ if inspect.isfunction(getattr(sliplens, name))}
+    assert calls <= public
+    # `load*` and `plot` give a value to go on with; corrections are drafted by `label --draft`
+    assert public - calls == {"load", "load_dataset", "plot", "draft_corrections"}
+
+
+@NAMED
+def test_help_fits_the_terminal(name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "70")
+    assert run(*name.split(), "--help") == 0
+    text = capsys.readouterr().out
+    assert "None]" not in text
+    assert " ".join(COMMANDS[name].example.split()) in " ".join(text.split())
+
+
+@NAMED
+def test_examples_can_be_typed(name: str):
+    program, *words = shlex.split(COMMANDS[name].example)
+    assert (program, words[: len(name.split())]) == ("sliplens", name.split())
+    app = cyclopts.App(result_action="return_value")
+    app.default(adapt(COMMANDS[name])[0])
+    _, bound, _ = app.parse_args(words[len(name.split()) :], exit_on_error=False, print_error=False)
+    assert len(bound.arguments) >= 0
+
+
+def test_tasks_name_commands(capsys: pytest.CaptureFixture[str]):
+    assert run("help") == 0
+    everything = capsys.readouterr().out
+    for name, (title, commands) in TASKS.items():
+        assert f"{title} ({name})" in everything
+        assert run("help", name) == 0
+        lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+        assert lines == [COMMANDS[command].example for command in commands]
+    assert "choose one of start, predict" in refused(capsys, "help", "fly")
+
+
+def test_the_overview_has_a_line_for_each_command(capsys: pytest.CaptureFixture[str]):
+    assert run("--help") == 0
+    text = capsys.readouterr().out
+    assert all(f"\n{name} " in text for name in COMMANDS)
+
+
+@pytest.mark.parametrize(
+    ("hint", "kind"),
+    [
+        (bytes | Path | str | None, str),
+        (Path | None, Path),
+        (Sequence[str], tuple[str, ...]),
+        (str | Sequence[Path | str], tuple[str, ...]),
+        (Mapping[str, float] | None, tuple[str, ...]),
+        (Literal["a", "b"] | None, Literal["a", "b"]),
+        (tuple[float, float] | None, tuple[float, float]),
+        (tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]),
+        (float | tuple[float, float] | str, str),
+        (bytes, None),
+        (Callable[[int], int] | None, None),
+    ],
+    ids=str,
+)
+def test_types_become_the_simplest_that_can_be_typed(hint: Any, kind: Any):
+    assert typed_kind(hint) == kind
+
+
+def test_constants_are_names_with_numbers():
+    assert constants(["target=0.3", "down_n_s=2"]) == {"target": 0.3, "down_n_s": 2.0}
+    for text in ("target", "target=much", "=1x"):
+        with pytest.raises(InputError, match="NAME=NUMBER"):
+            constants([text])
+
+
+def test_messages_name_options_as_they_are_typed():
+    names = ["batch_size", "out"]
+    assert name_options("batch_size must be at least 1", names) == "--batch-size must be at least 1"
+    assert name_options("out of memory", names) == "out of memory"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("prdict cup.mp4", "did you mean predict?"),
+        ("predict a b --frction 0.7", "Did you mean --friction?"),
+        ("label a -o b --reference-fram 3", "--reference-frame"),
+        ("predict a b c", "'c'"),
+        ("predict a --batch-size many", "--batch-size"),
+        ("sensor", "did you mean sensor new or sensor list?"),
+    ],
+)
+def test_a_typing_error_is_one_line_with_its_cure(words: str, message: str, capsys: pytest.CaptureFixture[str]):
+    line = refused(capsys, *words.split())
+    assert message in line
+    assert "--help` lists" in line
