@@ -8,8 +8,8 @@ import pytest
 import torch
 import tyro
 from PIL import Image
-
 from sliplens.cli.explain import Explain
+
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.occlusion import marker_regions
 from sliplens.explainers.table import EXPLAINERS

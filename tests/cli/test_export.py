@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 import tyro
-
 from sliplens.cli.export import Export
+
 from sliplens.errors import InputError
 from sliplens.extras import import_onnxruntime
 from sliplens.files import RUN_FILE

@@ -11,11 +11,11 @@ import pytest
 import tyro
 from own_recording import write_video
 from pyarrow.csv import read_csv
-
-from sliplens import __version__
 from sliplens.cli.command import in_options
 from sliplens.cli.predict import Predict
 from sliplens.cli.train import Train
+
+from sliplens import __version__
 from sliplens.errors import InputError, SliplensError
 from sliplens.files import hash_file, hash_json, read_json
 from sliplens.images import write_png

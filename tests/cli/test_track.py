@@ -3,8 +3,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from data_sets import save_dataset
-
 from sliplens.cli.track import Track
+
 from sliplens.errors import ImageError, InputError
 from sliplens.images import write_png
 from sliplens.markers import track_markers

@@ -6,8 +6,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-
 from sliplens.cli.view import View
+
 from sliplens.errors import InputError, RecordingError
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import write_dataset_table

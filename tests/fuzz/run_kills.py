@@ -41,12 +41,12 @@ sys.path += [str(_TESTS / "fuzz"), str(_TESTS / "helpers")]
 import lightning  # noqa: E402, F401 (after the threads are told; imported once for all children)
 import numpy as np  # noqa: E402
 import pyarrow as pa  # noqa: E402
+import sliplens.cli.study  # noqa: E402
 import torch  # noqa: E402
 from changes import count_changes  # noqa: E402
 from hostile import FORMATS  # noqa: E402
 from small import make_recording, save_untrained  # noqa: E402
 
-import sliplens.cli.study  # noqa: E402
 import sliplens.files  # noqa: E402
 import sliplens.study.run as study  # noqa: E402
 from sliplens.cli import main as command  # noqa: E402

@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from command_line import refused, run
-
 from sliplens.cli.evaluate import Evaluate
+
 from sliplens.errors import ImageError, InputError
 from sliplens.markers import track_markers
 from sliplens.markers.estimators import ESTIMATORS, field_trial, get_estimator

@@ -66,7 +66,9 @@ def _call(words: list[str]) -> list[str]:
         meant = f"did you mean {' or '.join(near)}? " if near else ""
         raise InputError(f"there is no command {words[0]}; {meant}`sliplens --help` lists all")
     function, options = adapt(COMMANDS[name])
-    app = cyclopts.App(name=f"sliplens {name}", help_format="plaintext", version_flags=(), console=OUT, result_action="return_value")
+    app = cyclopts.App(
+        name=f"sliplens {name}", help_format="plaintext", version_flags=(), console=OUT, result_action="return_value"
+    )
     app.default(function)
     app["--help"].show = False
     try:

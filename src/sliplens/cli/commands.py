@@ -1,7 +1,6 @@
 """The commands: each calls a function of the library and prints its result."""
 
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import replace
@@ -16,7 +15,7 @@ from sliplens.cli.app import Command
 from sliplens.cli.console import OUT, Terminal, print_table, say, wrote
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import require_new_file, to_builtins
-from sliplens.progress import number_of, open_stage, report_file, reporting
+from sliplens.progress import number_of, open_stage, reporting
 
 if TYPE_CHECKING:
     from sliplens.grip.hold import HoldStep
@@ -492,6 +491,62 @@ def export_dataset(call: Any) -> None:
     call()
 
 
+@command(
+    "explain",
+    "study.workspace:explain_source",
+    "sliplens explain runs/mine/train runs/mine/data -o runs/mine/explain",
+    ("methods", "--method"),
+)
+def explain(call: Any) -> None:
+    """Write the maps."""
+    if "out" not in call.keywords:
+        raise InputError("name the folder of the maps with -o FOLDER")
+    call()
+
+
+@command(
+    "score", "study.workspace:score_explained", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score"
+)
+def score(call: Any) -> None:
+    """Print the scores."""
+    scores = call()
+    print_table(
+        f"deletion score, {scores.input} images ({scores.source}), fill {scores.fill}: lower is more faithful",
+        ("method", "D_AUC", "+-", "last step", "frames"),
+        [
+            (name, f"{method.mean:.3f}", f"{method.sd:.3f}", f"{method.last_step_mean:.3f}", str(method.frames))
+            for name, method in scores.methods.items()
+        ],
+    )
+    for alarm in scores.alarms:
+        say(f"  alarm: {alarm}")
+
+
+@command("diagnose", "study.diagnose:diagnose", "sliplens diagnose runs/mine/train runs/mine/data -o runs/mine/why")
+def diagnose(call: Any) -> None:
+    """Print the findings, and draw the page."""
+    diagnosis = call()
+    for sentence in filter(None, (*diagnosis.sentences, diagnosis.left_out)):
+        say(f"- {sentence}")
+    if "out" in call.keywords:
+        output.draw_report(Path(call.keywords["out"]))
+
+
+@command(
+    "study",
+    "study.run:run_study",
+    "sliplens study runs/mine/data --network runs/mine/train -o runs/mine/study",
+    ("networks", "--network"),
+    ("methods", "--method"),
+)
+def study(call: Any) -> None:
+    """Draw the page."""
+    if "out" not in call.keywords:
+        raise InputError("name the folder of the study with -o FOLDER")
+    call()
+    output.draw_report(Path(call.keywords["out"]))
+
+
 @command("status", "runner:read_status", "sliplens status runs/mine/margins")
 def status(call: Any) -> None:
     """Print the progress."""
@@ -634,6 +689,3 @@ def doctor(call: Any) -> None:
     with reporting(Terminal()), open_stage("Trying what is installed"):
         items = call()
     output.print_items(items)
-
-
-__all__ = ["COMMANDS", "Counter", "report_file"]

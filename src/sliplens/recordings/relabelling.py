@@ -28,7 +28,7 @@ from sliplens.recordings.trial_writer import TrialJob, TrialWork, write_trials
 def label_dataset(
     data: Dataset | Path | str,
     *,
-    out: Path | str,
+    out: Path | str | None = None,
     labelling: LabelSettings | None = None,
     corrections: Mapping[str, Corrections] | Path | str | None = None,
     on: str = "serial",
@@ -43,7 +43,7 @@ def label_dataset(
     data
         Data set that stores its force samples, or its folder.
     out
-        Folder to make. The folder of the data set itself gets the new labels once all of them are made.
+        Folder to make. If None, the data set itself gets the new labels once all of them are made.
     labelling
         Forces and friction as far as they are known, for all trials.
     corrections
@@ -63,7 +63,7 @@ def label_dataset(
     """
     with reporting(on_progress):
         data = data if isinstance(data, Dataset) else load_dataset(data)
-        labelling, out = labelling or LabelSettings(), Path(out)
+        labelling, out = labelling or LabelSettings(), data.folder if out is None else Path(out)
         in_place = out.resolve() == data.folder.resolve()
         stored = {info.trial: read_header(trial_path(data.folder, info.trial)).labelling for info in data.trials}
         before = {trial: origin.corrections for trial, origin in stored.items() if origin and origin.corrections}
