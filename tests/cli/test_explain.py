@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import tyro
+from command_line import typed
 from PIL import Image
-from sliplens.cli.explain import Explain
 
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.occlusion import marker_regions
@@ -22,9 +21,7 @@ QUICK = ("--method", "grad-cam", "occlusion")
 
 
 def run(*words: object) -> None:
-    command = tyro.cli(Explain, args=[str(word) for word in words])
-    command.check()
-    command.run()
+    typed("explain", *words)
 
 
 def refused(message: str, *words: object) -> None:

@@ -4,8 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-import tyro
-from sliplens.cli.export import Export
+from command_line import typed
 
 from sliplens.errors import InputError
 from sliplens.extras import import_onnxruntime
@@ -21,7 +20,7 @@ def refused(message: str, *words: object) -> None:
 
 
 def run(*words: object) -> None:
-    tyro.cli(Export, args=[str(word) for word in words]).run()
+    typed("export", *words)
 
 
 def names(folder: Path) -> list[str]:
@@ -31,14 +30,14 @@ def names(folder: Path) -> list[str]:
 def test_a_network_becomes_an_onnx_file(difference_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     pytest.importorskip("onnxscript")
     output = tmp_path / "new" / "a.onnx"
-    run(difference_run, "-o", output, "--onnx")
-    assert "ONNX Runtime predicts the same as the network" in capsys.readouterr().out
+    run("onnx", difference_run, "-o", output)
+    assert "predicts as the network does" in capsys.readouterr().out
     assert names(tmp_path / "new") == ["a.onnx"]
     session = import_onnxruntime().InferenceSession(str(output), providers=["CPUExecutionProvider"])
     told = session.get_modelmeta().custom_metadata_map
     assert json.loads(told["sliplens.manifest"])["backbone"] == "shufflenet_v2_x1_0"
     before = output.read_bytes()
-    refused(r"a\.onnx exists; choose another file or pass --overwrite", difference_run, "-o", output, "--onnx")
+    refused(r"a\.onnx exists; choose another file or pass --overwrite", "onnx", difference_run, "-o", output)
     assert output.read_bytes() == before
 
 
@@ -51,7 +50,7 @@ def test_a_data_set_comes_back_from_other_formats(
         pytest.importorskip("rosbags")
     output = tmp_path / "out"
     chosen = ("--trials", "test-wet-7", "train-dry-1")
-    run(small_dataset.folder, "-o", output, f"--{kind}", *chosen)
+    run(kind, small_dataset.folder, "-o", output, *chosen)
     sources = [output] if kind == "lerobot" else [path for path in sorted(output.iterdir()) if path.suffix == ".mcap"]
     found = {capture.trial for path in sources for capture in open_captures(path, options=ReadOptions())}
     assert found == {"test-wet-7", "train-dry-1"}
@@ -63,10 +62,10 @@ def test_a_data_set_comes_back_from_other_formats(
     assert record["config"]["data_hash"] == small_dataset.hash
     assert names(tmp_path) == ["out"]
     capsys.readouterr()
-    run(small_dataset.folder, "-o", output, f"--{kind}", *chosen)
+    run(kind, small_dataset.folder, "-o", output, *chosen)
     assert "kept" in capsys.readouterr().out
-    refused("holds a result of other settings", small_dataset.folder, "-o", output, f"--{kind}")
-    run(small_dataset.folder, "-o", output, f"--{kind}", "--trials", "test-dry-6", "--overwrite")
+    refused("holds a result of other settings", kind, small_dataset.folder, "-o", output)
+    run(kind, small_dataset.folder, "-o", output, "--trials", "test-dry-6", "--overwrite")
     assert "1 trial, 12 frames" in capsys.readouterr().out
     assert names(tmp_path) == ["out"]
 
@@ -77,27 +76,24 @@ def test_a_failure_leaves_nothing_behind(small_dataset: Dataset, tmp_path: Path,
         raise InputError("the disk is full")
 
     monkeypatch.setattr("sliplens.recordings.formats.lerobot_export.write_lerobot", fail)
-    refused("the disk is full", small_dataset.folder, "-o", tmp_path / "out", "--lerobot")
+    refused("the disk is full", "lerobot", small_dataset.folder, "-o", tmp_path / "out")
     assert not names(tmp_path)
 
 
 def test_what_others_made_is_never_replaced(small_dataset: Dataset, tmp_path: Path):
     (tmp_path / "mine").write_text("")
-    refused("was not made by sliplens", small_dataset.folder, "-o", tmp_path, "--lerobot", "--overwrite")
+    refused("was not made by sliplens", "lerobot", small_dataset.folder, "-o", tmp_path, "--overwrite")
     assert names(tmp_path) == ["mine"]
 
 
 def test_the_wrong_kind_of_source_is_told(difference_run: Path, small_dataset: Dataset, tmp_path: Path):
     data, out = small_dataset.folder, tmp_path / "a.onnx"
-    refused("is a data set, and --onnx writes a network", data, "-o", out, "--onnx")
-    refused("is a run, and --lerobot writes a data set", difference_run, "-o", out, "--lerobot")
-    refused("one of --onnx, --lerobot and --mcap, got none", data, "-o", out)
-    refused("got --lerobot and --mcap", data, "-o", out, "--lerobot", "--mcap")
-    refused("does not end in .onnx", difference_run, "-o", tmp_path / "a", "--onnx")
-    refused("leave it out with --onnx", difference_run, "-o", out, "--onnx", "--trials", "a")
-    refused("has no trial nobody; it has train-dry-0, .*, test-wet-7$", data, "-o", out, "--mcap", "--trials", "nobody")
-    refused("the run .*nothing does not exist", tmp_path / "nothing", "-o", out, "--onnx")
-    refused("the data set .*nothing does not exist", tmp_path / "nothing", "-o", out, "--mcap")
+    refused("is not a run", "onnx", data, "-o", out)
+    refused("does not exist|is no data set|make a data set", "lerobot", difference_run, "-o", out)
+    refused("does not end in .onnx", "onnx", difference_run, "-o", tmp_path / "a")
+    refused("has no trial nobody; it has train-dry-0, .*, test-wet-7$", "mcap", data, "-o", out, "--trials", "nobody")
+    refused("the run .*nothing does not exist", "onnx", tmp_path / "nothing", "-o", out)
+    refused("the data set .*nothing does not exist", "mcap", tmp_path / "nothing", "-o", out)
     assert not names(tmp_path)
 
 
@@ -105,8 +101,8 @@ def test_without_the_extra_the_cure_is_told(difference_run: Path, tmp_path: Path
     monkeypatch.setattr("sliplens.extras.find_spec", lambda name: None if name != "onnx" else name)
     refused(
         r'needs onnxscript and onnxruntime, which are not installed; install with `pip install "sliplens\[onnx\]"`',
+        "onnx",
         difference_run,
         "-o",
         tmp_path / "a.onnx",
-        "--onnx",
     )

@@ -1,19 +1,14 @@
 """`sliplens predict`: the file it writes, and what is said to mistakes."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
-import tyro
+from command_line import typed
 from own_recording import write_video
 from pyarrow.csv import read_csv
-from sliplens.cli.command import in_options
-from sliplens.cli.predict import Predict
-from sliplens.cli.train import Train
 
 from sliplens import __version__
 from sliplens.errors import InputError, SliplensError
@@ -25,9 +20,7 @@ from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 
 def run(*words: object) -> None:
-    command = tyro.cli(Predict, args=[str(word) for word in words])
-    command.check()
-    command.run()
+    typed("predict", *words)
 
 
 def refused(message: str, *words: object) -> None:
@@ -128,22 +121,6 @@ def test_many_frames_are_told_by_their_lowest(difference_run: Path, small_datase
         assert len([sign for sign in line if "\u2581" <= sign <= "\u2588"]) == min(40, len(margins))
     assert {"normal_force_n", "tangential_force_n", "safety_margin"} <= rows[0].keys()
     assert (tmp_path / "a.png").stat().st_size > 10_000
-
-
-def test_mistakes_are_told_before_torch_is_imported(difference_folder: Path, tmp_path: Path):
-    script = "import sys; from sliplens.cli import main; code = main(sys.argv[1:]); print(code, 'torch' in sys.modules)"
-    words = ["predict", "chromatouch-difference", str(difference_folder), "-o", str(tmp_path / "a.txt")]
-    told = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=True)
-    assert told.stdout.split() == ["2", "False"]
-    assert "does not end in" in told.stderr
-
-
-def test_errors_name_the_option_that_was_typed():
-    command = tyro.cli(Train, args=["data", "-o", "run", "--batch-size", "1"])
-    said = "batch_size must be at least 2, since batch normalisation needs more than one image"
-    assert in_options(said, command) == said.replace("batch_size", "--batch-size")
-    assert in_options("epochs must be positive, got -1", command) == "--epochs must be positive, got -1"
-    assert in_options("the output of all epochs", command) == "the output of all epochs"
 
 
 def test_a_graphics_card_that_is_not_there_is_told(difference_run: Path, difference_folder: Path, tmp_path: Path):

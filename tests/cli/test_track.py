@@ -2,8 +2,8 @@ import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from command_line import command
 from data_sets import save_dataset
-from sliplens.cli.track import Track
 
 from sliplens.errors import ImageError, InputError
 from sliplens.images import write_png
@@ -32,7 +32,7 @@ def folder(tmp_path, moving):
 
 def test_a_folder_of_images_becomes_a_table_of_displacements(folder, tmp_path):
     output = tmp_path / "tracks.parquet"
-    Track(source=folder, output=output, reference=tmp_path / "untouched.png").run()
+    command("track", source=folder, out=output, reference=tmp_path / "untouched.png")
     table = pq.read_table(output)
     assert table.num_rows == 4 * 30
     assert set(table["status"].to_pylist()) == {"followed"}
@@ -46,7 +46,7 @@ def test_a_folder_of_images_becomes_a_table_of_displacements(folder, tmp_path):
 
 def test_without_a_reference_the_first_frame_stands_for_it_and_says_so(folder, tmp_path, capsys):
     output = tmp_path / "tracks.parquet"
-    Track(source=folder, output=output).run()
+    command("track", source=folder, out=output)
     table = pq.read_table(output)
     first = np.array(table["frame"]) == 0
     np.testing.assert_allclose(np.array(table["dx_px"])[first], 0.0, atol=1e-5)
@@ -62,14 +62,14 @@ def test_a_folder_of_parts_holds_the_same_rows_wherever_they_were_made(folder, t
     assert whole.trials[0].markers == 30
     assert whole.trials[0].followed_share == 1
     with pytest.raises(InputError, match="leave out --on, or --video"):
-        Track(source=folder, output=tmp_path / "b.parquet", video=tmp_path / "b.mp4", on="processes").run()
+        command("track", source=folder, out=tmp_path / "b.parquet", video=tmp_path / "b.mp4", on="processes")
 
 
 def test_a_data_set_gives_what_the_tracker_gives(trials, tmp_path):
     trial = trials["chromatouch"]
     data = save_dataset(tmp_path / "data", trial, split="test", simulated=True).folder
     output, clip = tmp_path / "tracks.parquet", tmp_path / "clip.mp4"
-    Track(source=data, output=output, markers="chromatouch", video=clip).run()
+    command("track", source=data, out=output, markers="chromatouch", video=clip)
     table = pq.read_table(output)
     tracks = track_markers(trial.frames, trial.reference, "chromatouch")
     known = np.array(table["marker"]) < tracks.from_reference.sum()
@@ -84,23 +84,23 @@ def test_a_data_set_gives_what_the_tracker_gives(trials, tmp_path):
 def test_what_cannot_be_followed_is_refused_and_leaves_no_file(folder, tmp_path, rng):
     output = tmp_path / "tracks.parquet"
     with pytest.raises(InputError, match=r"does not end in \.parquet"):
-        Track(source=folder, output=tmp_path / "tracks.csv").run()
+        command("track", source=folder, out=tmp_path / "tracks.csv")
     with pytest.raises(InputError, match="there is no kind of markers named 'digit'"):
-        Track(source=folder, output=output, markers="digit").run()
+        command("track", source=folder, out=output, markers="digit")
     with pytest.raises(InputError, match="named twice"):
-        Track(source=folder, output=output, reference=tmp_path / "untouched.png", reference_frame=1).run()
+        command("track", source=folder, out=output, reference=tmp_path / "untouched.png", reference_frame=1)
     with pytest.raises(InputError, match="has no frame 9"):
-        Track(source=folder, output=output, reference_frame=9).run()
+        command("track", source=folder, out=output, reference_frame=9)
     with pytest.raises(InputError, match="does not exist"):
-        Track(source=tmp_path / "nothing", output=output).run()
+        command("track", source=tmp_path / "nothing", out=output)
     with pytest.raises(InputError, match="no trial other"):
-        Track(source=folder, output=output, trial="other").run()
+        command("track", source=folder, out=output, trial="other")
     with pytest.raises(InputError, match=r"does not end in \.mp4"):
-        Track(source=folder, output=output, video=tmp_path / "clip.avi").run()
+        command("track", source=folder, out=output, video=tmp_path / "clip.avi")
     small = tmp_path / "small.png"
     write_png(small, rng.integers(0, 255, (40, 40, 3), dtype=np.uint8))
     with pytest.raises(ImageError):
-        Track(source=folder, output=output, reference=small).run()
+        command("track", source=folder, out=output, reference=small)
     assert not output.exists()
     assert not list(tmp_path.glob(".*"))
 
@@ -110,13 +110,13 @@ def test_one_frame_alone_has_nothing_to_move_against(tmp_path, moving):
     path.mkdir()
     write_png(path / "frame.png", moving[1][0])
     with pytest.raises(InputError, match="one frame and no reference"):
-        Track(source=path, output=tmp_path / "tracks.parquet").run()
+        command("track", source=path, out=tmp_path / "tracks.parquet")
 
 
 def test_a_result_is_not_overwritten_unless_asked(folder, tmp_path):
     output = tmp_path / "tracks.parquet"
     output.write_text("mine")
     with pytest.raises(InputError, match="exists"):
-        Track(source=folder, output=output).run()
-    Track(source=folder, output=output, overwrite=True).run()
+        command("track", source=folder, out=output)
+    command("track", source=folder, out=output, overwrite=True)
     assert pq.read_table(output).num_rows == 120

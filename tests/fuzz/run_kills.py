@@ -41,12 +41,12 @@ sys.path += [str(_TESTS / "fuzz"), str(_TESTS / "helpers")]
 import lightning  # noqa: E402, F401 (after the threads are told; imported once for all children)
 import numpy as np  # noqa: E402
 import pyarrow as pa  # noqa: E402
-import sliplens.cli.study  # noqa: E402
 import torch  # noqa: E402
 from changes import count_changes  # noqa: E402
 from hostile import FORMATS  # noqa: E402
 from small import make_recording, save_untrained  # noqa: E402
 
+import sliplens.cli.output  # noqa: E402
 import sliplens.files  # noqa: E402
 import sliplens.study.run as study  # noqa: E402
 from sliplens.cli import main as command  # noqa: E402
@@ -297,7 +297,7 @@ def shorten_study() -> None:
     defaults = {"tests": ("score", "faithfulness", "truth"), "settings": study.SETTINGS, "steps": 8}
     StudyConfig.__init__.__kwdefaults__ = {**(StudyConfig.__init__.__kwdefaults__ or {}), **defaults}
     study.JudgingByTruth = partial(study.JudgingByTruth, pairs=2)
-    sliplens.cli.study.Report.run = lambda self: None  # noqa: ARG005
+    sliplens.cli.output.draw_report = lambda workspace: None  # noqa: ARG005
 
 
 class Bench:

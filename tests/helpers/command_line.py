@@ -2,7 +2,9 @@
 
 import pytest
 
-from sliplens.cli import main
+from sliplens.cli import call_command, main
+from sliplens.cli.app import adapt
+from sliplens.cli.commands import COMMANDS
 
 
 def run(*words: object) -> int:
@@ -18,3 +20,13 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
     lines = [line for line in captured.err.strip().splitlines() if not line.lstrip().startswith("note: ")]
     assert len(lines) == 1
     return lines[0]
+
+
+def typed(*words: object) -> None:
+    """Run a command as it is typed; errors are raised instead of printed."""
+    call_command([str(word) for word in words])
+
+
+def command(name: str, **options: object) -> None:
+    """Call a command with parsed options; errors are raised instead of printed."""
+    adapt(COMMANDS[name])[0](**options)

@@ -1,6 +1,7 @@
 import json
 import shutil
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,8 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from command_line import refused, run
-from sliplens.cli.evaluate import Evaluate
 
+import sliplens as sl
 from sliplens.errors import ImageError, InputError
 from sliplens.markers import track_markers
 from sliplens.markers.estimators import ESTIMATORS, field_trial, get_estimator
@@ -217,9 +218,7 @@ def test_the_command_puts_them_beside_the_network(data: Dataset, network: Path, 
 def test_what_was_followed_before_an_interruption_is_not_followed_again(
     data: Dataset, network: Path, tmp_path: Path, monkeypatch
 ):
-    command = Evaluate(
-        model=network, data=data.folder, output=tmp_path / "out", baselines=("constant",), baseline_trials=2
-    )
+    command = partial(sl.evaluate, sl.load(network), data, tmp_path / "out", baselines=("constant",), baseline_trials=2)
     count = 2 + len(data.select(split="test"))
     calls = []
 
@@ -231,9 +230,9 @@ def test_what_was_followed_before_an_interruption_is_not_followed_again(
 
     monkeypatch.setattr("sliplens.training.evaluation.track_markers", follow)
     with pytest.raises(KeyboardInterrupt):
-        command.run()
+        command()
     assert not (tmp_path / "out").exists()
-    command.run()
+    command()
     # two were done, the third was begun and is begun anew
     assert len(calls) == count + 1
     assert json.loads((tmp_path / "out" / "result.json").read_text())["baselines"]["failed"] == {}

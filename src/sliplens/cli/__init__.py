@@ -56,7 +56,7 @@ def _overview() -> None:
     OUT.print(table, highlight=False)
 
 
-def _call(words: list[str]) -> list[str]:
+def call_command(words: list[str]) -> list[str]:
     """Call the command that the words name; returns the names of its options for the messages of its errors."""
     name = next((" ".join(words[:count]) for count in (2, 1) if " ".join(words[:count]) in COMMANDS), None)
     if name is None:
@@ -119,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif words[0] == "help":
             _help(words[1:])
         else:
-            _call(words)
+            call_command(words)
     except BrokenPipeError:
         # a reader such as `| head` has ended; what is still written goes nowhere
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
