@@ -32,7 +32,7 @@ def test_parameters_are_options_with_the_same_defaults(name: str):
     for option, parameter in inspect.signature(call).parameters.items():
         assert option in options
         if option in parameters and parameter.default not in ((), None):
-            assert parameter.default == parameters[option].default
+            assert parameter.default in (parameters[option].default, (parameters[option].default,))
     assert (call.__doc__ or "").endswith(COMMANDS[name].example)
 
 

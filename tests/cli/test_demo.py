@@ -1,6 +1,7 @@
 """The demo, small: every stage, the page that grows, and a second run that has nothing to do."""
 
 from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -95,7 +96,7 @@ def test_a_demo_of_other_settings_is_refused_with_a_cure_that_exists(
     def stop(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sliplens.demo, "_to_look_at", stop)
+    monkeypatch.setattr(sliplens.demo, "simulate", stop)
     assert run("demo", tmp_path / "demo") == 130
     assert run("demo", tmp_path / "demo") == 130  # the same goes on
     capsys.readouterr()
@@ -104,7 +105,7 @@ def test_a_demo_of_other_settings_is_refused_with_a_cure_that_exists(
 
 
 def test_wrong_options_are_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert "--max-minutes must be above 0" in refused(capsys, "demo", tmp_path / "a", "--train", "--max-minutes", "0")
+    assert "must be above 0" in refused(capsys, "demo", tmp_path / "a", "--train-minutes", "0")
     assert "folder of real frames" in refused(capsys, "demo", tmp_path / "a", "--real-frames", tmp_path / "none")
     assert not (tmp_path / "a").exists()
 
@@ -120,8 +121,9 @@ def test_real_frames_are_found_where_the_environment_says(tmp_path: Path, monkey
 def test_the_command_says_where_the_page_is_as_soon_as_it_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    def made(out: Path, *, on_page, on_progress, **options: object) -> Path:
-        page = out / "report.html"
+    def made(out: str, *, on_page: Callable | None = None, on_progress: Callable | None = None) -> Path:
+        assert on_page is not None
+        page = Path(out) / "report.html"
         on_page(page)
         on_progress.note("a method does not beat a random order")
         return page

@@ -12,7 +12,7 @@ from sliplens.report.grip import table_episodes
 
 
 def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    words = ("grip", "-o", tmp_path, "--controller", "fixed", "--episodes", 4, "--set", "force_n=3.5", "--mass", "0.05")
+    words = ("grip", "-o", tmp_path, "--controller", "fixed", "--episodes", 4, "--set", "force_n=3.5", "--script", "mass_kg=0.05")
     assert run(*words) == 0
     told = capsys.readouterr().out
     assert "0 of 4" in told
@@ -44,9 +44,9 @@ def test_grasps_of_the_same_objects_have_a_row_each(tmp_path: Path, capsys: pyte
         (("--sequence",), "add --rendered, or leave out --sequence"),
         (("--controller", "magic"), "there is no controller named 'magic'"),
         (("--condition", "oily"), "there is no condition named 'oily'"),
-        (("--set", "target"), "write --set NAME=NUMBER"),
+        (("--set", "target"), "write NAME=NUMBER"),
         (("--set", "speed=3"), "has no constant 'speed'"),
-        (("--mass", "-1"), "mass_kg must be above 0"),
+        (("--script", "mass_kg=-1"), "mass_kg must be above 0"),
         (("--network", "nothing"), "the run nothing does not exist"),
     ],
 )

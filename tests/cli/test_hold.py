@@ -48,7 +48,7 @@ def test_frames_of_another_sensor_are_told_once(small_dataset: Dataset, differen
         (("grip:anvil", "--dry-run"), "there is no object named 'anvil'"),
         (
             ("simulated", "--dry-run", "--reference", "one.png", "two.png"),
-            "an image a source, 1, got 2",
+            "an image for each source, 1, got 2",
         ),
         (("simulated", "--dry-run", "--controller", "fixed", "--set", "speed=3"), "has no constant 'speed'"),
         (("simulated", "--dry-run", "--sequence", "--friction", "0.6"), "leave out one of them"),

@@ -63,7 +63,7 @@ def test_what_can_be_read_is_listed(capsys: pytest.CaptureFixture[str]):
     ("words", "told"),
     [
         (["99"], "the camera /dev/video99 is not there; plug it in"),
-        (["0", "--size", "640"], "--size is '640'; give width and height as 640x480"),
+        (["0", "--size", "640"], "--size requires 2"),
         (["simulated", "--sink", "paper"], "there is no sink named 'paper'; choose one of json"),
         (["simulated", "--speed", "2"], "the simulated fingertip takes no --speed; leave it out"),
         (["nowhere"], "nowhere is no source that is known"),

@@ -43,7 +43,7 @@ def test_the_trials_go_where_the_table_says(folder: Path, table: Path, capsys: p
     assert ["test", "train", "1", "test-dry-6"] in cells(out)
     assert ["train", "test", "1", "train-dry-3"] in cells(out)
     assert "3 of 8 trials moved" in out
-    assert "train anew" in out
+    assert "train again" in out
     assert run("check", folder) == 0
     # and nothing moves twice
     after = contents(folder)
@@ -52,7 +52,7 @@ def test_the_trials_go_where_the_table_says(folder: Path, table: Path, capsys: p
     assert contents(folder) == after
     out = capsys.readouterr().out
     assert "every trial is in its split already" in out
-    assert "train anew" not in out
+    assert "train again" not in out
 
 
 def test_names_with_brackets_are_shown_as_they_are(folder: Path, table: Path, capsys: pytest.CaptureFixture[str]):

@@ -75,7 +75,6 @@ def test_two_networks_of_one_input_are_refused(
         (("--method", "guess"), "no explainer named 'guess'"),
         (("--random-orders", 0), "at least 1"),
         (("--on", "cloud"), "no executor named 'cloud'"),
-        (("--preset", "thesis"), "name a data set, or --preset"),
     ],
 )
 def test_mistakes_are_told_before_anything_is_made(

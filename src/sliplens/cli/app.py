@@ -89,7 +89,7 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     options = [replace(option, aliases=aliases.get(option.name, ())) for option in found]
     by_name = {option.name: option for option in options}
     reports = "on_progress" in signature(function).parameters
-    groups = {option.group: _group_type(function, option.group) for option in options if option.group}
+    groups = {option.group: _options_type(_hint_of(function, option.group)) for option in options if option.group}
 
     def call(*positional: object, **given: object) -> None:
         places = [option.name for option in options if option.positional]
@@ -123,7 +123,7 @@ def _options(function: Callable[..., object]) -> list[_Option]:
         if parameter.kind is Parameter.VAR_KEYWORD:
             found += _fields_of(get_args(hint)[0] if get_origin(hint) is Unpack else hint)
             continue
-        group = _group_type(function, name)
+        group = _options_type(hint)
         if group is not None:
             found += [option for option in _fields_of(group, group=name) if option.name not in {o.name for o in found}]
             continue
@@ -137,7 +137,7 @@ def _options(function: Callable[..., object]) -> list[_Option]:
             _Option(
                 name=name,
                 kind=kind,
-                default=() if isinstance(default, Mapping) else default,
+                default=(default,) if isinstance(default, str) and get_origin(kind) is tuple else default,
                 help=helps.get(name, ""),
                 positional=parameter.kind is Parameter.POSITIONAL_OR_KEYWORD,
             )
@@ -147,13 +147,17 @@ def _options(function: Callable[..., object]) -> list[_Option]:
 
 def _fields_of(kind: Any, *, group: str = "") -> list[_Option]:
     """Return the fields of a dataclass or TypedDict as options."""
-    helps, hints = _parameter_help(kind), get_type_hints(kind)
+    helps, hints, found = _parameter_help(kind), get_type_hints(kind), []
     defaults = {field.name: field.default for field in fields(kind)} if is_dataclass(kind) else {}
-    return [
-        _Option(name=name, kind=typed, default=defaults.get(name), help=helps.get(name, ""), group=group)
-        for name, hint in hints.items()
-        if (typed := typed_kind(hint)) is not None
-    ]
+    for name, hint in hints.items():
+        typed, inner = typed_kind(hint), _options_type(hint)
+        if typed is not None:
+            found.append(
+                _Option(name=name, kind=typed, default=defaults.get(name), help=helps.get(name, ""), group=group)
+            )
+        elif inner is not None and inner.__name__.endswith("Options") and not group:
+            found += _fields_of(inner, group=name)
+    return found
 
 
 def _further(run: Callable[..., object]) -> list[_Option]:
@@ -176,9 +180,8 @@ def _parameter_help(kind: Any) -> dict[str, str]:
     return helps
 
 
-def _group_type(function: Callable[..., object], name: str) -> Any:
+def _options_type(hint: Any) -> Any:
     """Return the dataclass of options that a parameter takes; None for any other parameter."""
-    hint = get_type_hints(function).get(name)
     kinds = [kind for kind in _members(hint) if is_dataclass(kind)] if typed_kind(hint) is None else []
     return next((kind for kind in kinds if all(_has_default(field) for field in fields(kind))), None)
 
@@ -227,8 +230,17 @@ def typed_kind(hint: Any) -> Any:
     return None
 
 
+def _hint_of(function: Callable[..., object], name: str) -> Any:
+    """Return the type of a parameter, or of a key of its typed keyword arguments."""
+    hints = get_type_hints(function)
+    for hint in hints.values():
+        if get_origin(hint) is Unpack:
+            hints = hints | get_type_hints(get_args(hint)[0])
+    return hints.get(name)
+
+
 def _is_constants(function: Callable[..., object], name: str) -> bool:
-    members = _members(get_type_hints(function).get(name))
+    members = _members(_hint_of(function, name))
     return any(get_origin(member) is Mapping and get_args(member) == (str, float) for member in members)
 
 

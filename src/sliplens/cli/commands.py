@@ -57,7 +57,14 @@ def demo(call: Any) -> None:
     say(f"open {page.resolve()}")
 
 
-@command("live", "live.loop:read_live", "sliplens live 0 --network chromatouch-pair --reference untouched.png")
+@command(
+    "live",
+    "live.loop:read_live",
+    "sliplens live 0 --network chromatouch-pair --reference untouched.png",
+    ("list_sources", "--list"),
+    ("rate_hz", "--rate"),
+    ("smoothing_s", "--smoothing"),
+)
 def live(
     call: Any,
     *,
@@ -97,14 +104,14 @@ def live(
     """
     from sliplens.grip.source import open_grip, usual_network
     from sliplens.live import LiveReader
-    from sliplens.live.contract import SourceOptions
+    from sliplens.live.contract import LiveOptions
     from sliplens.recordings import TrialFacts
     from sliplens.recordings.sensor import is_profile, load_profile
 
     if list_sources:
         output.print_sources()
         return
-    arguments = {"source": "simulated", "network": None, "options": SourceOptions(), "sensor": None} | call.keywords
+    arguments = {"source": "simulated", "network": None, "options": LiveOptions(), "sensor": None} | call.keywords
     sensor = arguments["sensor"] or ""
     profile = arguments["sensor"] = load_profile(sensor) if is_profile(sensor) else None
     if (grip := open_grip(arguments["source"], arguments["options"])) is not None:
@@ -468,7 +475,10 @@ def predict(call: Any, *, plot: Path | None = None) -> None:
 
         names = [call.keywords[name] for name in ("source", "run") if name in call.keywords]
         title = ", predicted by ".join(Path(name).name for name in names)
-        wrote(plot, draw_margins(predictions.frame(), plot, title=title))
+        trials = draw_margins(predictions.frame(), plot, title=title)
+        wrote(plot, f"margin over time of {number_of(trials, 'trial')}")
+    if predictions.path is not None:
+        wrote(predictions.path, f"{number_of(predictions.frames, 'frame')}, by {predictions.engine}")
 
 
 @command("export onnx", "models.onnx:export_onnx", "sliplens export onnx runs/mine/train -o tip.onnx")
@@ -553,7 +563,13 @@ def status(call: Any) -> None:
     output.print_status(Path(call.keywords["out"]), call())
 
 
-@command("grip", "grip.episodes:run_episodes", "sliplens grip -o runs/grip --object egg")
+@command(
+    "grip",
+    "grip.episodes:run_episodes",
+    "sliplens grip -o runs/grip --object egg --rendered",
+    ("settings", "--set"),
+    ("latency_s", "--latency"),
+)
 def grip(call: Any) -> None:
     """Print what became of the episodes, and draw the page."""
     if "out" not in call.keywords:
@@ -563,7 +579,14 @@ def grip(call: Any) -> None:
     output.draw_report(out)
 
 
-@command("hold", "grip.hold:hold_grip", "sliplens hold grip:cup simulated")
+@command(
+    "hold",
+    "grip.hold:hold_grip",
+    "sliplens hold grip:cup --gripper simulated",
+    ("settings", "--set"),
+    ("ceiling_n", "--ceiling"),
+    ("watchdog_s", "--watchdog"),
+)
 def hold(
     call: Any,
     *,
@@ -614,7 +637,7 @@ def hold(
     from sliplens.grip.hold import GRIPPERS
     from sliplens.grip.source import open_grip, usual_network
     from sliplens.live import LiveReader
-    from sliplens.live.contract import SourceOptions
+    from sliplens.live.contract import LiveOptions
     from sliplens.models import load
     from sliplens.recordings.sensor import load_profile
 
@@ -627,7 +650,7 @@ def hold(
     if reference and len(reference) != len(names):
         raise InputError(f"--reference takes an image for each source, {len(names)}, got {len(reference)}")
     profile = None if sensor is None else load_profile(sensor)
-    sources = [open_grip(source, SourceOptions()) or source for source in names]
+    sources = [open_grip(source, LiveOptions()) or source for source in names]
     networks = [arguments.get("network") or usual_network(source, profile) for source in sources]
     loaded = {name: load(name, device=device) for name in dict.fromkeys(networks) if name is not None}
     with ExitStack() as stack:

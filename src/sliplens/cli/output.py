@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sliplens.recordings.labelling import Labelling
     from sliplens.report.page import Written
     from sliplens.results.evaluation import Baselines, Evaluation, RegressionScores
-    from sliplens.results.grip import Grip
+    from sliplens.grip.records import Grip
     from sliplens.runner import Status
 
 _MOST_ROWS = 24
@@ -218,10 +218,10 @@ def print_known_trials(folder: Path, network: Path) -> None:
     """Print how many trials of each split trained a network."""
     from sliplens.models.checkpoint import load
     from sliplens.recordings.dataset import load_dataset
-    from sliplens.training.evaluation import find_known
+    from sliplens.training.evaluation import find_training_trials
 
     trials = load_dataset(folder).trials
-    known = Counter(trial.split for trial in find_known(trials, load(network)))
+    known = Counter(trial.split for trial in find_training_trials(trials, load(network)))
     for split, count in Counter(trial.split for trial in trials).items():
         say(f"{network} was trained on {known[split]} of the {count} {split} trials of {folder}")
 
@@ -329,7 +329,7 @@ def print_grip(result: "Grip", arguments: Mapping[str, Any]) -> None:
     ]
     names = [arguments.get(name, default) for name, default in (("controller", "margin"), ("object", "cup"))]
     print_table(f"{names[0]} on a {names[1]}, {arguments.get('condition', 'dry')}", ("", ""), rows)
-    if (grasps := arguments.get("grasps", 1)) > 1:
+    if (grasps := int(table.grasp.max())) > 1:
         by_grasp = [table.where(table.grasp == number) for number in range(1, grasps + 1)]
         rows = [
             (
@@ -375,7 +375,7 @@ def print_items(items: "Sequence[Item]") -> None:
     words = {True: "works", False: "fails", None: "not there"}
     width = max(len(item.name) for item in items)
     for item in items:
-        say(f"{words[item.works]:9}  {item.name:{width}}  {item.told}")
+        say(f"{words[item.works]:9}  {item.name:{width}}  {item.detail}")
     if failed := [item.name for item in items if item.works is False]:
         verb = "does" if len(failed) == 1 else "do"
         raise InputError(f"{', '.join(failed)} {verb} not work; see the lines above")

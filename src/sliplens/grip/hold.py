@@ -72,7 +72,7 @@ class HoldStep:
 
 def hold_grip(
     source: LiveReader | LiveSource | Path | str | Sequence[LiveReader],
-    gripper: Gripper | str,
+    gripper: Gripper | str | None = None,
     *,
     network: Network | Path | str | None = None,
     controller: str | Controller = "margin",
@@ -97,7 +97,7 @@ def hold_grip(
         simulated gripper (`GripSource`), predicted by `network` until the hold ends.
     gripper
         Gripper, or an address as in `open_gripper`, whose connection is closed at the end; `simulated` for the gripper
-        of the source `grip`; `dry-run` to record commands as if the gripper obeyed at once.
+        of the source `grip`; `dry-run` to record commands as if the gripper obeyed at once. None is refused.
     network
         Network for a source; for `grip` and `simulated` that of the package if None.
     controller
@@ -139,6 +139,8 @@ def hold_grip(
         raise InputError(f"seconds must be positive, got {seconds:g}")
     if settings and not isinstance(controller, str):
         raise InputError("settings change a controller of the table; set those of your own where you make it")
+    if gripper is None:
+        raise InputError("no gripper is given; name one with --gripper, or record commands with --dry-run")
     with ExitStack() as stack:
         address = gripper if isinstance(gripper, str) else type(gripper).__name__
         if isinstance(gripper, str) and gripper not in GRIPPERS:

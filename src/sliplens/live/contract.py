@@ -47,16 +47,6 @@ class LiveOptions:
                 raise InputError(f"{what} takes no --{option}; leave it out")
 
 
-def parse_size(text: str | None) -> tuple[int, int] | None:
-    """Parse height and width of a text such as 640x480, which has the width first; None stays None."""
-    if text is None:
-        return None
-    width, times, height = text.lower().partition("x")
-    if not (times and width.isdecimal() and height.isdecimal()):
-        raise InputError(f"--size is {text!r}; give width and height as 640x480")
-    return int(height), int(width)
-
-
 class LiveSource(ABC):
     """Running source of frames; a context manager that holds a device, file or connection while it is open.
 

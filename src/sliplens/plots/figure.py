@@ -295,7 +295,8 @@ def make_profile(
 
     path = Path(out)
     require_new_file(path, suffix=".toml", overwrite=overwrite)
-    size_px = None if keep_size else read_manifest(network).frame_size[::-1]
+    height, width = (0, 0) if keep_size else read_manifest(network).frame_size
+    size_px = None if keep_size else (width, height)
     proposal = propose_profile(source, name=name or path.stem, network=None if keep_size else network, size_px=size_px)
     with whole_file(path) as part:
         part.write_text(profile_text(proposal.profile, notes=proposal.notes), encoding="utf-8")

@@ -161,22 +161,35 @@ class RecipeChanges(TypedDict, total=False):
     """Changes of a preset; None leaves a field as it is."""
 
     dry_trials: int | tuple[int, ...] | None
+    """Number of trials on the dry object, spread over all days, or that of each day."""
     wet_trials: int | None
+    """Number of trials on the wet object, all on the days that test."""
     frames_per_trial: int | None
+    """Frames of each trial; the thesis has about 800."""
     days: int | None
+    """Number of days, each with its own friction, stiffness and light; the last one tests."""
     test_day: int | None
+    """Number of the first day that tests."""
     test_days: int | None
+    """Number of the last days that test."""
     validation_share: float | None
+    """Share of the trials of the days between that validate."""
     sensors: int | None
+    """Number of built sensors."""
     displacement: str | None
+    """Motion of the markers. calibrated: as in real ChromaTouch images; half-space: exact contact mechanics."""
     release: bool | None
+    """If True, let go of the object at the end of each trial."""
     pulls: str | None
-    """Row of `PULLS`."""
+    """steady: in about 5.8 s, the margin falling evenly; varied: in 0.8 to 8 s, with rests, jerks and reversals."""
     dry_friction: tuple[float, float] | None
     """Least and largest coefficient of friction of the dry object."""
     nuisances: Nuisances | None
+    """Ranges of everything that varies beside the margin."""
     series: str | None
+    """Name that is part of the seed, so that presets never share random numbers."""
     seed: int | None
+    """Seed: the same seed gives the same bytes on the same machine."""
 
 
 def make_recipe(
