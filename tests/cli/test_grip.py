@@ -12,7 +12,19 @@ from sliplens.report.grip import table_episodes
 
 
 def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    words = ("grip", "-o", tmp_path, "--controller", "fixed", "--episodes", 4, "--set", "force_n=3.5", "--script", "mass_kg=0.05")
+    words = (
+        "grip",
+        "-o",
+        tmp_path,
+        "--controller",
+        "fixed",
+        "--episodes",
+        4,
+        "--set",
+        "force_n=3.5",
+        "--script",
+        "mass_kg=0.05",
+    )
     assert run(*words) == 0
     told = capsys.readouterr().out
     assert "0 of 4" in told

@@ -88,7 +88,7 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     found = sorted((*_options(function), *_further(command.run)), key=lambda option: not option.positional)
     options = [replace(option, aliases=aliases.get(option.name, ())) for option in found]
     by_name = {option.name: option for option in options}
-    reports = "on_progress" in signature(function).parameters
+    reports = _hint_of(function, "on_progress") is not None
     groups = {option.group: _options_type(_hint_of(function, option.group)) for option in options if option.group}
 
     def call(*positional: object, **given: object) -> None:

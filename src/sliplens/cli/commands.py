@@ -503,33 +503,32 @@ def export_dataset(call: Any) -> None:
 
 @command(
     "explain",
-    "study.workspace:explain_source",
+    "study.explaining:explain",
     "sliplens explain runs/mine/train runs/mine/data -o runs/mine/explain",
-    ("methods", "--method"),
+    ("source", "--frames"),
 )
-def explain(call: Any) -> None:
-    """Write the maps."""
+def explain(call: Any, *, list_methods: bool = False) -> None:
+    """Write the maps.
+
+    Parameters
+    ----------
+    list_methods
+        Print the table of explainers and end.
+    """
+    if list_methods:
+        from sliplens.explainers.table import EXPLAINERS
+
+        print_table("Explainers", ("method", "name"), [(name, row.title) for name, row in EXPLAINERS.items()])
+        return
     if "out" not in call.keywords:
         raise InputError("name the folder of the maps with -o FOLDER")
     call()
 
 
-@command(
-    "score", "study.workspace:score_explained", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score"
-)
+@command("score", "study.scoring:score", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score")
 def score(call: Any) -> None:
     """Print the scores."""
-    scores = call()
-    print_table(
-        f"deletion score, {scores.input} images ({scores.source}), fill {scores.fill}: lower is more faithful",
-        ("method", "D_AUC", "+-", "last step", "frames"),
-        [
-            (name, f"{method.mean:.3f}", f"{method.sd:.3f}", f"{method.last_step_mean:.3f}", str(method.frames))
-            for name, method in scores.methods.items()
-        ],
-    )
-    for alarm in scores.alarms:
-        say(f"  alarm: {alarm}")
+    output.print_faithfulness(call())
 
 
 @command("diagnose", "study.diagnose:diagnose", "sliplens diagnose runs/mine/train runs/mine/data -o runs/mine/why")

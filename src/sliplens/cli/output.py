@@ -15,12 +15,13 @@ from sliplens.progress import fold_equal, number_of, open_stage, report_file, re
 
 if TYPE_CHECKING:
     from sliplens.doctor import Item
+    from sliplens.grip.records import Grip
     from sliplens.models.predictions import Predictions, TrialMargins
     from sliplens.recordings import Dataset, TrialInfo
     from sliplens.recordings.labelling import Labelling
     from sliplens.report.page import Written
     from sliplens.results.evaluation import Baselines, Evaluation, RegressionScores
-    from sliplens.grip.records import Grip
+    from sliplens.results.faithfulness import Faithfulness
     from sliplens.runner import Status
 
 _MOST_ROWS = 24
@@ -297,6 +298,33 @@ def print_baselines(evaluation: "Evaluation", baselines: "Baselines") -> None:
 
 def _errors(scores: "RegressionScores") -> tuple[str, str, str]:
     return f"{scores.mse:.4f}", "none" if scores.r2 is None else f"{scores.r2:.3f}", f"{scores.mae:.3f}"
+
+
+def print_faithfulness(faithfulness: "Faithfulness") -> None:
+    """Print the scores of each method, the deletion score of the thesis, and the alarms."""
+    rows = []
+    for scores in faithfulness.scores:
+        gain, lead = scores.srg, scores.lead_over_controls
+        ends = "" if gain.low is None or gain.high is None else f"{gain.low:+.3f} to {gain.high:+.3f}"
+        rows.append((scores.method, f"{gain.estimate:+.3f}", ends, "" if lead is None else f"{lead.gap.estimate:+.3f}"))
+    where = f"{faithfulness.input} images ({faithfulness.source})"
+    print_table(
+        f"symmetric gain, {where}: higher is more faithful",
+        ("method", "gain", "95 % interval", "less the best control"),
+        rows,
+    )
+    deletion = faithfulness.deletion
+    if deletion is not None:
+        print_table(
+            f"deletion score of the thesis, {where}, fill grey: lower is more faithful",
+            ("method", "D_AUC", "+-", "last step", "frames"),
+            [
+                (name, f"{scores.mean:.3f}", f"{scores.sd:.3f}", f"{scores.last_step_mean:.3f}", str(scores.frames))
+                for name, scores in deletion.methods.items()
+            ],
+        )
+    for alarm in dict.fromkeys(faithfulness.alarms + (() if deletion is None else deletion.alarms)):
+        say(f"  alarm: {alarm}")
 
 
 def print_status(out: Path, works: "Sequence[Status]") -> None:
