@@ -24,7 +24,8 @@ from sliplens.codec import (
     write_tables,
 )
 from sliplens.errors import InputError
-from sliplens.results import evaluation, explanation, faithfulness, grip, study
+from sliplens.grip import records as grip_records
+from sliplens.results import evaluation, explanation, faithfulness, study
 
 NEVER_LOADED = {faithfulness.DeletionCurve, faithfulness.RemovalCurve, study.MarkerPlaces, study.StateFrame}
 """Records of `results` that are made of tables when these have been read."""
@@ -210,7 +211,7 @@ def test_every_number_in_the_tables_and_maps_of_results_has_bounds():
                 yield f"{kind.__name__}.{name}", one
 
     records = [
-        one for module in (evaluation, explanation, faithfulness, grip, study) for one in vars(module).values()
+        one for module in (evaluation, explanation, faithfulness, grip_records, study) for one in vars(module).values()
         if isinstance(one, type) and one.__module__ == module.__name__ and one not in NEVER_LOADED
     ]  # fmt: skip
     numbers = {name: hint for one in records for name, hint in declared(one)}

@@ -66,8 +66,8 @@ class Columns:
         """Rows of each combination of values of some text columns, in the order in which these first appear."""
         codes = np.zeros(len(self), dtype=np.int64)
         for name in names:
-            known, place = np.unique(getattr(self, name), return_inverse=True)
-            codes = codes * len(known) + place
+            values, place = np.unique(getattr(self, name), return_inverse=True)
+            codes = codes * len(values) + place
         order = np.argsort(codes, kind="stable")
         pieces = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1) if len(order) else []
         pieces.sort(key=lambda rows: rows[0])
@@ -137,8 +137,8 @@ def from_builtins(values: object, kind: type[Record], *, where: Path | str, comm
         # in the words of this package: "expected `str`, got `int` at trials[2].day"
         text, _, place = str(error).partition(" - at ")
         place = place.strip("`").removeprefix("$").removeprefix(".") or "its top"
-        said = f"is not what was written: {text[0].lower()}{text[1:]} at {place}"
-        raise InputError(f"{where} {said}; {_cure(command)}") from None
+        message = f"is not what was written: {text[0].lower()}{text[1:]} at {place}"
+        raise InputError(f"{where} {message}; {_cure(command)}") from None
 
 
 def save_result(result: object, folder: Path) -> None:
@@ -188,14 +188,14 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     # one dataclass of what is in the JSON, so that msgspec checks it as declared; defaults are kept
     beside = {*arrays, *(name for name, table in columns.items() if table)}
     inside = [field for field in fields(kind) if field.name not in beside]  # pyright: ignore[reportArgumentType]
-    partial = make_dataclass(kind.__name__, [(one.name, declared[one.name], copy(one)) for one in inside])
+    partial = make_dataclass(kind.__name__, [(field.name, declared[field.name], copy(field)) for field in inside])
     read = from_builtins(values, partial, where=path, command=command)
-    given = {field.name: getattr(read, field.name) for field in inside}
-    given |= dict.fromkeys(beside)
-    given |= {name: _load_columns(folder / f"{name}.parquet", table, cure) for name, table in tables.items()}
-    given |= _load_arrays(folder / ARRAYS_FILE, arrays, cure) if arrays else {}
+    values = {field.name: getattr(read, field.name) for field in inside}
+    values |= dict.fromkeys(beside)
+    values |= {name: _load_columns(folder / f"{name}.parquet", table, cure) for name, table in tables.items()}
+    values |= _load_arrays(folder / ARRAYS_FILE, arrays, cure) if arrays else {}
     try:
-        return kind(**given)
+        return kind(**values)
     except ValueError as error:  # of a record that checks what its fields have to do with one another
         raise InputError(f"{folder} {error}; {cure}") from None
 
@@ -231,7 +231,7 @@ COLUMN_KINDS: dict[str, Callable[[pa.DataType], bool]] = {
 
 
 @contextmanager
-def telling_parquet(path: Path, *, cure: str, error: type[InputError] = InputError) -> Iterator[None]:
+def parquet_errors(path: Path, *, cure: str, error: type[InputError] = InputError) -> Iterator[None]:
     """Tell in one sentence what Arrow raises of a missing or damaged file, whatever is read of it inside."""
     try:
         yield
@@ -261,7 +261,7 @@ def open_parquet(
         size = require_file(path, missing=cure)
     except InputError as raised:
         raise error(str(raised)) from None
-    with telling_parquet(path, cure=cure, error=error):
+    with parquet_errors(path, cure=cure, error=error):
         file = open_table(path)
         schema, rows = file.schema_arrow, file.metadata.num_rows
         names = schema.names
@@ -277,7 +277,7 @@ def open_parquet(
                 for chunk in chunks
                 if chunk.path_in_schema in whole
                 and chunk.physical_type == "BYTE_ARRAY"
-                and any("DICT" in one for one in chunk.encodings)
+                and any("DICT" in encoding for encoding in chunk.encodings)
             ),
             default=0,
         )
@@ -300,7 +300,7 @@ def read_parquet(
     """Columns of a Parquet file as `open_parquet` lets it in, with no value missing."""
     open_parquet(path, columns, cure=cure, error=error).close()
     texts = [name for name, kind in columns.items() if kind == "texts"]
-    with telling_parquet(path, cure=cure, error=error):
+    with parquet_errors(path, cure=cure, error=error):
         # a text that is repeated is held once until its length is known
         with open_table(path, read_dictionary=texts) as file:
             table = file.read(columns=list(columns))
@@ -318,10 +318,10 @@ def read_parquet(
 
 def _kind_of(hint: Any) -> str:
     """Kind of a column that a field of `Columns` declares."""
-    shown = _shown(hint)
-    if hint is np.ndarray or shown.startswith("Shaped"):
+    name = _shown(hint)
+    if hint is np.ndarray or name.startswith("Shaped"):
         return "texts"
-    return "true and false" if shown.startswith("Bool") else "whole numbers" if "Int" in shown else "numbers"
+    return "true and false" if name.startswith("Bool") else "whole numbers" if "Int" in name else "numbers"
 
 
 _SIDES: dict[str, tuple[str, Callable[..., np.ndarray]]] = {
@@ -332,12 +332,12 @@ _SIDES: dict[str, tuple[str, Callable[..., np.ndarray]]] = {
 
 
 def _require_possible(values: np.ndarray, hint: Any, *, name: str, path: Path, cure: str) -> None:
-    """Hold numbers against the bounds that their field declares, if it does."""
+    """Check numbers against the bounds that their field declares, if it does."""
     hint = _one_array(hint)
-    said = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
-    bounds = [one for one in said if isinstance(one, msgspec.Meta)]
-    sides = {side: limit for one in bounds for side in _SIDES if (limit := getattr(one, side)) is not None}
-    wrong = np.isnan(values) if bounds and UNKNOWN not in said else np.zeros(values.shape, dtype=np.bool_)
+    facts = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+    bounds = [fact for fact in facts if isinstance(fact, msgspec.Meta)]
+    sides = {side: limit for bound in bounds for side in _SIDES if (limit := getattr(bound, side)) is not None}
+    wrong = np.isnan(values) if bounds and UNKNOWN not in facts else np.zeros(values.shape, dtype=np.bool_)
     for side, limit in sides.items():
         wrong |= _SIDES[side][1](values, limit)
     if wrong.any():
@@ -471,7 +471,7 @@ def _load_arrays(path: Path, declared: Mapping[str, Any], cure: str) -> dict[str
             arrays = {name: archive[name] for name in archive}
     except _NO_ARRAYS as error:
         raise InputError(f"{path} cannot be read as arrays ({one_line(error)}); {cure}") from None
-    given = {}
+    loaded = {}
     with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
         for name, hint in declared.items():
             kind, alone = _array_type(hint), hint is _one_array(hint)
@@ -480,11 +480,11 @@ def _load_arrays(path: Path, declared: Mapping[str, Any], cure: str) -> dict[str
                 if key not in arrays:
                     raise InputError(f"{path} lacks {key!r}; {cure}")
                 if not isinstance(arrays[key], kind):
-                    held = f"{arrays[key].dtype} of shape {arrays[key].shape}"
-                    raise InputError(f"{path} holds {held} as {key!r} where {_shown(kind)} belongs; {cure}")
+                    actual = f"{arrays[key].dtype} of shape {arrays[key].shape}"
+                    raise InputError(f"{path} holds {actual} as {key!r} where {_shown(kind)} belongs; {cure}")
                 _require_possible(arrays[key], hint, name=key, path=path, cure=cure)
-            given[name] = arrays[name] if alone else {key[len(name) + 1 :]: arrays[key] for key in keys}
-    return given
+            loaded[name] = arrays[name] if alone else {key[len(name) + 1 :]: arrays[key] for key in keys}
+    return loaded
 
 
 def _columns_type(hint: object) -> type[Columns] | None:

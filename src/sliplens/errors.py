@@ -12,8 +12,8 @@ class SliplensError(Exception):
     """
 
     def __str__(self) -> str:
-        told = super().__str__()
-        return told if len(told) <= _LONGEST else f"{told[: _LONGEST - 500]}\N{HORIZONTAL ELLIPSIS}{told[-499:]}"
+        text = super().__str__()
+        return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 500]}\N{HORIZONTAL ELLIPSIS}{text[-499:]}"
 
 
 class InputError(SliplensError):

@@ -47,11 +47,11 @@ _PACKAGES = ("numpy", "torch", "torchvision", "lightning", "captum", "matplotlib
 
 def versions() -> dict[str, str]:
     """Versions of sliplens, Python and the libraries that shape a result, read without importing them."""
-    found = {"sliplens": __version__, "python": platform.python_version()}
+    versions_by_name = {"sliplens": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
+            versions_by_name[name] = metadata.version(name)
+    return versions_by_name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ class Provenance:
 
 
 def to_builtins(value: object) -> Any:
-    """What JSON can hold of a record, or of anything made of records, mappings, sequences, paths, texts and numbers.
+    """Convert a record, or anything made of records, mappings, sequences, paths, texts and numbers, for JSON.
 
     Arrays have no form in JSON: declare short ones as tuples, long ones as fields of a result (`codec.save_result`).
     """
@@ -119,7 +119,7 @@ def hash_tree(path: Path) -> str:
     """SHA-256 of a file's bytes, or of the names and bytes of all files below a folder."""
     if path.is_file():
         return hash_file(path)
-    return hash_json({str(one.relative_to(path)): hash_file(one) for one in path.rglob("*") if one.is_file()})
+    return hash_json({str(file.relative_to(path)): hash_file(file) for file in path.rglob("*") if file.is_file()})
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -190,17 +190,17 @@ def require_file(path: Path, *, missing: str = "check the path", most: int | Non
 
 
 def parse_json(text: bytes | str, *, where: object, cure: str) -> Any:
-    """What JSON from a file holds; text that is none, or nothing of ours nests so deep, is an `InputError`."""
+    """Parse JSON from a file; raise `InputError` for text that is not JSON or nests too deep."""
     try:
         value = msgspec.json.decode(text)
     except (msgspec.DecodeError, ValueError, RecursionError) as error:  # a whole number may have too many digits
         raise InputError(f"{where} is not valid JSON ({error}); {cure}") from None
     level = [value]
     for _ in range(_DEEPEST):
-        if any(isinstance(one, int) and abs(one) >= 2**64 for one in level):
+        if any(isinstance(item, int) and abs(item) >= 2**64 for item in level):
             raise InputError(f"{where} holds a whole number of more than 64 bits; {cure}")
-        inner = (one.values() if isinstance(one, dict) else one for one in level if isinstance(one, dict | list))
-        if not (level := [each for one in inner for each in one]):
+        inner = (item.values() if isinstance(item, dict) else item for item in level if isinstance(item, dict | list))
+        if not (level := [item for items in inner for item in items]):
             return value
     raise InputError(f"{where} nests more than {_DEEPEST} deep; {cure}")
 

@@ -46,9 +46,9 @@ class Difference:
 
     @property
     def over(self) -> str:
-        """What the interval was taken over, in words: "14 trials, one day, one network"."""
-        named = {"trial": self.units, "day": self.days, "network": self.networks}
-        return ", ".join(f"one {name}" if count == 1 else f"{count} {name}s" for name, count in named.items())
+        """Return the units of the interval in words: "14 trials, one day, one network"."""
+        counts = {"trial": self.units, "day": self.days, "network": self.networks}
+        return ", ".join(f"one {name}" if count == 1 else f"{count} {name}s" for name, count in counts.items())
 
 
 def paired_difference(
@@ -128,10 +128,11 @@ def mean_interval(
     >>> round(found.estimate, 2), found.low, found.high
     (0.7, -1.0, 1.0)
     """
-    found = paired_difference(values, np.zeros(len(values)), clusters=clusters, rng=rng)
-    if found.low is None or found.high is None:
-        return found
-    return replace(found, low=float(max(found.low, limits[0])), high=float(min(found.high, limits[1])))
+    interval = paired_difference(values, np.zeros(len(values)), clusters=clusters, rng=rng)
+    if interval.low is None or interval.high is None:
+        return interval
+    low, high = max(interval.low, limits[0]), min(interval.high, limits[1])
+    return replace(interval, low=float(low), high=float(high))
 
 
 def _within(inner: Int[np.ndarray, " images"], outer: Int[np.ndarray, " images"]) -> bool:
@@ -155,10 +156,10 @@ def _drawn_ends(
     means = sums[rows].sum(axis=1) / sizes
     rest = sums[rows] - means[:, None] * counts[rows]
     errors = np.sqrt(len(sums) / (len(sums) - 1) * (rest**2).sum(axis=1)) / sizes
-    known = errors > 0  # the same cluster in every place has no spread
-    if not known[0]:
+    spread = errors > 0  # the same cluster in every place has no spread
+    if not spread[0]:
         return np.zeros(2)
-    return -errors[0] * np.quantile((means - means[0])[known] / errors[known], 1 - at)
+    return -errors[0] * np.quantile((means - means[0])[spread] / errors[spread], 1 - at)
 
 
 def _student_ends(
@@ -177,12 +178,14 @@ def _student_ends(
         alone -= (sums / counts)[level]
         cells = cells * len(sums) + level
     # what is left in each cell is in the spread of every level: it counts once
-    own = (np.bincount(cells, weights=alone) ** 2).sum() / len(gap) ** 2
-    shared = own * np.prod([1 + 1 / one for one in freedom])
+    within = (np.bincount(cells, weights=alone) ** 2).sum() / len(gap) ** 2
+    shared = within * np.prod([1 + 1 / degree for degree in freedom])
     variance = max(sum(parts) - (len(parts) - 1) * shared, *parts, 0.0)
     if variance == 0:
         return np.zeros(2)
-    degrees = variance**2 / sum(part**2 / one for part, one in zip(parts, freedom, strict=True))  # Satterthwaite's
+    degrees = variance**2 / sum(
+        part**2 / degree for part, degree in zip(parts, freedom, strict=True)
+    )  # Satterthwaite's
     from scipy.special import stdtrit  # noqa: PLC0415 (takes a second, and predictions have none)
 
     return np.sqrt(variance) * stdtrit(degrees, at)

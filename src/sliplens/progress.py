@@ -27,8 +27,8 @@ def visible(text: str) -> str:
     >>> visible("cup" + chr(27) + "[2J")
     'cup\\x1b[2J'
     """
-    seen = (one.isprintable() or one == "\N{NO-BREAK SPACE}" for one in text)
-    return "".join(one if is_seen else repr(one)[1:-1] for one, is_seen in zip(text, seen, strict=True))
+    printable = (letter.isprintable() or letter == "\N{NO-BREAK SPACE}" for letter in text)
+    return "".join(letter if shows else repr(letter)[1:-1] for letter, shows in zip(text, printable, strict=True))
 
 
 def number_of(count: int, noun: str) -> str:
@@ -116,17 +116,17 @@ def fold_equal(messages: Iterable[str]) -> list[str]:
         same = len({message.removeprefix(_named(message)) for message in counts}) == 1
         more = f" and {len(others) - 2} more" if len(others) > 3 else ""
         if others:
-            shown = ", ".join(others[:2] if more else others)
-            told = f"{'' if same else 'with other numbers '}also {shown}{more}"
+            names = ", ".join(others[:2] if more else others)
+            repeats = f"{'' if same else 'with other numbers '}also {names}{more}"
         else:
-            told = f"{times} times" if same else f"and {len(counts) - 1} more with other numbers"
-        folded.append(first if counts.total() == 1 else f"{first} ({told})")
+            repeats = f"{times} times" if same else f"and {len(counts) - 1} more with other numbers"
+        folded.append(first if counts.total() == 1 else f"{first} ({repeats})")
     return folded
 
 
 def _named(message: str) -> str:
     """Name that a message begins with, and the colon after it; empty where it begins with none."""
-    return found[0] if (found := re.match(r"\S+: ", message)) else ""
+    return match[0] if (match := re.match(r"\S+: ", message)) else ""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

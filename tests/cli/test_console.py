@@ -65,7 +65,7 @@ def test_names_of_files_move_no_cursor_and_paint_nothing(screen: Console) -> Non
     console.say(HOSTILE)
     console.say(HOSTILE, aside=True)
     console.fail(HOSTILE)
-    console.wrote(Path(HOSTILE), HOSTILE)
+    console.print_file(Path(HOSTILE), HOSTILE)
     print_table(HOSTILE, [HOSTILE, "D"], [[HOSTILE, "1"]])
 
     text = screen.export_text(styles=False)

@@ -19,6 +19,7 @@ from sliplens.errors import InputError, RecordingError
 from sliplens.images import decode_png
 from sliplens.live import viewer as viewer_process
 from sliplens.live.viewer import Overlays, open_viewer, view_capture, view_explained, view_stored, write_rrd
+from sliplens.progress import reporting
 from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
@@ -92,11 +93,8 @@ def written(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulated")
     data = save_dataset(folder / "data", trial)
     told = []
-    write_rrd(
-        view_stored(data, data.trials[0]),
-        folder / "new" / "a.rrd",
-        on_progress=lambda done, total: told.append((done, total)),
-    )
+    with reporting(lambda done, total: told.append((done, total))):
+        write_rrd(view_stored(data, data.trials[0]), folder / "new" / "a.rrd")
     assert told == [(done, FRAMES) for done in range(1, FRAMES + 1)]
     assert [path.name for path in (folder / "new").iterdir()] == ["a.rrd"]
     return folder / "new" / "a.rrd"
@@ -409,8 +407,8 @@ def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
     def interrupt(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd", on_progress=interrupt)
+    with pytest.raises(KeyboardInterrupt), reporting(interrupt):
+        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
     assert not list(tmp_path.iterdir())
 
 

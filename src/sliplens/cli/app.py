@@ -85,15 +85,15 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     module, _, name = command.function.partition(":")
     function = getattr(import_module(module), name)
     aliases = {**ALIASES, **{name: (alias,) for name, alias in command.aliases}}
-    found = sorted((*_options(function), *_further(command.run)), key=lambda option: not option.positional)
-    options = [replace(option, aliases=aliases.get(option.name, ())) for option in found]
+    ordered = sorted((*_options(function), *_further(command.run)), key=lambda option: not option.positional)
+    options = [replace(option, aliases=aliases.get(option.name, ())) for option in ordered]
     by_name = {option.name: option for option in options}
     reports = _hint_of(function, "on_progress") is not None
     groups = {option.group: _options_type(_hint_of(function, option.group)) for option in options if option.group}
 
-    def call(*positional: object, **given: object) -> None:
+    def call(*positional: object, **values: object) -> None:
         places = [option.name for option in options if option.positional]
-        values = dict(zip(places, positional, strict=False)) | given
+        values = dict(zip(places, positional, strict=False)) | values
         further = {name: values.pop(name) for name in list(values) if by_name[name].further}
         arguments: dict[str, Any] = {"on_progress": Terminal()} if reports else {}
         for name, value in values.items():
@@ -117,15 +117,17 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
 
 def _options(function: Callable[..., object]) -> list[_Option]:
     """Return the parameters of a function that can be typed; fields of dataclasses are options of their own."""
-    helps, hints, found = _parameter_help(function), get_type_hints(function), []
+    helps, hints, options = _parameter_help(function), get_type_hints(function), []
     for name, parameter in signature(function).parameters.items():
         hint = hints.get(name, Any)
         if parameter.kind is Parameter.VAR_KEYWORD:
-            found += _fields_of(get_args(hint)[0] if get_origin(hint) is Unpack else hint)
+            options += _fields_of(get_args(hint)[0] if get_origin(hint) is Unpack else hint)
             continue
         group = _options_type(hint)
         if group is not None:
-            found += [option for option in _fields_of(group, group=name) if option.name not in {o.name for o in found}]
+            options += [
+                option for option in _fields_of(group, group=name) if option.name not in {o.name for o in options}
+            ]
             continue
         kind = typed_kind(hint)
         if kind is None:
@@ -133,7 +135,7 @@ def _options(function: Callable[..., object]) -> list[_Option]:
                 raise TypeError(f"{function.__qualname__} needs {name}, which cannot be typed")
             continue
         default = parameter.default
-        found.append(
+        options.append(
             _Option(
                 name=name,
                 kind=kind,
@@ -142,22 +144,22 @@ def _options(function: Callable[..., object]) -> list[_Option]:
                 positional=parameter.kind is Parameter.POSITIONAL_OR_KEYWORD,
             )
         )
-    return found
+    return options
 
 
 def _fields_of(kind: Any, *, group: str = "") -> list[_Option]:
     """Return the fields of a dataclass or TypedDict as options."""
-    helps, hints, found = _parameter_help(kind), get_type_hints(kind), []
+    helps, hints, options = _parameter_help(kind), get_type_hints(kind), []
     defaults = {field.name: field.default for field in fields(kind)} if is_dataclass(kind) else {}
     for name, hint in hints.items():
         typed, inner = typed_kind(hint), _options_type(hint)
         if typed is not None:
-            found.append(
+            options.append(
                 _Option(name=name, kind=typed, default=defaults.get(name), help=helps.get(name, ""), group=group)
             )
         elif inner is not None and inner.__name__.endswith("Options") and not group:
-            found += _fields_of(inner, group=name)
-    return found
+            options += _fields_of(inner, group=name)
+    return options
 
 
 def _further(run: Callable[..., object]) -> list[_Option]:

@@ -12,7 +12,7 @@ import msgspec
 
 from sliplens.cli import output
 from sliplens.cli.app import Command
-from sliplens.cli.console import OUT, Terminal, print_table, say, wrote
+from sliplens.cli.console import OUT, Terminal, print_file, print_table, say
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import require_new_file, to_builtins
 from sliplens.progress import number_of, open_stage, reporting
@@ -37,7 +37,7 @@ def command(name: str, function: str, example: str, *aliases: tuple[str, str]) -
 
 
 @command("demo", "demo:run_demo", "sliplens demo runs/demo")
-def demo(call: Any) -> None:
+def run_demo(call: Any) -> None:
     """Print where the page is as soon as it exists; its notes are on the page."""
     started = time.perf_counter()
     pages: list[Path] = []
@@ -65,7 +65,7 @@ def demo(call: Any) -> None:
     ("rate_hz", "--rate"),
     ("smoothing_s", "--smoothing"),
 )
-def live(
+def run_live(
     call: Any,
     *,
     list_sources: bool = False,
@@ -126,12 +126,12 @@ def live(
         stack.callback(lambda: [say(str(state), aside=True) for state in reader.outputs])
         stack.callback(lambda: reader.lesson and say(reader.lesson, aside=True))
         with suppress(KeyboardInterrupt), reader:
-            shown = nullcontext()
+            serving = nullcontext()
             if page:
                 waits = "seconds" not in arguments and not sink
                 into = record or Path("recorded")
-                shown = _served(reader, facts=facts, host=host, port=port, record_into=into, waits=waits)
-            with shown:
+                serving = _served(reader, facts=facts, host=host, port=port, record_into=into, waits=waits)
+            with serving:
                 _watch(reader, quiet=page, lines=not sink)
 
 
@@ -169,17 +169,17 @@ def _watch(reader: "LiveReader", *, quiet: bool, lines: bool) -> None:
 @command(
     "sensor new", "plots.figure:make_profile", "sliplens sensor new --from tip.mp4 -o tip.toml", ("source", "--from")
 )
-def sensor_new(call: Any) -> None:
+def run_sensor_new(call: Any) -> None:
     """Write the profile and its picture."""
     proposal, path = call(), Path(call.keywords["out"])
     for sentence in proposal.notes:
         say(f"  {sentence}")
-    wrote(path, "correct it where the picture shows an error")
-    wrote(path.with_suffix(".png"), "what the profile does to a frame")
+    print_file(path, "correct it where the picture shows an error")
+    print_file(path.with_suffix(".png"), "what the profile does to a frame")
 
 
 @command("sensor list", "recordings.sensor:shipped_profiles", "sliplens sensor list")
-def sensor_list(call: Any) -> None:
+def run_sensor_list(call: Any) -> None:
     """Print the profiles."""
     from sliplens.recordings.sensor import load_profile
 
@@ -191,7 +191,7 @@ def sensor_list(call: Any) -> None:
 
 
 @command("simulate", "simulation.trials:simulate", "sliplens simulate runs/mine/data --preset small")
-def simulate(call: Any, *, preview: Path | None = None, video: Path | None = None) -> None:
+def run_simulate(call: Any, *, preview: Path | None = None, video: Path | None = None) -> None:
     """Print the splits.
 
     Parameters
@@ -225,7 +225,7 @@ def simulate(call: Any, *, preview: Path | None = None, video: Path | None = Non
     "recordings.importing:import_recordings",
     "sliplens import cup.mp4 --forces cup.csv --sensor tip.toml -o runs/mine/data",
 )
-def import_(call: Any, *, audit: bool = True) -> None:
+def run_import(call: Any, *, audit: bool = True) -> None:
     """Print what the labels rest on.
 
     Parameters
@@ -237,14 +237,14 @@ def import_(call: Any, *, audit: bool = True) -> None:
     if audit:
         output.draw_audits(data, data.folder / "audit")
     output.show_labelling("Imported", data)
-    output.write_trials_page(data)
+    output.show_trials_page(data)
     if data.left_out:
         print_table("Left out", ("trial", "why"), [(trial.trial, trial.why) for trial in data.left_out])
         raise SystemExit(1)
 
 
 @command("label", "recordings.relabelling:label_dataset", "sliplens label runs/mine/data --draft corrections.csv")
-def label(call: Any, *, draft: Path | None = None, audit: bool = True, audit_only: bool = False) -> None:
+def run_label(call: Any, *, draft: Path | None = None, audit: bool = True, audit_only: bool = False) -> None:
     """Print what the labels rest on.
 
     Parameters
@@ -268,7 +268,7 @@ def label(call: Any, *, draft: Path | None = None, audit: bool = True, audit_onl
     data, out = load_dataset(folder), Path(arguments.get("out") or folder)
     if draft is not None:
         draft_corrections(data, draft)
-        wrote(draft, f"edit it, then: sliplens label {folder} --corrections {draft}")
+        print_file(draft, f"edit it, then: sliplens label {folder} --corrections {draft}")
         return
     if audit_only:
         output.draw_audits(data, out / "audit")
@@ -277,18 +277,18 @@ def label(call: Any, *, draft: Path | None = None, audit: bool = True, audit_onl
     if audit:
         output.draw_audits(labelled, out / "audit")
     output.show_labelling("Labelled", labelled)
-    output.write_trials_page(labelled)
+    output.show_trials_page(labelled)
 
 
 @command("recover", "recordings.dataset:recover_dataset", "sliplens recover runs/mine/data")
-def recover(call: Any) -> None:
+def run_recover(call: Any) -> None:
     """Print what the data set holds."""
     data = call()
     say(f"{data.folder} holds {number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}")
 
 
 @command("split", "recordings.splits:split_dataset", "sliplens split runs/mine/data --splits object --dry-run")
-def split(call: Any) -> None:
+def run_split(call: Any) -> None:
     """Print the splits, and the trials that move."""
     from sliplens.recordings.dataset import load_dataset
 
@@ -302,13 +302,13 @@ def split(call: Any) -> None:
     if call.keywords.get("dry_run"):
         say("nothing is written (--dry-run)")
         return
-    wrote(data.folder, f"{len(moves)} of {len(data.trials)} trials moved")
+    print_file(data.folder, f"{len(moves)} of {len(data.trials)} trials moved")
     if moves:
         say("networks trained before had other splits: a trial of the test may have trained them; train again")
 
 
 @command("check", "recordings.check:check_dataset", "sliplens check runs/mine/data")
-def check(call: Any) -> None:
+def run_check(call: Any) -> None:
     """Print the findings; exit code 2 if there are any."""
     from sliplens.recordings.dataset import load_dataset, trial_path
     from sliplens.recordings.store import read_header
@@ -332,7 +332,7 @@ def check(call: Any) -> None:
 
 
 @command("compare", "simulation.sharing:compare_datasets", "sliplens compare runs/mine/data runs/other/data")
-def compare(call: Any) -> None:
+def run_compare(call: Any) -> None:
     """Print what two data sets share, or which trials of a data set trained a network."""
     from sliplens.recordings.dataset import DATASET_FILE
 
@@ -355,7 +355,7 @@ def compare(call: Any) -> None:
     "live.viewer:view",
     "sliplens view runs/mine/data --trial cup --predictions margins.parquet --maps runs/mine/explain",
 )
-def view(call: Any) -> None:
+def run_view(call: Any) -> None:
     """Print what is shown."""
     trial = call()
     about = f"{trial.trial.trial}, {number_of(len(trial.trial), 'frame')}"
@@ -363,11 +363,11 @@ def view(call: Any) -> None:
         say(f"{about}, are in the Rerun viewer")
         say("the viewer reports its use to its makers, not what it shows: see `rerun analytics disable`")
     else:
-        wrote(Path(out), f"{about}; open it with `rerun {out}`")
+        print_file(Path(out), f"{about}; open it with `rerun {out}`")
 
 
 @command("track", "markers.tracking:track", "sliplens track cup.mp4 --reference untouched.png -o markers.parquet")
-def track(call: Any, *, video: Path | None = None) -> None:
+def run_track(call: Any, *, video: Path | None = None) -> None:
     """Print how many markers were followed.
 
     Parameters
@@ -398,9 +398,9 @@ def track(call: Any, *, video: Path | None = None) -> None:
         tracking = call(on_tracked=draw)
     for trial in tracking.trials:
         say(str(trial))
-    wrote(tracking.path, f"{number_of(tracking.frames, 'frame')} of {number_of(len(tracking.trials), 'trial')}")
+    print_file(tracking.path, f"{number_of(tracking.frames, 'frame')} of {number_of(len(tracking.trials), 'trial')}")
     if video is not None:
-        wrote(video, "to look at: lossy video moves markers")
+        print_file(video, "to look at: lossy video moves markers")
 
 
 @command(
@@ -408,7 +408,7 @@ def track(call: Any, *, video: Path | None = None) -> None:
     "training.fitting:train",
     "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-pair --epochs 5",
 )
-def train(call: Any) -> None:
+def run_train(call: Any) -> None:
     """Draw the learning curve."""
     from sliplens.plots.errors import draw_learning_curve
 
@@ -424,7 +424,7 @@ def train(call: Any) -> None:
 @command(
     "evaluate", "training.evaluation:evaluate", "sliplens evaluate runs/mine/train runs/mine/data -o runs/mine/evaluate"
 )
-def evaluate(call: Any, *, device: str = "cpu") -> None:
+def run_evaluate(call: Any, *, device: str = "cpu") -> None:
     """Print the scores and draw them.
 
     Parameters
@@ -450,7 +450,7 @@ def evaluate(call: Any, *, device: str = "cpu") -> None:
     "models.predictions:predict",
     "sliplens predict cup.mp4 --sensor tip.toml --plot margin.png -o margins.csv",
 )
-def predict(call: Any, *, plot: Path | None = None) -> None:
+def run_predict(call: Any, *, plot: Path | None = None) -> None:
     """Print the margins.
 
     Parameters
@@ -476,13 +476,13 @@ def predict(call: Any, *, plot: Path | None = None) -> None:
         names = [call.keywords[name] for name in ("source", "run") if name in call.keywords]
         title = ", predicted by ".join(Path(name).name for name in names)
         trials = draw_margins(predictions.frame(), plot, title=title)
-        wrote(plot, f"margin over time of {number_of(trials, 'trial')}")
+        print_file(plot, f"margin over time of {number_of(trials, 'trial')}")
     if predictions.path is not None:
-        wrote(predictions.path, f"{number_of(predictions.frames, 'frame')}, by {predictions.engine}")
+        print_file(predictions.path, f"{number_of(predictions.frames, 'frame')}, by {predictions.engine}")
 
 
 @command("export onnx", "models.onnx:export_onnx", "sliplens export onnx runs/mine/train -o tip.onnx")
-def export_onnx(call: Any) -> None:
+def run_export_onnx(call: Any) -> None:
     """Print what was written."""
     from sliplens.models.checkpoint import load
 
@@ -491,12 +491,12 @@ def export_onnx(call: Any) -> None:
         path = call(run=network)
     manifest = network.manifest
     about = f"{manifest.backbone}, {manifest.head} head, {manifest.image_size} px, {manifest.input} images"
-    wrote(path, f"{about}; predicts as the network does")
+    print_file(path, f"{about}; predicts as the network does")
 
 
 @command("export lerobot", "recordings.exporting:export_lerobot", "sliplens export lerobot runs/mine/data -o lerobot")
 @command("export mcap", "recordings.exporting:export_mcap", "sliplens export mcap runs/mine/data -o mcap")
-def export_dataset(call: Any) -> None:
+def run_export_dataset(call: Any) -> None:
     """Write the data set."""
     call()
 
@@ -507,7 +507,7 @@ def export_dataset(call: Any) -> None:
     "sliplens explain runs/mine/train runs/mine/data -o runs/mine/explain",
     ("source", "--frames"),
 )
-def explain(call: Any, *, list_methods: bool = False) -> None:
+def run_explain(call: Any, *, list_methods: bool = False) -> None:
     """Write the maps.
 
     Parameters
@@ -526,13 +526,13 @@ def explain(call: Any, *, list_methods: bool = False) -> None:
 
 
 @command("score", "study.scoring:score", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score")
-def score(call: Any) -> None:
+def run_score(call: Any) -> None:
     """Print the scores."""
     output.print_faithfulness(call())
 
 
 @command("diagnose", "study.diagnose:diagnose", "sliplens diagnose runs/mine/train runs/mine/data -o runs/mine/why")
-def diagnose(call: Any) -> None:
+def run_diagnose(call: Any) -> None:
     """Print the findings, and draw the page."""
     diagnosis = call()
     for sentence in filter(None, (*diagnosis.sentences, diagnosis.left_out)):
@@ -548,7 +548,7 @@ def diagnose(call: Any) -> None:
     ("networks", "--network"),
     ("methods", "--method"),
 )
-def study(call: Any) -> None:
+def run_study(call: Any) -> None:
     """Draw the page."""
     if "out" not in call.keywords:
         raise InputError("name the folder of the study with -o FOLDER")
@@ -557,7 +557,7 @@ def study(call: Any) -> None:
 
 
 @command("status", "runner:read_status", "sliplens status runs/mine/margins")
-def status(call: Any) -> None:
+def run_status(call: Any) -> None:
     """Print the progress."""
     output.print_status(Path(call.keywords["out"]), call())
 
@@ -569,7 +569,7 @@ def status(call: Any) -> None:
     ("settings", "--set"),
     ("latency_s", "--latency"),
 )
-def grip(call: Any) -> None:
+def run_grip(call: Any) -> None:
     """Print what became of the episodes, and draw the page."""
     if "out" not in call.keywords:
         raise InputError("name the folder to make with -o FOLDER")
@@ -586,7 +586,7 @@ def grip(call: Any) -> None:
     ("ceiling_n", "--ceiling"),
     ("watchdog_s", "--watchdog"),
 )
-def hold(
+def run_hold(
     call: Any,
     *,
     dry_run: bool = False,
@@ -676,7 +676,7 @@ def hold(
         if reader.lesson is not None:
             say(f"{name}: {reader.lesson}" if len(readers) > 1 else reader.lesson, aside=True)
     if "out" in arguments:
-        wrote(Path(arguments["out"]), number_of(len(result.steps), "command"))
+        print_file(Path(arguments["out"]), number_of(len(result.steps), "command"))
     if result.ended == "failed":
         raise SliplensError(result.why)
 
@@ -700,13 +700,13 @@ class _Steps:
 
 
 @command("report", "report.page:write_report", "sliplens report runs/mine")
-def report(call: Any) -> None:
+def run_report(call: Any) -> None:
     """Print what was written."""
     output.print_written(call())
 
 
 @command("doctor", "doctor:examine_installation", "sliplens doctor")
-def doctor(call: Any) -> None:
+def run_doctor(call: Any) -> None:
     """Print a line for each part; exit code 2 if something that is installed does not work."""
     with reporting(Terminal()), open_stage("Trying what is installed"):
         items = call()

@@ -35,8 +35,8 @@ def say(message: str, *, aside: bool = False) -> None:
     (ERR if aside else OUT).print(_shown(message), soft_wrap=True, highlight=False)
 
 
-def wrote(path: Path, what: str, *, kept: bool = False) -> None:
-    """Say what was written where, or that it was there already."""
+def print_file(path: Path, what: str, *, kept: bool = False) -> None:
+    """Print what was written where, or that it was complete already."""
     verb, what = ("kept", "made before with the same settings; --overwrite makes it again") if kept else ("wrote", what)
     OUT.print(f"[green]{verb}[/] {_shown(str(path))}  [dim]{_shown(what)}[/]", soft_wrap=True, highlight=False)
 
@@ -44,13 +44,15 @@ def wrote(path: Path, what: str, *, kept: bool = False) -> None:
 class Terminal:
     """Progress of a command on the terminal: a bar for each stage that is open, what was written, and notes.
 
-    Give it as `on_progress` to any call of the library. Notes that are told while a stage is open are shown when the
-    last one ends, equal ones once, with how often they were told.
+    Give it as `on_progress` to any call of the library. Notes that come while a stage is open are printed when the last
+    one ends, equal ones once, with their number.
     """
 
     def __init__(self) -> None:
-        told = [getattr(rich_progress, f"{name}Column")() for name in ("MofNComplete", "TimeElapsed", "TimeRemaining")]
-        columns = rich_progress.TextColumn("{task.description}"), rich_progress.BarColumn(bar_width=30), *told
+        counters = [
+            getattr(rich_progress, f"{name}Column")() for name in ("MofNComplete", "TimeElapsed", "TimeRemaining")
+        ]
+        columns = rich_progress.TextColumn("{task.description}"), rich_progress.BarColumn(bar_width=30), *counters
         self._bars = rich_progress.Progress(*columns, console=OUT)
         self._open: list[rich_progress.TaskID] = []
         self._notes: Counter[str] = Counter()
@@ -81,10 +83,10 @@ class Terminal:
                     self._tell_notes()
                 self._bars.remove_task(task)
 
-    wrote = staticmethod(wrote)
+    wrote = staticmethod(print_file)
 
     def note(self, message: str, /) -> None:
-        """Say a sentence; one that is told again and again is shown once, with a count."""
+        """Print a sentence; one that is repeated is printed once, with a count."""
         with self._lock:
             self._notes[message] += 1
             if not self._open:
@@ -102,12 +104,12 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
         _column(visible(" ".join(name.split())), [visible(row[place]) for row in rows], names=place == 0)
         for place, name in enumerate(header)
     ]
-    for number, shown in enumerate(_fitting(columns, OUT.width)):
+    for number, part in enumerate(_fitting(columns, OUT.width)):
         table = Table(title=_shown(title) + (", continued" if number else ""), title_justify="left")
-        for column in shown:
+        for column in part:
             numbers = column is not columns[0] and any(re.match(r"[-+]?\d", cell) for cell in column.cells)
             table.add_column(column.head, justify="right" if numbers else "left")
-        for cells in zip(*(column.cells for column in shown), strict=True):
+        for cells in zip(*(column.cells for column in part), strict=True):
             table.add_row(*map(escape, cells))
         OUT.print(table)
 
@@ -135,11 +137,11 @@ def _column(name: str, cells: Sequence[str], *, names: bool) -> _Column:
 
 def _fitting(columns: Sequence[_Column], width: int) -> Iterator[list[_Column]]:
     """Deal columns out to tables no wider than the terminal, the column of names in each."""
-    shown = [columns[0]]
+    fitting = [columns[0]]
     for column in columns[1:]:
         # two blanks and a rule a column, and one rule more
-        if sum(one.width + 3 for one in (*shown, column)) + 1 > width and len(shown) > 1:
-            yield shown
-            shown = [columns[0]]
-        shown.append(column)
-    yield shown
+        if sum(each.width + 3 for each in (*fitting, column)) + 1 > width and len(fitting) > 1:
+            yield fitting
+            fitting = [columns[0]]
+        fitting.append(column)
+    yield fitting

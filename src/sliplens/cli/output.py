@@ -8,7 +8,7 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sliplens.cli.console import Terminal, print_table, say, wrote
+from sliplens.cli.console import Terminal, print_file, print_table, say
 from sliplens.errors import InputError
 from sliplens.files import RUN_FILE
 from sliplens.progress import fold_equal, number_of, open_stage, report_file, reporting
@@ -125,14 +125,14 @@ def draw_audits(data: "Dataset", folder: Path) -> None:
     from sliplens.plots.audit import write_audits
 
     if write_audits(data, folder, on_progress=Terminal()):
-        wrote(folder, "a page for each trial: look at them before you train")
+        print_file(folder, "a page for each trial: look at them before you train")
 
 
-def write_trials_page(data: "Dataset") -> None:
+def show_trials_page(data: "Dataset") -> None:
     """Write the page of all trials."""
-    from sliplens.report.trials import write_trials_page as write
+    from sliplens.report.trials import write_trials_page
 
-    wrote(write(data), "all trials at a glance: margins, friction, flags")
+    print_file(write_trials_page(data), "all trials at a glance: margins, friction, flags")
 
 
 def show_labelling(title: str, data: "Dataset") -> None:
@@ -222,9 +222,9 @@ def print_known_trials(folder: Path, network: Path) -> None:
     from sliplens.training.evaluation import find_training_trials
 
     trials = load_dataset(folder).trials
-    known = Counter(trial.split for trial in find_training_trials(trials, load(network)))
+    trained = Counter(trial.split for trial in find_training_trials(trials, load(network)))
     for split, count in Counter(trial.split for trial in trials).items():
-        say(f"{network} was trained on {known[split]} of the {count} {split} trials of {folder}")
+        say(f"{network} was trained on {trained[split]} of the {count} {split} trials of {folder}")
 
 
 def print_scores(evaluation: "Evaluation") -> None:
@@ -394,8 +394,8 @@ def print_written(written: "Written") -> None:
     """Print the page and the figures of a report."""
     if written.figures:
         count = number_of(len(written.figures) // 2, "figure")
-        wrote(written.figures[0].parent, f"{count} as PDF, their numbers as CSV")
-    wrote(written.page, "open it in a browser")
+        print_file(written.figures[0].parent, f"{count} as PDF, their numbers as CSV")
+    print_file(written.page, "open it in a browser")
 
 
 def print_items(items: "Sequence[Item]") -> None:

@@ -225,25 +225,22 @@ def require_rerun() -> ModuleType:
     return rerun
 
 
-def write_rrd(
-    viewed: ViewedTrial, path: Path, *, overlays: Overlays = Overlays(), on_progress: OnProgress | None = None
-) -> None:
+def write_rrd(viewed: ViewedTrial, path: Path, *, overlays: Overlays = Overlays()) -> None:
     """Write a trial as a file of the Rerun viewer; it appears when complete."""
     require_rrd_path(path)
     require_rerun()
-    with written_whole(path) as part, reporting(on_progress):
+    with written_whole(path) as part:
         part.touch()  # Rerun reports a file that cannot be written in its own way
         failure = f"{path} could not be written; see what space is left"
         _play_into(viewed, lambda stream: stream.save(part), overlays, failure=failure)
 
 
-def open_viewer(viewed: ViewedTrial, *, overlays: Overlays = Overlays(), on_progress: OnProgress | None = None) -> None:
+def open_viewer(viewed: ViewedTrial, *, overlays: Overlays = Overlays()) -> None:
     """Open a trial in a Rerun viewer of its own, which stays when this process ends."""
     require_rerun()
     address = start_viewer()
-    with reporting(on_progress):
-        failure = "the Rerun viewer was closed too early; leave it open"
-        _play_into(viewed, lambda stream: stream.connect_grpc(address), overlays, failure=failure)
+    failure = "the Rerun viewer was closed too early; leave it open"
+    _play_into(viewed, lambda stream: stream.connect_grpc(address), overlays, failure=failure)
 
 
 def _play_into(viewed: ViewedTrial, connect: Callable[[Any], None], overlays: Overlays, *, failure: str) -> None:

@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float, UInt8
 
-from sliplens.codec import from_builtins, open_parquet, read_parquet, telling_parquet, to_builtins
+from sliplens.codec import from_builtins, open_parquet, parquet_errors, read_parquet, to_builtins
 from sliplens.errors import RecordingError
 from sliplens.files import hash_json, parse_json, whole_file
 from sliplens.images import MOST_PIXELS, decode_png, encode_png
@@ -40,7 +40,7 @@ CODEC = "rows+zstd"
 ROW_GROUP = 64
 """Frames that are written and read together."""
 _AGAIN = "make the data set again"
-reading = partial(telling_parquet, cure=_AGAIN, error=RecordingError)
+reading = partial(parquet_errors, cure=_AGAIN, error=RecordingError)
 """Context that turns errors of a missing or damaged file into a `RecordingError` with its cure."""
 
 

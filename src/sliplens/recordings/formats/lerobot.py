@@ -17,7 +17,7 @@ from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import Float
 
-from sliplens.codec import open_parquet, read_parquet, telling_parquet
+from sliplens.codec import open_parquet, parquet_errors, read_parquet
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import read_json
 from sliplens.images import telling_damage
@@ -220,7 +220,7 @@ def image_frames(episode: Episode, key: str) -> tuple[tuple[int, int], Callable[
 def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int, int] | None) -> Iterator[Frame]:
     index = 0
     columns = {"episode_index": "whole numbers", key: "values"}
-    damage = telling_parquet(path, cure=_COPY, error=RecordingError)
+    damage = parquet_errors(path, cure=_COPY, error=RecordingError)
     with open_parquet(path, columns, cure=_COPY, error=RecordingError) as file, damage:
         # without this, each episode would cost all that share its file
         import pyarrow.dataset as ds  # noqa: PLC0415 (takes a second, and other formats are read without)
