@@ -15,7 +15,6 @@ from sliplens.plots.errors import (
     plot_bins,
     plot_faithfulness,
     plot_learning_curves,
-    plot_margin_over_time,
     plot_predictions,
 )
 from sliplens.plots.style import BLUE, GREEN, INPUT_COLOURS, ORANGE
@@ -40,13 +39,11 @@ def legend(ax: Axes) -> list[str]:
 
 def draw(name: str, results: Results, ax: Axes) -> Axes:
     evaluations, scored = results.evaluations, results.scores["difference", "simulated"]
-    trial = {key: one.predictions.where(one.predictions.trial == "day4-dry-000") for key, one in evaluations.items()}
     return {
         "bins": lambda: plot_bins({key: one.conditions["dry"].bins for key, one in evaluations.items()}, ax=ax),
         "predictions": lambda: plot_predictions(evaluations["raw"].predictions, colour=ORANGE, ax=ax),
         "learning": lambda: plot_learning_curves(results.trainings, ax=ax),
         "faithfulness": lambda: plot_faithfulness(scored.curves, pixels=24 * 24, ax=ax),
-        "time": lambda: plot_margin_over_time(trial, ax=ax),
     }[name]()
 
 
@@ -65,7 +62,6 @@ def draw(name: str, results: Results, ax: Axes) -> Axes:
             ("Pixels removed (%)", "Deletion score D (no unit)"),
             ["Grad-CAM", "Integrated Gradients", "Poly-CAM", "Random order (control)"],
         ),
-        ("time", ("Time (s)", "Safety margin Γ (%)"), ["true", "Raw", "Difference"]),
     ],
 )
 def test_figure_names_its_axes_units_and_series(results, ax, name, labels, entries):
@@ -96,11 +92,9 @@ def test_an_input_keeps_its_colour_in_every_figure(results):
     assert INPUT_COLOURS == {"raw": ORANGE, "difference": BLUE, "pair": GREEN}
     bars = draw("bins", results, Figure().subplots())
     learning = draw("learning", results, Figure().subplots())
-    time = draw("time", results, Figure().subplots())
 
     assert [to_hex(group[0].get_facecolor()).upper() for group in bars.containers] == [ORANGE, BLUE]
     assert [line.get_color() for line in learning.lines] == [ORANGE, ORANGE, BLUE, BLUE]
-    assert [line.get_color() for line in time.lines][1:3] == [ORANGE, BLUE]
 
 
 def test_faithfulness_curve_is_the_mean_over_frames(results, ax):

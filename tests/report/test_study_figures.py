@@ -9,19 +9,16 @@ from matplotlib.figure import Figure
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.faithfulness.scoring import deletion_order
 from sliplens.report import load_results
-from sliplens.report.pictures import plate_removal, plate_truth
+from sliplens.report.pictures import plate_truth
 from sliplens.report.plates import (
     Cell,
     Plate,
     bright_pictures,
     draw_grid,
     explained_of,
-    gone,
     picture_brightness,
     shown_frames,
-    told_frame,
     write_plates,
 )
 from sliplens.report.tables import table_scores
@@ -42,16 +39,6 @@ def make_plate(name: str = "one", numbers: dict | None = None) -> Plate:
     )
 
 
-def test_what_is_gone_is_what_the_score_removes(rng):
-    # many ties: which of them goes first must be the same too
-    saliency = rng.integers(0, 4, (12, 9)) / 3
-
-    for pixels in (0, 1, 17, 60, 108):
-        expected = np.zeros(saliency.size, dtype=bool)
-        expected[deletion_order(saliency)[:pixels]] = True
-        np.testing.assert_array_equal(gone(saliency, pixels), expected.reshape(saliency.shape))
-
-
 def test_shown_frames_are_one_trial_from_stick_to_slip(results):
     explained = explained_of(results, "raw")
     assert explained is not None
@@ -60,16 +47,6 @@ def test_shown_frames_are_one_trial_from_stick_to_slip(results):
 
     assert [frame.level for frame in frames] == [1.0, 0.8, 0.6, 0.4, 0.2, 0.0]
     assert {explained.frames[frame.index].id[:3] for frame in frames} == {"t00"}
-
-
-def test_deletion_is_shown_on_the_scored_frame_nearest_to_a_fifth(results):
-    explained = explained_of(results, "raw")
-    assert explained is not None
-
-    index = told_frame(explained, results.scores["raw", "simulated"].curves)
-
-    assert index is not None
-    assert explained.frames[index].id == "t00-f0032"
 
 
 def test_differences_are_made_brighter_all_alike_and_raw_frames_never(results):
@@ -116,15 +93,6 @@ def test_only_pictures_on_black_are_brightened():
     assert picture_brightness("signed", middle) == picture_brightness("raw", middle) == (1.0, "Input")
 
 
-def test_removed_pixels_are_as_many_as_the_caption_says(results):
-    plate = plate_removal(results, "poly-cam")
-
-    assert plate is not None
-    shares = np.array(plate.numbers["share_removed"])[:7]
-    # one step removes 1/24 of the image: the nearest step is within half of that
-    np.testing.assert_allclose(shares, [0, 0.01, 0.05, 0.1, 0.2, 0.5, 1.0], atol=1 / 24)
-
-
 def test_grid_has_an_axes_for_each_cell_and_leaves_absent_ones_blank():
     picture = np.zeros((5, 5, 3), dtype=np.uint8)
 
@@ -155,18 +123,6 @@ def test_folder_that_cannot_be_made_is_told(tmp_path):
 
     with pytest.raises(InputError, match=r"cannot write .*one.pdf"):
         write_plates([make_plate()], tmp_path / "figures")
-
-
-def test_same_plate_makes_the_same_files(tmp_path):
-    files = [write_plates([make_plate()], tmp_path / name)[0].read_bytes() for name in "ab"]
-
-    assert files[0] == files[1]
-    assert make_plate().picture == make_plate().picture
-
-
-def test_figures_of_the_thesis_are_named_as_such():
-    assert make_plate("fig-05-deletion").files.startswith("Fig. 5 of the thesis, for this data;")
-    assert make_plate("timing").files.startswith("Also figures/timing.pdf")
 
 
 @pytest.mark.parametrize(("more", "beside"), [((), "Poly-CAM"), (("poly-cam-thesis",), "Poly-CAM as in the thesis")])

@@ -113,25 +113,6 @@ def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: A
     return ax
 
 
-def plot_margin_over_time(trials: Mapping[str, ScoredFrames], *, ax: Axes) -> Axes:
-    """Draw the label and the prediction of each network through one trial, by input."""
-    ordered = {name: trials[name].where(np.argsort(trials[name].time_s)) for name in inputs_in_order(trials)}
-    label = next(iter(ordered.values()))
-    ax.plot(label.time_s, 100 * label.safety_margin, color=BLACK, linewidth=2.4, label="true")
-    # where only some networks withhold, their lines have gaps
-    together = zip(*(trial.withheld.tolist() for trial in ordered.values()), strict=False)
-    shade_withheld(label.time_s, [reasons[0] if all(reasons) else "" for reasons in together], ax=ax)
-    for name, trial in ordered.items():
-        line = {"color": INPUT_COLOURS.get(name, PURPLE), "marker": "o", "markersize": 3, "linewidth": 1.2}
-        read = np.where(trial.withheld == "", 100 * trial.prediction, np.nan)
-        ax.plot(trial.time_s, read, label=short_input_name(name), **line)
-    ax.axhline(0, color=GREY, linewidth=0.8)
-    ylim = _limits(np.concatenate([trial.prediction for trial in trials.values()]))
-    ax.set(xlabel="Time (s)", ylabel=MARGIN_LABEL, ylim=ylim)
-    _legend_above(ax)
-    return ax
-
-
 def _legend_above(ax: Axes) -> None:
     # right of the title, where it can hide no data
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3, borderaxespad=0.2, columnspacing=1.2)

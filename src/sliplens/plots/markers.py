@@ -1,20 +1,14 @@
-"""Figures of markers: arrows on a frame, the displacement field, and both beside saliency."""
-
-from collections.abc import Sequence
-from dataclasses import dataclass
+"""Figures of markers: arrows on a frame, and the displacement field."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from matplotlib.patheffects import Normal, Stroke
 
-from sliplens.errors import InputError
 from sliplens.markers import DisplacementField
-from sliplens.plots.saliency import overlay_saliency, plot_colour_bar, stretch_saliency
-from sliplens.plots.style import BLACK, GREY, drawing_style
+from sliplens.plots.style import BLACK
 
 # light is far: equal under every common colour blindness
 FIELD_COLOURS = "cividis"
@@ -24,18 +18,6 @@ ARROWS = 5.0
 """Length of arrows over the displacement."""
 STILL_PX = 0.3
 """Displacement below which a direction is noise."""
-_PANEL_IN = 2.2
-
-
-@dataclass(frozen=True, kw_only=True)
-class MarkedFrame:
-    """A frame with its displacement field and the saliency of a prediction."""
-
-    title: str
-    frame: UInt8[np.ndarray, "height width 3"]
-    field: DisplacementField
-    saliency: Float[np.ndarray, "_ _"]
-    """In [0, 1]."""
 
 
 def plot_arrows(
@@ -84,47 +66,10 @@ def plot_field(
     return ScalarMappable(norm, FIELD_COLOURS)
 
 
-def draw_fields_beside_saliency(frames: Sequence[MarkedFrame]) -> Figure:
-    """Draw each frame, its field and the saliency on it side by side, a row a frame (thesis, Fig. 12)."""
-    if not frames:
-        raise InputError("there is no frame to draw; give at least one")
-    fields = [marked.field for marked in frames]
-    longest = max(
-        float(np.linalg.norm(field.displacement_px, axis=-1)[field.confidence > SURE].max()) for field in fields
-    )
-    with drawing_style():
-        figure = Figure(figsize=(3 * _PANEL_IN + 1.4, _PANEL_IN * len(frames) + 1.3), layout="constrained")
-        heights = [*[1.0] * len(frames), 0.07]
-        grid = figure.add_gridspec(len(frames) + 1, 3, height_ratios=heights)
-        axes = np.array([[figure.add_subplot(grid[row, column]) for column in range(3)] for row in range(len(frames))])
-        mappable = None
-        for marked, row in zip(frames, axes, strict=True):
-            row[0].imshow(marked.frame)
-            mappable = plot_field(marked.field, size=marked.frame.shape[:2], ax=row[1], longest_px=longest)
-            row[2].imshow(overlay_saliency(marked.frame, stretch_saliency(marked.saliency)))
-            for place in row:
-                place.grid(visible=False)
-                place.set(xlabel="", ylabel="")
-                place.tick_params(labelleft=place is row[0], labelbottom=place in axes[-1])
-            row[0].set_ylabel(f"{marked.title}\ny (px)", color=GREY)
-        for place in axes[-1]:
-            place.set_xlabel("x (px)")
-        for place, title in zip(axes[0], ("Camera", "Displacement field", "Saliency"), strict=True):
-            place.set_title(title)
-        bars = [figure.add_subplot(grid[-1, column]) for column in (1, 2)]
-        assert mappable is not None  # there is a frame
-        figure.colorbar(mappable, cax=bars[0], orientation="horizontal", label="Displacement (px)")
-        plot_colour_bar(ax=bars[1])
-        bars[1].set_xlabel("Saliency (share of the brightest)")
-    return figure
-
-
 def _ends(places: Float[np.ndarray, " places"]) -> tuple[float, float]:
     """Return the outer edges of the cells of an even grid."""
     half = (places[1] - places[0]) / 2
     return float(places[0] - half), float(places[-1] + half)
 
 
-__all__ = [
-    "ARROWS", "FIELD_COLOURS", "MarkedFrame", "draw_fields_beside_saliency", "plot_arrows", "plot_field",
-]  # fmt: skip
+__all__ = ["ARROWS", "FIELD_COLOURS", "plot_arrows", "plot_field"]

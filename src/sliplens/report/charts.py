@@ -16,7 +16,6 @@ from sliplens.report.plates import Plate, named_columns, rows_of
 from sliplens.report.results import Results
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, RemovalCurve, is_control
 
-_EACH_FIGURES = {"difference": "fig-17-faithfulness-difference", "raw": "fig-18-faithfulness-raw"}
 _FEW = 4  # charts in a row
 
 
@@ -93,36 +92,6 @@ def plate_predictions(results: Results) -> Plate:
     )
 
 
-def plate_over_time(results: Results) -> Plate | None:
-    """Draw label and answers through one typical test trial of each condition."""
-    chosen = {
-        result: trial for result in _conditions(results) if (trial := _typical_trial(results, result)) is not None
-    }
-    if not chosen:
-        return None
-    figure, axes = make_charts(len(chosen), each=(4.6, 3.1))
-    rows = []
-    with style.drawing_style():
-        for ax, (condition, trial) in zip(axes, chosen.items(), strict=True):
-            drawn = {}
-            for name, evaluation in results.evaluations.items():
-                of_trial = (evaluation.predictions.trial == trial) & (evaluation.predictions.condition == condition)
-                if of_trial.any():
-                    drawn[name] = frames = evaluation.predictions.where(of_trial)
-                    values = rows_of(frames.time_s, frames.safety_margin, frames.prediction, frames.withheld)
-                    rows += [(name, trial, *value) for value in values]
-            errors.plot_margin_over_time(drawn, ax=ax).set_title(condition.capitalize(), parse_math=False)
-    text = ", ".join(f"{trial} ({condition})" for condition, trial in chosen.items())
-    return Plate(
-        name="over-time",
-        figure=figure,
-        alt=f"True and predicted Γ over time through the test trials {text}",
-        caption="Safety margin through one test trial of each condition: the trial whose mean error is the median of "
-        f"all, neither the best nor the worst. Shown: {text}.",
-        numbers=named_columns(("input", "trial", "time_s", "safety_margin", "prediction", "withheld"), rows),
-    )
-
-
 def plate_learning(results: Results) -> Plate:
     """Draw the learning curves of all inputs."""
     trainings = {name: results.trainings[name] for name in style.inputs_in_order(results.trainings)}
@@ -166,33 +135,6 @@ def plate_faithfulness(scores: Mapping[str, DeletionScores]) -> Plate:
         "is the mean over frames, the band holds the middle half of them. A curve that falls early names pixels the "
         f"network relies on. Mean over all steps, lowest first, {text}.",
         numbers=_deletion_numbers(scores),
-    )
-
-
-def plate_each_frame(scored: DeletionScores) -> Plate:
-    """Draw the thesis's curve of every frame, a chart a method (thesis, Figs. 17 and 18)."""
-    methods, name = style.methods_in_order(scored.curves), style.input_name(scored.input).lower()
-    figure, axes = make_charts(len(methods), each=(2.9, 2.5))
-    text = []
-    with style.drawing_style():
-        for ax, method in zip(axes, methods, strict=True):
-            curve, colour = scored.curves[method], style.method_colour(method)
-            share = 100 * curve.pixels_removed / _pixels(scored)
-            # dozens of curves as vectors would swell the page
-            ax.plot(share, curve.scores.T, color=colour, alpha=0.3, linewidth=0.7, rasterized=True)
-            ax.plot(share, curve.scores.mean(axis=0), color=style.BLACK, linewidth=2)
-            ax.set(xlim=(0, 100), ylim=(0, 1.03), xlabel="Pixels removed (%)", ylabel="D (no unit)")
-            ax.set_title(style.method_name(method), fontsize=9.5)
-            means = curve.scores.mean(axis=1)
-            text.append(f"{style.method_name(method)} {means.mean():.3f} (standard deviation {means.std():.3f})")
-    frames = max(len(curve.frame_ids) for curve in scored.curves.values())
-    return Plate(
-        name=_EACH_FIGURES.get(scored.input, f"faithfulness-{scored.input}"),
-        figure=figure,
-        alt=f"Deletion score D of every frame, {name}: {'; '.join(text)}",
-        caption=f"Deletion score D of each of {number_of(frames, 'frame')} ({name}), in black their mean. "
-        f"Score: {'; '.join(text)}.",
-        numbers=_deletion_numbers({scored.input: scored}),
     )
 
 
@@ -298,15 +240,6 @@ def _conditions(results: Results) -> list[str]:
     return style.conditions_in_order(
         name for evaluation in results.evaluations.values() for name in evaluation.conditions
     )
-
-
-def _typical_trial(results: Results, condition: str) -> str | None:
-    # judged by the last input (difference where it was run), so that the choice favours neither curve by eye
-    chosen = results.evaluations[style.inputs_in_order(results.evaluations)[-1]].predictions
-    chosen = chosen.where(chosen.condition == condition)
-    error = np.abs(chosen.prediction - chosen.safety_margin)
-    ranked = sorted(np.unique(chosen.trial).tolist(), key=lambda trial: float(error[chosen.trial == trial].mean()))
-    return ranked[(len(ranked) - 1) // 2] if ranked else None
 
 
 def _pixels(scored: DeletionScores) -> int:

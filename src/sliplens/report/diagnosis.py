@@ -31,7 +31,6 @@ def show_diagnosis(diagnosis: Diagnosis) -> Iterable[Table | Plate]:
     yield table_slices(diagnosis)
     if len(diagnosis.frictions):
         yield plate_frictions(diagnosis)
-        yield plate_refilmed(diagnosis)
     yield plate_kinds(diagnosis)
 
 
@@ -87,25 +86,6 @@ def plate_frictions(diagnosis: Diagnosis) -> Plate:
         "Best: the slope of the best reading of the markers, which knows how far frictions and loads range: far below "
         "1 where the picture hardly shows the friction.",
         numbers=named_columns(names, rows_of(*(getattr(diagnosis.frictions, name) for name in names))),
-    )
-
-
-def plate_refilmed(diagnosis: Diagnosis) -> Plate:
-    """Show one frame with each of its frictions."""
-    frames = diagnosis.frictions.where(diagnosis.frictions.frame_id == diagnosis.shown_frame)
-    factor, name = picture_brightness(diagnosis.input, diagnosis.pictures)
-    pictures = brighten(diagnosis.other_frictions, factor)
-    rows = rows_of(frames.friction, frames.safety_margin, frames.prediction)
-    words = [f"Γ {percent(margin)}, read {percent(answer)}" for _, margin, answer in rows]
-    cells = [Cell(picture=picture, words=below) for picture, below in zip(pictures, words, strict=True)]
-    return Plate(
-        name=f"diagnosis-refilmed-{diagnosis.input}",
-        figure=draw_grid([(name, cells)], heads=[f"friction {row[0]:.2f}" for row in rows]).figure,
-        alt=f"One frame filmed with other frictions: {'; '.join(words)}",
-        caption=f"{diagnosis.shown_frame} with the same forces on objects of other friction, as the network would see "
-        "it, with the true margin and the answer.",
-        numbers=named_columns(("friction", "safety_margin", "prediction"), rows),
-        pixels=True,
     )
 
 

@@ -10,7 +10,7 @@ from textwrap import fill
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -28,7 +28,6 @@ from sliplens.plots.style import (
 )
 from sliplens.report.results import Results
 from sliplens.results.explanation import Explanation
-from sliplens.results.faithfulness import DeletionCurve
 
 CELL_IN = 1.5
 _GAP_IN, _LEFT_IN, _HEAD_IN, _WORDS_IN, _BAR_IN = 0.06, 1.25, 0.42, 0.2, 0.75
@@ -224,22 +223,3 @@ def picture_brightness(name: str, pictures: Iterable[UInt8[np.ndarray, "height w
     # where no change is black; elsewhere the ground would turn white
     factor = brightening([picture[None] for picture in pictures]) if name in {"difference", "amplitude"} else 1.0
     return factor, "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"
-
-
-def told_frame(explained: Explanation, curves: dict[str, DeletionCurve]) -> int | None:
-    """Pick the frame that deletion is shown on: the first of those scored whose label is nearest to 20 %."""
-    scored = {name for curve in curves.values() for name in curve.frame_ids}
-    labels = {
-        index: abs(frame.safety_margin - THESIS_LEVEL)
-        for index, frame in enumerate(explained.frames)
-        if frame.id in scored and frame.safety_margin is not None
-    }
-    # labels of frames looked for at one level differ by chance: the first trial's will do
-    return min(labels, key=lambda index: (round(labels[index], 2), index), default=None)
-
-
-def gone(saliency: np.ndarray, pixels: int) -> Bool[np.ndarray, "height width"]:
-    """Mark the most salient pixels of a map, ties to the later pixel first, as the score removes them."""
-    mask = np.zeros(saliency.size, dtype=bool)
-    mask[np.argsort(saliency.ravel(), kind="stable")[::-1][:pixels]] = True
-    return mask.reshape(saliency.shape)

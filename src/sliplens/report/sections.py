@@ -93,7 +93,6 @@ def _accuracy(results: Results, _: np.random.Generator) -> Iterable[Block | None
         yield tables.table_accuracy(results)
         yield charts.plate_bins(results)
         yield charts.plate_predictions(results)
-        yield charts.plate_over_time(results)
 
 
 def _faithfulness(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
@@ -102,8 +101,6 @@ def _faithfulness(results: Results, _: np.random.Generator) -> Iterable[Block | 
         yield tables.table_scores(records[name], results.scores.get((name, results.study.source)))
         yield tables.table_leads(records[name])
         yield _alarms(results, name, "faithfulness")
-        yield tables.table_equal_areas(records[name])
-        yield tables.table_agreement(records[name])
         yield charts.plate_removal_curves(records[name])
 
 
@@ -117,7 +114,6 @@ def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | No
     yield from (
         tables.table_deletion(scores, rng=rng) for scores in by_source.values() if not results.study.faithfulness
     )
-    yield pictures.plate_deletion(results)
     yield from (charts.plate_faithfulness(scores) for scores in by_source.values())
     remedies, rows = results.study.remedies, by_source.get(results.study.source, {})
     for name in _names({*rows, *remedies}):
@@ -125,11 +121,6 @@ def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | No
         if name in remedies:
             yield tables.table_remedies(remedies[name], rows.get(name))
             yield _alarms(results, name, "remedies")
-    yield pictures.plate_highlighted(results)
-    if rows:
-        yield from (pictures.plate_removal(results, method) for method in pictures.shown_methods(results))
-    if results.study:
-        yield from (charts.plate_each_frame(scored) for scored in rows.values())
 
 
 def _randomisation(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
@@ -143,7 +134,6 @@ def _randomisation(results: Results, _: np.random.Generator) -> Iterable[Block |
 def _maps(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     study = results.study
     if study.states is not None:
-        yield pictures.plate_contact_states(study.states)
         yield _notes("Markers that could not be followed", study.states.untracked, tone="caution")
     yield pictures.plate_methods(results)
     for name in _names(results.inputs):
@@ -151,26 +141,20 @@ def _maps(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
         if explained is not None:
             yield pictures.plate_states(results, explained)
             yield _alarms(results, name, "explain")
-    yield pictures.plate_poly_cam(results) if study else None
-    yield pictures.plate_fields_beside_saliency(results)
     yield tables.table_looks(study.map_quality) if study.map_quality else None
 
 
 def _real(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     chosen = {name: explanation for (name, source), explanation in results.explanations.items() if source == "real"}
-    if chosen:
-        yield tables.table_real(results)
-        if results.study.source != "real":
-            for name in _names(chosen):
-                yield pictures.plate_states(results, chosen[name])
-                yield _alarms(results, name, "explain") if explained_of(results, name) is None else None
+    if chosen and results.study.source != "real":
+        for name in _names(chosen):
+            yield pictures.plate_states(results, chosen[name])
+            yield _alarms(results, name, "explain") if explained_of(results, name) is None else None
 
 
 def _cost(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     if results.study.timing:
         yield tables.table_times(results.study.timing)
-    elif results.explanations:
-        yield tables.table_seconds(results)
 
 
 def _truth(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
@@ -212,7 +196,7 @@ def _recipe(results: Results, absent: list[str]) -> Section:
         short_title="Recipe",
         intro=intro,
         missing=(f"{', '.join(absent)}: not run yet; `sliplens study` makes it.",) if absent else (),
-        blocks=(tables.table_training(results), charts.plate_learning(results)) if results.trainings else (),
+        blocks=(charts.plate_learning(results),) if results.trainings else (),
     )
 
 
@@ -341,7 +325,7 @@ SECTIONS: tuple[Section, ...] = (
         short_title="Cost",
         intro="Seconds a frame; a study measures them with warm-up, and waiting for the device to finish.",
         build=_cost,
-        needs=lambda results: results.study.timing or {name for name, _ in results.explanations},
+        needs=lambda results: results.study.timing,
     ),
     Section(
         id="choice",

@@ -9,12 +9,10 @@ import numpy as np
 from sliplens.intervals import Difference
 from sliplens.plots.style import (
     FILL_NAMES,
-    UNIT_NAMES,
     UNKNOWN,
     conditions_in_order,
     decimals,
     fill_name,
-    in_order,
     input_name,
     inputs_in_order,
     method_name,
@@ -32,7 +30,6 @@ from sliplens.report.comparisons import (
     NETWORK_PIXELS,
     SECONDS,
     against_control,
-    mean_at,
     settings,
     tell_bounds,
     tell_interval,
@@ -40,7 +37,6 @@ from sliplens.report.comparisons import (
     thesis_row,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import (
     CHANCE,
     DeletionScores,
@@ -54,7 +50,6 @@ from sliplens.results.faithfulness import (
 from sliplens.results.study import MAP_MEASURES, REGIONS, Choice, MapQuality, Randomisation, Timing, Truth
 
 Kind = Literal["name", "number", "best", "thesis"]
-_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
 _LOOK_NAMES = {
     "resolution": "Resolution",
     "total_variation": "Total variation",
@@ -74,8 +69,6 @@ class Cell:
 
     text: str
     kind: Kind = "number"
-    shade: int = 0
-    """How dark its ground is, from 0 (as the page) to 4, where a table is read as a map of heat."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,67 +166,6 @@ def table_deletion(scores: Mapping[str, DeletionScores], *, rng: np.random.Gener
     )
 
 
-def table_seconds(results: Results) -> Table:
-    """Tabulate the seconds a frame that each method took, one column for each input and origin of the frames."""
-    keys = sorted(results.explanations, key=lambda key: (key[1] == "real", key[0] != "raw", key))
-    explained = {key: results.explanations[key] for key in keys}
-    methods = {name for explanation in explained.values() for name in explanation.methods}
-    sides = " and ".join(map(str, sorted({explanation.image_size for explanation in explained.values()})))
-    return make_table(
-        f"Seconds to explain one frame, images of {sides} px. The thesis timed images of {NETWORK_PIXELS} px on an RTX "
-        "3060 Ti and did not wait for the GPU to finish, so its seconds show the order of magnitude only.",
-        ("Method", *(f"{short_input_name(name)}, {source}" for name, source in keys), "Thesis"),
-        [
-            (
-                method_name(method),
-                *(_seconds_of(explanation, method) for explanation in explained.values()),
-                _thesis_seconds(method, methods),
-            )
-            for method in methods_in_order(methods)
-        ],
-    )
-
-
-def table_real(results: Results) -> Table:
-    """Tabulate label and answers of each real frame."""
-    explained = {name: explanation for (name, source), explanation in results.explanations.items() if source == "real"}
-    names = inputs_in_order(explained)
-    read = {(name, frame.id): frame.prediction for name in names for frame in explained[name].frames}
-    frames = {frame.id: frame for name in names for frame in explained[name].frames}
-    answers = {frame: [read.get((name, frame)) for name in names] for frame in frames}
-    return make_table(
-        f"{number_of(len(frames), 'real frame')}: the recorded safety margin, and what each network reads.",
-        ("Frame", "Objects", "True Γ", *(f"Read from {input_name(name).lower()}" for name in names)),
-        [
-            (
-                frame.id,
-                frame.condition.capitalize(),
-                *(percent(value) for value in (frame.safety_margin, *answers[frame.id])),
-            )
-            for frame in sorted(frames.values(), key=lambda one: (-(one.safety_margin or 0), one.id))
-        ],
-        names=2,
-    )
-
-
-def table_training(results: Results) -> Table:
-    """Tabulate how each network was trained."""
-    runs = [results.trainings[name] for name in inputs_in_order(results.trainings)]
-    frames = [(run.train_frames, run.validation_frames) for run in runs]
-    rows = (
-        ("Backbone", *(run.backbone for run in runs)),
-        ("Image side (camera)", *(f"{run.image_size} px ({' x '.join(map(str, run.frame_size))})" for run in runs)),
-        ("Frames: training / validation", *(" / ".join(map(_whole, counts)) for counts in frames)),
-        ("Epochs", *(decimals(run.epochs, 1) for run in runs)),
-        ("Minutes", *(decimals(run.minutes, 1) for run in runs)),
-        ("Stopped by", *(run.stopped_by for run in runs)),
-        ("Best validation MSE", *(decimals(run.best_validation_mse, 4) for run in runs)),
-        ("Parameters", *(_whole(run.parameters) for run in runs)),
-        ("Seed", *(str(run.seed) for run in runs)),
-    )
-    return make_table("How each network was trained.", ("", *(input_name(run.input) for run in runs)), rows)
-
-
 def table_scores(faithful: Faithfulness, scored: DeletionScores | None) -> Table:
     """Tabulate the thesis's deletion score (its Table 2) beside the symmetric gain under every fill."""
     fills = settings(faithful)
@@ -283,56 +215,6 @@ def table_leads(faithful: Faithfulness) -> Table:
         [
             (method_name(method), *(tell(leads.get((*setting, method))) for setting in fills))
             for method in methods_in_order({key[2] for key in leads})
-        ],
-    )
-
-
-def table_equal_areas(faithful: Faithfulness) -> Table | None:
-    """Tabulate the change where equal areas are gone, under the most natural fill; None without scores."""
-    fills = settings(faithful)
-    if not fills:
-        return None
-    fill, unit = fills[0]
-    scores = {score.method: score for score in faithful.scores if score.key[:2] == (fill, unit)}
-    areas = [area for area in _AREAS if any(area in score.at for score in scores.values())]
-    top = {
-        area: max((score.at[area] for score in scores.values() if area in score.at and not score.control), default=None)
-        for area in areas
-    }
-
-    def lost(score: RemovalScore, area: float) -> Cell:
-        return _best(decimals(score.at.get(area), 3), not score.control and score.at.get(area, np.nan) == top[area])
-
-    rows = [
-        (method_name(method), *(lost(scores[method], area) for area in areas)) for method in methods_in_order(scores)
-    ]
-    curve = next(curve for key, curve in faithful.curves.items() if key[:2] == (fill, unit))
-    chance = (f"{faithful.random_orders} random orders", *(decimals(mean_at(curve, area)[1], 3) for area in areas))
-    return make_table(
-        f"{input_name(faithful.input)}: mean evidence lost, in margin units, where equal shares of the image are gone, "
-        f"most supporting {UNIT_NAMES.get(unit, unit)} first (fill: {fill_name(fill)}). Bold: largest of the methods.",
-        ("Method", *(f"{percent(area)} gone" for area in areas)),
-        [*rows, chance],
-    )
-
-
-def table_agreement(faithful: Faithfulness) -> Table | None:
-    """Tabulate Kendall's tau between the fills' rankings of the methods as a map of heat; None where it is unknown."""
-    rows = [record for record in faithful.agreement if record.unit == "pixel"] or list(faithful.agreement)
-    if not rows:
-        return None
-    taus = {pair: row.tau for row in rows for pair in ((row.first, row.second), (row.second, row.first))}
-    fills = in_order({name for pair in taus for name in pair}, FILL_NAMES)
-    valid = [row.tau for row in rows if row.tau is not None]
-    worst = f" The lowest is {signed(min(valid), 2)}." if valid else ""
-    return make_table(
-        f"{input_name(faithful.input)}: how far two fills agree on the order of the methods "
-        f"({UNIT_NAMES.get(rows[0].unit, rows[0].unit)}): Kendall's tau, 1 for the same order, 0 for unrelated ones; "
-        f"darker = closer.{worst}",
-        ("Fill", *(fill_name(fill) for fill in fills)),
-        [
-            (fill_name(fill), *("·" if fill == other else _tau_cell(taus.get((fill, other))) for other in fills))
-            for fill in fills
         ],
     )
 
@@ -525,10 +407,6 @@ def _thesis_seconds(method: str, among: Collection[str]) -> str:
     return decimals(SECONDS.get(thesis_row(method, among) or ""), 3)
 
 
-def _seconds_of(explained: Explanation, method: str) -> str:
-    return decimals(explained.methods[method].seconds_per_frame if method in explained.methods else None, 3)
-
-
 def _score_cell(score: MethodScore | None, best: float | None) -> Cell:
     return Cell(text=UNKNOWN) if score is None else _best(tell_spread(score.mean, score.sd), score.mean == best)
 
@@ -541,15 +419,5 @@ def _gain_cell(score: RemovalScore | None, best: float | None) -> Cell:
     return _best(text, not score.control and score.srg.estimate == best)
 
 
-def _tau_cell(tau: float | None) -> Cell:
-    if tau is None:
-        return Cell(text=UNKNOWN)
-    return Cell(text=signed(tau, 2), shade=sum(tau >= step for step in (-1.0, 0.0, 0.4, 0.8)))
-
-
 def _seconds(value: float | None) -> str:
     return decimals(value, 4 if value is not None and value < 0.1 else 2)
-
-
-def _whole(value: int) -> str:
-    return f"{value:,}".replace(",", " ")
