@@ -119,12 +119,3 @@ def test_a_trial_that_fails_again_and_again_is_left_out_until_it_is_added(
     assert run("import", manifest, "-o", data, "--no-audit", "--add") == 0
     assert [info.trial for info in load_dataset(data).trials] == ["cup", "jar"]
     assert not load_dataset(data).left_out
-
-
-def test_many_at_once_give_the_bytes_that_one_by_one_give(imported: Path, source: Path, tmp_path: Path):
-    words = ("--sensor", source / "tip.toml", "--forces", source / "cup.csv", "--no-audit")
-    assert run("import", source / "cup.mkv", "-o", tmp_path / "one", *words) == 0
-    one, many = load_dataset(tmp_path / "one"), load_dataset(imported)
-    np.testing.assert_allclose(
-        one.read_labels(one.find("cup")).safety_margin, many.read_labels(many.find("cup")).safety_margin
-    )

@@ -22,13 +22,7 @@ from sliplens.recordings import (
     read_corrections,
 )
 from sliplens.recordings.dataset import trial_path
-from sliplens.recordings.store import (
-    forces_path,
-    load_forces,
-    load_recording,
-    read_header,
-    save_forces,
-)
+from sliplens.recordings.store import forces_path, load_forces, load_recording, read_header, save_forces
 from sliplens.runner import read_status
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -73,13 +67,6 @@ def test_an_imported_data_set_keeps_its_labels_and_what_it_is(tmp_path: Path, tr
     assert (tmp_path / "data" / "audit" / f"{trial.trial}.png").is_file()
 
 
-def test_what_is_said_on_the_command_line_counts_before_what_the_source_tells(tmp_path: Path, simulated: Path):
-    words = ("--sensor", "tip", "--day", 7, "--condition", "wet", "--object", "glass", "--test-trials", 1)
-    assert run("import", simulated, "-o", tmp_path / "data", "--no-audit", *words) == 0
-    (info,) = load_dataset(tmp_path / "data").trials
-    assert (info.sensor, info.day, info.condition, info.object, info.split) == ("tip", 7, "wet", "glass", "test")
-
-
 def test_the_labels_of_a_simulated_trial_come_back_from_its_forces(trial: Recording, relabelled: Path):
     back = load_recording(trial_path(relabelled, trial.trial))
     labelling = there(back.labelling)
@@ -120,28 +107,6 @@ def test_force_samples_are_kept_and_labels_made_anew_from_them_are_the_same(
     assert (last.source, last.notes) == (first.source, first.notes)
 
 
-def test_a_trial_of_the_default_simulation_is_labelled_though_its_frames_tell_no_lag(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    trial = simulate_trial(plan_trials(PRESETS["small"])[0])
-    save_dataset(tmp_path / "data", trial, simulated=True)
-    assert run("label", tmp_path / "data", "-o", tmp_path / "out", "--no-audit") == 0
-    assert "unknown" in capsys.readouterr().out
-    back = load_recording(trial_path(tmp_path / "out", trial.trial))
-    # six frames a second: the slip is known to a sixth of a second, in which the margin changes by some 0.02
-    error = (back.safety_margin - trial.safety_margin)[there(back.valid)]
-    assert len(error) > 35
-    assert np.sqrt(np.mean(error**2)) < 0.02
-
-
-def test_labels_made_anew_tell_how_the_reference_was_chosen(tmp_path: Path, trial: Recording, relabelled: Path):
-    assert run("label", relabelled, "-o", tmp_path / "data", "--no-audit", "--reference-frame", 2) == 0
-    chosen = there(read_header(trial_path(tmp_path / "data", trial.trial)).labelling)
-    assert run("label", tmp_path / "data", "--no-audit", "--mu", 1.6) == 0
-    anew = there(read_header(trial_path(tmp_path / "data", trial.trial)).labelling)
-    assert (anew.reference.index, anew.reference) == (2, chosen.reference)
-
-
 def test_labels_that_were_not_found_are_not_overwritten(simulated: Path, capsys: pytest.CaptureFixture[str]):
     before = (simulated / "dataset.json").read_bytes()
     assert "did not come from its forces and would be lost" in refused(capsys, "label", simulated)
@@ -163,15 +128,6 @@ def test_changed_force_samples_are_found(tmp_path: Path, trial: Recording, relab
     shutil.copytree(relabelled, tmp_path / "data")
     forces_path(tmp_path / "data", trial.trial).write_bytes(b"PAR1")
     assert run("check", tmp_path / "data") == 2
-
-
-def test_force_samples_that_no_trial_lists_are_found(
-    tmp_path: Path, trial: Recording, relabelled: Path, capsys: pytest.CaptureFixture[str]
-):
-    shutil.copytree(relabelled, tmp_path / "data")
-    shutil.copy(forces_path(relabelled, trial.trial), forces_path(tmp_path / "data", "stray"))
-    assert run("check", tmp_path / "data") == 2
-    assert "forces/stray.parquet" in capsys.readouterr().out.replace("\n", "")
 
 
 @pytest.fixture
@@ -215,25 +171,6 @@ def test_a_source_that_does_not_tell_its_sensor_needs_it_told(
     tmp_path: Path, thesis_lists: Path, capsys: pytest.CaptureFixture[str]
 ):
     assert "does not name its sensor" in refused(capsys, "import", thesis_lists, "-o", tmp_path / "data")
-
-
-def test_real_clips_come_with_what_is_known_of_them_and_no_label(tmp_path: Path, reference_folder: Path):
-    grasp = reference_folder / "gelsight_mini_slip" / "slip" / "jute_basket__exp_num_2"
-    if not grasp.is_dir():
-        pytest.skip(f"the real clips are not at {grasp}")
-    assert run("import", grasp, "-o", tmp_path / "data") == 0
-    assert run("check", tmp_path / "data") == 0
-    data = load_dataset(tmp_path / "data")
-    assert {info.object for info in data.trials} == {"jute_basket"}
-    assert {info.sensor for info in data.trials} == {"gelsight-mini"}
-    for info in data.trials:
-        back = data.load(info)
-        assert back.labelling is not None
-        assert there(back.labelling.clip).slips
-        assert not back.labelled.any()
-        assert set(back.contact_state) == {ContactState.UNKNOWN}
-        np.testing.assert_array_equal(back.reference, back.frames[back.labelling.reference.index])
-    assert len(list((tmp_path / "data" / "audit").glob("*.png"))) == 2
 
 
 def margins(folder: Path, trial: Recording) -> np.ndarray:
@@ -349,7 +286,7 @@ def test_corrections_outside_their_data_set_are_refused_with_their_cure(
     folder, table = shutil.copytree(relabelled, tmp_path / "data"), tmp_path / "corrections.csv"
     before = contents(folder)
     cases = {
-        f"{trial.trial},100..900,": "frames 100 to 900 cannot be marked as bad: the trial has frames 0 to 239",
+        f"{trial.trial},100..900,": "frames 100 to 900 cannot be marked as bad: name them from 0 to 239",
         f"{trial.trial},,99": "the slip is set to 99.00 s",
         "nobody,1..2,": f"has no trial nobody; it has {trial.trial}",
     }

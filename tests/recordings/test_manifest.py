@@ -78,12 +78,6 @@ def test_a_manifest_says_all_of_a_trial(tmp_path: Path):
     assert find_rows(path) == (one, two)
 
 
-def test_a_table_of_forces_is_no_manifest(tmp_path: Path):
-    path = tmp_path / "forces.csv"
-    path.write_text("time_s,fx,fy,fz\n0,0,0,1\n")
-    assert find_rows(path) is None
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [

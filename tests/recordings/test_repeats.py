@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from readers import read_video
 
-import sliplens as sl
 from sliplens.recordings import Recording
 from sliplens.recordings.repeats import describe_repeats, inspect_repeats
 
@@ -47,20 +46,9 @@ def test_a_camera_slower_than_its_file_is_noticed(
     assert all("repeat the one before" in note for note in notes)
 
 
-def test_predict_and_track_say_it(trials: dict[str, Recording], tmp_path: Path):
-    path = write_video(tmp_path / "a.mkv", trials["chromatouch"].frames[:20], np.arange(40) // 2, codec="ffv1")
-    predictions = sl.predict("chromatouch-difference", path, reference_frame=0)
-    assert any("repeat the one before" in note for note in predictions.notes)
-
-
 def test_a_scene_that_rests_is_no_repeat():
     moves = np.r_[np.ones(20), np.full(15, 0.01), np.ones(20), np.full(30, 0.01)]
     assert describe_repeats(moves, np.arange(len(moves)) / 30) is None
-
-
-@pytest.mark.parametrize("frames", [1, 2, 5, 60])
-def test_frames_that_never_change_are_no_repeats(frames: int):
-    assert describe_repeats(np.zeros(frames), np.arange(frames) / 30) is None
 
 
 def test_key_frames_of_lossy_video_are_no_repeats():

@@ -1,6 +1,5 @@
 """Splits: whole groups, their shares, the same on every machine; tables, and what is refused."""
 
-import hashlib
 import json
 import shutil
 from collections import Counter
@@ -102,36 +101,6 @@ def test_a_group_stays_whole_and_the_order_of_the_trials_does_not_matter(
     shuffled = data.draw(st.permutations(trials))
     assert dealt(shuffled, by, seed=seed) == splits
     assert set(deal_splits(shuffled, by=by).notes) == set(deal_splits(trials, by=by).notes)
-
-
-def test_more_trials_of_an_object_move_no_other():
-    more = [*LAB, fact("egg-3", object="egg"), fact("egg-4", object="egg", day=9)]
-    before, after = dealt(LAB, "object"), dealt(more, "object")
-    assert {name: after[name] for name in before} == before
-
-
-@pytest.mark.parametrize("count", range(10, 40, 3))
-def test_a_new_group_moves_few_others(count: int):
-    before, after = dealt(singles(count)), dealt(singles(count + 1))
-    # each of two borders lies within one group of its exact place, which moves by less than one; the groups beside it
-    # stay or move by one: at most two cross it
-    assert sum(before[name] != after[name] for name in before) <= 4
-
-
-def test_groups_are_dealt_in_the_order_of_their_hash():
-    trials = singles(10)
-    order = sorted((one.trial for one in trials), key=lambda name: hashlib.sha256(f"5:{name}".encode()).digest())
-    splits = dealt(trials, seed=5)
-    assert [splits[name] for name in order] == ["train"] * 7 + ["validation"] * 2 + ["test"]
-
-
-def test_over_the_seeds_each_group_tests_as_often():
-    trials, tests = singles(4), Counter()
-    for seed in range(400):
-        tests += Counter(name for name, split in dealt(trials, seed=seed).items() if split == "test")
-    # one of four tests each time: 100 of 400, five standard deviations of 400 draws at 1/4 are 43
-    assert sum(tests.values()) == 400
-    assert all(abs(tests[one.trial] - 100) < 43 for one in trials)
 
 
 def table(folder: Path, text: str) -> Path:

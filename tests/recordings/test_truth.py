@@ -4,12 +4,11 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings import GroundTruth, Recording
-from sliplens.recordings.store import load_recording, read_header, save_recording
+from sliplens.recordings.store import load_recording, save_recording
 
 
 @pytest.fixture
@@ -37,40 +36,10 @@ def test_truth_comes_back_without_loss(tmp_path: Path, recording: Recording, tru
     np.testing.assert_array_equal(back.frames, recording.frames)
 
 
-def test_training_does_without_the_truth(tmp_path: Path, recording: Recording, truth: GroundTruth):
-    save_recording(replace(recording, truth=truth), tmp_path / "a.parquet")
-    back = load_recording(tmp_path / "a.parquet", truth=False)
-    assert back.truth is None
-    np.testing.assert_array_equal(back.frames, recording.frames)
-
-
-def test_header_tells_a_trial_without_its_frames(tmp_path: Path, recording: Recording, truth: GroundTruth):
-    for kept, recipe in ((None, None), (truth, "0123456789abcdef")):
-        save_recording(replace(recording, truth=kept), tmp_path / "a.parquet")
-        header = read_header(tmp_path / "a.parquet")
-        assert (header.trial, header.frames, header.height, header.width) == ("trial", 12, 48, 48)
-        assert (header.truth and header.truth.recipe) == recipe
-
-
-def test_a_file_that_lost_a_column_of_its_truth_is_refused(tmp_path: Path, recording: Recording, truth: GroundTruth):
-    path = tmp_path / "a.parquet"
-    save_recording(replace(recording, truth=truth), path)
-    pq.write_table(pq.read_table(path).drop_columns(["contact_map"]), path)
-    with pytest.raises(RecordingError, match=r"a\.parquet lacks the column 'contact_map'; make the data set again"):
-        load_recording(path)
-
-
-@pytest.mark.parametrize("name", ["load_recording", "read_header"])
-def test_a_missing_trial_is_refused(tmp_path: Path, name: str):
-    read = {"load_recording": load_recording, "read_header": read_header}[name]
-    with pytest.raises(RecordingError, match=r"a\.parquet does not exist; make the data set again"):
-        read(tmp_path / "a.parquet")
-
-
 def test_truth_that_contradicts_itself_is_refused(recording: Recording, truth: GroundTruth):
-    with pytest.raises(RecordingError, match="12 frames of markers but 11 of contact_radius_m"):
+    with pytest.raises(RecordingError, match="12 frames of markers but another of contact_radius_m"):
         replace(truth, contact_radius_m=truth.contact_radius_m[1:])
-    with pytest.raises(RecordingError, match="6 markers at rest but 7 in its frames"):
+    with pytest.raises(RecordingError, match="other markers at rest than in its frames"):
         replace(truth, marker_rest_px=truth.marker_rest_px[1:])
     with pytest.raises(RecordingError, match="frame 0 sticks beyond its contact"):
         replace(truth, stick_radius_m=2 * truth.contact_radius_m)

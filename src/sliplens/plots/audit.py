@@ -210,20 +210,14 @@ def force_ratio(recording: Recording) -> Float[np.ndarray, " frames"]:
 
 
 def end_of_ratio(ratio: Float[np.ndarray, " frames"], mu: float, *, above: float = 0.0) -> float:
-    """Choose the upper end of a chart of F_t / F_n: a little above ratio, friction and the value `above`.
-
-    A light touch does not stretch it; `mu` is 0 where the friction is unknown.
-    """
+    """Choose the upper end of a chart of F_t / F_n: a little above ratio, friction and the value `above`."""
     least, largest = max(mu, above), float(np.max(ratio, where=np.isfinite(ratio), initial=0))
     highest = max(_HIGHEST * mu, least) if mu else _HIGHEST_UNKNOWN
     return 1.12 * max(least, min(largest, highest)) or 1.0
 
 
 def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *, ax: Axes) -> None:
-    """Draw F_t / F_n of the frames in contact, and the static friction with its interval.
-
-    Where friction came with the frames (None), that of each frame is drawn.
-    """
+    """Draw F_t / F_n of the frames in contact, and the static friction with its interval."""
     ratio = force_ratio(recording)
     drawn = {"color": BLUE, "linewidth": _width(recording), "marker": _marker(recording)}
     ax.plot(recording.time_s, ratio, label="$F_t/F_n$ in contact" if np.isfinite(ratio).any() else "_", **drawn)
@@ -292,12 +286,7 @@ ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"
 
 
 def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadFrames | None = None) -> Figure:
-    """Draw a page from which to judge the labels of an imported trial.
-
-    Forces, their ratio beside the static friction, and the safety margin with its uncertainty, on the camera's clock;
-    beneath them the reference and five frames from full stick down to the slip, each with its absolute difference; at
-    the left the settings behind the labels. `read_frames` is for a trial that was loaded without its pixels.
-    """
+    """Draw a page from which to judge the labels of an imported trial."""
     height = float(np.clip(_PICTURE * recording.reference.shape[0] / recording.reference.shape[1], *_PICTURE_HEIGHT))
     top = _HEIGHT - _FOOT - 2 * height - _GAP
     with drawing_style():
@@ -339,11 +328,7 @@ def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None 
 
 
 def choose_along(recording: Recording) -> list[int]:
-    """Choose five frames in the order of time, or all if there are fewer, evenly spaced in their margins.
-
-    The first is at full stick, pressed hardest, the last in full slip; without these they are the first label and the
-    least margin. Where no frame has a margin, the frames are evenly spaced in time.
-    """
+    """Choose five frames in the order of time, or all if there are fewer, evenly spaced in their margins."""
     if not np.isfinite(recording.safety_margin).any():
         return np.unique(np.linspace(0, len(recording) - 1, len(_SHARES)).round().astype(int)).tolist()
     margins, margin = choose_margins(recording), np.nan_to_num(recording.safety_margin)

@@ -10,12 +10,10 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images import require_rgb
-from sliplens.progress import number_of
 from sliplens.recordings.labelling import Clip, ReferenceChoice
 from sliplens.recordings.trial import CLOCK_S, Labels, TrialFacts
 
-Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]
-"""RGB image of the camera."""
+Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]  #: RGB image of the camera.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,15 +23,14 @@ class Forces:
     time_s: Float[np.ndarray, " _"]
     force_n: Float[np.ndarray, "_ 3"]
     """x, y, z of the sensor, sign and tare as recorded; NaN where a sample dropped out."""
-    source: str
-    """Topic, file or column names in messages."""
+    source: str  #: Topic, file or column names in messages.
 
     def __post_init__(self) -> None:
         if len(self.time_s) == 0:
             raise RecordingError(f"{self.source} has no force sample; record the force sensor too")
         if len(self.force_n) != len(self.time_s):
             raise RecordingError(
-                f"{self.source} has {len(self.time_s)} times but {len(self.force_n)} forces; give one force a time"
+                f"{self.source} has {len(self.time_s)} times for {len(self.force_n)} forces; give as many"
             )
         _require_rising(self.time_s, what=self.source)
         if not np.isfinite(self.force_n).all(axis=1).any():
@@ -42,40 +39,26 @@ class Forces:
 
 @dataclass(frozen=True, kw_only=True)
 class Capture(TrialFacts):
-    """One trial as recorded; facts that its source does not have are the defaults.
+    """One trial as recorded; facts that its source does not have are the defaults."""
 
-    Frames are read one at a time, so that a long recording needs no more memory than a short.
-    """
-
-    source: str
-    """File, folder or topic in messages."""
+    source: str  #: File, folder or topic in messages.
     frame_time_s: Float[np.ndarray, " _"]
     """Times on the clock of the camera, from the same zero as the forces; all NaN where they are unknown."""
-    frame_size: tuple[int, int]
-    """Height and width, in pixels."""
+    frame_size: tuple[int, int]  #: Height and width, in pixels.
     read_frames: Callable[[], Iterator[Frame]]
     """Iterate from the first frame at every call: one RGB image for each time, in their order."""
-    forces: Forces | None = None
-    """None where only images were recorded."""
-    notes: tuple[str, ...] = ()
-    """Assumptions and omissions of the reader, a sentence each, to be shown to the user."""
-    labels: Labels | None = None
-    """Labels that came with the frames; None where they are to be estimated."""
-    reference: Frame | None = None
-    """Image of the untouched sensor, where it was recorded apart from the frames."""
-    reference_index: int | None = None
-    """Number of the untouched frame, by the source or its reader."""
+    forces: Forces | None = None  #: None where only images were recorded.
+    notes: tuple[str, ...] = ()  #: Assumptions and omissions of the reader, a sentence each, to be shown to the user.
+    labels: Labels | None = None  #: Labels that came with the frames; None where they are to be estimated.
+    reference: Frame | None = None  #: Image of the untouched sensor, where it was recorded apart from the frames.
+    reference_index: int | None = None  #: Number of the untouched frame, by the source or its reader.
     reference_choice: ReferenceChoice | None = None
     """How the image of the untouched sensor was chosen; None where unknown."""
-    clip: Clip | None = None
-    """Facts about the whole recording."""
-    split: str = ""
-    """Split in the source; empty where it has none."""
+    clip: Clip | None = None  #: Facts about the whole recording.
+    split: str = ""  #: Split in the source; empty where it has none.
     simulated: bool = False
-    files: tuple[str, ...] | None = None
-    """Names of the images of a folder."""
-    opened: str = "frames in memory"
-    """Path that was opened, for messages and metadata."""
+    files: tuple[str, ...] | None = None  #: Names of the images of a folder.
+    opened: str = "frames in memory"  #: Path that was opened, for messages and metadata.
 
     def __post_init__(self) -> None:
         if len(self.frame_time_s) == 0:
@@ -83,18 +66,11 @@ class Capture(TrialFacts):
         if self.time_s is not None:
             _require_rising(self.frame_time_s, what=f"the frames of {self.source}")
         if self.labels is not None and len(self.labels.safety_margin) != len(self.frame_time_s):
-            raise RecordingError(
-                f"{self.source} has {number_of(len(self.frame_time_s), 'frame')} but "
-                f"{number_of(len(self.labels.safety_margin), 'label')}; "
-                "give one a frame"
-            )
+            raise RecordingError(f"{self.source} has labels for other frames than its {len(self)}; give as many")
         if self.reference is not None:
             require_rgb(self.reference, what="levels of the reference")
         if self.reference is not None and self.reference.shape[:2] != self.frame_size:
-            raise RecordingError(
-                f"{self.source} has frames of {self.frame_size[0]} x {self.frame_size[1]} pixels but a reference of "
-                f"{self.reference.shape[0]} x {self.reference.shape[1]}; record both with the same camera settings"
-            )
+            raise RecordingError(f"{self.source} has a reference of another size than its frames; record both alike")
 
     def __len__(self) -> int:
         return len(self.frame_time_s)
@@ -146,19 +122,11 @@ def _require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None
         raise RecordingError(f"{what}: the time of sample {at} is {time_s[at]}, no number; mend its stamp")
     if not np.all(steps > 0):
         at = int(np.argmax(~(steps > 0))) + 1
-        raise RecordingError(
-            f"{what}: time does not rise at sample {at} ({time_s[at - 1]:.6f} s, then {time_s[at]:.6f} s); "
-            "sort the samples or mend their stamps"
-        )
+        raise RecordingError(f"{what}: time does not rise at sample {at} ({time_s[at]:.6f} s); sort or mend the stamps")
     if time_s[0] < CLOCK_S[0] or time_s[-1] > CLOCK_S[1]:
-        raise RecordingError(
-            f"{what}: times run from {time_s[0]:.4g} to {time_s[-1]:.4g} s, as no clock does; give them in seconds"
-        )
+        raise RecordingError(f"{what}: times reach {time_s[0]:.4g} or {time_s[-1]:.4g} s, as none do; give seconds")
     if np.any(steps > _LONGEST_S):
         at = int(np.argmax(steps > _LONGEST_S)) + 1
-        raise RecordingError(
-            f"{what}: sample {at} comes {steps[at - 1]:.3g} s after the one before, more than a day; mend or drop its "
-            "stamp"
-        )
+        raise RecordingError(f"{what}: sample {at} comes more than a day after the one before; mend or drop its stamp")
     if len(steps) and np.median(steps) < _SHORTEST_S:
         raise RecordingError(f"{what}: samples are {np.median(steps):.3g} s apart; declare the right unit of time")

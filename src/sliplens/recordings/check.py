@@ -27,10 +27,8 @@ _ROUNDING = 1e-6
 class Violation:
     """Law that a data set violates."""
 
-    where: str
-    """The trial, or the file of the data set."""
-    what: str
-    """Error, and the frame it is at."""
+    where: str  #: The trial, or the file of the data set.
+    what: str  #: Error, and the frame it is at.
 
 
 def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None = None) -> tuple[Violation, ...]:
@@ -42,11 +40,6 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
     data set: no trial is listed twice, which would put its frames into two splits, no file is unlisted, and no
     recording was cut off. Flags on labels, such as faults of the force sensor, are notes and not violations: frames
     at a fault are not valid.
-
-    Raises
-    ------
-    SliplensError
-        If the folder is no data set at all.
     """
     data = data if isinstance(data, Dataset) else load_dataset(data)
     folder, violations, labellings = data.folder, [], []

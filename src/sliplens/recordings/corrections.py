@@ -33,11 +33,6 @@ def read_corrections(path: Path | str) -> dict[str, Corrections]:
 
     The column `trial` names the trial, the others are fields of `Corrections`. An empty cell leaves the automatic
     value. Columns that `draft_corrections` writes for information are ignored.
-
-    Raises
-    ------
-    RecordingError
-        If a column is unknown, a trial is listed twice, or a value does not fit its column.
     """
     path = Path(path)
     require_file(path, most=MOST_TEXT, missing="write one with `sliplens label DATA --draft corrections.csv`")
@@ -92,11 +87,6 @@ def draft_corrections(data: Dataset | Path | str, path: Path | str) -> None:
 
     Columns that begin with `current_` show the values of the present labels and are ignored on reading: write the value
     that should hold instead into the column without that prefix. `sliplens label DATA --corrections` applies the table.
-
-    Raises
-    ------
-    InputError
-        If the file exists.
     """
     data, path = data if isinstance(data, Dataset) else load_dataset(data), Path(path)
     if path.exists():
@@ -140,6 +130,3 @@ def _cell(value: object) -> str:
         case tuple():
             return " ".join("..".join(map(str, item)) if isinstance(item, tuple) else _cell(item) for item in value)
     return str(value)
-
-
-__all__ = ["Corrections", "draft_corrections", "read_corrections"]

@@ -26,12 +26,10 @@ class TrialInfo(TrialFacts):
 
     split: str
     frames: int
-    height: int
-    """Rows of its frames, in pixels."""
+    height: int  #: Rows of its frames, in pixels.
     width: int
     sha256: str
-    forces_sha256: str = ""
-    """Hash of the samples of the force sensor; empty where none are kept."""
+    forces_sha256: str = ""  #: Hash of the samples of the force sensor; empty where none are kept.
 
     def __post_init__(self) -> None:
         require_stored(self)
@@ -41,12 +39,9 @@ class TrialInfo(TrialFacts):
 class LeftOut:
     """Recording of many that could not be imported."""
 
-    trial: str
-    """Name that its trial would have."""
-    source: str
-    """File or folder."""
-    why: str
-    """Error and its cure."""
+    trial: str  #: Name that its trial would have.
+    source: str  #: File or folder.
+    why: str  #: Error and its cure.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +64,7 @@ class Dataset:
     folder: Path
     trials: tuple[TrialInfo, ...]
     simulated: bool = False
-    left_out: tuple[LeftOut, ...] = ()
-    """Recordings that could not be imported."""
+    left_out: tuple[LeftOut, ...] = ()  #: Recordings that could not be imported.
 
     @property
     def source(self) -> str:
@@ -105,10 +99,8 @@ class Dataset:
         )
         if not chosen:
             present = sorted({f"{trial.split}/{trial.condition}" for trial in self.trials})
-            raise RecordingError(
-                f"{self.folder} has no trial with split {split or 'any'} and condition {condition or 'any'}; "
-                f"it has {', '.join(present)}"
-            )
+            wanted = f"split {split or 'any'} and condition {condition or 'any'}"
+            raise RecordingError(f"{self.folder} has no trial with {wanted}; it has {', '.join(present)}")
         return chosen
 
     def load(self, info: TrialInfo, *, truth: bool = True) -> Recording:
@@ -133,11 +125,6 @@ def load_dataset(folder: Path | str) -> Dataset:
     """Open a data set that `import_recordings` or `simulate` made; trials are read on request.
 
     A recording that was cut off is noted, and no trial of the data set until `recover_dataset` finishes it.
-
-    Raises
-    ------
-    InputError
-        If the folder or its table is missing, damaged or of another schema, or lists no trial.
     """
     folder = Path(folder)
     require_folder(folder, what="the data set")
@@ -158,11 +145,6 @@ def recover_dataset(folder: Path | str, *, on_progress: OnProgress | None = None
     """Make trials of recordings that were cut off, up to the last whole frame, and open the data set.
 
     A data set without such a recording stays as it is.
-
-    Raises
-    ------
-    RecordingError
-        If it is still being recorded, a journal is damaged, or no recording holds a whole frame.
     """
     folder = Path(folder)
     require_folder(folder, what="the data set")
@@ -182,22 +164,12 @@ def _read_table(folder: Path) -> _Table:
         path, missing=f"make a data set of recordings with `sliplens import {folder} -o DATA`, and name that"
     )
     if not isinstance(values, dict) or values.get("schema_version") != SCHEMA_VERSION:
-        raise RecordingError(
-            f"{path} is not a sliplens data set of schema {SCHEMA_VERSION}; make it again with this version"
-        )
+        raise RecordingError(f"{path} is not a sliplens data set of schema {SCHEMA_VERSION}; make it again")
     return from_builtins(values, _Table, where=path, command="sliplens import")
 
 
 def begin_recording(folder: Path, *, simulated: bool) -> tuple[JournalLock, tuple[str, ...]]:
-    """Prepare a new or an existing data set for trials to be recorded into it, after recovering what was cut off.
-
-    Returns the lock on the data set, to be passed to `finish_recording`, and the names of its trials.
-
-    Raises
-    ------
-    RecordingError
-        If the folder is something else, is being recorded, or holds trials of the other kind, real or simulated.
-    """
+    """Prepare a new or an existing data set for trials to be recorded into it, after recovering what was cut off."""
     exists = (folder / DATASET_FILE).is_file()
     # a recording that was killed before it wrote its table leaves these alone
     leftovers = {folder / JOURNAL_FOLDER, folder / JOURNAL_FOLDER / LOCK_FILE, folder / f".{DATASET_FILE}.part"}
@@ -217,10 +189,7 @@ def begin_recording(folder: Path, *, simulated: bool) -> tuple[JournalLock, tupl
 
 
 def finish_recording(folder: Path, lock: JournalLock | None = None) -> None:
-    """Make trials of the journals of a data set; a data set without a trial is removed.
-
-    `lock` is the one of `begin_recording`; if None, it is acquired, so that a running recording is never finished.
-    """
+    """Make trials of the journals of a data set; a data set without a trial is removed."""
     lock = lock or JournalLock(folder)
     try:
         table = _read_table(folder)

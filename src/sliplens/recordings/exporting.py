@@ -41,13 +41,6 @@ def export_lerobot(
     trials
         Names of trials; all if None.
 
-    Raises
-    ------
-    InputError
-        If `out` holds something else, or there is no such trial.
-    RecordingError
-        If a trial is damaged, or sizes of frames or frame rates differ.
-
     References
     ----------
     https://huggingface.co/docs/lerobot/lerobot-dataset-v3
@@ -82,13 +75,6 @@ def export_mcap(
         Folder to make.
     trials
         Names of trials; all if None. Their frames may have any size and rate.
-
-    Raises
-    ------
-    InputError
-        If `out` holds something else, there is no such trial, or the extra `ros` is not installed.
-    RecordingError
-        If a trial is damaged, or its times do not fit into stamps of ROS (2**31 seconds).
     """
     from sliplens.recordings.formats.mcap import write_mcap  # noqa: PLC0415 (ROS messages come with it)
 

@@ -102,15 +102,6 @@ def import_recordings(
         `ImportOptions`: `reference` (image of the untouched sensor; by default that of the source, else one of the
         frames before the contact), `day`, `condition` and `object` (by default those of the source), `format`,
         `validation_trials` and `test_trials` (numbers of the last trials, in place of `splits`), `retry_failed`.
-
-    Raises
-    ------
-    InputError
-        If a source is missing, damaged or of no known format, or `out` holds something else.
-    RecordingError
-        If a trial has neither labels nor forces, nothing touches, or it never slips and no friction is given.
-    PartError
-        If trials failed that may not be left out, or all of them, when all others are done.
     """
     require_executor(on)
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]
@@ -143,12 +134,8 @@ def import_recordings(
         plan = None if splits is None else load_splits(splits)
         deal = partial(_deal, plan=plan, last=None if last == (None, None) else last)
         dealt = deal(old, captures)  # a mistake in the splits is found before anything slow
-        config = {
-            **work.recipe(),
-            "splits": plan,
-            "last_trials": last,
-            **({} if before is None else {"added_to": before.hash}),
-        }
+        config = {**work.recipe(), "splits": plan, "last_trials": last}
+        config |= {} if before is None else {"added_to": before.hash}
         with output_folder(Path(out), stage="import", config=config, overwrite=overwrite or add) as output:
             if not output.complete:
                 if before is not None:
@@ -212,23 +199,19 @@ def _prepare_work(
 def _list_rows(paths: Sequence[Path], defaults: ManifestRow, *, single: bool) -> Iterator[ManifestRow]:
     """List the recordings of manifests and folders; a path that is one recording becomes a row without a name."""
     for path in paths:
-        rows = None if single else find_rows(path)
-        if rows is None:
-            yield replace(defaults, video=path)
-        for row in rows or ():
-            yield replace(defaults, **{name: value for name, value in vars(row).items() if value is not None})
+        for row in (None if single else find_rows(path)) or ({"video": path},):
+            values = row if isinstance(row, dict) else vars(row)
+            yield replace(defaults, **{name: value for name, value in values.items() if value is not None})
 
 
-_Item: TypeAlias = tuple[int, int]
-"""Number of a row, and of a trial in it."""
+_Item: TypeAlias = tuple[int, int]  #: Number of a row, and of a trial in it.
 
 
 @dataclass(frozen=True, kw_only=True)
 class _ImportWork(TrialWork):
     """Work on recordings, which every process opens again by their paths."""
 
-    rows: tuple[ManifestRow, ...]
-    """Recordings; those without a name of their own must not be left out."""
+    rows: tuple[ManifestRow, ...]  # recordings; those without a name of their own must not be left out
     reading: ReadOptions
     labelling: LabelSettings
     profile: SensorProfile | None
@@ -307,11 +290,8 @@ def _fingerprint(path: Path) -> tuple[str, int, int]:
     """Return path, size and time of the last change of a file or folder, without reading all of it."""
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     stats = [file.stat() for file in files]
-    return (
-        str(path.resolve()),
-        sum(each.st_size for each in stats),
-        max((each.st_mtime_ns for each in stats), default=0),
-    )
+    changed = max((each.st_mtime_ns for each in stats), default=0)
+    return str(path.resolve()), sum(each.st_size for each in stats), changed
 
 
 def _link_trials(source: Path, folder: Path) -> None:
@@ -362,9 +342,6 @@ def _deal(
             raise InputError(f"numbers of trials are not negative, got {validation} and {test}; give 0 or more")
         training = len(captures) - validation - test
         if training < 0:
-            raise InputError(
-                f"{number_of(validation, 'trial')} to validate and {test} to test are more than the {len(captures)} "
-                "there are; give fewer"
-            )
+            raise InputError(f"{validation} to validate and {test} to test are more than {len(captures)}; give fewer")
         splits = ["train"] * training + ["validation"] * validation + ["test"] * test
     return SplitResult(splits=(*(info.split for info in old), *splits), notes=())

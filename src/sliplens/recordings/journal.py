@@ -21,18 +21,10 @@ from sliplens.files import parse_json, require_file
 from sliplens.images import decode_png, encode_png
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
-from sliplens.recordings.store import (
-    ROW_GROUP,
-    decode_pixels,
-    encode_pixels,
-    forces_path,
-    save_forces,
-    write_trial,
-)
+from sliplens.recordings.store import ROW_GROUP, decode_pixels, encode_pixels, forces_path, save_forces, write_trial
 from sliplens.recordings.trial import TrialFacts, labels_of_margins
 
-JOURNAL_FOLDER = "recording"
-"""Folder of a data set with the journals of recordings that run or were cut off."""
+JOURNAL_FOLDER = "recording"  #: Folder of a data set with the journals of recordings that run or were cut off.
 LOCK_FILE = "lock"
 _HEADER, _REFERENCE = b"sliplens", b"reference"
 _SCHEMA = pa.schema(
@@ -51,20 +43,14 @@ class JournalHeader:
     """Facts of a trial before its first frame."""
 
     facts: TrialFacts
-    source: str
-    """Camera, stream or file."""
+    source: str  #: Camera, stream or file.
     simulated: bool
-    size: tuple[int, int]
-    """Height and width of the frames, in pixels."""
-    forces: str | None = None
-    """Source of the forces; None where there is none."""
+    size: tuple[int, int]  #: Height and width of the frames, in pixels.
+    forces: str | None = None  #: Source of the forces; None where there is none.
 
 
 class Journal:
-    """Journal of one trial; frames are appended one by one, with rising times.
-
-    `reference` is the image of the untouched sensor; if None, the first frame stands for it.
-    """
+    """Journal of one trial; frames are appended one by one, with rising times."""
 
     def __init__(self, folder: Path, header: JournalHeader, *, reference: Frame | None) -> None:
         metadata = {_HEADER: msgspec.json.encode(to_builtins(header))}
@@ -93,10 +79,7 @@ class Journal:
 
 
 class JournalLock:
-    """Lock of a data set into which trials are recorded; the system releases it when the process ends, even killed.
-
-    A data set that is locked already is a `RecordingError`.
-    """
+    """Lock of a data set into which trials are recorded; the system releases it when the process ends, even killed."""
 
     def __init__(self, data: Path) -> None:
         self.folder = data / JOURNAL_FOLDER
@@ -124,10 +107,7 @@ def journals_of(data: Path) -> list[Path]:
 
 
 def finish_journal(journal: Path, trial: Path) -> JournalHeader | None:
-    """Make a trial, and the file of its force samples, of a journal; None where it holds no complete frame.
-
-    Labels are the margins of the source. Without any, `label_dataset` makes them from the forces.
-    """
+    """Make a trial, and the file of its force samples, of a journal; None where it holds no complete frame."""
     require_file(journal, missing="move it away")
     try:
         with pa.memory_map(str(journal)) as file:

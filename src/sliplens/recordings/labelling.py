@@ -13,8 +13,7 @@ from sliplens.recordings.options import LabelSettings
 
 AXES = ("x", "y", "z")
 
-Vector: TypeAlias = tuple[float, float, float]
-"""x, y, z of the force sensor, as recorded."""
+Vector: TypeAlias = tuple[float, float, float]  #: x, y, z of the force sensor, as recorded.
 
 
 class Found(StrEnum):
@@ -29,31 +28,22 @@ class Found(StrEnum):
 class ForceAxes:
     """Axes, sign and tare of a force sensor; an unknown axis or sign is a `RecordingError`."""
 
-    normal: str
-    """x, y or z: the axis that presses."""
-    sign: int
-    """1 where pressing is positive as recorded, else -1."""
-    tare_n: Vector
-    """Reading of the untouched sensor."""
-    noise_n: Vector
-    """Standard deviation of a sample's noise."""
-    tare_sigma_n: Vector
-    """Standard uncertainty of the tare."""
-    still_until_s: float | None
-    """Time until which the sensor is certainly untouched; None where it is never touched."""
+    normal: str  #: x, y or z: the axis that presses.
+    sign: int  #: 1 where pressing is positive as recorded, else -1.
+    tare_n: Vector  #: Reading of the untouched sensor.
+    noise_n: Vector  #: Standard deviation of a sample's noise.
+    tare_sigma_n: Vector  #: Standard uncertainty of the tare.
+    still_until_s: float | None  #: Time until which the sensor is certainly untouched; None where it is never touched.
     normal_found: Found
     sign_found: Found
     tare_found: Found
     drift_n_s: Vector = (0.0, 0.0, 0.0)
     """Rate at which the reading of the untouched sensor drifts; 0 where it is not significant."""
-    drift_sigma_n_s: Vector = (0.0, 0.0, 0.0)
-    """Standard uncertainty of that rate."""
+    drift_sigma_n_s: Vector = (0.0, 0.0, 0.0)  #: Standard uncertainty of that rate.
     direction: Vector | None = None
     """Unit vector along which pressing points, where the sensor is tilted; None where that is the axis."""
-    direction_sigma: float = 0.0
-    """Standard uncertainty of that direction, in radians."""
-    notes: tuple[str, ...] = ()
-    """Doubts, a sentence each."""
+    direction_sigma: float = 0.0  #: Standard uncertainty of that direction, in radians.
+    notes: tuple[str, ...] = ()  #: Doubts, a sentence each.
 
     def __post_init__(self) -> None:
         if self.normal not in AXES:
@@ -76,41 +66,26 @@ class ForceAxes:
 
 @dataclass(frozen=True, kw_only=True)
 class FrictionEstimate:
-    """Static friction of a trial, and when its contact slipped.
+    """Static friction of a trial, and when its contact slipped."""
 
-    A coefficient that is not positive or lies outside its interval is a `RecordingError`.
-    """
-
-    mu: float
-    """Static coefficient of friction mu_s."""
-    low: float
-    """Lower end of the coefficient's 68 % interval."""
-    high: float
-    """Upper end of the coefficient's 68 % interval."""
-    onset_s: float | None = None
-    """First gross slip, on the force sensor's clock; None where no slip is known."""
+    mu: float  #: Static coefficient of friction mu_s.
+    low: float  #: Lower end of the coefficient's 68 % interval.
+    high: float  #: Upper end of the coefficient's 68 % interval.
+    onset_s: float | None = None  #: First gross slip, on the force sensor's clock; None where no slip is known.
     found: Found = Found.DECLARED
-    method: str = "given by hand"
-    """Method of the estimate, in words."""
-    onset_sigma_s: float | None = None
-    """Standard uncertainty of the onset; None where it is unknown."""
+    method: str = "given by hand"  #: Method of the estimate, in words.
+    onset_sigma_s: float | None = None  #: Standard uncertainty of the onset; None where it is unknown.
     image_sigmas: float | None = None
     """Motion of the image at the onset beyond that before it, in standard deviations; None where not measured."""
-    later_onsets_s: tuple[float, ...] = ()
-    """Gross slips of later contacts, at most one each."""
+    later_onsets_s: tuple[float, ...] = ()  #: Gross slips of later contacts, at most one each.
     notes: tuple[str, ...] = ()
     """Contradictions with the forces, a sentence each; they count as errors of the friction."""
 
     def __post_init__(self) -> None:
         if not 0 < self.mu <= MOST_FRICTION:
-            raise RecordingError(
-                f"the coefficient of friction is {self.mu:.3g}; give a positive one, no larger than {MOST_FRICTION:g}"
-            )
+            raise RecordingError(f"the coefficient of friction is {self.mu:.3g}; give 0 to {MOST_FRICTION:g}")
         if not 0 <= self.low <= self.mu <= self.high < np.inf:
-            raise RecordingError(
-                f"the coefficient of friction {self.mu:.3g} lies outside its interval {self.low:.3g} to "
-                f"{self.high:.3g}; give low, mu, high in their order"
-            )
+            raise RecordingError(f"friction {self.mu:.3g} lies outside its interval; give low, mu, high in their order")
 
     @property
     def sigma(self) -> float:
@@ -120,33 +95,25 @@ class FrictionEstimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Lag:
-    """Time by which the camera's stamps are later than the force sensor's, for the same event.
-
-    A lag that is not finite, or has a negative uncertainty, is a `RecordingError`.
-    """
+    """Time by which the camera's stamps are later than the force sensor's, for the same event."""
 
     lag_s: float
     """Positive where the camera is late; an event stamped t by the camera is t - lag_s to the force sensor."""
-    sigma_s: float
-    """Standard uncertainty of the lag."""
+    sigma_s: float  #: Standard uncertainty of the lag.
     correlation: float | None = None
     """Correlation coefficient of image motion and force rate at this lag; None where it was given by hand."""
-    doubt: str = ""
-    """Reason why this trial does not determine the lag; empty where it does."""
+    doubt: str = ""  #: Reason why this trial does not determine the lag; empty where it does.
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.lag_s) and self.sigma_s >= 0):
-            raise RecordingError(
-                f"a lag of {self.lag_s:g} s with an uncertainty of {self.sigma_s:g} s cannot be; give it in seconds"
-            )
+            raise RecordingError(f"a lag of {self.lag_s:g} s +- {self.sigma_s:g} s cannot be; give it in seconds")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceChoice:
     """Choice of the frame that shows the sensor untouched."""
 
-    index: int | None = None
-    """Number of the frame; None where the reference was recorded apart from the frames."""
+    index: int | None = None  #: Number of the frame; None where the reference was recorded apart from the frames.
     method: str
     contact_energy: float | None = None
     """Mean absolute high-pass difference from the median untouched frame, in grey levels; None where not measured."""
@@ -161,10 +128,8 @@ class Clip:
     """Facts of a whole recording that label no single frame."""
 
     slips: bool
-    grasp: str
-    """Name of the grasp; its fingers belong into one split."""
-    stale_frames: int
-    """Frames left out at the start."""
+    grasp: str  #: Name of the grasp; its fingers belong into one split.
+    stale_frames: int  #: Frames left out at the start.
 
 
 class Reason(StrEnum):
@@ -191,11 +156,9 @@ class ForceFault:
     """Stretch of faulty samples of a force sensor."""
 
     kind: Reason
-    start_s: float
-    """On the force sensor's clock."""
+    start_s: float  #: On the force sensor's clock.
     end_s: float
-    largest_n: float | None = None
-    """Largest absolute value of any axis in it, as recorded; None for missing samples."""
+    largest_n: float | None = None  #: Largest absolute value of any axis in it, as recorded; None for missing samples.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,24 +167,16 @@ class LabelBasis:
 
     axes: ForceAxes
     friction: FrictionEstimate
-    friction_change: float
-    """Relative standard deviation of the change of friction from touch to slip."""
-    slip_s: float | None
-    """First gross slip, on the force sensor's clock; None if there is none."""
-    lag: Lag | None
-    """None where it was neither estimated nor set."""
+    friction_change: float  #: Relative standard deviation of the change of friction from touch to slip.
+    slip_s: float | None  #: First gross slip, on the force sensor's clock; None if there is none.
+    lag: Lag | None  #: None where it was neither estimated nor set.
     lag_applied: bool
     contact_threshold_n: float
-    window_s: float
-    """Time over which the forces of a frame were averaged."""
-    gap_s: float
-    """Time beyond which samples count as missing between two others."""
-    force_range_n: float | None
-    """Largest force that each axis can measure; None where it is unknown."""
-    faults: tuple[ForceFault, ...] = ()
-    """Samples that were left out, in the order of time."""
-    doubts: tuple[str, ...] = ()
-    """Other implausible findings, a sentence each."""
+    window_s: float  #: Time over which the forces of a frame were averaged.
+    gap_s: float  #: Time beyond which samples count as missing between two others.
+    force_range_n: float | None  #: Largest force that each axis can measure; None where it is unknown.
+    faults: tuple[ForceFault, ...] = ()  #: Samples that were left out, in the order of time.
+    doubts: tuple[str, ...] = ()  #: Other implausible findings, a sentence each.
 
     @property
     def flags(self) -> tuple[str, ...]:
@@ -250,22 +205,14 @@ class Corrections:
     A value that no trial can have is a `RecordingError`.
     """
 
-    exclude: bool = False
-    """If True, no frame of the trial has a label."""
-    reference_frame: int | None = None
-    """Number of the untouched frame."""
-    contact_s: float | None = None
-    """Begin of the contact, in seconds on the clock of the forces."""
-    slip_s: float | None = None
-    """First gross slip, in seconds on the clock of the forces."""
-    tare: Vector | None = None
-    """Reading of the untouched force sensor, in newtons."""
-    normal_sign: int | None = None
-    """1 where pressing is positive as recorded, -1 where it is negative."""
-    mu: float | None = None
-    """Static coefficient of friction."""
-    bad_frames: tuple[tuple[int, int], ...] = ()
-    """First and last frame of each span whose frames are not valid."""
+    exclude: bool = False  #: If True, no frame of the trial has a label.
+    reference_frame: int | None = None  #: Number of the untouched frame.
+    contact_s: float | None = None  #: Begin of the contact, in seconds on the clock of the forces.
+    slip_s: float | None = None  #: First gross slip, in seconds on the clock of the forces.
+    tare: Vector | None = None  #: Reading of the untouched force sensor, in newtons.
+    normal_sign: int | None = None  #: 1 where pressing is positive as recorded, -1 where it is negative.
+    mu: float | None = None  #: Static coefficient of friction.
+    bad_frames: tuple[tuple[int, int], ...] = ()  #: First and last frame of each span whose frames are not valid.
 
     def __post_init__(self) -> None:
         for name in ("contact_s", "slip_s", "tare"):
@@ -295,17 +242,12 @@ class Corrections:
 class Labelling:
     """Origin of a trial and of its labels."""
 
-    source: str
-    """File, folder or topic of the frames."""
-    forces: str | None
-    """Topic, file or columns of the forces; None where none were recorded."""
-    notes: tuple[str, ...]
-    """Assumptions made on import, a sentence each."""
+    source: str  #: File, folder or topic of the frames.
+    forces: str | None  #: Topic, file or columns of the forces; None where none were recorded.
+    notes: tuple[str, ...]  #: Assumptions made on import, a sentence each.
     reference: ReferenceChoice
     clip: Clip | None = None
-    basis: LabelBasis | None = None
-    """None where the labels came with the frames."""
-    corrections: Corrections | None = None
-    """Settings that were corrected by hand; None where none were."""
+    basis: LabelBasis | None = None  #: None where the labels came with the frames.
+    corrections: Corrections | None = None  #: Settings that were corrected by hand; None where none were.
     first_reference: ReferenceChoice | None = None
     """Choice of the reference before a correction named another frame; None where none did."""

@@ -9,7 +9,6 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from sliplens.errors import RecordingError
-from sliplens.progress import number_of
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.tables import trial_name
 
@@ -24,24 +23,15 @@ _LONGEST_HEADER = 100_000  # characters
 class ManifestRow:
     """Recording of one trial, its force table and its facts; None where the manifest names none."""
 
-    trial: str
-    """Name of the trial."""
-    video: Path
-    """Video, folder of images or bag."""
-    forces: Path | None = None
-    """Table of forces beside it."""
-    sensor: str | None = None
-    """Name of the sensor, or its profile."""
-    day: int | None = None
-    """Counted from 1."""
-    object: str | None = None
-    """Name of the object in the grasp."""
-    condition: str | None = None
-    """State of the surface, such as dry or wet."""
-    mu: float | None = None
-    """Static coefficient of friction."""
-    reference: Path | int | None = None
-    """Image of the untouched sensor, or the number of the frame that shows it."""
+    trial: str  #: Name of the trial.
+    video: Path  #: Video, folder of images or bag.
+    forces: Path | None = None  #: Table of forces beside it.
+    sensor: str | None = None  #: Name of the sensor, or its profile.
+    day: int | None = None  #: Counted from 1.
+    object: str | None = None  #: Name of the object in the grasp.
+    condition: str | None = None  #: State of the surface, such as dry or wet.
+    mu: float | None = None  #: Static coefficient of friction.
+    reference: Path | int | None = None  #: Image of the untouched sensor, or the number of the frame that shows it.
 
 
 _COLUMNS = tuple(field.name for field in fields(ManifestRow))
@@ -61,11 +51,6 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
 
     The table of `cup.mp4` is `cup.csv`, or `cup_forces.csv`. Other files are ignored, and so are data sets of
     sliplens, which may have been made of this very folder.
-
-    Raises
-    ------
-    RecordingError
-        If there is no recording, two have one name, or a recording has two tables.
     """
     tables: dict[str, list[Path]] = {}
     recordings: dict[str, list[Path]] = {}
@@ -80,16 +65,13 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
             # a recording may itself be named lift_ft
             tables.setdefault(stem if stem in recordings else _FORCE_SUFFIX.sub("", stem), []).append(path)
     if not recordings:
-        raise RecordingError(
-            f"{folder} holds no recording (looked for videos such as .mp4, bags, and folders of images); check the path"
-        )
+        raise RecordingError(f"{folder} holds no recording (a video, a bag or a folder of images); check the path")
     for kind, by_stem in (("recordings", recordings), ("tables of forces", tables)):
         for stem, same_name in by_stem.items():
             if len(same_name) > 1 and stem in recordings:
-                raise RecordingError(
-                    f"{folder} has several {kind} named {stem} ({', '.join(path.name for path in same_name)}); rename "
-                    "all but one, or list what belongs together in a manifest (CSV)"
-                )
+                names = ", ".join(path.name for path in same_name)
+                several = f"{folder} has several {kind} named {stem} ({names})"
+                raise RecordingError(f"{several}; rename all but one, or list them in a manifest (CSV)")
     rows = tuple(
         ManifestRow(trial=trial_name(stem), video=path, forces=tables.get(stem, [None])[0])
         for stem, (path,) in recordings.items()
@@ -107,11 +89,6 @@ def read_rows(path: Path) -> tuple[ManifestRow, ...]:
     """Read a manifest: a CSV with a row a trial and the columns of `ManifestRow`, of which `video` alone is required.
 
     Paths are relative to the manifest; `reference` is an image or the number of a frame.
-
-    Raises
-    ------
-    RecordingError
-        If a column is unknown, a row names no recording, or a value is not a number where one is needed.
     """
     rows = tuple(_parse_row(cells, path.parent, where) for where, cells in read_csv(path, _COLUMNS, what="a manifest"))
     if not rows:
@@ -138,13 +115,7 @@ def _read_header(path: Path) -> tuple[list[str], str]:
 
 
 def read_csv(path: Path, columns: Collection[str], *, what: str) -> Iterator[tuple[str, dict[str, str]]]:
-    """Read a table that a person wrote; yields the place of each row and its cells that are not empty, by column.
-
-    Raises
-    ------
-    RecordingError
-        If a column is not one of `columns`, a row has too many cells, or the file is not CSV in UTF-8.
-    """
+    """Read a table that a person wrote; yields the place of each row and its cells that are not empty, by column."""
     names, delimiter = _read_header(path)
     if unknown := [name for name in names if name not in columns]:
         raise RecordingError(f"{path} has a column {unknown[0]!r}; {what} has {', '.join(columns)}")
@@ -153,15 +124,13 @@ def read_csv(path: Path, columns: Collection[str], *, what: str) -> Iterator[tup
             reader = csv.reader(stream, delimiter=delimiter)
             next(reader)
             for cells in reader:
+                where = f"{path}, line {reader.line_num}"
                 if not any(cell.strip() for cell in cells):
                     continue
                 if len(cells) > len(names):
-                    raise RecordingError(
-                        f"{path}, line {reader.line_num}: {number_of(len(cells), 'cell')} but "
-                        f"{number_of(len(names), 'column')}; correct the row"
-                    )
+                    raise RecordingError(f"{where}: {len(cells)} cells but {len(names)} columns; correct the row")
                 filled = {name: cell.strip() for name, cell in zip(names, cells, strict=False) if cell.strip()}
-                yield f"{path}, line {reader.line_num}", filled
+                yield where, filled
     except (UnicodeDecodeError, csv.Error, StopIteration) as error:
         raise RecordingError(f"{path} cannot be read as CSV ({error}); export it again as UTF-8") from None
 
@@ -192,6 +161,3 @@ def _parse_row(cells: dict[str, str], folder: Path, where: str) -> ManifestRow:
         reference=None if reference is None else int(reference) if reference.isdecimal() else folder / reference,
         **numbers,  # pyright: ignore[reportArgumentType]
     )
-
-
-__all__ = ["ManifestRow", "find_rows", "pair_recordings", "read_csv", "read_rows"]

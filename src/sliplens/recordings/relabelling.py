@@ -51,15 +51,6 @@ def label_dataset(
         replace those of the last call, and take precedence over `labelling`. If None, those of the last call hold.
     on, retry_failed
         See `import_recordings`.
-
-    Raises
-    ------
-    InputError
-        If a trial has no forces, or its labels did not come from them and would be overwritten.
-    RecordingError
-        If a correction does not fit its trial, nothing touches, or a trial never slips and its friction is unknown.
-    PartError
-        If some of several trials fail, after all others are labelled; the data set is as it was.
     """
     with reporting(on_progress):
         data = data if isinstance(data, Dataset) else load_dataset(data)
@@ -79,10 +70,7 @@ def label_dataset(
         for trial, origin in stored.items():
             excluded = origin is not None and origin.corrections is not None and origin.corrections.exclude
             if in_place and (origin is None or (origin.basis is None and not excluded)):
-                raise InputError(
-                    f"the labels of {trial} did not come from its forces and would be lost; "
-                    "name a new folder with --output"
-                )
+                raise InputError(f"the labels of {trial} did not come from its forces and would be lost; give --output")
         config = {"labelling": labelling, "data_hash": data.hash, "corrections": dict(corrections)}
         with output_folder(out, stage="label", config=config, overwrite=overwrite or in_place) as output:
             if not output.complete:
@@ -114,10 +102,8 @@ class _Relabelling(TrialWork):
         info, folder = self.data.trials[item], self.data.folder
         capture = read_stored_trial(self.data, info)
         if capture.forces is None:
-            raise InputError(
-                f"{info.trial} of {folder} has no forces, and without them there is no label; "
-                "import it again with its table of forces"
-            )
+            no_forces = f"{info.trial} of {folder} has no forces, and without them there is no label"
+            raise InputError(f"{no_forces}; import it again with its table of forces")
         profile, corrections = self.data.profile(capture.sensor), self.corrections.get(info.trial)
         settings = self.labelling if profile is None else profile.settings(self.labelling)
         if corrections is not None:

@@ -14,19 +14,11 @@ from sliplens.recordings.labels.lag import measure_motion
 _STILL = 0.15
 _MOST_IN_A_ROW = 3
 _LEAST_SHARE, _FEWEST = 0.1, 5
-_INSPECTED = 90
-"""Frames from the beginning that `inspect_repeats` reads."""
+_INSPECTED = 90  #: Frames from the beginning that `inspect_repeats` reads.
 
 
 def describe_repeats(motion: Float[np.ndarray, " frames"], time_s: Float[np.ndarray, " frames"]) -> str | None:
-    """Return a sentence on how many frames repeat the one before, with the cure; None where next to none does.
-
-    Parameters
-    ----------
-    motion
-        Change of each frame from the one before, in grey levels (`measure_motion`).
-    time_s
-        Times of the frames.
+    """Describe how many frames repeat the one before, by their `measure_motion`; None where next to none does.
 
     Examples
     --------

@@ -17,7 +17,6 @@ from PIL import Image
 from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2
 from sliplens.files import read_toml
-from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.options import LabelSettings, ReferenceMethod
 
@@ -99,28 +98,18 @@ class SensorProfile:
         for what, size in (("camera_size_px", self.camera_size_px), ("resize_px", self.resize_px)):
             if size is not None and min(size) <= 0:
                 raise ValueError(f"{what} is {size}; widths and heights are positive")
-        if self.crop_px is not None:
+        if self.camera_size_px is None and (self.crop_px is not None or self.undistort is not None):
+            raise ValueError("crop_px and undistort are in pixels of a frame; set its camera_size_px, too")
+        if self.crop_px is not None and self.camera_size_px is not None:
             x, y, width, height = self.crop_px
-            if self.camera_size_px is None:
-                raise ValueError("crop_px is in pixels of a frame; set its camera_size_px, width and height, too")
             inside = x + width <= self.camera_size_px[0] and y + height <= self.camera_size_px[1]
             if min(x, y) < 0 or min(width, height) <= 0 or not inside:
                 raise ValueError(f"crop_px is {list(self.crop_px)}, not inside a frame of {list(self.camera_size_px)}")
         if self.pull_direction_deg is not None and not 0 <= self.pull_direction_deg < 360:
-            raise ValueError(
-                f"pull_direction_deg is {self.pull_direction_deg:g}; give 0 for right, 90 for down, up to below 360"
-            )
-        if self.undistort is not None and self.camera_size_px is None:
-            raise ValueError("undistort is in pixels of a frame; set its camera_size_px, width and height, too")
+            raise ValueError(f"pull_direction_deg is {self.pull_direction_deg:g}; give 0 (right), 90 (down) up to 360")
 
     def output_size(self, size: tuple[int, int]) -> tuple[int, int]:
-        """Return height and width of a prepared frame, from those of the camera's frame.
-
-        Raises
-        ------
-        ImageError
-            If the frame has another shape than the camera's, or would be stretched.
-        """
+        """Return height and width of a prepared frame, from those of the camera's frame."""
         x0, y0, x1, y1 = self._box(size)
         height, width = y1 - y0, x1 - x0
         if self.rotate_deg in {90, 270}:
@@ -129,10 +118,8 @@ class SensorProfile:
             return height, width
         wanted_width, wanted_height = self.resize_px
         if abs(wanted_width * height / (wanted_height * width) - 1) > _MOST_STRETCH:
-            raise ImageError(
-                f"the profile {self.name} makes {width} x {height} pixels (width x height) to {wanted_width} x "
-                f"{wanted_height}, which stretches them; crop to the same shape with crop_px in its file"
-            )
+            made = f"the profile {self.name} makes {width} x {height} pixels to {wanted_width} x {wanted_height}"
+            raise ImageError(f"{made}, which stretches them; crop to the same shape with crop_px in its file")
         return wanted_height, wanted_width
 
     def apply(self, frame: Frame) -> UInt8[np.ndarray, "rows columns 3"]:
@@ -177,11 +164,8 @@ class SensorProfile:
         has_reference = capture.reference is not None or capture.reference_index is not None
         index = capture.reference_index if has_reference else self.reference_frame
         if index is not None and not 0 <= index < len(capture):
-            raise InputError(
-                f"{capture.source} has {number_of(len(capture), 'frame')} but the profile {self.name} takes frame "
-                f"{index} for the untouched sensor; name one that is there with --reference-frame, or change "
-                "reference_frame in its file"
-            )
+            frames = f"{capture.source} has {len(capture)} frames but the profile {self.name} takes frame {index}"
+            raise InputError(f"{frames} for the untouched sensor; name one that is there with --reference-frame")
         return replace(
             capture,
             sensor=self.name,
@@ -207,11 +191,9 @@ class SensorProfile:
             return 1.0, 1.0
         across, down = size[1] / self.camera_size_px[0], size[0] / self.camera_size_px[1]
         if abs(across / down - 1) > _MOST_STRETCH:
-            raise ImageError(
-                f"frames are {size[1]} x {size[0]} pixels (width x height) but the profile {self.name} is for a "
-                f"camera of {self.camera_size_px[0]} x {self.camera_size_px[1]}; make one for this camera with "
-                "`sliplens sensor new`"
-            )
+            (width, height), (rows, columns) = self.camera_size_px, size
+            camera = f"is for a camera of {width} x {height}, and frames are {columns} x {rows}"
+            raise ImageError(f"the profile {self.name} {camera}; make one with `sliplens sensor new`")
         return across, down
 
     def _box(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
@@ -246,11 +228,6 @@ def shipped_profiles() -> tuple[str, ...]:
 def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
     """Read a sensor profile: a TOML file, or the name of one that comes with sliplens.
 
-    Raises
-    ------
-    InputError
-        If there is none, or its file has an unknown key or an impossible value.
-
     Examples
     --------
     >>> from sliplens.recordings.sensor import load_profile
@@ -263,10 +240,8 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
     if not path.exists() and str(profile) in shipped_profiles():
         path = _SHIPPED / f"{profile}.toml"
     if not path.is_file():
-        raise InputError(
-            f"there is no sensor profile {profile}; name a file that `sliplens sensor new` made, or one of "
-            f"{', '.join(shipped_profiles())}"
-        )
+        there = ", ".join(shipped_profiles())
+        raise InputError(f"there is no sensor profile {profile}; name the file of `sensor new`, or one of {there}")
     values = read_toml(path, what="a sensor profile")
     names = [field.name for field in fields(SensorProfile)]
     if strange := sorted(set(values) - set(names)):
@@ -297,6 +272,3 @@ def profile_text(profile: SensorProfile, *, notes: tuple[str, ...] = ()) -> str:
             # texts, numbers and lists of numbers are equal in JSON and TOML
             rows.append(f"{field.name} = {json.dumps(value, ensure_ascii=False)}")
     return "\n".join([*rows, *tables]) + "\n"
-
-
-__all__ = ["Lens", "SensorProfile", "load_profile", "profile_text", "shipped_profiles"]

@@ -25,11 +25,9 @@ from sliplens.recordings.repeats import inspect_repeats
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.runner import LONGEST, Part, part
 
-Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
-"""RGB images of the camera, one after another."""
+Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]  #: RGB images of the camera, one after another.
 Other = TypeVar("Other")
-_INSPECTED = 8
-"""Recordings whose first frames are checked for repeats."""
+_INSPECTED = 8  #: Recordings whose first frames are checked for repeats.
 
 
 class SourceOptions(TypedDict, total=False):
@@ -76,12 +74,6 @@ def open_source(
     whole
         If True, read the samples of forces that a data set stores; images must then have times.
 
-    Raises
-    ------
-    InputError
-        If the source is missing, damaged, or does not take an option; `ImageError` for an image, `RecordingError` for a
-        recording.
-
     Examples
     --------
     >>> import numpy as np
@@ -101,10 +93,7 @@ def open_source(
         if names := options.given():
             raise InputError(f"{opened.folder} is a data set of sliplens, which does not take {option_flags(names)}")
         if profile is not None:
-            raise InputError(
-                f"{opened.folder} is a data set of sliplens, whose frames went through their profile on import; "
-                "leave out --sensor"
-            )
+            raise InputError(f"{opened.folder} is a data set, which went through its profile; leave out --sensor")
         infos = opened.select(split=split)
         places = _choose_trial([info.trial for info in infos], trial, str(opened.folder))
         stored = (read_stored_trial(opened, infos[place], samples=whole) for place in places)
@@ -136,11 +125,9 @@ def _open_dataset(source: Path | str | Other, format: str | None) -> Path | Data
 class Trials:
     """Trials of a source that every process can open again, by their paths and names."""
 
-    source: Path | Dataset | tuple[Capture, ...]
-    """Source to open; captures stay in this process."""
+    source: Path | Dataset | tuple[Capture, ...]  #: Source to open; captures stay in this process.
     options: SourceOptions
-    kinds: tuple[Capture, ...]
-    """A capture of each sensor and size of frames, by which to check a source quickly."""
+    kinds: tuple[Capture, ...]  #: A capture of each sensor and size of frames, by which to check a source quickly.
     rows: tuple[tuple[str, int, str], ...]
     """Name, number of frames, and hash of each trial; the hash is empty where parts are not stored."""
 
@@ -184,10 +171,7 @@ class Trials:
         return {**self.options, "reference": image}
 
     def reader(self) -> Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]:
-        """Return a function that opens a shard: its trial, and its frames with their numbers.
-
-        A shard of a long trial that follows the one before goes on where that ended.
-        """
+        """Return a function that opens a shard: its trial, and its frames with their numbers."""
         source, options = self.source, self.options
         opened = open_source(source, **options) if isinstance(source, Path) else source
         by_name = {} if isinstance(opened, Dataset) else {capture.name: capture for capture in opened}
@@ -228,15 +212,7 @@ def open_trials(
     resumable: bool = True,
     **options: Unpack[SourceOptions],
 ) -> Trials:
-    """Open a source for work that other processes may do; the options are those of `open_source`.
-
-    Where parts are stored for another run (`resumable`), files other than a data set are read whole for their hash.
-
-    Raises
-    ------
-    InputError
-        See `open_source`; and if frames in memory are to be worked on in other processes.
-    """
+    """Open a source for work that other processes may do; the options are those of `open_source`."""
     source = _open_dataset(source, options.get("format"))
     if isinstance(source, Dataset):
         trial = options.pop("trial", None)
@@ -293,21 +269,12 @@ def _require_usual(capture: Capture, allowed: Sequence[Budget]) -> None:
         "frames": (len(capture), number_of(len(capture), "frame")),
         "pixels": (height * width, f"frames of {height} x {width} pixels"),
         "samples": (samples := len(capture.forces.time_s) if capture.forces else 0, f"{samples:,} samples of forces"),
-        "span": max(((float(time[-1] - time[0]), _describe_span(time)) for time in clocks), default=(0.0, "")),
+        "span": max(((span := float(np.ptp(time)), f"times over {span:.6g} s") for time in clocks), default=(0.0, "")),
     }
     for name, (size, text) in sizes.items():
         if size > LIMITS[name] and name not in allowed:
-            raise RecordingError(
-                f"{capture.source} has {text}, more than the {LIMITS[name]:,} that are usual; cut or mend it, or say "
-                f"--allow-large {name} if it is right"
-            )
-
-
-def _describe_span(time_s: np.ndarray) -> str:
-    """Describe the length of a series of times, and its longest gap."""
-    at = int(np.argmax(np.diff(time_s))) if len(time_s) > 1 else 0
-    gap = f", {time_s[at + 1] - time_s[at]:.6g} s of them after stamp {at}" if len(time_s) > 1 else ""
-    return f"times over {time_s[-1] - time_s[0]:.6g} s{gap}"
+            usual = f"more than the {LIMITS[name]:,} that are usual; cut or mend it"
+            raise RecordingError(f"{capture.source} has {text}, {usual}, or say --allow-large {name} if it is right")
 
 
 def _choose_trial(names: Sequence[str], trial: str | None, source: str) -> Sequence[int]:
@@ -334,7 +301,6 @@ def _read_images(folder: Path, frame_rate: float | None) -> Capture:
 
 
 def _frame_times(count: int, frame_rate: float | None) -> Float[np.ndarray, " frames"]:
-    """Return times of frames; NaN where their rate is unknown."""
     return np.full(count, np.nan) if frame_rate is None else evenly_spaced(count, frame_rate=frame_rate)
 
 
@@ -344,17 +310,13 @@ def _with_reference(trial: Capture, image: Path | str | Frame | None, number: in
         number = trial.reference_index
     if number is not None:
         if not 0 <= number < trial.frames:
-            raise InputError(
-                f"{trial.name} has no frame {number}; name one from 0 to {trial.frames - 1} with --reference-frame"
-            )
+            raise InputError(f"{trial.name} has no frame {number}; name one from 0 to {trial.frames - 1}")
         return replace(trial, reference=None, reference_index=number)
     if image is None:
         return trial
     pixels = read_image(Path(image)) if isinstance(image, str | Path) else image
     if pixels.shape[:2] != trial.frame_size:
         height, width = trial.frame_size
-        raise ImageError(
-            f"the reference is {pixels.shape[0]} x {pixels.shape[1]} pixels but the frames of {trial.name} are "
-            f"{height} x {width}; record both with the same camera settings"
-        )
+        sizes = f"{pixels.shape[0]} x {pixels.shape[1]} pixels but the frames of {trial.name} are {height} x {width}"
+        raise ImageError(f"the reference is {sizes}; record both with the same camera settings")
     return replace(trial, reference=pixels)

@@ -17,10 +17,8 @@ from sliplens.recordings.dataset import Dataset, load_dataset, write_dataset_tab
 from sliplens.recordings.manifest import read_csv
 from sliplens.recordings.trial import TrialFacts
 
-SPLITS = ("train", "validation", "test")
-"""Splits that trials are dealt to."""
-Group: TypeAlias = Literal["trial", "object", "day"]
-"""Facts by which trials are grouped."""
+SPLITS = ("train", "validation", "test")  #: Splits that trials are dealt to.
+Group: TypeAlias = Literal["trial", "object", "day"]  #: Facts by which trials are grouped.
 _SPLIT_NAME = re.compile(r"[a-z][a-z0-9_-]*")
 # shares are written with few digits: thirds as 0.3333 should be corrected by whoever wrote them
 _SUM_TOLERANCE = 1e-6
@@ -31,22 +29,13 @@ _MOST_NAMES = 5  # names in a message before the rest is counted
 class SplitResult:
     """Split of every trial, and remarks on it."""
 
-    splits: tuple[str, ...]
-    """In the order of the trials."""
+    splits: tuple[str, ...]  #: In the order of the trials.
     notes: tuple[str, ...]
     """Sentences about rows without effect, splits without trials, objects or days in both train and test."""
 
 
 def read_split_table(path: Path) -> dict[str, str]:
-    """Read a table (CSV) with the columns `trial` and `split`.
-
-    A trial is a name or a pattern with `*`, `?` and `[0-9]`; the first row that matches a trial decides.
-
-    Raises
-    ------
-    RecordingError
-        If a column or a cell is missing, a trial is listed twice, or a split cannot be named so.
-    """
+    """Read a table (CSV) with the columns `trial` and `split`."""
     cure = "name trial, object or day, or write a table with the columns trial and split (CSV)"
     require_file(path, missing=cure, most=MOST_TEXT)
     table: dict[str, str] = {}
@@ -66,11 +55,6 @@ def read_split_table(path: Path) -> dict[str, str]:
 
 def assign_splits(trials: Sequence[TrialFacts], table: Mapping[str, str]) -> SplitResult:
     """Assign to every trial the split of the first row of a table that matches its name.
-
-    Raises
-    ------
-    InputError
-        If a trial is listed twice or matches no row.
 
     Examples
     --------
@@ -100,11 +84,6 @@ def deal_splits(
     Each split gets its share of the groups by the method of largest remainders; a split without a group takes one from
     the split with most beyond its share, as long as there are groups enough. Groups are dealt in the order of the
     SHA-256 of `SEED:GROUP`: independent of the order and number of trials, so that a new group moves few others.
-
-    Raises
-    ------
-    InputError
-        If a trial is listed twice, `by` is unknown for all of them, or the shares do not sum to 1.
 
     Examples
     --------
@@ -179,11 +158,6 @@ def split_dataset(
         Seed of the order in which groups are dealt.
     dry_run
         If True, nothing is written.
-
-    Raises
-    ------
-    InputError
-        If the data set or the table cannot be read, a trial matches no row, or no trial has an object to be dealt by.
     """
     data = data if isinstance(data, Dataset) else load_dataset(data)
     splits = load_splits(splits)
@@ -227,9 +201,3 @@ def _list(names: Sequence[str]) -> str:
     if rest > 1:
         return f"{', '.join(names[:_MOST_NAMES])} and {rest} more"
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
-__all__ = [
-    "SPLITS", "Group", "SplitResult", "assign_splits", "deal_splits", "load_splits", "read_split_table",
-    "split_dataset",
-]  # fmt: skip

@@ -13,7 +13,6 @@ from hashlib import sha256
 from itertools import islice
 from math import prod
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeAlias, TypeVar
 
 import msgspec
@@ -35,10 +34,8 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 SCHEMA_VERSION = 2
-CODEC = "rows+zstd"
-"""Coding of the images, named in the metadata of a trial."""
-ROW_GROUP = 64
-"""Frames that are written and read together."""
+CODEC = "rows+zstd"  #: Coding of the images, named in the metadata of a trial.
+ROW_GROUP = 64  #: Frames that are written and read together.
 _AGAIN = "make the data set again"
 reading = partial(parquet_errors, cure=_AGAIN, error=RecordingError)
 """Context that turns errors of a missing or damaged file into a `RecordingError` with its cure."""
@@ -59,10 +56,7 @@ def encode_frames(frames: Iterable[Pixels]) -> Iterator[list[bytes]]:
 
 
 def in_turn(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
-    """Apply a function in threads while the next items are made; yields the results in the order of the items.
-
-    At most two items a thread are in memory.
-    """
+    """Apply a function in threads while the next items are made; yields the results in the order of the items."""
     cores = os.environ.get("OMP_NUM_THREADS", "")  # of this process, where several work
     workers = int(cores) if cores.isdigit() and int(cores) else os.cpu_count() or 1
     waiting: deque[Future[_Result]] = deque()
@@ -104,7 +98,7 @@ class Spool:
     def __enter__(self) -> "Spool":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.close()
 
 
@@ -145,13 +139,7 @@ class TrialHeader(TrialFacts):
 
 
 def require_stored(trial: TrialFacts) -> None:
-    """Check name and frame size of a stored trial.
-
-    Raises
-    ------
-    ValueError
-        If the name is no file name, or the size not that of a camera; the codec adds the file to the message.
-    """
+    """Check name and frame size of a stored trial."""
     if not _NAME.fullmatch(trial.trial):
         raise ValueError(f"a trial is named with letters, digits, dots, dashes and underscores, not {trial.trial!r}")
     frames, height, width = (getattr(trial, name) for name in ("frames", "height", "width"))
@@ -203,10 +191,7 @@ def _open(path: Path) -> tuple[pq.ParquetFile, TrialHeader]:
 
 
 _TRUTH_SIGNALS = ("static_friction", "contact_radius_m", "stick_radius_m")
-_TRUTH_KINDS = {
-    **dict.fromkeys(_TRUTH_SIGNALS, "numbers"),
-    **{"marker_px": "lists of numbers", "contact_map": "bytes"},
-}
+_TRUTH_KINDS = {**dict.fromkeys(_TRUTH_SIGNALS, "numbers"), **{"marker_px": "lists of numbers", "contact_map": "bytes"}}
 
 
 def save_recording(recording: Recording, path: Path) -> None:
@@ -233,10 +218,7 @@ def write_trial(
     first_reference: Frame | None = None,
     truth: GroundTruth | None = None,
 ) -> None:
-    """Write the Parquet file of a trial, its encoded images a row group at a time; it appears when complete.
-
-    `first_reference` is the reference from before a correction named another.
-    """
+    """Write the Parquet file of a trial, its encoded images a row group at a time; it appears when complete."""
     columns: dict[str, Any] = {"time_s": time_s, "contact_state": labels.contact_state}
     columns |= {name: getattr(labels, name) for name in (*SIGNALS[1:], *OPTIONAL_LABELS)}
     columns = {name: values for name, values in columns.items() if values is not None}
@@ -291,11 +273,7 @@ def _in_place(images: list[bytes]) -> pa.ChunkedArray:
 
 
 def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Recording:
-    """Read a trial written by `save_recording`.
-
-    Without pixels, and then without the truth, a trial of any length takes little memory: the reference stands for
-    every frame, and `read_frames` reads those that are needed.
-    """
+    """Read a trial written by `save_recording`."""
     truth = truth and pixels
     file, header = _open(path)
     with file:
@@ -309,9 +287,7 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
     if frames == 0:
         raise RecordingError(f"trial {header.trial} has no frames; leave it out or record it again")
     if pixels and frames * prod(size) > _MOST_BYTES:
-        raise RecordingError(
-            f"{path} claims {frames:,} frames of {size[0]} x {size[1]} pixels, which no memory holds; {_AGAIN}"
-        )
+        raise RecordingError(f"{path} claims {frames:,} frames, more than memory holds; {_AGAIN}")
     table = read_parquet(path, wanted, cure=_AGAIN, error=RecordingError)
     labels: dict[str, Any] = {
         name: table.column(name).to_pylist()

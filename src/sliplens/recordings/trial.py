@@ -12,24 +12,18 @@ from sliplens.mechanics import stick_ratio
 from sliplens.progress import number_of
 from sliplens.recordings.labelling import Labelling
 
-OUTSIDE, SLIPS, STICKS = 0, 1, 2
-"""Values of a contact map."""
+OUTSIDE, SLIPS, STICKS = 0, 1, 2  #: Values of a contact map.
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialFacts:
     """Facts of a trial: name, sensor, day and object, by which trials are grouped."""
 
-    trial: str
-    """Name of the trial: letters, digits, dots, dashes and underscores."""
-    sensor: str = ""
-    """Name of the sensor; empty where it is unknown."""
-    day: int = 1
-    """Day of the recording, counted from 1."""
-    condition: str = "dry"
-    """dry or wet, or any other word for the state of the surface."""
-    object: str = ""
-    """Name of the object in the grasp; empty where it is unknown."""
+    trial: str  #: Name of the trial: letters, digits, dots, dashes and underscores.
+    sensor: str = ""  #: Name of the sensor; empty where it is unknown.
+    day: int = 1  #: Day of the recording, counted from 1.
+    condition: str = "dry"  #: dry or wet, or any other word for the state of the surface.
+    object: str = ""  #: Name of the object in the grasp; empty where it is unknown.
 
 
 class ContactState(StrEnum):
@@ -51,8 +45,7 @@ def contact_states(margin: Float[np.ndarray, " frames"], *, without: ContactStat
 
 LABEL_SIGNALS = ("normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
 """The numbers of `Labels`, in the order they are stored."""
-SIGNALS = ("time_s", *LABEL_SIGNALS)
-"""The per-frame numbers of a `Recording`, in the order they are stored."""
+SIGNALS = ("time_s", *LABEL_SIGNALS)  #: The per-frame numbers of a `Recording`, in the order they are stored.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,14 +65,11 @@ class Labels:
     contact_state: tuple[ContactState, ...]
     safety_margin_sigma: Float[np.ndarray, " _"] | None = None
     """Standard uncertainty of the safety margin; None where it is exact or was not estimated."""
-    valid: Bool[np.ndarray, " _"] | None = None
-    """Frames whose label can be trusted; None where all that have one can."""
-    reason: tuple[str, ...] | None = None
-    """Why a label is not valid; empty where it is."""
+    valid: Bool[np.ndarray, " _"] | None = None  #: Frames whose label can be trusted; None where all that have one can.
+    reason: tuple[str, ...] | None = None  #: Why a label is not valid; empty where it is.
     force_time_s: Float[np.ndarray, " _"] | None = None
     """Times of the frames on the force sensor's clock, where forces were interpolated."""
-    labelling: Labelling | None = None
-    """Provenance of the labels; None where it is unknown."""
+    labelling: Labelling | None = None  #: Provenance of the labels; None where it is unknown.
 
     def __post_init__(self) -> None:
         self._require_one_each(len(self.safety_margin), f"there are {len(self.safety_margin)} safety margins but")
@@ -109,8 +99,7 @@ class Labels:
         return dict(Counter("valid" if valid else reason or "no label" for valid, reason in pairs))
 
 
-OPTIONAL_LABELS = ("safety_margin_sigma", "valid", "reason", "force_time_s")
-"""Fields of `Labels` that may be None."""
+OPTIONAL_LABELS = ("safety_margin_sigma", "valid", "reason", "force_time_s")  #: Fields of `Labels` that may be None.
 
 
 def labels_of_margins(safety_margin: Float[np.ndarray, " frames"]) -> Labels:
@@ -143,19 +132,15 @@ class GroundTruth:
     Lengths that disagree, or a stick zone larger than the contact, are a `RecordingError`.
     """
 
-    recipe: str
-    """Hash of the recipe that made the trial."""
+    recipe: str  #: Hash of the recipe that made the trial.
     displacement: str
     """Model that moved the markers; the stick zone of `calibrated` is nominal, that of `half-space` exact."""
     # sizes that must agree are left open here and checked below, in the user's words
-    marker_rest_px: Float32[np.ndarray, "_ 2"]
-    """Markers of the untouched sensor."""
-    marker_px: Float32[np.ndarray, "_ _ 2"]
-    """Markers in every frame, in the order of those at rest."""
+    marker_rest_px: Float32[np.ndarray, "_ 2"]  #: Markers of the untouched sensor.
+    marker_px: Float32[np.ndarray, "_ _ 2"]  #: Markers in every frame, in the order of those at rest.
     static_friction: Float[np.ndarray, " _"]
     """mu_s, even in slip; `Recording.friction_coefficient` is the coefficient in force."""
-    contact_radius_m: Float[np.ndarray, " _"]
-    """0 without contact."""
+    contact_radius_m: Float[np.ndarray, " _"]  #: 0 without contact.
     stick_radius_m: Float[np.ndarray, " _"]
     contact_map: UInt8[np.ndarray, "_ _ _"]
     """Contact of the skin as the camera sees it: 0 none, 1 slipping, 2 sticking."""
@@ -164,49 +149,29 @@ class GroundTruth:
         count = len(self.marker_px)
         for name in ("static_friction", "contact_radius_m", "stick_radius_m", "contact_map"):
             if len(getattr(self, name)) != count:
-                raise RecordingError(
-                    f"the truth has {number_of(count, 'frame')} of markers but {len(getattr(self, name))} of {name}; "
-                    "give one a frame"
-                )
+                raise RecordingError(f"the truth has {count} frames of markers but another of {name}; give as many")
         if self.marker_px.shape[1:] != self.marker_rest_px.shape:
-            raise RecordingError(
-                f"the truth has {len(self.marker_rest_px)} markers at rest but {self.marker_px.shape[1]} in "
-                "its frames; give each marker a place in both"
-            )
+            raise RecordingError("the truth has other markers at rest than in its frames; give each a place in both")
         if np.any(self.stick_radius_m > self.contact_radius_m):
             at = int(np.argmax(self.stick_radius_m > self.contact_radius_m))
-            raise RecordingError(
-                f"frame {at} sticks beyond its contact; the stick radius is at most the contact radius"
-            )
+            raise RecordingError(f"frame {at} sticks beyond its contact; make the stick radius at most the contact's")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording(TrialFacts, Labels):
-    """One trial in memory: its facts, its frames (uint8 RGB) at their times, and their labels.
+    """One trial in memory: its facts, its frames (uint8 RGB) at their times, and their labels."""
 
-    Raises
-    ------
-    RecordingError
-        If the trial is empty, lengths or sizes disagree, times do not rise, or a label lies outside [0, 1].
-    """
-
-    reference: UInt8[np.ndarray, "_ _ 3"]
-    """Image of the untouched sensor."""
+    reference: UInt8[np.ndarray, "_ _ 3"]  #: Image of the untouched sensor.
     frames: UInt8[np.ndarray, "_ _ _ 3"]
-    time_s: Float[np.ndarray, " _"]
-    """Times on the camera's clock, rising."""
-    truth: GroundTruth | None = None
-    """Ground truth of a simulator; None for a real trial."""
+    time_s: Float[np.ndarray, " _"]  #: Times on the camera's clock, rising.
+    truth: GroundTruth | None = None  #: Ground truth of a simulator; None for a real trial.
 
     def __post_init__(self) -> None:
         count = len(self.frames)
         if count == 0:
             raise RecordingError(f"trial {self.trial} has no frames; leave it out or record it again")
         if self.frames.shape[1:] != self.reference.shape:
-            raise RecordingError(
-                f"trial {self.trial} has frames of {self.frames.shape[1:3]} pixels but a reference of "
-                f"{self.reference.shape[:2]}; record both with the same camera settings"
-            )
+            raise RecordingError(f"trial {self.trial} has a reference of another size than frames; record both alike")
         begin = f"trial {self.trial} has {number_of(count, 'frame')} but"
         self._require_one_each(count, begin, "time_s")
         if self.truth is not None and len(self.truth.marker_px) != count:
@@ -216,10 +181,7 @@ class Recording(TrialFacts, Labels):
             raise RecordingError(f"trial {self.trial}: the time of frame {at} is {self.time_s[at]}; mend its stamp")
         if not np.all(np.diff(self.time_s) > 0):
             at = int(np.argmax(~(np.diff(self.time_s) > 0))) + 1
-            raise RecordingError(
-                f"trial {self.trial}: time does not rise at frame {at} ({self.time_s[at - 1]:.6g} s, then "
-                f"{self.time_s[at]:.6g} s); sort the frames or mend their stamps"
-            )
+            raise RecordingError(f"trial {self.trial}: time does not rise at frame {at}; mend the stamps")
         self._require_possible(self.trial)
 
     def __len__(self) -> int:
@@ -228,8 +190,7 @@ class Recording(TrialFacts, Labels):
 
 CLOCK_S = (-1e6, 1e10)
 """Range of plausible times: seconds since the start of a recording or since 1970; others are in another unit."""
-MOST_FORCE_N = 1e4
-"""Largest force on a fingertip, in newtons; a larger number is in another unit."""
+MOST_FORCE_N = 1e4  #: Largest force on a fingertip, in newtons; a larger number is in another unit.
 _FORCES = (-MOST_FORCE_N, MOST_FORCE_N, "give it in newtons")
 _FRACTION = (0.0, 1.0, "give it as a fraction, not in percent")
 LABEL_BOUNDS = {

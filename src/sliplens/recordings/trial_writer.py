@@ -15,7 +15,7 @@ from sliplens.codec import RESULT_FILE, load_record, save_record
 from sliplens.errors import PartError, RecordingError, SliplensError
 from sliplens.files import remove
 from sliplens.images import Soft, require_rgb, soften
-from sliplens.progress import number_of, open_stage, report_progress
+from sliplens.progress import open_stage, report_progress
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import LeftOut, TrialInfo, trial_info, trial_path
 from sliplens.recordings.labelling import Corrections, Labelling, ReferenceChoice
@@ -43,14 +43,10 @@ class TrialJob:
 
     capture: Capture
     settings: LabelSettings
-    corrections: Corrections | None = None
-    """Corrections by hand, which `settings` follow already."""
-    cure: str = ""
-    """End of an error message, where corrections may be the cause."""
-    profile: SensorProfile | None = None
-    """Profile that its frames go through."""
-    one_of_many: bool = False
-    """If True, a failure leaves the trial out instead of stopping the others."""
+    corrections: Corrections | None = None  #: Corrections by hand, which `settings` follow already.
+    cure: str = ""  #: End of an error message, where corrections may be the cause.
+    profile: SensorProfile | None = None  #: Profile that its frames go through.
+    one_of_many: bool = False  #: If True, a failure leaves the trial out instead of stopping the others.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,14 +75,10 @@ class TrialWork(Work):
             capture = job.capture
             trial, samples = trial_path(path, capture.trial), forces_path(path, capture.trial)
             try:
-                rng = trial_rng(job.settings, capture.trial)
+                # random numbers that do not depend on the other trials
+                rng = np.random.default_rng((job.settings.seed, *capture.trial.encode()))
                 import_trial(
-                    capture,
-                    trial,
-                    settings=job.settings,
-                    corrections=job.corrections,
-                    rng=rng,
-                    forces_file=samples,
+                    capture, trial, settings=job.settings, corrections=job.corrections, rng=rng, forces_file=samples
                 )
             except SliplensError as error:
                 if job.cure:
@@ -102,11 +94,6 @@ class TrialWork(Work):
         return make
 
 
-def trial_rng(settings: LabelSettings, trial: str) -> np.random.Generator:
-    """Make the random numbers for the labels of a trial, independent of the other trials."""
-    return np.random.default_rng((settings.seed, *trial.encode()))
-
-
 def leave_cores() -> AbstractContextManager:
     """Run NumPy's matrix products, which are small here, in one thread: idle ones would spin on all cores."""
     return threadpool_limits(1, user_api="blas")
@@ -114,20 +101,9 @@ def leave_cores() -> AbstractContextManager:
 
 @contextmanager
 def write_trials(
-    work: TrialWork,
-    trials: Sequence[tuple[Any, str, int]],
-    folder: Path,
-    *,
-    title: str,
-    on: str,
-    retry_failed: bool,
+    work: TrialWork, trials: Sequence[tuple[Any, str, int]], folder: Path, *, title: str, on: str, retry_failed: bool
 ) -> Iterator[tuple[list[TrialInfo], list[LeftOut]]]:
-    """Write trials into the folder of a data set; yields their rows, and the trials that were left out of many.
-
-    `trials` gives the item of the shard, the name and the number of frames of each. Finished trials are reused by the
-    next attempt until the enclosed block ends without an error. A trial of many that fails again and again is left out
-    like a damaged one.
-    """
+    """Write trials into the folder of a data set; yields their rows, and the trials that were left out of many."""
     parts = folder / "parts"
 
     # the folder is of these recordings and settings alone (`files.output_folder`)
@@ -142,12 +118,9 @@ def write_trials(
             failed = {name: work.open(item) for item, name, _ in trials if name in error.errors}
             if len(failed) == len(trials) or not all(job.one_of_many for job in failed.values()):
                 raise
+            again = "the same command with --add tries it again"
             left_out = [
-                LeftOut(
-                    trial=name,
-                    source=job.capture.source,
-                    why=f"{error.errors[name]}; the same command with --add tries it again",
-                )
+                LeftOut(trial=name, source=job.capture.source, why=f"{error.errors[name]}; {again}")
                 for name, job in failed.items()
             ]
     set_aside = {trial.trial for trial in left_out}
@@ -178,17 +151,13 @@ def import_trial(
     rng: np.random.Generator,
     forces_file: Path | None = None,
 ) -> None:
-    """Write a recording as a trial of a data set, with its own labels or with automatic ones; complete or not at all.
-
-    The frames are decoded once, never all at once. The samples of the force sensor, from which labels can be made
-    again, are written to `forces_file`. `corrections` are stored with the labels; `settings` follow them already.
-    """
+    """Write a recording as a trial of a data set, with its own or automatic labels; complete or not at all."""
     require_forces(capture)
     with Spool(path.parent) as images:
-        footage = _read_footage(capture, images)
+        motion, read = _read_footage(capture, images)
         try:
             reference, labels = _label_footage(
-                capture, footage, settings=settings or LabelSettings(), corrections=corrections, rng=rng
+                capture, motion, read, settings=settings or LabelSettings(), corrections=corrections, rng=rng
             )
         except RecordingError as error:
             raise RecordingError(f"{capture.source}: {error}") from None
@@ -207,18 +176,10 @@ def import_trial(
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Footage:
-    """Frames of a recording, decoded once before they are labelled."""
-
-    motion: Float[np.ndarray, " frames"]
-    """See `measure_motion`."""
-    read: Callable[[Sequence[int]], Iterator[Frame]]
-    """Reads frames of rising numbers."""
-
-
-def _read_footage(capture: Capture, images: Spool) -> _Footage:
-    """Decode the frames of a recording and spool them, encoded as they are stored."""
+def _read_footage(
+    capture: Capture, images: Spool
+) -> tuple[Float[np.ndarray, " frames"], Callable[[Sequence[int]], Iterator[Frame]]]:
+    """Decode and spool the frames of a recording; returns their motion, and how to read frames of rising numbers."""
 
     def spool() -> Iterator[Soft]:
         for image, soft in in_turn(lambda frame: (encode_pixels(frame), soften(frame)), _check_frames(capture)):
@@ -231,21 +192,20 @@ def _read_footage(capture: Capture, images: Spool) -> _Footage:
             where = f"frame {place} of {capture.source}"
             yield decode_pixels(images[place], size=(*capture.frame_size, 3), where=where)
 
-    return _Footage(motion=measure_motion(spool()), read=read)
+    return measure_motion(spool()), read
 
 
 def require_forces(capture: Capture) -> None:
     """Refuse a recording that has neither labels nor forces to make them from."""
     if capture.labels is None and capture.forces is None:
-        raise RecordingError(
-            f"{capture.source} has no forces, and without them there is no label; give the table of the force sensor "
-            "with --forces FILE, or in a folder of recordings under the name of the recording"
-        )
+        cure = "give the table of the force sensor with --forces FILE, or under the name of the recording"
+        raise RecordingError(f"{capture.source} has no forces, and without them there is no label; {cure}")
 
 
 def _label_footage(
     capture: Capture,
-    footage: _Footage,
+    motion: Float[np.ndarray, " frames"],
+    read: Callable[[Sequence[int]], Iterator[Frame]],
     *,
     settings: LabelSettings,
     corrections: Corrections | None,
@@ -258,12 +218,12 @@ def _label_footage(
         labels = replace(labels, reason=(Reason.EXCLUDED,) * len(capture))
     elif labels is None:
         assert capture.forces is not None
-        automatic = label_trial(capture.frame_time_s, footage.motion, capture.forces, settings=settings, rng=rng)
+        automatic = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
         labels, basis = automatic, automatic.basis
         untouched = np.array([reason is Reason.NO_CONTACT for reason in automatic.reason])
-        if (doubt := describe_repeats(footage.motion, capture.frame_time_s)) is not None:
+        if (doubt := describe_repeats(motion, capture.frame_time_s)) is not None:
             basis = replace(basis, doubts=(*basis.doubts, doubt))
-    image, choice = _choose_reference(capture, footage, settings=settings, untouched=untouched)
+    image, choice = _choose_reference(capture, read, settings=settings, untouched=untouched)
     first = None
     if capture.reference is not None and corrections is not None and corrections.reference_frame is not None:
         # for who takes the correction back
@@ -282,7 +242,11 @@ def _label_footage(
 
 
 def _choose_reference(
-    capture: Capture, footage: _Footage, *, settings: LabelSettings, untouched: Bool[np.ndarray, " frames"] | None
+    capture: Capture,
+    read: Callable[[Sequence[int]], Iterator[Frame]],
+    *,
+    settings: LabelSettings,
+    untouched: Bool[np.ndarray, " frames"] | None,
 ) -> tuple[Frame, ReferenceChoice]:
     """Return the image of the untouched sensor: the one named, the recorded one, or one of the untouched frames."""
     index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
@@ -290,7 +254,7 @@ def _choose_reference(
         method = "came with the recording" if untouched is None else "recorded apart from the frames"
         return capture.reference, capture.reference_choice or ReferenceChoice(method=method)
     if untouched is not None:
-        choice = choose_reference(footage.read, untouched, index=index, method=settings.reference_method)
+        choice = choose_reference(read, untouched, index=index, method=settings.reference_method)
     elif index is None:
         raise RecordingError("no frame is known to be untouched; name one with --reference-frame")
     elif not 0 <= index < len(capture):
@@ -298,7 +262,7 @@ def _choose_reference(
     else:
         choice = ReferenceChoice(index=index, method="named")
     assert choice.index is not None
-    (image,) = footage.read([choice.index])
+    (image,) = read([choice.index])
     return image, choice
 
 
@@ -308,13 +272,8 @@ def _check_frames(capture: Capture) -> Iterator[Frame]:
     for frame in capture.read_frames():
         require_rgb(frame, what=f"levels of frame {count} of {capture.source}")
         if frame.shape[:2] != capture.frame_size:
-            raise RecordingError(
-                f"frame {count} of {capture.source} is {frame.shape[0]} x {frame.shape[1]} pixels, not "
-                f"{capture.frame_size[0]} x {capture.frame_size[1]} as its first; cut the recording there"
-            )
+            raise RecordingError(f"frame {count} of {capture.source} is of another size; cut the recording there")
         count += 1
         yield frame
     if count != len(capture):
-        raise RecordingError(
-            f"{capture.source} promised {number_of(len(capture), 'frame')} but gave {count}; copy or export it again"
-        )
+        raise RecordingError(f"{capture.source} promised {len(capture)} frames but gave {count}; copy it again")

@@ -33,23 +33,6 @@ def test_frames_come_in_natural_order(folder: Path, frames: np.ndarray):
     assert capture.notes == ("trial 7: frames were declared to be taken 30 times a second.",)
 
 
-def test_frames_can_be_read_again(folder: Path):
-    capture = read_image_folder(folder, frame_rate=30.0)
-    np.testing.assert_array_equal(list(capture.read_frames()), list(capture.read_frames()))
-
-
-def test_grey_frames_are_repeated_in_every_channel(tmp_path: Path, frames: np.ndarray):
-    Image.fromarray(frames[0, :, :, 0]).save(tmp_path / "1.png")
-    (frame,) = read_image_folder(tmp_path, frame_rate=30.0).read_frames()
-    np.testing.assert_array_equal(frame, np.repeat(frames[0, :, :, :1], 3, axis=2))
-
-
-def test_lossy_frames_are_told(tmp_path: Path, frames: np.ndarray):
-    Image.fromarray(frames[0]).save(tmp_path / "1.jpg")
-    write_png(tmp_path / "2.png", frames[1])
-    assert "1 of 2 frames are JPEG" in read_image_folder(tmp_path, frame_rate=30.0).notes[1]
-
-
 def test_a_table_of_times_orders_the_frames(folder: Path, frames: np.ndarray, tmp_path: Path):
     rows = [f"C:\\camera\\{path.name},{10 - 0.1 * int(path.stem[6:])}" for path in folder.iterdir()]
     table = tmp_path / "times.csv"
@@ -83,12 +66,12 @@ def test_forces_lie_beside_the_frames(folder: Path, tmp_path: Path):
     assert capture.forces is not None
     np.testing.assert_allclose(capture.forces.time_s, [100, 100.1])
     np.testing.assert_allclose(capture.frame_time_s, 100 + np.arange(12) / 30)
-    with pytest.raises(RecordingError, match=r"have no moment in common; declare with --start-s"):
+    with pytest.raises(RecordingError, match=r"have no moment in common; give --start-s"):
         read_image_folder(folder, frame_rate=30.0, forces=table, time_unit="s")
 
 
 def test_times_must_be_given_in_one_way(folder: Path):
-    refused(read_image_folder, folder, "trial 7 have no times; give exactly one of --times, --frame-rate and")
+    refused(read_image_folder, folder, "trial 7 have no times; give one of --times, --frame-rate,")
     refused(read_image_folder, folder, "more than one source of times", frame_rate=30.0, name_unit="s")
     refused(read_image_folder, folder, r"a frame rate of 0\.0 frames/s cannot be", frame_rate=0.0)
 
@@ -162,9 +145,3 @@ def test_a_folder_without_images_is_refused(tmp_path: Path):
         read_image_folder(tmp_path, frame_rate=30.0)
     with pytest.raises(InputError, match="does not exist"):
         read_image_folder(tmp_path / "nothing", frame_rate=30.0)
-
-
-def test_names_without_numbers_are_refused(tmp_path: Path, frames: np.ndarray):
-    write_png(tmp_path / "start.png", frames[0])
-    with pytest.raises(RecordingError, match=r"start\.png has no number in its name; give its time in a table"):
-        read_image_folder(tmp_path, name_unit="s")

@@ -3,7 +3,6 @@
 import contextlib
 import io
 import sqlite3
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from PIL import Image
 from readers import read_rosbag, refused
 from there import there
 
-from sliplens.errors import InputError, RecordingError
+from sliplens.errors import RecordingError
 
 pytest.importorskip("rosbags")
 
@@ -175,28 +174,6 @@ def test_a_file_of_a_bag_is_read_like_its_folder(tmp_path, pixels, frames_of, su
     assert capture.trial == "trial-7"
 
 
-@pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
-def test_a_bag_split_into_files_is_read_as_one(tmp_path, pixels, forces, recorded, storage):
-    first = write_bag(tmp_path / "first", recorded[:9], storage=storage)
-    second = write_bag(tmp_path / "second", recorded[9:], storage=storage)
-    (file,) = second.glob("second.*")
-    file.rename(first / file.name)
-    metadata = first / "metadata.yaml"
-    text = metadata.read_text()
-    assert f"- first{file.suffix}\n" in text
-    metadata.write_text(text.replace(f"- first{file.suffix}\n", f"- first{file.suffix}\n  - {file.name}\n", 1))
-    capture = read_rosbag(first)
-    np.testing.assert_array_equal(list(capture.read_frames()), pixels)
-    np.testing.assert_array_equal(there(capture.forces).force_n, forces)
-
-
-def test_frames_begin_anew_at_every_call(tmp_path, frames_of):
-    capture = read_rosbag(write_bag(tmp_path / "trial", frames_of()))
-    first, again = capture.read_frames(), capture.read_frames()
-    next(first)
-    np.testing.assert_array_equal(next(first), [*again][1])
-
-
 def test_bgr_is_turned_into_rgb_and_grey_is_repeated(tmp_path, pixels):
     bgr = [(CAMERA, raw_image(image[..., ::-1], frame_ns(i), encoding="bgr8"), i) for i, image in enumerate(pixels)]
     np.testing.assert_array_equal(list(read_rosbag(write_bag(tmp_path / "bgr", bgr)).read_frames()), pixels)
@@ -220,15 +197,6 @@ def test_compressed_images_are_what_pillow_makes_of_their_bytes(tmp_path, pixels
             np.testing.assert_array_equal(frames, pixels)
 
 
-def test_a_grey_jpeg_is_repeated_in_three_channels(tmp_path, pixels):
-    data = encode(pixels[0, ..., 0], "JPEG")
-    (frame,) = read_rosbag(
-        write_bag(tmp_path / "trial", [(CAMERA, compressed_image(data, frame_ns(0), form="mono8; jpeg"), 0)])
-    ).read_frames()
-    expected = np.array(Image.open(io.BytesIO(data)))
-    np.testing.assert_array_equal(frame, np.stack([expected] * 3, axis=-1))
-
-
 @pytest.mark.parametrize(("encoding", "channels"), [("16UC1", 2), ("rgba8", 4), ("bayer_rggb8", 1), ("", 3)])
 def test_another_encoding_is_refused_by_name(tmp_path, rng, encoding, channels):
     pixels = rng.integers(0, 256, (HEIGHT, WIDTH, channels), dtype=np.uint8)
@@ -248,12 +216,6 @@ def test_another_kind_of_compressed_image_is_refused(tmp_path, pixels):
         read_rosbag(write_bag(tmp_path / "alpha", [(CAMERA, alpha, 0)]))
 
 
-def test_frames_of_changing_size_are_refused(tmp_path, pixels, frames_of):
-    small = (CAMERA, raw_image(pixels[0, :-2], frame_ns(FRAMES)), frame_ns(FRAMES) + 2_000_000)
-    with pytest.raises(RecordingError, match=r"frame 5 of .* is 10 x 16 pixels, those before it are 12 x 16; cut"):
-        read_rosbag(write_bag(tmp_path / "trial", [*frames_of(), small]))
-
-
 @pytest.mark.parametrize(
     "claims",
     [
@@ -264,14 +226,14 @@ def test_frames_of_changing_size_are_refused(tmp_path, pixels, frames_of):
 )
 def test_a_header_that_claims_more_than_there_is_is_refused_without_allocating(tmp_path, frames_of, claims):
     path = write_bag(tmp_path / "trial", frames_of(**claims))
-    told = r"claims \d+ rows of \d+ bytes but holds 576 bytes; record it again"
+    told = r"claims \d+ rows of \d+ bytes but holds fewer; mend it"
     with held_below(64e6), pytest.raises(RecordingError, match=told):
         read_rosbag(path)
 
 
 @pytest.mark.parametrize("claims", [{"height": 0}, {"width": 0}, {"step": 0}, {"width": WIDTH + 1}])
 def test_a_header_that_contradicts_itself_is_refused(tmp_path, frames_of, claims):
-    with pytest.raises(RecordingError, match=r"claims \d+ x \d+ pixels in rows of \d+ bytes, which cannot be in rgb8"):
+    with pytest.raises(RecordingError, match=r"claims rows of \d+ bytes, no rgb8"):
         read_rosbag(write_bag(tmp_path / "trial", frames_of(**claims)))
 
 
@@ -310,15 +272,6 @@ def test_clocks_that_never_meet_are_replaced_by_the_time_of_the_bag(tmp_path, pi
     assert f"header stamps of {CAMERA} and {FORCE} are of different clocks" in capture.notes[0]
 
 
-def test_stamps_out_of_order_are_refused(tmp_path, pixels):
-    swapped = [
-        (CAMERA, raw_image(im, frame_ns(t)), frame_ns(i))
-        for i, (im, t) in enumerate(zip(pixels, (0, 1, 3, 2, 4), strict=True))
-    ]
-    with pytest.raises(RecordingError, match=r"the frames of /tactile/image of .*: time does not rise at sample 3"):
-        read_rosbag(write_bag(tmp_path / "trial", swapped))
-
-
 def test_a_bag_without_wrenches_has_no_forces(tmp_path, frames_of):
     capture = read_rosbag(write_bag(tmp_path / "a", frames_of()))
     assert capture.forces is None
@@ -343,21 +296,9 @@ def test_of_several_topics_one_must_be_named(tmp_path, pixels, frames_of, wrench
     refused(read_rosbag, path, r"has 2 topics with wrenches, /left .*, /wrench .*; name one of them")
 
 
-def test_a_topic_that_is_not_there_or_holds_something_else_is_refused(tmp_path, recorded):
-    path = write_bag(tmp_path / "trial", recorded)
-    with pytest.raises(
-        RecordingError, match=r"has no topic /camera; it has /tactile/image \(sensor_msgs/msg/Image\), /wr"
-    ):
-        read_rosbag(path, image_topic="/camera")
-    with pytest.raises(
-        RecordingError, match=r"/wrench of .* holds geometry_msgs/msg/WrenchStamped, no images; name one"
-    ):
-        read_rosbag(path, image_topic=FORCE)
-
-
 @pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
 def test_an_empty_bag_is_refused(tmp_path, storage):
-    with pytest.raises(RecordingError, match=r"has no topic with images .*; record the camera too \(it has no topic\)"):
+    with pytest.raises(RecordingError, match=r"has no topic with images; record the camera too \(it has no topic\)"):
         read_rosbag(write_bag(tmp_path / "nothing", [], storage=storage))
     silent = write_bag(tmp_path / "silent", [], storage=storage, topics=[(CAMERA, "sensor_msgs/msg/Image")])
     refused(read_rosbag, silent, r"/tactile/image of .* has no frame; leave it out or record it again")
@@ -387,13 +328,6 @@ def test_a_bag_with_any_byte_changed_raises_no_foreign_error(tmp_path, rng, reco
             file.write_bytes(whole)
 
 
-def test_definitions_in_the_bag_are_not_needed(tmp_path, pixels, frames_of):
-    path = write_bag(tmp_path / "trial", frames_of(), storage="SQLITE3")
-    with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as database, database:
-        database.execute("DELETE FROM message_definitions")
-    np.testing.assert_array_equal(list(read_rosbag(path).read_frames()), pixels)
-
-
 def test_a_path_that_is_no_bag_is_refused(tmp_path, frames_of):
     bag = write_bag(tmp_path / "bag", frames_of())
     (bag / "metadata.yaml").unlink()
@@ -421,29 +355,3 @@ def test_files_of_something_else_are_refused(tmp_path, frames_of):
     for text in ("", "- a list", "rosbag2_bagfile_information: {version: 99}", "a: [", "a: !!python/object:os.x {}"):
         (bag / "metadata.yaml").write_text(text)
         refused(read_rosbag, bag, "bag is not a readable ROS 2 bag")
-
-
-def test_memory_does_not_grow_with_the_length_of_the_bag(tmp_path, rng):
-    image = rng.integers(0, 256, (240, 320, 3), dtype=np.uint8)
-    path = write_bag(tmp_path / "long", [(CAMERA, raw_image(image, frame_ns(i)), frame_ns(i)) for i in range(200)])
-    # 46 MB of pixels in chunks of 1 MiB, each held a few times over while it is cut into messages
-    with held_below(16e6):
-        assert sum(1 for _ in read_rosbag(path).read_frames()) == 200
-
-
-def test_without_rosbags_the_extra_is_named(tmp_path, monkeypatch, frames_of):
-    path = write_bag(tmp_path / "trial", frames_of())
-    monkeypatch.setitem(sys.modules, "rosbags", None)
-    with pytest.raises(InputError, match=r'pip install "sliplens\[ros\]"'):
-        read_rosbag(path)
-
-
-@pytest.mark.real
-@pytest.mark.parametrize(("name", "topic"), [("tactip_db3", "/sensors/tactip"), ("tactip_mcap", "/servo/out/state")])
-def test_a_real_bag_without_images_has_its_topics_named(reference_folder, name, topic):
-    with pytest.raises(
-        RecordingError, match=rf"{name} has no topic with images .*; record the camera too \(it has .*{topic} \("
-    ):
-        read_rosbag(reference_folder / "rosbags" / name)
-    with pytest.raises(RecordingError, match=rf"{topic} of .*{name} holds .*, no images"):
-        read_rosbag(reference_folder / "rosbags" / name, image_topic=topic)

@@ -1,4 +1,3 @@
-import csv
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from readers import read_video, refused
 
 from sliplens.errors import RecordingError
 from sliplens.images import write_png
-from sliplens.recordings.formats.gelsight import is_gelsight, list_gelsight_clips, read_gelsight_clip
+from sliplens.recordings.formats.gelsight import is_gelsight, read_gelsight_clip
 from sliplens.recordings.formats.video import count_stale, least_contact, small_copies
 from sliplens.recordings.labelling import Clip
 
@@ -102,13 +101,6 @@ def test_frames_come_in_the_order_they_are_shown(tmp_path: Path, name: str, code
     assert "frames are coded with loss" in capture.notes[0]
 
 
-def test_frames_are_reordered_in_the_files_above(tmp_path: Path):
-    path = write_video(tmp_path / "a.mp4", brightening(30), codec="libx264", pixels="yuv420p", reordered=3)
-    with av.open(str(path)) as container:
-        stamps = [packet.pts for packet in container.demux(video=0) if packet.pts is not None]
-    assert stamps != sorted(stamps)
-
-
 @pytest.mark.parametrize("codec", ["ffv1", "libx264"])
 def test_a_variable_frame_rate_is_kept(tmp_path: Path, codec: str):
     stamps = [0, 33, 67, 500, 501, 2000, 2040, 2080]
@@ -117,12 +109,6 @@ def test_a_variable_frame_rate_is_kept(tmp_path: Path, codec: str):
     capture = read_video(path)
     np.testing.assert_allclose(capture.frame_time_s, np.array(stamps) / 1000, atol=1e-9)
     assert len(list(capture.read_frames())) == 8
-
-
-def test_a_declared_rate_takes_the_place_of_the_stamps(tmp_path: Path):
-    capture = read_video(write_video(tmp_path / "a.mkv", brightening(6)), frame_rate=8.0)
-    np.testing.assert_allclose(capture.frame_time_s, np.arange(6) / 8)
-    assert capture.notes == ("a.mkv: frames were declared to be taken 8 times a second, whatever its stamps say.",)
 
 
 def test_a_stream_without_stamps_needs_a_declared_rate(tmp_path: Path):
@@ -157,7 +143,7 @@ def test_forces_lie_beside_the_video(tmp_path: Path):
     np.testing.assert_array_equal(capture.forces.force_n, [[1, 2, 3], [4, 5, 6]])
     np.testing.assert_allclose(capture.frame_time_s, 10 + np.arange(1, 6) / 25, atol=1e-3)
     assert "a.mkv: the first frame was declared to be taken at 10 s of the force clock." in capture.notes
-    refused(read_video, path, r"have no moment in common; declare with --start-s when the first frame", forces=table)
+    refused(read_video, path, r"have no moment in common; give --start-s", forces=table)
     table.write_text("t_s,fx,fy,fz\n0,1,2,3\n0.1,4,5,6\n")
     assert "taken to count from the same zero" in read_video(path, forces=table).notes[-1]
 
@@ -169,7 +155,7 @@ def test_forces_lie_beside_the_video(tmp_path: Path):
         (
             "a.avi",
             "mpeg4",
-            r"a\.avi is truncated or damaged: it ends before frame \d+, sooner than its header says; copy",
+            r"a\.avi is truncated or damaged: it ends before frame \d+; copy",
         ),
         ("a.mkv", "mpeg4", r"a\.mkv is truncated or damaged: it ends before frame \d+"),
         ("a.mkv", "ffv1", r"a\.mkv is truncated or damaged: it ends before frame \d+"),
@@ -190,15 +176,7 @@ def test_not_one_frame_may_be_missing_at_the_end(tmp_path: Path, rng: np.random.
     with av.open(str(path)) as container:
         starts = [packet.pos for packet in container.demux(video=0) if packet.pos is not None]
     path.write_bytes(path.read_bytes()[: starts[kept]])
-    refused(read_video, path, rf"it ends before frame {kept}, sooner than its header says")
-
-
-def test_names_in_another_encoding_do_no_harm(tmp_path: Path):
-    path = write_video(tmp_path / "a.mkv", brightening(3))
-    data = path.read_bytes()
-    assert b"Lavf" in data  # the name of the program that wrote it
-    path.write_bytes(data.replace(b"Lavf", b"Lav\xe9"))
-    assert len(list(read_video(path).read_frames())) == 3
+    refused(read_video, path, rf"it ends before frame {kept}; copy")
 
 
 def test_damage_within_a_video_is_found_at_the_frame(tmp_path: Path, rng: np.random.Generator):
@@ -230,21 +208,6 @@ def test_a_file_that_is_no_video_is_refused(tmp_path: Path, rng: np.random.Gener
     refused(read_video, tmp_path, "is no file; name a video file")
 
 
-def test_a_sound_file_is_refused(tmp_path: Path):
-    path = tmp_path / "a.mkv"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
-        assert isinstance(stream, av.AudioStream)
-        sound = av.AudioFrame.from_ndarray(np.zeros((1, 800), dtype=np.int16), format="s16", layout="mono")
-        sound.sample_rate = 8000
-        container.mux(stream.encode(sound))
-    refused(read_video, path, r"a\.mkv has no video stream; name the file that the camera wrote")
-
-
-def test_a_video_without_frames_is_refused(tmp_path: Path):
-    refused(read_video, write_video(tmp_path / "a.avi", []), r"a\.avi (holds no frame|cannot be read)")
-
-
 def test_an_absurd_frame_size_is_refused(tmp_path: Path):
     path = write_video(tmp_path / "a.avi", brightening(2))
     data = path.read_bytes()
@@ -274,15 +237,6 @@ def test_frames_up_to_a_leap_from_another_scene_are_stale(rng: np.random.Generat
     assert count_stale(small_copies(frames)) == 9
 
 
-def test_a_touch_that_comes_and_goes_is_not_stale(rng: np.random.Generator):
-    frames = scene(rng, 60)
-    for start in (5, 30):
-        for step in range(10):
-            depth = 6 * min(step, 9 - step)
-            frames[start + step, 10:50, 20:80] += np.uint8(depth)
-    assert count_stale(small_copies(frames)) == 0
-
-
 def test_steady_motion_is_not_stale(rng: np.random.Generator):
     texture = rng.integers(0, 256, (SIZE[0], SIZE[1] + 180, 3), dtype=np.uint8)
     assert count_stale(small_copies([texture[:, 3 * shift : 3 * shift + SIZE[1]] for shift in range(60)])) == 0
@@ -293,11 +247,6 @@ def test_an_object_that_slides_away_at_the_start_is_not_stale(rng: np.random.Gen
     for index in range(10):
         frames[index, 10:50, 8 * index : 8 * index + 16] //= 2
     assert count_stale(small_copies(frames)) == 0
-
-
-def test_short_videos_have_no_rule_to_break(rng: np.random.Generator):
-    assert count_stale(small_copies([])) == 0
-    assert count_stale(small_copies(scene(rng, 2))) == 0
 
 
 def test_the_candidate_for_a_reference_shows_no_relief(rng: np.random.Generator):
@@ -335,18 +284,6 @@ def gelsight_folder(reference_folder: Path) -> Path:
 
 
 @pytest.mark.real
-def test_every_gelsight_clip_has_the_frames_its_table_lists(gelsight_folder: Path):
-    with (gelsight_folder / "labels.csv").open(newline="") as stream:
-        frames = {row["file"]: int(row["n_frames"]) for row in csv.DictReader(stream)}
-    clips = list_gelsight_clips(gelsight_folder)
-    assert len(clips) == len(frames) == 104
-    for clip in clips:
-        capture = read_video(clip)
-        assert len(capture.frame_time_s) == frames[str(clip.relative_to(gelsight_folder))]
-        assert capture.frame_size == (240, 320)
-
-
-@pytest.mark.real
 @pytest.mark.parametrize(
     ("clip", "slipped", "stale"),
     [
@@ -372,25 +309,6 @@ def test_a_gelsight_clip_comes_without_its_pitfalls(gelsight_folder: Path, clip:
     told = " ".join(read.notes)
     for pitfall in ("times are nominal", "one label for the whole clip", "no reference frame was recorded"):
         assert pitfall in told
-
-
-@pytest.mark.real
-def test_a_clip_that_its_table_does_not_know_is_refused(gelsight_folder: Path, tmp_path: Path):
-    table = tmp_path / "labels.csv"
-    clip = gelsight_folder / "slip/jute_basket__exp_num_2/camera_0.avi"
-    with pytest.raises(RecordingError, match=r"labels\.csv, the labels of the clips, cannot be read"):
-        read_gelsight_clip(clip, labels=table)
-    table.write_text("file,slip_label,object,n_frames\nslip/other/camera_0.avi,1,other,9\n")
-    with pytest.raises(
-        RecordingError, match=r"does not list slip/jute_basket__exp_num_2/camera_0\.avi; name a clip of"
-    ):
-        read_gelsight_clip(clip, labels=table)
-    table.write_text("file,slip_label,object,n_frames\nslip/jute_basket__exp_num_2/camera_0.avi,1,jute_basket,9\n")
-    with pytest.raises(RecordingError, match=r"has 75 frames but labels\.csv says 9; copy the clip again"):
-        read_gelsight_clip(clip, labels=table)
-    table.write_text("clip,label\na,1\n")
-    with pytest.raises(RecordingError, match="is no table of GelSight clips; it needs columns file, n_frames, object"):
-        read_gelsight_clip(clip, labels=table)
 
 
 CORNERED = np.zeros((48, 64, 3), dtype=np.uint8)  # no turn and no mirror image leaves it as it is

@@ -54,20 +54,6 @@ def test_noise_with_a_memory_makes_the_tare_less_certain(trial: Trial, rng: np.r
     assert np.all(filtered.tare_sigma_n > 1.5 * np.array(quick.tare_sigma_n))
 
 
-def test_turned_forces_press_positively_without_tare(trial: Trial):
-    forces = trial.forces(tare_n=TARE, order=(1, 0, 2), sign=-1)
-    turned = apply_axes(forces, infer_axes(forces))
-    np.testing.assert_allclose(turned.normal_n, trial.contact_n[:, 0], atol=1e-9)
-    np.testing.assert_allclose(turned.tangential_n, trial.contact_n[:, 1:], atol=1e-9)
-
-
-def test_what_is_declared_is_kept(trial: Trial):
-    axes = infer_axes(trial.forces(), normal="z", sign=-1, tare_n=(0.1, 0.2, 0.3))
-    assert (axes.normal, axes.sign) == ("z", -1)
-    np.testing.assert_array_equal(axes.tare_n, [0.1, 0.2, 0.3])
-    assert (axes.normal_found, axes.sign_found, axes.tare_found) == (Found.DECLARED,) * 3
-
-
 def test_a_recording_that_begins_in_the_press_has_no_still_samples(trial: Trial, rng: np.random.Generator):
     whole = trial.forces(noise_n=0.02, rng=rng)
     kept = whole.time_s > TOUCH_S + 0.02
@@ -146,13 +132,6 @@ def test_a_sensor_that_is_never_touched_is_refused(trial: Trial, rng: np.random.
     with pytest.raises(RecordingError, match=r"sensor never departs from its noise.*; give --normal-axis"):
         infer_axes(forces)
     assert infer_axes(forces, normal="z", sign=1).still_until_s is None
-
-
-def test_an_axis_that_is_none_is_refused(trial: Trial):
-    with pytest.raises(RecordingError, match="the normal axis is 'w'; name x, y or z"):
-        infer_axes(trial.forces(), normal="w")
-    with pytest.raises(RecordingError, match="the sign of the normal force is 0; give 1, or -1"):
-        infer_axes(trial.forces(), sign=0)
 
 
 @pytest.mark.parametrize("force_n", [0.1, NORMAL_N])

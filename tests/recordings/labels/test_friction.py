@@ -124,19 +124,6 @@ def test_too_few_samples_about_the_slip_are_refused(rng: np.random.Generator):
         fit_break(time, time, about_s=0.5, rng=rng, draws=10)
 
 
-def test_friction_by_hand_is_as_exact_as_its_interval():
-    assert FrictionEstimate(mu=0.5, low=0.5, high=0.5).sigma == 0
-    assert FrictionEstimate(mu=0.5, low=0.4, high=0.7).sigma == pytest.approx(0.15)
-    assert FrictionEstimate(mu=0.5, low=0.5, high=0.5).found is Found.DECLARED
-
-
-def test_friction_that_cannot_be_is_refused():
-    with pytest.raises(RecordingError, match="the coefficient of friction is 0; give a positive one"):
-        FrictionEstimate(mu=0.0, low=0.0, high=0.0)
-    with pytest.raises(RecordingError, match=r"0\.5 lies outside its interval 0\.6 to 0\.7; give low, mu, high"):
-        FrictionEstimate(mu=0.5, low=0.6, high=0.7)
-
-
 def test_samples_too_few_to_fit_a_fall_tell_the_break_between_two_of_them(rng: np.random.Generator):
     # six samples a second, the last two after the slip
     time = np.arange(0, 2, 1 / 6)

@@ -37,22 +37,6 @@ def test_the_margin_is_one_less_the_used_friction(trial: Trial):
     np.testing.assert_allclose(labels.stick_ratio, labels.safety_margin ** (2 / 3))
 
 
-def test_frames_keep_their_own_times(trial: Trial, rng: np.random.Generator):
-    time = np.sort(rng.uniform(0.1, 5.4, 80))
-    labels = label_frames(time, trial.contact(), friction=FRICTION)
-    np.testing.assert_array_equal(labels.force_time_s, time)
-    # a window over a kink errs by its slope, 3 N/s, times an eighth of the window of some 50 ms
-    np.testing.assert_allclose(labels.normal_force_n, np.interp(time, trial.time_s, trial.contact_n[:, 0]), atol=0.03)
-
-
-def test_every_margin_in_contact_is_that_of_the_friction_that_holds(trial: Trial):
-    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
-    contact = ~np.isnan(labels.safety_margin)
-    held = (labels.friction_coefficient * labels.normal_force_n)[contact]
-    used = labels.tangential_force_n[contact] / held
-    np.testing.assert_allclose(labels.safety_margin[contact], 1 - used, atol=1e-9)
-
-
 def test_states_follow_the_grasp(trial: Trial):
     labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
     states = np.array(labels.contact_state)
@@ -253,12 +237,3 @@ def test_without_an_onset_slip_begins_outside_the_friction_cone(trial: Trial):
     # the ratio reaches 0.4 after two thirds of the pull; the next frame is outside
     assert labels.basis.slip_s == pytest.approx(PULL_S + 2 / 3 * (SLIP_S - PULL_S), abs=0.04)
     assert not labels.valid[trial.frame_time_s > labels.basis.slip_s].any()
-
-
-def test_a_contact_that_holds_is_valid_to_the_end(trial_without_slip: Trial):
-    friction = replace(FRICTION, onset_s=None)
-    labels = label_frames(trial_without_slip.frame_time_s, trial_without_slip.contact(), friction=friction)
-    assert labels.basis.slip_s is None
-    assert labels.valid[trial_without_slip.frame_time_s > TOUCH_S + 0.1].all()
-    # pulled to five sixths
-    assert labels.safety_margin[-1] == pytest.approx(1 / 6, abs=1e-3)

@@ -51,11 +51,6 @@ def test_brightness_alone_is_no_contact():
     assert touched > 2 * plain
 
 
-def test_the_first_still_frame_is_after_the_hand_has_gone():
-    film = Film()
-    assert choose_reference(film.read, film.untouched, method="first still").index in {2, 4, 5}
-
-
 def test_the_first_still_frame_is_found_in_a_stretch_of_any_length():
     film = Film()
     still = film.frames[2]
@@ -82,15 +77,6 @@ def test_memory_does_not_grow_with_the_untouched_stretch():
     peak(400)  # what is made once only
     # two hundred frames are compared of either; 3,600 more softened frames of 9 kB would be 34 MB
     assert peak(4000) < peak(400) + 1e6
-
-
-def test_drift_of_a_long_stretch_is_that_of_its_first_and_last_ten_frames():
-    dark, bright = (np.full((SIZE, SIZE, 3), level, dtype=np.uint8) for level in (60, 90))
-    middle = np.full((SIZE, SIZE, 3), 200, dtype=np.uint8)
-    frames = [dark] * 10 + [middle] * 980 + [bright] * 10
-    reference = choose_reference(lambda places: map(frames.__getitem__, places), np.ones(1000, dtype=bool))
-    assert reference.drift == pytest.approx(30)
-    assert reference.drift_span == (0, 999)
 
 
 def test_a_named_frame_is_taken_even_if_it_touches():

@@ -1,7 +1,6 @@
 """From recorded forces to labels in one go."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -47,18 +46,6 @@ def test_what_is_declared_is_used(trial_without_slip: Trial, rng: np.random.Gene
     assert labels.normal_force_n[labels.valid].min() >= 0.3
 
 
-def test_a_lag_that_was_measured_otherwise_is_used(trial: Trial, rng: np.random.Generator):
-    lag = Lag(lag_s=0.01, sigma_s=0.001, correlation=1.0)
-    labels = label_trial(trial.frame_time_s, trial.motion, trial.forces(), settings=LabelSettings(), rng=rng, lag=lag)
-    assert (labels.basis.lag, labels.basis.lag_applied) == (lag, False)
-
-
-def test_a_trial_that_never_slips_needs_its_friction_by_hand(trial_without_slip: Trial, rng: np.random.Generator):
-    trial = trial_without_slip
-    with pytest.raises(RecordingError, match="give it with --mu"):
-        label_trial(trial.frame_time_s, trial.motion, trial.forces(), settings=LabelSettings(), rng=rng)
-
-
 @pytest.mark.parametrize("mu", [None, STATIC])
 def test_without_a_tangential_force_there_is_no_margin(trial: Trial, rng: np.random.Generator, mu: float | None):
     pressed = replace(trial, contact_n=trial.contact_n * np.array([1, 0, 0]))
@@ -75,21 +62,3 @@ def test_few_frames_are_labelled_without_a_lag(trial: Trial, rng: np.random.Gene
     truth = 1 - ratio(time) / STATIC
     # windows are four times as long as at the full rate, so kinks err by four times as much
     np.testing.assert_allclose(labels.safety_margin[labels.valid], truth[labels.valid], atol=0.05)
-
-
-def test_the_same_seed_gives_the_same_labels(trial: Trial):
-    forces = trial.forces(noise_n=0.02, rng=np.random.default_rng(0))
-    runs = [
-        label_trial(
-            trial.frame_time_s, trial.motion, forces, settings=LabelSettings(), rng=np.random.default_rng(1)
-        ).safety_margin_sigma
-        for _ in range(2)
-    ]
-    for one, other in pairwise(runs):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_a_lag_that_is_no_number_is_refused(trial: Trial, rng: np.random.Generator):
-    settings = LabelSettings(lag_ms=float("nan"))
-    with pytest.raises(RecordingError, match=r"a lag of nan s .* cannot be; give it in seconds"):
-        label_trial(trial.frame_time_s, trial.motion, trial.forces(), settings=settings, rng=rng)

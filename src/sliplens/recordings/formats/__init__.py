@@ -27,12 +27,10 @@ from sliplens.recordings.options import ReadOptions, option_flags
 class Reader:
     """Reader of one format."""
 
-    words: str
-    """Description of the format in messages."""
+    words: str  #: Description of the format in messages.
     recognises: Callable[[Path], bool]
     """Return True for a file or folder of this format, by names or the header of a table; no frame is read."""
-    takes: tuple[str, ...]
-    """Fields of `ReadOptions` that the reader supports."""
+    takes: tuple[str, ...]  #: Fields of `ReadOptions` that the reader supports.
     read: Callable[[Path, ReadOptions], Capture | list[Capture]]
 
 
@@ -82,8 +80,7 @@ _ROWS = {
         read=read_video,
     ),
 }
-FORMATS = Table("format", "sliplens.formats", _ROWS)
-"""Readers by format."""
+FORMATS = Table("format", "sliplens.formats", _ROWS)  #: Readers by format.
 
 
 def recognise(path: Path) -> str | None:
@@ -93,10 +90,7 @@ def recognise(path: Path) -> str | None:
 
 
 def open_captures(path: Path, *, format: str | None = None, options: ReadOptions) -> tuple[Capture, ...]:
-    """Open a source with the reader of its format: a row of `FORMATS`, recognised by names if None.
-
-    Raises `InputError` where the source is missing, of no known format, or does not take an option that was given.
-    """
+    """Open a source with the reader of its format: a row of `FORMATS`, recognised by names if None."""
     if format is not None:
         FORMATS.pick(format)  # a wrong name is reported before a wrong path
     if not path.exists():
@@ -111,6 +105,3 @@ def open_captures(path: Path, *, format: str | None = None, options: ReadOptions
         raise InputError(f"{path} is read as {name}, which does not take {flags}; leave it out or name another format")
     captures = reader.read(path, options)
     return (captures,) if isinstance(captures, Capture) else tuple(captures)
-
-
-__all__ = ["FORMATS", "Reader", "open_captures", "recognise"]

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 
 from sliplens.errors import RecordingError
-from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.formats.tables import open_text_table, trial_name
 from sliplens.recordings.formats.video import count_stale, least_contact, read_video, small_copies
@@ -17,8 +16,7 @@ from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import labels_of_margins
 
 LABELS_FILE = "labels.csv"
-FRAME_RATE_HZ = 8.0
-"""Rough rate: the files say 25, their author that 10 to 13 s of video are 37 s of motion."""
+FRAME_RATE_HZ = 8.0  #: Rough rate: the files say 25, their author that 10 to 13 s of video are 37 s of motion.
 
 
 def is_gelsight(path: Path) -> bool:
@@ -45,11 +43,7 @@ def read_gelsight(path: Path, options: ReadOptions) -> list[Capture]:
 
 
 def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: float = FRAME_RATE_HZ) -> Capture:
-    """Open a clip of the data set behind *Incipient Slip Detection* (A. Parag), as laid out in its `labels.csv`.
-
-    No frame has a label; `Capture.clip` has the label of the whole clip. Its reference is the frame with the least
-    relief, which may show a contact: check it before use.
-    """
+    """Open a clip of the data set behind *Incipient Slip Detection* (A. Parag), as laid out in its `labels.csv`."""
     table = path.absolute().parent.parent.parent / LABELS_FILE if labels is None else labels
     rows = _read_labels(table)
     # the names of clips repeat in every folder: the last three parts tell them apart
@@ -58,9 +52,7 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
         raise RecordingError(f"{table} does not list {key}; name a clip of the data set it belongs to")
     row, whole = rows[key], read_video(path, ReadOptions())
     if len(whole) != int(row["n_frames"]):
-        raise RecordingError(
-            f"{path} has {number_of(len(whole), 'frame')} but {table.name} says {row['n_frames']}; copy the clip again"
-        )
+        raise RecordingError(f"{path} has {len(whole)} frames but {table.name} says {row['n_frames']}; copy it again")
     copies = small_copies(whole.read_frames())
     stale = count_stale(copies)
     slipped = row["slip_label"].strip() == "1"
@@ -99,9 +91,7 @@ def _read_labels(path: Path) -> dict[str, dict[str, str]]:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             rows = list(csv.DictReader(stream))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(
-            f"{path}, the labels of the clips, cannot be read ({error}); copy it beside them"
-        ) from None
+        raise RecordingError(f"{path}, the labels of the clips, cannot be read ({error}); copy it again") from None
     needed = {"file", "slip_label", "object", "n_frames"}
     if not rows or needed - set(rows[0]):
         raise RecordingError(f"{path} is no table of GelSight clips; it needs columns {', '.join(sorted(needed))}")

@@ -28,7 +28,6 @@ from sliplens.recordings.formats.tables import (
     evenly_spaced,
     guess_time_column,
     guess_time_unit,
-    guessed_encodings,
     open_text_table,
     place_on_clock,
     require_rising,
@@ -85,10 +84,8 @@ def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
     for path in paths[1:]:
         size = frame_size(path)
         if size != first:
-            raise RecordingError(
-                f"{path} is {size[1]} x {size[0]} pixels but {paths[0].name} is {first[1]} x {first[0]}; "
-                "record all frames of a trial with the same camera settings"
-            )
+            sizes = f"{path} is {size[1]} x {size[0]} pixels but {paths[0].name} is {first[1]} x {first[0]}"
+            raise RecordingError(f"{sizes}; record all frames of a trial with the same camera settings")
     return first
 
 
@@ -102,9 +99,7 @@ def read_frame_times(
     text = open_text_table(table)
     name_column = next((name for name in text.header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
     if name_column is None:
-        raise RecordingError(
-            f"{table} has no column with the names of images among {', '.join(map(repr, text.header))}; call it file"
-        )
+        raise RecordingError(f"{table} has no column with the names of images among {text.names}; call it file")
     time_column = guess_time_column(text)
     name_at, time_at = text.header.index(name_column), text.header.index(time_column)
     stamps: dict[str, tuple[float, int]] = {}
@@ -130,7 +125,6 @@ def read_frame_times(
     if unit is None:
         unit, how = guess_time_unit(time), "guessed from its steps"
     notes = [
-        *guessed_encodings(table),
         f"{table.name}: times of images are those of column {time_column!r}, in {unit} ({how}), "
         f"their names those of {name_column!r}.",
     ]
@@ -144,10 +138,8 @@ def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
     times, frame_rate, name_unit = options.times, options.frame_rate, options.name_unit
     count = sum(option is not None for option in (times, frame_rate, name_unit))
     if count != 1:
-        raise RecordingError(
-            f"the images of {folder} have {'more than one source of times' if count else 'no times'}; "
-            "give exactly one of --times, --frame-rate and --name-unit"
-        )
+        what = "more than one source of times" if count else "no times"
+        raise RecordingError(f"the images of {folder} have {what}; give one of --times, --frame-rate, --name-unit")
     paths = tuple(list_images(folder))
     notes = []
     if times is not None:
@@ -161,10 +153,8 @@ def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
         notes.append(f"{folder.name}: the last number in a file's name was declared to be its time in {unit}.")
     lossy = sum(path.suffix.lower() in {".jpg", ".jpeg"} for path in paths)
     if lossy:
-        notes.append(
-            f"{folder.name}: {lossy} of {len(paths)} frames are JPEG, which moves markers a little; "
-            "record PNG or TIFF where you can."
-        )
+        jpeg = f"{folder.name}: {lossy} of {len(paths)} frames are JPEG, which moves markers a little"
+        notes.append(f"{jpeg}; record PNG or TIFF where you can.")
     size = common_size(paths)
     time, samples, more = place_on_clock(time, options, source=folder.name)
     return Capture(

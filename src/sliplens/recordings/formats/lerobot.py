@@ -28,10 +28,8 @@ from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.formats.video import display_turn, open_video, read_display_turn, require_size
 from sliplens.recordings.options import ReadOptions
 
-CAMERA = "observation.images.tactile"
-"""Feature of the images that `export_lerobot` writes."""
-COMPANION = Path("meta", "sliplens")
-"""Folder in an exported data set with all of its trials but the images."""
+CAMERA = "observation.images.tactile"  #: Feature of the images that `export_lerobot` writes.
+COMPANION = Path("meta", "sliplens")  #: Folder in an exported data set with all of its trials but the images.
 _COPY = "copy the data set again"
 _NO_VIDEO = "copy the data set again, with its videos"
 _LATEST_S = 1e7  # of a stamp in a video: four months
@@ -44,13 +42,10 @@ class Episode:
     """Place of an episode in the files."""
 
     index: int
-    length: int
-    """Frames."""
+    length: int  #: Frames.
     data_file: Path
-    video_file: Path | None
-    """None where the frames are in the data file."""
-    video_start_s: float
-    """Stamp of the first frame in the video."""
+    video_file: Path | None  #: None where the frames are in the data file.
+    video_start_s: float  #: Stamp of the first frame in the video.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,10 +81,8 @@ def read_layout(folder: Path) -> Layout:
     if version is None:
         raise RecordingError(f"{path} has no codebase_version; name the folder of a LeRobot data set")
     if not _VERSION.fullmatch(str(version)):
-        raise RecordingError(
-            f"{folder} is a LeRobot data set of version {version}, v3.0 is needed; convert it with "
-            "`python -m lerobot.scripts.convert_dataset_v21_to_v30`"
-        )
+        cure = "convert it with `python -m lerobot.scripts.convert_dataset_v21_to_v30`"
+        raise RecordingError(f"{folder} is a LeRobot data set of version {version}, v3.0 is needed; {cure}")
     try:
         return msgspec.convert({**info, "folder": folder}, Layout)
     except msgspec.ValidationError as error:
@@ -117,9 +110,7 @@ def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
         if episodes and episodes[-1].index == index:
             raise RecordingError(f"{folder} lists episode {index} twice; copy the data set again")
         if in_video and not 0 <= video[2] <= _LATEST_S:
-            raise RecordingError(
-                f"{folder} begins episode {index} at {video[2]:g} s of a video; copy the data set again"
-            )
+            raise RecordingError(f"{folder} begins episode {index} at {video[2]:g} s of a video; {_COPY}")
         data = {"chunk_index": chunk, "file_index": file}
         places = {"video_key": camera_key, **dict(zip(data, video, strict=False))}
         episodes.append(
@@ -140,10 +131,8 @@ def _expand(layout: Layout, template: str, values: Mapping[str, int | str]) -> P
     parts = {*PurePosixPath(path).parts, *PureWindowsPath(path).parts}
     outside = PurePosixPath(path).is_absolute() or PureWindowsPath(path).anchor or ".." in parts
     if not path or outside or re.search(r"[{}\0]", path):
-        raise RecordingError(
-            f"{layout.folder / 'meta' / 'info.json'} names files by {template!r}, which leads out of the data set or "
-            "cannot be filled in; copy the data set from one you trust"
-        )
+        info = f"{layout.folder / 'meta' / 'info.json'} names files by {template!r}"
+        raise RecordingError(f"{info}, which leads out of the data set or cannot be filled in; copy one you trust")
     return layout.folder / path
 
 
@@ -155,10 +144,8 @@ def read_tables(episodes: list[Episode], columns: Mapping[str, str]) -> Iterator
         path = episode.data_file
         rows = read(path).filter(pc.field("episode_index") == episode.index)
         if rows.num_rows != episode.length or not rows.num_rows:
-            raise RecordingError(
-                f"{path} has {rows.num_rows} frames of episode {episode.index}, its metadata say {episode.length}; "
-                "leave the episode out, or copy the data set again"
-            )
+            rows_of = f"{path} has {rows.num_rows} frames of episode {episode.index}"
+            raise RecordingError(f"{rows_of}, its metadata say {episode.length}; leave the episode out, or {_COPY}")
         yield episode, rows
 
 
@@ -167,9 +154,7 @@ def read_vectors(rows: pa.Table, key: str, *, width: int, path: Path) -> Float[n
     column = rows.column(key).combine_chunks()
     numbers = column.flatten() if hasattr(column, "flatten") else column
     if len(numbers) != len(rows) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
-        raise RecordingError(
-            f"{key} of {path} does not hold {width} numbers a frame, as meta/info.json says; copy the data set again"
-        )
+        raise RecordingError(f"{key} of {path} does not hold {width} numbers a frame, as meta/info.json says; {_COPY}")
     return numbers.to_numpy().astype(np.float64).reshape(-1, width)
 
 
@@ -193,17 +178,12 @@ def video_frames(
             while current and following and abs(following[0] - stamp) < abs(current[0] - stamp):
                 current, following = following, next(decoded, None)
             if current is None or abs(current[0] - stamp) > tolerance_s:
-                raise RecordingError(
-                    f"{path} has no frame at {stamp:.3f} s; it is cut off, or was not written with this data set"
-                )
+                raise RecordingError(f"{path} has no frame at {stamp:.3f} s; it is cut off, {_COPY}")
             frame = current[1]
             turn = display_turn(frame, where=path)
             height, width = turn.size(frame.height, frame.width)
             if (height, width) != frame_size:
-                raise RecordingError(
-                    f"{path} has frames of {height} x {width} pixels at {stamp:.3f} s, its header says "
-                    f"{frame_size[0]} x {frame_size[1]}; leave the episode out"
-                )
+                raise RecordingError(f"{path} changes its size of frames at {stamp:.3f} s; leave the episode out")
             yield turn.apply(frame.to_ndarray(format="rgb24"))
 
 
@@ -236,10 +216,7 @@ def _stored_images(path: Path, key: str, episode: int, *, frame_size: tuple[int,
                     raise RecordingError(f"{where} is not in the file; embed the images, or copy the data set again")
                 pixels = decode_image(data, where=where)
                 if frame_size is not None and pixels.shape[:2] != frame_size:
-                    raise RecordingError(
-                        f"{where} is {pixels.shape[0]} x {pixels.shape[1]} pixels, the first is "
-                        f"{frame_size[0]} x {frame_size[1]}; leave the episode out"
-                    )
+                    raise RecordingError(f"{where} is of another size than the first; leave the episode out")
                 yield pixels
                 index += 1
 
@@ -269,11 +246,7 @@ _TORQUE = re.compile(r"torque|moment|(?<![a-z])[tm]_?[xyz](?![a-z])", re.IGNOREC
 
 
 def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
-    """Read a data set, one trial an episode; one that `export_lerobot` wrote is restored, unless a feature is named.
-
-    Frames and forces are rows of one table and have its times. Frames of a video are those shown within half a frame of
-    their row's time.
-    """
+    """Read a data set, one trial an episode; one that `export_lerobot` wrote is restored, unless a feature is named."""
     layout = read_layout(folder)
     if options.camera_key is None and options.force_key is None and (folder / COMPANION).is_dir():
         return _restore_episodes(layout)
@@ -314,10 +287,7 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
 def _restore_episodes(layout: Layout) -> list[Capture]:
     """Read the trials of an exported data set as they were."""
     if CAMERA not in layout.features:
-        raise RecordingError(
-            f"meta/info.json of {layout.folder} lacks {CAMERA}; copy the data set again, or remove "
-            f"{layout.folder / COMPANION} to read it without labels"
-        )
+        raise RecordingError(f"meta/info.json of {layout.folder} lacks {CAMERA}; {_COPY}, or remove {COMPANION} in it")
     images = []
     for episode, _ in read_tables(read_episodes(layout, camera_key=CAMERA), {}):
         size, read_frames = image_frames(episode, CAMERA)
@@ -342,10 +312,8 @@ def _choose_camera(layout: Layout, name: str | None) -> tuple[str, list[str]]:
         return cameras[0], [f"{cameras[0]} was taken for the tactile camera, for there is no other."]
     if not cameras:
         raise RecordingError(f"{layout.folder} has no camera; record one, as video or images")
-    raise RecordingError(
-        f"{layout.folder} has cameras {_list_keys(cameras)}, of which {_list_keys(tactile)} could be tactile; "
-        "name one with --camera-key"
-    )
+    several = f"{_list_keys(cameras)}, of which {_list_keys(tactile)} could be tactile"
+    raise RecordingError(f"{layout.folder} has cameras {several}; name one with --camera-key")
 
 
 def _choose_force(layout: Layout, name: str | None) -> str | None:
@@ -359,10 +327,8 @@ def _choose_force(layout: Layout, name: str | None) -> str | None:
             raise RecordingError(f"{layout.folder} has no feature {name}; 3 or 6 numbers have {_list_keys(fitting)}")
         if name not in fitting:
             feature = layout.features[name]
-            raise RecordingError(
-                f"{name} of {layout.folder} is {feature.dtype} of shape {list(feature.shape)}; a force has 3 or 6 "
-                "floating-point numbers"
-            )
+            kind = f"{feature.dtype} of shape {list(feature.shape)}"
+            raise RecordingError(f"{name} of {layout.folder} is {kind}; a force has 3 or 6 floating-point numbers")
         forces = [name]
     else:
         # what was commanded is not what was felt

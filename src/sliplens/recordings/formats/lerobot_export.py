@@ -28,14 +28,13 @@ NUMBERS = {
 VALID, STATE, REASON = "observation.valid", "observation.contact_state", "observation.invalid_reason"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _CHUNK_FILES = 1000
+_APART = "export them apart"
 _STATES = [str(state) for state in ContactState]
 _IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 
-Features: TypeAlias = dict[str, dict[str, Any]]
-"""Features by name, as `meta/info.json` lists them."""
-Stats: TypeAlias = dict[str, list]
-"""min, max, mean, std, count and quantiles, as JSON holds them."""
+Features: TypeAlias = dict[str, dict[str, Any]]  #: Features by name, as `meta/info.json` lists them.
+Stats: TypeAlias = dict[str, list]  #: min, max, mean, std, count and quantiles, as JSON holds them.
 
 
 def write_lerobot(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> None:
@@ -62,17 +61,9 @@ def write_lerobot(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> N
         counts = _write_episode(paths[-1], schema, columns, capture)
         numbers = {name: number_stats(values.reshape(len(capture), -1)) for name, values in columns.items()}
         stats.append({CAMERA: pixel_stats(counts, len(capture)), **numbers})
-        rows.append(
-            {
-                "episode_index": episode,
-                "tasks": [task],
-                "length": len(capture),
-                "data/chunk_index": chunk,
-                "data/file_index": file,
-                "dataset_from_index": first,
-                "dataset_to_index": first + len(capture),
-            }
-        )
+        places = {"data/chunk_index": chunk, "data/file_index": file}
+        ends = {"dataset_from_index": first, "dataset_to_index": first + len(capture)}
+        rows.append({"episode_index": episode, "tasks": [task], "length": len(capture), **places, **ends})
         levels += counts
         first += len(capture)
     total = {name: number_stats(_read_feature(paths, name)) for name in features if name != CAMERA}
@@ -87,24 +78,12 @@ def write_lerobot(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> N
     _write_tasks(meta / "tasks.parquet", list(tasks))
     _write_episodes(meta / "episodes" / "chunk-000" / "file-000.parquet", rows, stats)
     write_json(meta / "stats.json", total)
-    write_json(
-        meta / "info.json",
-        {
-            "codebase_version": "v3.0",
-            "robot_type": None,
-            "total_episodes": len(rows),
-            "total_frames": first,
-            "total_tasks": len(tasks),
-            "chunks_size": _CHUNK_FILES,
-            "data_files_size_in_mb": 100,
-            "video_files_size_in_mb": 200,
-            "fps": fps,
-            "splits": {split: f"{splits.index(split)}:{splits.index(split) + splits.count(split)}" for split in splits},
-            "data_path": DATA_PATH,
-            "video_path": None,
-            "features": features,
-        },
-    )
+    ranges = {split: f"{splits.index(split)}:{splits.index(split) + splits.count(split)}" for split in splits}
+    totals = {"total_episodes": len(rows), "total_frames": first, "total_tasks": len(tasks)}
+    sizes = {"chunks_size": _CHUNK_FILES, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
+    paths_of = {"data_path": DATA_PATH, "video_path": None}
+    info = {"codebase_version": "v3.0", "robot_type": None, **totals, **sizes, "fps": fps, "splits": ranges}
+    write_json(meta / "info.json", {**info, **paths_of, "features": features})
 
 
 def _frame_rate(data: Dataset, trials: Sequence[TrialInfo]) -> int | float:
@@ -114,10 +93,7 @@ def _frame_rate(data: Dataset, trials: Sequence[TrialInfo]) -> int | float:
     rate = 1 / float(np.median(np.concatenate(list(steps.values()))))
     for trial, trial_steps in steps.items():
         if len(trial_steps) and abs(np.median(trial_steps) * rate - 1) > 0.1:
-            raise RecordingError(
-                f"trial {trial} has {1 / np.median(trial_steps):.4g} frames/s, most have {rate:.4g}, and a LeRobot "
-                "data set has one rate; export them apart"
-            )
+            raise RecordingError(f"trial {trial} has another frame rate, and a LeRobot data set has one rate; {_APART}")
     return round(rate) if abs(round(rate) / rate - 1) < 0.01 else rate
 
 
@@ -126,10 +102,7 @@ def _features(trials: Sequence[TrialInfo]) -> Features:
     first = trials[0]
     for info in trials:
         if (info.height, info.width) != (first.height, first.width):
-            raise RecordingError(
-                f"trial {info.trial} has frames of {info.height} x {info.width} pixels, trial {first.trial} of "
-                f"{first.height} x {first.width}, and a LeRobot data set has one size; export them apart"
-            )
+            raise RecordingError(f"trial {info.trial} has other frames, and a LeRobot data set has one size; {_APART}")
     features: Features = {
         CAMERA: {"dtype": "image", "shape": [first.height, first.width, 3], "names": ["height", "width", "channels"]},
         TIME: {"dtype": "float64", "shape": [1], "names": ["time_s"]},

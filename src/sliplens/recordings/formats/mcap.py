@@ -62,11 +62,7 @@ def trial_types() -> "Typestore":
 
 
 def write_mcap(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> None:
-    """Write trials into an empty folder; see `export_mcap`.
-
-    Frames are PNG: on simulated frames those are 22 % smaller than raw images under the Zstandard of MCAP. Wrenches are
-    the samples of the force sensor where the data set stores them, else the forces of the frames.
-    """
+    """Write trials into an empty folder; see `export_mcap`."""
     for info in track(trials, sizes=[info.frames for info in trials]):
         with (
             (folder / f"{info.trial}.mcap").open("wb") as stream,
@@ -184,10 +180,7 @@ def _stamp_offset_s(capture: Capture) -> int:
     first, last = min(times[0].item() for times in series), max(times[-1].item() for times in series)
     offset_s = 0 if first >= 1 else 1 - math.floor(first)
     if last + offset_s >= _LAST_S:
-        raise RecordingError(
-            f"trial {capture.trial} goes from {first:.6g} s to {last:.6g} s, and stamps of ROS end at {_LAST_S} s; "
-            "import it with times in seconds"
-        )
+        raise RecordingError(f"trial {capture.trial} goes to {last:.6g} s, beyond ROS; import it with times in seconds")
     return offset_s
 
 

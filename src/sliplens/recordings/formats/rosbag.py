@@ -5,7 +5,6 @@ from array import array
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import cache, partial
 from importlib import import_module
 from importlib.util import find_spec, module_from_spec
@@ -15,7 +14,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Int64
 from PIL import Image
 
 from sliplens.errors import InputError, RecordingError, SliplensError
@@ -45,20 +44,12 @@ def image_size(message: Any, *, where: str) -> tuple[int, int]:
             return upright_size(image)
     channels = _CHANNELS.get(message.encoding)
     if channels is None:
-        raise RecordingError(
-            f"{where} has encoding {message.encoding[:40]!r}; record it as {', '.join(_CHANNELS)}, JPEG or PNG"
-        )
+        raise RecordingError(f"{where} has encoding {message.encoding[:40]!r}; record it as rgb8, bgr8, mono8 or PNG")
     if min(message.height, message.width) == 0 or message.step < message.width * channels:
-        raise RecordingError(
-            f"{where} claims {message.height} x {message.width} pixels in rows of {message.step} bytes, which cannot "
-            f"be in {message.encoding}; record it again"
-        )
+        raise RecordingError(f"{where} claims rows of {message.step} bytes, no {message.encoding}; record it again")
     # Python's integers do not overflow, and nothing has the claimed size until it is known to be there
     if message.height * message.step > len(message.data):
-        raise RecordingError(
-            f"{where} claims {message.height} rows of {message.step} bytes but holds {len(message.data)} bytes; "
-            "record it again"
-        )
+        raise RecordingError(f"{where} claims {message.height} rows of {message.step} bytes but holds fewer; mend it")
     return message.height, message.width
 
 
@@ -81,7 +72,6 @@ def image_pixels(message: Any, *, where: str) -> Frame:
 @contextmanager
 def _open_compressed(message: Any, *, where: str) -> Iterator[Image.Image]:
     """Open an image and read its header; one that would expand too far (a decompression bomb) is refused."""
-    # `format` is free text, and drivers differ in it
     text = f"{where}, of format {message.format[:40]!r}, cannot be read as JPEG or PNG"
     damage = telling_damage(text, "record it again, or as one of these", kind=RecordingError)
     with damage, open_encoded(message.data, where=where) as image:
@@ -90,8 +80,7 @@ def _open_compressed(message: Any, *, where: str) -> Iterator[Image.Image]:
 
 MOST_BYTES = 256 * 2**20
 """In memory at a time: of a chunk, of all chunks that cover one moment, or of a message. Chunks are of some 1 MB."""
-MOST_TIMES = 100
-"""A file that is compressed as a whole expands on disk, so far that its size may be multiplied."""
+MOST_TIMES = 100  #: A file that is compressed as a whole expands on disk, so far that its size may be multiplied.
 
 
 class ExpandsTooFarError(Exception):
@@ -215,12 +204,7 @@ def bag_topics(path: Path) -> dict[str, str]:
 
 
 def bag_messages(path: Path, topics: Mapping[str, str]) -> Iterator[tuple[str, int, Any]]:
-    """Iterate over topic, time of arrival in nanoseconds and content of messages, in the order of recording.
-
-    `topics` has the type of each topic: a second channel of the same topic could hold anything, and is passed over.
-    Definitions that the bag brings along are not used, for `rosbags` turns them into code. Message data are views of
-    the bytes read: a large header claims nothing.
-    """
+    """Iterate over topic, time of arrival in nanoseconds and content of messages, in the order of recording."""
     with open_bag(path) as bag:
         types = trial_types()
         chosen = [each for each in bag.connections if topics.get(each.topic) == each.msgtype]
@@ -245,15 +229,11 @@ def open_bag(path: Path) -> Iterator["Reader"]:
     except SliplensError:
         raise
     except ExpandsTooFarError as error:
-        raise RecordingError(
-            f"{path}: {error}, as damaged and hostile files do; expand it beforehand, or record it in smaller pieces"
-        ) from None
+        raise RecordingError(f"{path}: {error}, as damaged and hostile files do; expand it beforehand") from None
     # a damaged byte may lead rosbags, sqlite or YAML into any error there is, from KeyError to MemoryError
     except Exception as error:
         text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise RecordingError(
-            f"{path} is not a readable ROS 2 bag ({text}); copy it again, or mend it with `mcap recover`"
-        ) from None
+        raise RecordingError(f"{path} is not a readable ROS 2 bag ({text}); try `mcap recover`") from None
 
 
 def _require_bag(path: Path) -> None:
@@ -281,19 +261,15 @@ def _require_whole_pages(file: Path) -> None:
         raise RecordingError(f"{file} is cut off; copy it again")
 
 
-@dataclass(kw_only=True)
 class _Topic:
     """Stamps and forces of the messages of a topic; stamps of an hour at 1 kHz are 58 MB."""
 
-    header_ns: array = field(default_factory=lambda: array("q"))
-    bag_ns: array = field(default_factory=lambda: array("q"))
-    force_n: array = field(default_factory=lambda: array("d"))
+    def __init__(self) -> None:
+        self.stamps_ns = {"header": array("q"), "bag": array("q")}
+        self.force_n = array("d")
 
     def times(self, clock: str) -> Int64[np.ndarray, " messages"]:
-        return np.array(self.header_ns if clock == "header" else self.bag_ns, dtype=np.int64)
-
-    def forces(self) -> Float[np.ndarray, "messages 3"]:
-        return np.array(self.force_n, dtype=np.float64).reshape(-1, 3)
+        return np.array(self.stamps_ns[clock], dtype=np.int64)
 
 
 def _scan(path: Path, topics: Mapping[str, str], *, images: str) -> tuple[dict[str, _Topic], tuple[int, int]]:
@@ -302,19 +278,16 @@ def _scan(path: Path, topics: Mapping[str, str], *, images: str) -> tuple[dict[s
     for name, bag_ns, message in bag_messages(path, topics):
         topic = scanned[name]
         if name == images:
-            where = f"frame {len(topic.bag_ns)} of {images} in {path}"
+            where = f"frame {len(topic.stamps_ns['bag'])} of {images} in {path}"
             before, size = size, image_size(message, where=where)
-            if before is not None and before != size:
-                raise RecordingError(
-                    f"{where} is {size[0]} x {size[1]} pixels, those before it are {before[0]} x {before[1]}; cut the "
-                    "bag there"
-                )
+            if before not in {None, size}:
+                raise RecordingError(f"{where} is of another size than those before it; cut the bag there")
         else:
             force = message.wrench.force
             topic.force_n.extend((force.x, force.y, force.z))
         stamp = message.header.stamp
-        topic.header_ns.append(stamp.sec * 1_000_000_000 + stamp.nanosec)
-        topic.bag_ns.append(bag_ns)
+        topic.stamps_ns["header"].append(stamp.sec * 1_000_000_000 + stamp.nanosec)
+        topic.stamps_ns["bag"].append(bag_ns)
     if size is None:
         raise RecordingError(f"{images} of {path} has no frame; leave it out or record it again")
     return scanned, size
@@ -344,10 +317,7 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     images = _choose(topics, options.image_topic, types=_IMAGES, what="images", path=path)
     wrenches = _choose(topics, wrench_topic, types=_WRENCHES, what="wrenches", path=path)
     if images is None:
-        raise RecordingError(
-            f"{path} has no topic with images ({' or '.join(_IMAGES)}); record the camera too "
-            f"(it has {_list_topics(topics)})"
-        )
+        raise RecordingError(f"{path} has no topic with images; record the camera too (it has {_list_topics(topics)})")
     chosen = [name for name in (images, wrenches) if name is not None]
     scanned, size = _scan(path, {name: topics[name] for name in chosen}, images=images)
     notes = []
@@ -362,7 +332,8 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     forces = None
     if wrenches is not None:
         time_s = (times.get(wrenches, np.zeros(0)) - zero) / 1e9
-        forces = Forces(time_s=time_s, force_n=scanned[wrenches].forces(), source=f"{wrenches} of {path}")
+        force_n = np.array(scanned[wrenches].force_n, dtype=np.float64).reshape(-1, 3)
+        forces = Forces(time_s=time_s, force_n=force_n, source=f"{wrenches} of {path}")
     return Capture(
         trial=trial_name(path.stem if path.is_file() else path.resolve().name),
         source=f"{images} of {path}",
@@ -384,7 +355,7 @@ def _restore_trial(path: Path, copy: Path) -> Capture | None:
                 return None
         scanned, size = _scan(path, {IMAGE: TOPICS[IMAGE]}, images=IMAGE)
         read_frames = partial(_read_frames, path, IMAGE, TOPICS[IMAGE])
-        (capture,) = restore_trials(copy, [(str(path), len(scanned[IMAGE].bag_ns), size, read_frames)])
+        (capture,) = restore_trials(copy, [(str(path), len(scanned[IMAGE].stamps_ns["bag"]), size, read_frames)])
     except InputError as error:
         raise RecordingError(str(error).replace(str(copy), str(path))) from None
     return capture
@@ -406,24 +377,19 @@ def _choose(topics: dict[str, str], name: str | None, *, types: tuple[str, ...],
 
 def _choose_clock(topics: dict[str, _Topic]) -> tuple[str, list[str]]:
     """Choose the clock that all topics have, "header" or "bag", with a note where it is not the header's."""
+    instead = "times are those at which the bag received the messages."
     for name, topic in topics.items():
-        missing = topic.header_ns.count(0)
-        if missing:
-            return "bag", [
-                f"{missing} of {len(topic.header_ns)} messages of {name} have no header stamp: "
-                "times are those at which the bag received the messages."
-            ]
-    if len(topics) == 2 and not _meet("header", *topics.values()) and _meet("bag", *topics.values()):
-        return "bag", [
-            f"The header stamps of {' and '.join(topics)} are of different clocks: "
-            "times are those at which the bag received the messages."
-        ]
+        stamps = topic.stamps_ns["header"]
+        if missing := stamps.count(0):
+            return "bag", [f"{missing} of {len(stamps)} messages of {name} have no header stamp: {instead}"]
+
+    def meet(clock: str) -> bool:
+        frames, wrenches = (topic.stamps_ns[clock] for topic in topics.values())
+        return frames[0] <= wrenches[-1] and wrenches[0] <= frames[-1]
+
+    if len(topics) == 2 and not meet("header") and meet("bag"):
+        return "bag", [f"The header stamps of {' and '.join(topics)} are of different clocks: {instead}"]
     return "header", []
-
-
-def _meet(clock: str, *topics: _Topic) -> bool:
-    frames, wrenches = (topic.times(clock) for topic in topics)
-    return bool(frames[0] <= wrenches[-1] and wrenches[0] <= frames[-1])
 
 
 def _list_topics(topics: dict[str, str]) -> str:

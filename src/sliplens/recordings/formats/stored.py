@@ -18,15 +18,12 @@ from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_
 from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames, write_trial
 from sliplens.recordings.trial import Labels, Recording, TrialFacts
 
+_AGAIN = "export the data set again, or remove that folder to import without labels"
 _BATCH = 16  # frames that are encoded side by side
 
 
 def read_stored(folder: Path) -> list[Capture]:
-    """Read a data set, one capture a trial, with its labels and its reference frame.
-
-    Forces are the samples that the import stored. Where there are none, as for a simulated trial, they are the forces
-    of the frames: the tangential force along x, the normal force along z.
-    """
+    """Read a data set, one capture a trial, with its labels and its reference frame."""
     data = load_dataset(folder)
     return [read_stored_trial(data, info) for info in data.trials]
 
@@ -80,10 +77,7 @@ def fill_labels(labels: Labels) -> Labels:
 
 
 def save_without_images(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> None:
-    """Write a copy of a data set that has everything but the images and the ground truth of simulated trials.
-
-    An export carries it beside the images, so that `restore_trials` gives back labels, reference frame and forces.
-    """
+    """Write a copy of a data set that has everything but the images and the ground truth of simulated trials."""
     rows = []
     for info in trials:
         stored = load_recording(trial_path(data.folder, info.trial), pixels=False)
@@ -101,20 +95,7 @@ def save_without_images(data: Dataset, trials: Sequence[TrialInfo], folder: Path
 def restore_trials(
     folder: Path, images: Sequence[tuple[str, int, tuple[int, int], Callable[[], Iterator[Frame]]]]
 ) -> list[Capture]:
-    """Join the trials of `save_without_images` with their images.
-
-    Parameters
-    ----------
-    folder
-        Copy without images.
-    images
-        For each trial: source for people, number of frames, their height and width, and how to read them.
-
-    Raises
-    ------
-    RecordingError
-        If the copy is damaged, or the images are not those of its trials.
-    """
+    """Join the trials of `save_without_images` with their images."""
     try:
         data = load_dataset(folder)
         for info in data.trials:
@@ -129,17 +110,10 @@ def restore_trials(
     except InputError as error:
         raise RecordingError(str(error)) from None
     if len(stored) != len(images):
-        raise RecordingError(
-            f"{folder} describes {len(stored)} trials beside the images of {len(images)}; export the data set again, "
-            "or remove that folder to import without labels"
-        )
+        raise RecordingError(f"{folder} describes {len(stored)} trials beside the images of {len(images)}; {_AGAIN}")
     captures = []
     for capture, (source, frames, size, read_frames) in zip(stored, images, strict=True):
         if (len(capture), capture.frame_size) != (frames, size):
-            raise RecordingError(
-                f"{source} has {frames} frames of {size[0]} x {size[1]} pixels, but trial {capture.trial} in {folder} "
-                f"has {len(capture)} of {capture.frame_size[0]} x {capture.frame_size[1]}; export the data set again, "
-                "or remove that folder to import without labels"
-            )
+            raise RecordingError(f"{source} has not the frames of trial {capture.trial} in {folder}; {_AGAIN}")
         captures.append(replace(capture, source=f"{capture.trial}, {source}", read_frames=read_frames))
     return captures

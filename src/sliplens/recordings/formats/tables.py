@@ -15,7 +15,6 @@ from jaxtyping import Float
 
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import require_file
-from sliplens.progress import number_of
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labels.axes import typical_step
 from sliplens.recordings.options import ReadOptions
@@ -24,10 +23,8 @@ from sliplens.recordings.trial import MOST_FORCE_N
 _SEPARATORS = ("\t", ";", ",")  # a comma may be a decimal one where another separator is there
 _LACKING = ("", "nan", "na", "n/a", "null")  # fields of a sample that dropped out
 _COMMENTS = ("#", "%")
-_PROBED_BYTES = 65536
 _LONGEST_LINE = 100_000  # characters; a file without line breaks would be held whole
-_OLD = "cp1252"
-_CONTROLS = frozenset(range(32)) - frozenset(b"\t\n\r\f\x1a\x1b")
+_CSV = "export the table as CSV in UTF-8"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,17 +35,19 @@ class TextTable:
     encoding: str
     separator: str
     header: tuple[str, ...]
-    first_line: int
-    """Line of the file after the header, counted from 1."""
+    first_line: int  #: Line of the file after the header, counted from 1.
+
+    @property
+    def names(self) -> str:
+        """Names of the columns, for messages."""
+        return _quote(self.header)
 
     def require(self, name: str, *, option: str) -> str:
         """Return the name of a column as the file writes it."""
         exact = [column for column in self.header if column == name]
         same = exact or [column for column in self.header if column.lower() == name.strip().lower()]
         if not same:
-            raise RecordingError(
-                f"{self.path} has no column {name!r}, it has {_quote(self.header)}; name one of them with {option}"
-            )
+            raise RecordingError(f"{self.path} has no column {name!r}, it has {self.names}; name it with {option}")
         if len(same) > 1:
             raise RecordingError(f"{self.path} has {len(same)} columns {name!r}; rename one of them")
         return same[0]
@@ -58,53 +57,35 @@ class TextTable:
         for line, text in _lines(self.path, self.encoding):
             if line < self.first_line or _is_comment(text):
                 continue
-            fields = _split(text, self.separator, where=f"{self.path}, line {line}")
-            if len(fields) == len(self.header) + 1 and not fields[-1]:
-                fields.pop()  # some loggers end every row, but not the header, with a separator
+            where = f"{self.path}, line {line}"
+            fields = _split(text, self.separator, where=where)
             if len(fields) != len(self.header):
-                cure = "mend or drop the line"
-                if self.separator == "," and len(fields) > len(self.header):
-                    cure = "where decimals are commas, separate the columns by semicolons"
-                raise RecordingError(
-                    f"{self.path}, line {line} has {number_of(len(fields), 'column')} but the header "
-                    f"{len(self.header)}; {cure}"
-                )
+                comma = self.separator == "," and len(fields) > len(self.header)
+                cure = "where decimals are commas, separate the columns by semicolons" if comma else "mend the line"
+                raise RecordingError(f"{where} has {len(fields)} columns but the header {len(self.header)}; {cure}")
             yield line, fields
 
 
 def open_text_table(path: Path) -> TextTable:
     """Find the separator and the header of a table, after a byte order mark, comments and empty lines."""
     encoding = _encoding(path)
-    comment = ""
     for line, text in _lines(path, encoding):
         if _is_comment(text):
-            comment = text
             continue
         separator = next((mark for mark in _SEPARATORS if mark in text), None)
         if separator is None:
-            raise RecordingError(
-                f"{path} has a single column {text.strip()[:40]!r}; separate the columns by commas, semicolons or tabs"
-            )
-        header, first_line = _split(text, separator, where=f"{path}, line {line}"), line + 1
-        if all(map(_is_number, header)):
-            # NumPy writes the header as a comment
-            header, first_line = _split(comment.lstrip("#% "), separator, where=f"{path}, line {line}"), line
-            if len(header) != text.count(separator) + 1:
-                raise RecordingError(
-                    f"{path} begins with numbers, not with the names of its columns; "
-                    "add a first line such as time_s,fx,fy,fz"
-                )
-        return TextTable(path=path, encoding=encoding, separator=separator, header=tuple(header), first_line=first_line)
+            raise RecordingError(f"{path} has a single column {text[:40]!r}; separate by commas, semicolons or tabs")
+        header = _split(text, separator, where=f"{path}, line {line}")
+        if not any(re.search("[a-z]", name, re.IGNORECASE) for name in header):
+            raise RecordingError(f"{path} begins with numbers, not names of columns; begin with time_s,fx,fy,fz")
+        return TextTable(path=path, encoding=encoding, separator=separator, header=tuple(header), first_line=line + 1)
     raise RecordingError(f"{path} is empty; name a table with a header and a row a sample")
 
 
 def read_numbers(
     table: TextTable, names: Sequence[str], *, may_lack: Collection[str] = ()
 ) -> tuple[Float[np.ndarray, "rows columns"], array, bool]:
-    """Read columns as finite numbers: the numbers, the line of each row, and True where decimals have commas.
-
-    Columns in `may_lack` are NaN where a field is empty or `nan`.
-    """
+    """Read columns as finite numbers: the numbers, the line of each row, and True where decimals have commas."""
     places = [table.header.index(name) for name in names]
     values, lines = array("d"), array("q")
     commas = points = False
@@ -144,8 +125,7 @@ def require_rising(time: Float[np.ndarray, " rows"], lines: Sequence[int], *, pa
         before, after = time[wrong[0] : wrong[0] + 2].tolist()
         what = "repeats" if after == before else "falls"
         raise RecordingError(
-            f"{path}, line {lines[wrong[0] + 1]}: {column!r} {what} ({before:.9g}, then {after:.9g}); "
-            "sort the rows or mend their stamps"
+            f"{path}, line {lines[wrong[0] + 1]}: {column!r} {what} ({before:.9g}, then {after:.9g}); sort it"
         )
 
 
@@ -154,30 +134,14 @@ def text_lines(path: Path) -> Iterator[tuple[int, str]]:
     return _lines(path, _encoding(path))
 
 
-def guessed_encodings(*paths: Path) -> tuple[str, ...]:
-    """Note text files whose encoding was guessed: characters beyond ASCII may be wrong."""
-    guessed = [path.name for path in paths if _encoding(path) == _OLD]
-    return tuple(f"{name}: the text is not UTF-8 and was read as Windows-1252." for name in guessed)
-
-
 def _encoding(path: Path) -> str:
     try:
         require_file(path)
         with path.open("rb") as stream:
-            start = stream.read(_PROBED_BYTES)
-    except InputError as error:
+            start = stream.read(2)
+    except (InputError, OSError) as error:
         raise RecordingError(str(error)) from None
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); name a text file") from None
-    if start.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return "utf-16"  # "Unicode text" of Excel
-    if not _CONTROLS.isdisjoint(start):
-        raise RecordingError(f"{path} is not a text file; export the table as CSV")
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(start)
-    except UnicodeDecodeError:
-        return _OLD  # the micro sign of an older logger on Windows
-    return "utf-8-sig"
+    return "utf-16" if start in {codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE} else "utf-8-sig"  # that of Excel's "Unicode"
 
 
 def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
@@ -185,13 +149,13 @@ def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
         with path.open(encoding=encoding) as stream:
             for number, text in enumerate(iter(lambda: stream.readline(_LONGEST_LINE), ""), start=1):
                 if len(text) == _LONGEST_LINE:
-                    raise RecordingError(
-                        f"{path}, line {number} is longer than {_LONGEST_LINE:,} characters; export the table as CSV"
-                    )
+                    raise RecordingError(f"{path}, line {number} is too long; {_CSV}")
+                if "\0" in text:
+                    raise RecordingError(f"{path} is not a text file; {_CSV}")
                 if text.strip():
                     yield number, text.rstrip("\r\n")
     except UnicodeError:
-        raise RecordingError(f"{path} is not a text file; export the table as CSV") from None
+        raise RecordingError(f"{path} is not a text file; {_CSV}") from None
 
 
 def _split(text: str, separator: str, *, where: str) -> list[str]:
@@ -204,14 +168,6 @@ def _split(text: str, separator: str, *, where: str) -> list[str]:
 
 def _is_comment(text: str) -> bool:
     return text.lstrip().startswith(_COMMENTS)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text.replace(",", "."))
-    except ValueError:
-        return False
-    return True
 
 
 UNITS = {
@@ -249,10 +205,8 @@ def unit_of(name: str, *, quantity: str, path: str) -> str | None:
     if bracket:
         unit = _find_unit(bracket[1].lower(), quantity)
         if unit is None:
-            raise RecordingError(
-                f"{path}: {name!r} is in {bracket[1]!r}, which is no known unit of {quantity} "
-                f"({', '.join(UNITS[quantity])}); declare the right one with --{quantity}-unit"
-            )
+            known = f"is in {bracket[1]!r}, which is no known unit of {quantity} ({', '.join(UNITS[quantity])})"
+            raise RecordingError(f"{path}: {name!r} {known}; declare the right one with --{quantity}-unit")
         return unit
     words = _words(name)
     # "f_n" is a normal force, "fx_n" one along x in newtons
@@ -296,22 +250,14 @@ def guess_force_columns(table: TextTable) -> tuple[str, ...]:
             )
     alone = columns["z"] + columns["normal"]
     if alone and not columns["x"] + columns["y"] + columns["tangential"]:
-        raise RecordingError(
-            f"{table.path} has a normal force ({alone[0]!r}) but no tangential force that is known by its name, and a "
-            f"safety margin needs both; name its columns with {option}, or go without margins: sliplens track follows "
-            "the markers"
-        )
-    raise RecordingError(
-        f"{table.path} has no columns that look like forces (fx, fy, fz or fn, ft) among {_quote(table.header)}; name "
-        f"them with {option}"
-    )
+        one = f"{table.path} has a normal force ({alone[0]!r}) but no tangential force that is known by its name"
+        raise RecordingError(f"{one}, and a safety margin needs both; name its columns with {option}")
+    looked = "has no columns that look like forces (fx, fy, fz or fn, ft)"
+    raise RecordingError(f"{table.path} {looked} among {table.names}; name them with {option}")
 
 
 def guess_time_unit(time: Float[np.ndarray, " samples"]) -> str:
-    """Guess the unit of times from their size: by the date where they count from 1970, else by the usual step.
-
-    A force sensor or camera is read 2 to 10 000 times a second: a step of 0.01 is in seconds, 1 or 10 in milliseconds.
-    """
+    """Guess the unit of times from their size: by the date where they count from 1970, else by the usual step."""
     size, step = float(np.abs(time[-1])), typical_step(time)
     for unit, since_1970 in (("ns", 1e17), ("us", 1e14), ("ms", 1e11), ("s", 1e8)):
         if size >= since_1970 and (unit != "s" or step < 0.5):
@@ -343,9 +289,7 @@ def _quote(names: Sequence[str]) -> str:
 
 def _require_single(names: Sequence[str], *, table: TextTable, what: str, option: str) -> str:
     if not names:
-        raise RecordingError(
-            f"{table.path} has no column that looks like {what} among {_quote(table.header)}; name it with {option}"
-        )
+        raise RecordingError(f"{table.path} has no column that looks like {what} among {table.names}; give {option}")
     if len(names) > 1:
         raise RecordingError(f"{table.path}: {what} could be any of {_quote(names)}; name the right one with {option}")
     return names[0]
@@ -367,9 +311,7 @@ def trial_name(text: str) -> str:
 def require_trial_name(trial: str) -> None:
     """Check that the name of a trial can name a file."""
     if trial_name(trial) != trial:
-        raise RecordingError(
-            f"trial {trial[:40]!r} cannot name a file; name it with letters, digits, dots, dashes and underscores"
-        )
+        raise RecordingError(f"trial {trial[:40]!r} cannot name a file; use letters, digits, dots, dashes, underscores")
 
 
 def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[str, ...]]:
@@ -383,9 +325,7 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     if force_columns is None:
         names = guess_force_columns(table)
     elif len(force_columns) not in {2, 3}:
-        raise RecordingError(
-            f"{len(force_columns)} force columns were named; name three (x, y, z) or two (normal, tangential)"
-        )
+        raise RecordingError(f"{len(force_columns)} force columns were named; name x, y, z, or normal, tangential")
     else:
         names = tuple(table.require(name, option="--force-columns") for name in force_columns)
         if len(set(names)) < len(names):
@@ -399,15 +339,12 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     large = np.any(np.abs(forces) > MOST_FORCE_N, axis=1)
     if large.any():
         at = int(np.argmax(large))
-        raise RecordingError(
-            f"{path}, line {lines[at]}: {np.nanmax(np.abs(forces[at])):.4g} N is no force of a fingertip; "
-            "declare the right one with --force-unit"
-        )
+        size = f"{path}, line {lines[at]}: {np.nanmax(np.abs(forces[at])):.4g} N is no force of a fingertip"
+        raise RecordingError(f"{size}; declare the right one with --force-unit")
     by_name = "by its name" if time_column is None else "declared"
     by_names = "by their names" if force_columns is None else "declared"
     axes = "x, y, z" if len(names) == 3 else "normal (laid along z), tangential (laid along x)"
     notes = [
-        *guessed_encodings(path),
         f"{path.name}: times are those of column {time_name!r} ({by_name}), in {time_unit} ({how}).",
         f"{path.name}: forces are those of {_quote(names)} as {axes} ({by_names}), in {units}.",
     ]
@@ -448,10 +385,7 @@ def _force_factors(
 def place_on_clock(
     time_s: Float[np.ndarray, " frames"], options: ReadOptions, *, source: str
 ) -> tuple[Float[np.ndarray, " frames"], Forces | None, tuple[str, ...]]:
-    """Return times of frames on the clock of the forces in the table beside them, these forces, and notes.
-
-    The first frame was taken at `start_s` on the clock of the forces; if that is None, both count from the same zero.
-    """
+    """Return times of frames on the clock of the forces in the table beside them, these forces, and notes."""
     start_s = options.start_s
     samples, notes = (None, ()) if options.forces is None else read_force_table(options.forces, options)
     if start_s is not None:
@@ -462,9 +396,7 @@ def place_on_clock(
     elif samples is not None:
         notes += (f"{source}: the times of its frames and of the forces were taken to count from the same zero.",)
     if samples is not None and (time_s[-1] < samples.time_s[0] or time_s[0] > samples.time_s[-1]):
-        raise RecordingError(
-            f"the frames of {source} ({time_s[0]:.6g} to {time_s[-1]:.6g} s) and the forces of {samples.source} "
-            f"({samples.time_s[0]:.6g} to {samples.time_s[-1]:.6g} s) have no moment in common; "
-            "declare with --start-s when the first frame was taken, on the clock of the forces"
-        )
+        spans = f"{source} ({time_s[0]:.6g} to {time_s[-1]:.6g} s) and the forces of {samples.source}"
+        span = f"{samples.time_s[0]:.6g} to {samples.time_s[-1]:.6g} s"
+        raise RecordingError(f"the frames of {spans} ({span}) have no moment in common; give --start-s")
     return time_s, samples, notes

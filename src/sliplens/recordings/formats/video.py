@@ -59,11 +59,7 @@ def count_stale(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
 
 
 def least_contact(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
-    """Find the frame with the least relief: the candidate for a reference where none was recorded.
-
-    Where an object presses into a gel lit by coloured lamps, colours change within a few pixels; those of the untouched
-    gel change slowly.
-    """
+    """Find the frame with the least relief: the candidate for a reference where none was recorded."""
     colour = copies[..., [0, 2]] - copies[..., [1]]
     padded = np.pad(colour, ((0, 0), (2, 2), (2, 2), (0, 0)), mode="edge")
     smooth = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(1, 2)).mean(axis=(-2, -1))
@@ -101,10 +97,8 @@ class VideoFile:
     stamps: Int64[np.ndarray, " frames"] | None
     """Stamps in units of the stream, in the order of display; None where there are none."""
     time_s: Float[np.ndarray, " frames"] | None
-    counted: bool
-    """True where the container counts frames and holds no presentation stamps."""
-    frame_size: tuple[int, int]
-    """Height and width of the upright frames, in pixels."""
+    counted: bool  #: True where the container counts frames and holds no presentation stamps.
+    frame_size: tuple[int, int]  #: Height and width of the upright frames, in pixels.
     notes: tuple[str, ...]
 
 
@@ -133,10 +127,7 @@ def inspect_video(path: Path) -> VideoFile:
             zero = stamps[0] if container.format.name in _ANY_ZERO else 0
             time = (stamps - zero) * float(video.time_base)
         if cut or _ends_early(container, video, len(packets), time):
-            raise RecordingError(
-                f"{path} is truncated or damaged: it ends before frame {len(packets)}, sooner than its header says; "
-                "copy it again"
-            )
+            raise RecordingError(f"{path} is truncated or damaged: it ends before frame {len(packets)}; copy it again")
         notes = _notes(container, video, path)
         turn = read_display_turn(path)
     return VideoFile(
@@ -148,8 +139,7 @@ def inspect_video(path: Path) -> VideoFile:
 class DisplayTurn:
     """Turn by right angles, and mirror image, by which a player shows the frames of a video."""
 
-    transpose: bool = False
-    """Rows become columns, before anything is reversed."""
+    transpose: bool = False  #: Rows become columns, before anything is reversed.
     reverse_columns: bool = False
     reverse_rows: bool = False
 
@@ -164,25 +154,14 @@ class DisplayTurn:
 
 
 def display_turn(frame: av.VideoFrame, *, where: object) -> DisplayTurn:
-    """Return how a frame is turned by its display matrix, in which a telephone keeps how it was held.
-
-    The matrix maps column p and row q to column a p + c q and row b p + d q; its first entries are a, b, u, c, d in
-    16.16 fixed point (ISO/IEC 14496-12, 8.2.2).
-
-    Raises
-    ------
-    RecordingError
-        If it does more than turn by right angles and mirror.
-    """
+    """Return how a frame is turned by its display matrix, in which a telephone keeps how it was held."""
     side_data = frame.side_data.get("DISPLAYMATRIX")
     if side_data is None:
         return DisplayTurn()
     fixed = np.frombuffer(bytes(side_data), dtype=np.int32)  # pyright: ignore[reportArgumentType]
     a, b, _, c, d = (fixed[:5] / 65536).tolist()
     if (abs(a), abs(b), abs(c), abs(d)) not in {(1, 0, 0, 1), (0, 1, 1, 0)}:
-        raise RecordingError(
-            f"{where} is turned by {frame.rotation} degrees, or stretched, by its display matrix; export it upright"
-        )
+        raise RecordingError(f"{where} is turned by {frame.rotation} degrees, or stretched; export it upright")
     return DisplayTurn(transpose=a == 0, reverse_columns=a + c < 0, reverse_rows=b + d < 0)
 
 
@@ -211,7 +190,9 @@ def open_video(path: Path, *, missing: str = "name a video file") -> Iterator[tu
                 raise RecordingError(f"{path} has no video stream; name the file that the camera wrote")
             if streams[0].codec_context is None:
                 raise RecordingError(f"{path} {_NO_DECODER}")
-            _require_few_bits(streams[0], path)
+            if (pixels := streams[0].codec_context.format) and max(part.bits for part in pixels.components) >= 16:
+                # a decoder keeps the upper 8, and of a camera with 12 bits those hold four
+                raise RecordingError(f"{path} has 16 bits a channel ({pixels.name}); export it with 8")
             yield container, streams[0]
     except (FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
@@ -222,20 +203,8 @@ def require_size(path: Path, video: VideoStream) -> tuple[int, int]:
     """Return height and width of the frames in the header, where they are possible."""
     size = video.codec_context.height, video.codec_context.width
     if min(size) <= 0 or size[0] * size[1] > MOST_PIXELS:
-        raise RecordingError(
-            f"{path} claims frames of {size[1]} x {size[0]} pixels; the file is damaged, copy or export it again"
-        )
+        raise RecordingError(f"{path} claims frames of {size[1]} x {size[0]} pixels; the file is damaged, copy it")
     return size
-
-
-def _require_few_bits(video: VideoStream, path: Path) -> None:
-    """Refuse 16 bits a channel: a decoder keeps the upper 8, and of a camera with 12 bits those hold four."""
-    pixels = video.codec_context.format
-    if pixels is not None and max(part.bits for part in pixels.components) >= 16:
-        raise RecordingError(
-            f"{path} has 16 bits a channel ({pixels.name}), and does not say how many of them its camera used; export "
-            "it with 8, the camera's largest level as 255"
-        )
 
 
 def _moving(container: InputContainer) -> list[VideoStream]:
@@ -252,10 +221,8 @@ def _notes(container: InputContainer, video: VideoStream, path: Path) -> tuple[s
     if streams > 1:
         notes.append(f"{path.name}: the first of {streams} video streams was read.")
     if codec.lossy:
-        notes.append(
-            f"{path.name}: frames are coded with loss ({codec.canonical_name}), which moves markers a little; "
-            "record losslessly (FFV1, PNG) where you can."
-        )
+        loss = f"{path.name}: frames are coded with loss ({codec.canonical_name}), which moves markers a little"
+        notes.append(f"{loss}; record losslessly (FFV1, PNG) where you can.")
     if max(part.bits for part in pixels.components) > 8:
         notes.append(f"{path.name}: frames have more than 8 bits a channel and were reduced to 8.")
     return tuple(notes)
@@ -294,10 +261,7 @@ def decode_video(path: Path, file: VideoFile) -> Iterator[Frame]:
                 turn = display_turn(frame, where=path)
                 height, width = turn.size(frame.height, frame.width)
                 if (height, width) != file.frame_size:
-                    raise RecordingError(
-                        f"frame {count} of {path} is {width} x {height} pixels but the file says "
-                        f"{file.frame_size[1]} x {file.frame_size[0]}; record one size a file"
-                    )
+                    raise RecordingError(_damaged(path, count, "it is of another size than the file says"))
                 count += 1
                 yield turn.apply(to_rgb.reformat(frame, format="rgb24").to_ndarray())
         except FFmpegError as error:

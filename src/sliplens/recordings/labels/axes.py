@@ -1,7 +1,7 @@
 """Axes, sign, tare and noise of a force sensor, declared or inferred, and means of its samples."""
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,37 +11,27 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import AXES, ForceAxes, Found, Vector
 
 _WINDOW_S = 0.03  # time over which the force is averaged to find the touch: a press takes longer, a spike is shorter
-_FIRST_S = 0.1  # time at the start in which the sensor must be untouched, to measure its tare
-_TOUCH_SIGMAS = 6.0  # a departure from the tare by so many standard deviations of the averaged noise is a touch
-_TOUCH_SHARE = 0.05  # and by so much of the largest force: drift and vibration are no touch
-_GUARD_S = 0.15  # samples before the touch that are left out of the tare: a soft press begins before it is noticed
-# share of the contact, from its start, in which the object is pressed and held but not yet pulled far
-_PRESS_SHARE = 0.25
-_SPIKE_SIGMAS = 4.0  # a still sample further from the median is a spike
-_LEAST_TYPICAL = 0.9  # share of the still samples that are no spikes
-_FEW_STILL = 10  # fewer still samples give no tare
+_FIRST_S, _GUARD_S = 0.1, 0.15  # untouched time at the start, and time before the touch that is left out of the tare
+# a touch departs by so many standard deviations, and by so much of the largest force: drift and vibration are none
+_TOUCH_SIGMAS, _TOUCH_SHARE = 6.0, 0.05
+_PRESS_SHARE = 0.25  # of the contact, from its start, in which the object is pressed and not yet pulled far
+_SPIKE_SIGMAS, _LEAST_TYPICAL = 4.0, 0.9  # of a still sample from the median; share of still samples within
+_FEW_STILL, _FEW_RISING, _FEW_MEANS = 10, 4, 20  # fewer samples give no tare, no direction, no spread
 _STRETCHES = 10  # parts of the still samples whose means are compared
 _DOUBTFUL = 0.6  # a second axis that departs by this share of the first makes the normal axis doubtful
-_FEW_RISING = 4  # fewer samples of a press give no direction
 _RISE = (0.15, 0.9)  # shares of the load in hold between which the direction of the press is measured
-_TILT_SIGMAS = 3.0  # a press that departs from an axis by so many standard uncertainties is tilted
-_LEAST_TILT_DEG = 0.5  # less moves a margin by 1 % or so
-_TILT_FLAG_DEG = 3.0  # more is flagged: sensors are mounted, and objects pressed, to about so many degrees
-_SHEAR_FLAG_DEG = 10.0  # a press that is pulled, too, is no fault up to here
-# of the tilt: a force that is pulled from the touch on turns by more than its whole angle in the time after the press,
-# that of a tilted sensor not at all
-_MOST_BEND = 0.25
-# of a drift, by the untouched sensor at the end or by its slope before the touch: a false one costs good labels
-_DRIFT_SIGMAS, _SLOPE_SIGMAS = 4.0, 3.0
-# of the standard uncertainty of a drift that is measured before the touch alone: all of it would cost 40 % of the
-# labels of sound trials that are held to their end, 0.6 a quarter, none leaves a third of those of drifting ones wrong
+_TILT_SIGMAS, _LEAST_TILT_DEG = 3.0, 0.5  # of a tilt that counts: less moves a margin by 1 % or so
+# mounting and pressing are as exact as the first; a press that is pulled, too, is no fault up to the second
+_TILT_FLAG_DEG, _SHEAR_FLAG_DEG = 3.0, 10.0
+_MOST_BEND = 0.25  # of the tilt: a pulled force turns by more than its angle, that of a tilted sensor not at all
+_DRIFT_SIGMAS, _SLOPE_SIGMAS = 4.0, 3.0  # of a drift, to the end or before the touch: a false one costs good labels
+# of the uncertainty of a drift that is measured before the touch alone: all of it would cost 40 % of sound labels
 _UNCERTAIN_SHARE = 0.3
-_UNCERTAIN_LOAD = 0.1  # of the load: a drift that may be larger by the end is noted
-_DRIFT_SHARE = 0.01  # of the load: less does not matter
+_UNCERTAIN_LOAD, _DRIFT_SHARE = 0.1, 0.01  # of the load: a drift that is noted, and one that does not matter
 _CALM_NOISES = 1.5
 _RELEASED_SHARE = 0.3  # of the load: a smaller force at the end may be the drift of an untouched sensor
 _MAD_TO_SIGMA = 1.4826  # standard deviation of a Gaussian over its median absolute deviation
-
+_MOST_WINDOWS = 4_000_000
 
 Axes: TypeAlias = Float[np.ndarray, "3"]
 Samples: TypeAlias = Float[np.ndarray, " samples"]
@@ -57,11 +47,9 @@ def typical_step(time_s: Samples) -> float:
 def mean_force(
     time_s: Samples, force_n: Columns, at_s: Times, *, window_s: float, until_s: float = np.inf
 ) -> Float[np.ndarray, "times *axes"]:
-    """Return the mean force over a window about given times, with the force interpolated linearly between samples.
+    """Return the exact mean over windows about given times of the broken line through the samples.
 
-    It is the exact mean of the broken line through the samples, so it holds for samples that are not evenly spaced,
-    and a window of 0 is plain interpolation. Near the ends of the samples, and of `until_s`, the onset of slip
-    where the force breaks off, the window shrinks evenly about its time.
+    Near the ends of the samples, and of the onset of slip `until_s`, the window shrinks evenly about its time.
     """
     at = np.clip(at_s, time_s[0], time_s[-1])
     half = half_window(time_s, at, window_s=window_s, until_s=until_s)
@@ -80,14 +68,8 @@ def half_window(time_s: Samples, at_s: Times, *, window_s: float, until_s: float
     return np.clip(np.minimum(room, np.abs(at_s - until_s)), 0, window_s / 2)
 
 
-_MOST_WINDOWS = 4_000_000
-
-
 def middles(time_s: Samples, start_s: float, end_s: float, *, width_s: float) -> Times:
-    """Return the middles of adjacent windows from a start to an end.
-
-    Where a gap would make them too many, windows without a sample are left out.
-    """
+    """Return the middles of adjacent windows; where a gap would make them too many, of those with a sample."""
     if (end_s - start_s) / width_s <= _MOST_WINDOWS:
         return np.arange(start_s + width_s / 2, end_s, width_s)
     at_s = start_s + (np.unique(np.floor((time_s - start_s) / width_s)) + 0.5) * width_s
@@ -95,19 +77,14 @@ def middles(time_s: Samples, start_s: float, end_s: float, *, width_s: float) ->
 
 
 def noise_sigma(values: Columns) -> Float[np.ndarray, "*axes"]:
-    """Estimate the standard deviation of the noise of each column from second differences, which slow changes cancel.
-
-    The median ignores a few jumps. A column that hardly ever changes has a noise of 0.
-    """
+    """Estimate the standard deviation of the noise of each column by the median of its second differences."""
     if len(values) < 3:
         return np.zeros(values.shape[1:])
     second = values[2:] - 2 * values[1:-1] + values[:-2]
     return np.asarray(_MAD_TO_SIGMA * np.median(np.abs(second), axis=0) / np.sqrt(6))
 
 
-def _integral(
-    time_s: Float[np.ndarray, " samples"], values: Float[np.ndarray, "samples columns"], at_s: Float[np.ndarray, " t"]
-) -> Float[np.ndarray, "t columns"]:
+def _integral(time_s: Samples, values: Columns, at_s: Times) -> Float[np.ndarray, "times columns"]:
     """Integrate the broken line through the samples, from the first of them."""
     # about the mean: a large offset would cost digits
     steps = np.diff(time_s)[:, None] * (values[1:] + values[:-1]) / 2
@@ -129,22 +106,18 @@ def infer_axes(
 ) -> ForceAxes:
     """Infer the axes, sign and tare of a force sensor that are not declared.
 
-    The tare is the mean of the samples before the touch, spikes left out. The normal axis is the one that departs
-    furthest from it in the press, and its sign makes that positive. While nothing shears, the force of a press keeps
-    its direction: where that is no axis, the sensor is tilted, and its normal is that direction, unless an axis was
-    declared. A force that turns within the press is sheared already, and gives the axis alone. A sensor that is pressed
-    from the first sample on looks untouched: declare its tare. Where nothing is ever pressed, axis and sign cannot be
-    inferred, which is a `RecordingError`. `drift_n_s` is the standard deviation of the rate at which the zero may
-    drift, if known; `moved_s` the time from which on samples were moved to remove a step, so that they show no drift.
+    The tare is the mean of the samples before the touch, spikes left out. The normal axis departs furthest from it in
+    the press, positively by its sign. While nothing shears, the force of a press keeps its direction: where that is no
+    axis, the sensor is tilted, and its normal is that direction, unless an axis was declared. Where nothing is ever
+    pressed, axis and sign cannot be inferred, which is a `RecordingError`. `drift_n_s` is the standard deviation of the
+    rate at which the zero may drift, if known; samples from `moved_s` on were moved, and show no drift.
     """
     noise = np.asarray(noise_sigma(forces.force_n))
     touch = _find_touch(forces, tare_n=tare_n) if touch_s is None else touch_s
     until = touch - min(_GUARD_S, max(0.0, touch - float(forces.time_s[0])) / 2) if np.isfinite(touch) else touch
     if np.isinf(touch) and (normal is None or sign is None):
-        raise RecordingError(
-            f"{forces.source} never departs from its noise: no touch to infer the axes from; "
-            "give --normal-axis, --normal-sign and --tare, or leave the trial out"
-        )
+        never = f"{forces.source} never departs from its noise: no touch to infer the axes from"
+        raise RecordingError(f"{never}; give --normal-axis, --normal-sign and --tare, or leave the trial out")
     still = forces.force_n[forces.time_s < until]
     tare, tare_sigma, tare_found = np.zeros(3), np.zeros(3), Found.ASSUMED
     notes = []
@@ -167,28 +140,29 @@ def infer_axes(
     first, second = np.sort(np.abs(press))[[-1, -2]]
     if normal is None and main is press and second > _DOUBTFUL * first:
         notes.append(
-            f"the normal axis is doubtful: {axis} departs by {first:.2f} N in the press, another by {second:.2f} N; "
-            "declare it"
+            f"the normal axis is doubtful: {axis} departs by {first:.2f} N, another by {second:.2f} N; declare it"
         )
     # ForceAxes refuses an unknown axis
     inferred_sign = 1 if axis not in AXES or main[AXES.index(axis)] >= 0 else -1
-    tilt_deg = 0.0 if rise is None or axis not in AXES else rise.tilt_deg(axis, sign or inferred_sign)
+    tilt_deg = 0.0 if rise is None or axis not in AXES else _tilt_deg(rise, axis, sign or inferred_sign)
     turned = rise is not None and not rise.bends and normal is None and sign in (None, inferred_sign) and tilt_deg > 0
     if rise is not None and tilt_deg > (_SHEAR_FLAG_DEG if rise.bends else _TILT_FLAG_DEG):
-        notes.append(_tilt_note(axis, tilt_deg, turned=turned, bends=rise.bends))
+        cure = (
+            f"so the axes were turned by that; if the press was oblique, give --normal-axis {axis}"
+            if turned
+            else "and turns on the way: the sensor is tilted or something shears; press first, then pull"
+            if rise.bends
+            else "that was declared; leave out --normal-axis and --normal-sign if the sensor is tilted"
+        )
+        notes.append(f"the force of the press points {tilt_deg:.0f} degrees off the axis {axis} {cure}")
     if drift_n_s is not None:
         drift_sigma = np.full(3, drift_n_s)
     elif np.any(drift_sigma * np.ptp(forces.time_s) > _UNCERTAIN_LOAD * np.linalg.norm(press)):
-        notes.append(
-            f"the zero may drift by {_signed(drift_sigma * np.ptp(forces.time_s))} N (x, y, z) over the trial without "
-            "showing, which makes late labels uncertain; let go before the recording ends, wait some seconds before "
-            "the touch, or give --drift-rate"
-        )
+        most = f"the zero may drift by {_signed(drift_sigma * np.ptp(forces.time_s))} N (x, y, z) over the trial unseen"
+        notes.append(f"{most}: let go before the recording ends, wait before the touch, or give --drift-rate")
     if drift.any():
-        notes.append(
-            f"the zero of the force sensor drifts by {_signed(drift * np.ptp(forces.time_s))} N (x, y, z) over the "
-            "trial, which counts as an error of its size; let it warm up"
-        )
+        most = f"the zero of the force sensor drifts by {_signed(drift * np.ptp(forces.time_s))} N (x, y, z) in all"
+        notes.append(f"{most}, which counts as an error of its size; let it warm up")
     return ForceAxes(
         normal=axis,
         sign=inferred_sign if sign is None else sign,
@@ -207,21 +181,18 @@ def infer_axes(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Rise:
-    """Direction of the force while the load of a press rises."""
+class _Rise(NamedTuple):
+    """Direction of the force while the load of a press rises, and its standard uncertainty in radians."""
 
     direction: Axes
-    """Unit vector, in the axes of the sensor as recorded."""
     sigma: float
-    """Standard uncertainty of the direction, in radians."""
-    bends: bool
-    """True where the direction changes on the way or soon after, because something shears."""
+    bends: bool  # on the way or soon after, because something shears
 
-    def tilt_deg(self, axis: str, sign: int) -> float:
-        """Return the angle to an axis; 0 where it is not significant."""
-        angle = float(np.rad2deg(np.arccos(np.clip(sign * self.direction[AXES.index(axis)], -1, 1))))
-        return angle if angle > max(_LEAST_TILT_DEG, _TILT_SIGMAS * np.rad2deg(self.sigma)) else 0.0
+
+def _tilt_deg(rise: _Rise, axis: str, sign: int) -> float:
+    """Return the angle of a press to an axis; 0 where it is not significant."""
+    angle = float(np.rad2deg(np.arccos(np.clip(sign * rise.direction[AXES.index(axis)], -1, 1))))
+    return angle if angle > max(_LEAST_TILT_DEG, _TILT_SIGMAS * np.rad2deg(rise.sigma)) else 0.0
 
 
 def _measure_rise(
@@ -249,7 +220,6 @@ def _measure_rise(
         return None
 
     def direction(part: Int[np.ndarray, " part"]) -> tuple[Axes, float]:
-        """Fit the slope of the force over its length by least squares; returns its standard uncertainty, too."""
         weight = float(np.sum(load[part] ** 2))
         slope = load[part] @ force[part] / weight
         white = float(np.linalg.norm(noise)) / np.sqrt(weight)
@@ -260,25 +230,13 @@ def _measure_rise(
     tilt = float(np.sqrt(max(0.0, 1 - np.max(np.abs(press)) ** 2)))
     bend = float(np.linalg.norm(hold - press))
     bends = bend > max(_TILT_SIGMAS * np.hypot(sigma, hold_sigma), _MOST_BEND * tilt)
-    return _Rise(direction=press, sigma=sigma, bends=bool(bends))
-
-
-def _tilt_note(axis: str, tilt_deg: float, *, turned: bool, bends: bool) -> str:
-    points = f"the force of the press points {tilt_deg:.0f} degrees off the axis {axis}"
-    if turned:
-        return f"{points}, so the axes were turned by that; if the press was oblique, give --normal-axis {axis}"
-    if bends:
-        return f"{points} and turns on the way: the sensor is tilted or something shears; press first, then pull"
-    return f"{points} that was declared; leave out --normal-axis and --normal-sign if the sensor is tilted"
+    return _Rise(press, sigma, bool(bends))
 
 
 def _find_drift(
     forces: Forces, tare_n: Axes, tare_sigma_n: Axes, *, noise: Axes, until_s: float, moved_s: float
 ) -> tuple[Axes, Axes]:
-    """Measure the rate at which the zero drifts, and its standard uncertainty.
-
-    The rate is that to the end of the trial if nothing touches there, else that of the samples before the touch.
-    """
+    """Measure the rate at which the zero drifts, to an untouched end or else before the touch, and its uncertainty."""
     time, force = forces.time_s, forces.force_n
     still, ends = time < until_s, time > time[-1] - _FIRST_S
     away = np.linalg.norm(force - tare_n, axis=1)
@@ -342,55 +300,39 @@ def _find_touch(forces: Forces, *, tare_n: Vector | None) -> float:
     return float(time[np.argmax(touched)]) if touched.any() else float("inf")
 
 
-_FEW_MEANS = 20  # fewer means give no spread
-
-
-@dataclass(frozen=True, kw_only=True)
-class NormalTangential:
-    """A standard deviation of the normal force, and of one component of the tangential, in newtons."""
-
-    normal: float
-    tangential: float
-
-
 @dataclass(frozen=True, kw_only=True)
 class ContactForces:
     """Forces in the axes of the contact, tare taken off, on the force sensor's clock."""
 
     recorded: Forces
-    normal_n: Float[np.ndarray, " samples"]
-    """Positive when pressing."""
-    tangential_n: Float[np.ndarray, "samples 2"]
-    """The two other axes in their order. Their length would be biased by noise: average first; see `magnitude`."""
+    normal_n: Float[np.ndarray, " samples"]  #: Positive when pressing.
+    tangential_n: Float[np.ndarray, "samples 2"]  #: The two other axes in their order; of their length see `magnitude`.
     axes: ForceAxes
 
     @property
-    def time_s(self) -> Float[np.ndarray, " samples"]:
+    def time_s(self) -> Samples:
         """Times of the samples."""
         return self.recorded.time_s
 
     @property
-    def noise_n(self) -> NormalTangential:
-        """Standard deviation of a sample's noise."""
+    def noise_n(self) -> tuple[float, float]:
+        """Standard deviation of a sample's noise: of the normal force, and of a tangential component."""
         return self._split(self.axes.noise_n)
 
     def tare_sigma_n(self, time_s: Times) -> tuple[Times, Times]:
-        """Return the standard uncertainty of the tare at given times: of the normal force, of a tangential component.
-
-        A drift, certain or possible, counts as an error of its size from the middle of the untouched samples on.
-        """
-        still = self._split(self.axes.tare_sigma_n)
+        """Return the standard uncertainty of the tare, in which drifts count as errors, as `noise_n`."""
+        normal, tangential = self._split(self.axes.tare_sigma_n)
         tilt = self.axes.direction_sigma * np.abs(np.interp(time_s, self.time_s, self.normal_n))
-        drift = self._split(np.hypot(self.axes.drift_n_s, self.axes.drift_sigma_n_s))
+        normal_drift, drift = self._split(np.hypot(self.axes.drift_n_s, self.axes.drift_sigma_n_s))
         begin = float(self.time_s[0])
         until = begin if self.axes.still_until_s is None else self.axes.still_until_s
         since = np.maximum(time_s - (begin + until) / 2, 0)
         # of a drift the length counts, for it is the same in all samples
-        tangential = np.hypot(np.hypot(still.tangential, np.sqrt(2) * drift.tangential * since), tilt)
-        return np.hypot(still.normal, drift.normal * since), tangential
+        across = np.hypot(np.hypot(tangential, np.sqrt(2) * drift * since), tilt)
+        return np.hypot(normal, normal_drift * since), across
 
-    def noise_of_means_n(self, window_s: float) -> NormalTangential:
-        """Return the standard deviation of the noise of means over a window, measured on means, white or not."""
+    def noise_of_means_n(self, window_s: float) -> tuple[float, float]:
+        """Return `noise_n` of means over a window, measured on means, white or not."""
         time = self.time_s
         ends = float(time[0]), float(time[-1] - window_s / 2)
         apart = middles(time, *ends, width_s=window_s) if window_s > 0 else time
@@ -398,12 +340,10 @@ class ContactForces:
         # of too few means the spread is unknown: that of the samples stands for it
         return self._split(noise_sigma(means)) if len(means) >= _FEW_MEANS else self.noise_n
 
-    def _split(self, of_axes: Vector | Axes) -> NormalTangential:
+    def _split(self, of_axes: Vector | Axes) -> tuple[float, float]:
         index = self.axes.normal_index
         squares = turn_matrix(self.axes) ** 2 @ np.square(of_axes)
-        return NormalTangential(
-            normal=float(np.sqrt(squares[index])), tangential=float(np.sqrt(np.mean(np.delete(squares, index))))
-        )
+        return float(np.sqrt(squares[index])), float(np.sqrt(np.mean(np.delete(squares, index))))
 
 
 def turn_matrix(axes: ForceAxes) -> Float[np.ndarray, "3 3"]:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, permutations
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -26,29 +26,27 @@ GAP_STEPS = 4.0  # samples are missing where two are further apart than so many 
 FAULTS = (Reason.NONE, Reason.DROP_OUT, Reason.STUCK, Reason.CLIPPED, Reason.SPIKE, Reason.STEP, Reason.MARKED)
 _DROP_OUT, _STUCK, _CLIPPED, _SPIKE, _STEP, MARKED = range(1, len(FAULTS))
 
-_LEAST_RUN = 4  # equal samples: fewer delay a frame's force by less than its noise
-_RUN_CHANCE = 1e-4  # chance that a healthy sensor repeats a value as often, anywhere in a trial
-# share of the interior samples that are peaks or dips: 2/3 of white noise, none of a smooth curve without noise
-_NOISY = 0.3
-_WIDEST_SPIKE = 3  # samples; longer faults are found by the jumps at their ends
-_BESIDE = 4  # samples on either side that a spike is compared with
-_SPIKE_SIGMAS = 8.0  # of the noise of a sample; sensors have more outliers than Gaussian noise
-_SPIKE_RANGES = 3.0  # and so many ranges of the samples beside it
+# equal samples: fewer delay a frame's force by less than its noise; chance that a healthy sensor repeats as often
+_LEAST_RUN, _RUN_CHANCE = 4, 1e-4
+_NOISY = 0.3  # share of the interior samples that turn: 2/3 of white noise, none of a smooth curve without noise
+_WIDEST_SPIKE, _BESIDE = 3, 4  # samples; longer faults are found by the jumps at their ends; compared on either side
+_SPIKE_SIGMAS, _SPIKE_RANGES = 8.0, 3.0  # of the noise of a sample, and of the range of the samples beside it
 _SLOW_S = 0.025  # with a longer step a jump looks like a press
 _FIT_S, _FIT_SAMPLES = 0.03, (4, 15)  # part of either side of a jump that a line is fitted to
-_JUMP_SIGMAS = 7.0
-_BURST_SIGMAS = 12.0  # of a change from one sample to the next, where there is no room for lines
+_JUMP_SIGMAS, _BURST_SIGMAS = 7.0, 12.0  # the second of a change between samples, where there is no room for lines
 # of the load: a smaller jump moves the margin by no more than its usual uncertainty, a kink of a press looks as large
 _JUMP_SHARE, _BURST_SHARE = 0.04, 0.15
 _TILTED_SHARE = 0.2  # of a fall of the pull that may show along the normal: axes that are off by 11 degrees
-_REST_SHARE = 0.1  # of the load: with less the object is released, even if the zero has drifted
-_RELEASE_S = 0.3  # longest release that looks like jumps
+_REST_SHARE, _RELEASE_S = 0.1, 0.3  # of the load of a released object; longest release that looks like jumps
 _SLIP_S = 0.1  # largest distance of a slip set by hand from its jump
 _BRIEF_S = 0.1  # a fault as short as this has ended when the force is back near its former value
 _LONGEST_LAG_S = 0.25  # search range for the image motion at a jump if the lag is unknown
 _ROUNDING = 1e-6  # of a mean of flags that are all 0
 _COARSE = 1.1  # mean length of runs of equal samples: more are coarse or repeated
 _ROUNDS = 3  # a large fault hides small ones
+_QUIET_S = 0.3  # time about a jump in which the image moves without it
+# of the image motion at such a change of the force elsewhere in the trial, taken at a quantile of the changes
+_MOVES_SHARE, _MOVES_SIGMAS, _PULLED = 0.3, 4.0, 0.9
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,13 +54,10 @@ class Screened:
     """Force samples without the faulty ones."""
 
     forces: Forces
-    codes: Codes
-    """Index in `FAULTS` of the fault of each recorded sample; 0 for none."""
+    codes: Codes  # index in `FAULTS` of the fault of each recorded sample; 0 for none
     recorded: Forces
-    moved_s: float = np.inf
-    """Time from which on samples were moved back by a step."""
-    doubts: tuple[str, ...] = ()
-    """Slips at which the image rests, a sentence each."""
+    moved_s: float = np.inf  # time from which on samples were moved back by a step
+    doubts: tuple[str, ...] = ()  # slips at which the image rests, a sentence each
 
     @property
     def faults(self) -> tuple[ForceFault, ...]:
@@ -71,14 +66,11 @@ class Screened:
         ends = np.flatnonzero(np.diff(codes, prepend=-1, append=-1))
         faults = [
             ForceFault(
-                kind=FAULTS[codes[start]],
-                start_s=float(time[start]),
-                end_s=float(time[end - 1]),
+                kind=FAULTS[codes[start]], start_s=float(time[start]), end_s=float(time[end - 1]),
                 largest_n=float(np.nanmax(np.abs(force[start:end]), initial=0.0)),
             )
-            for start, end in pairwise(ends.tolist())
-            if codes[start]
-        ]
+            for start, end in pairwise(ends.tolist()) if codes[start]
+        ]  # fmt: skip
         gaps = np.flatnonzero(np.diff(time) > GAP_STEPS * typical_step(time))
         faults += [
             ForceFault(kind=Reason.MISSING_SAMPLES, start_s=float(time[at]), end_s=float(time[at + 1]))
@@ -99,13 +91,11 @@ def screen_forces(
 ) -> Screened:
     """Find the faulty samples of a force sensor and leave them out.
 
-    Faults are: values that are not finite or no force (`MOST_FORCE_N`); values that a noisy sensor repeats; clipped
-    tops; spikes, which neither side of them explains; and the samples between jumps at which the image rests, until the
-    force is back: the jumps cancel, or one change of signs, scales or axes undoes both. A jump without a way back is a
-    slip where the tangential force falls at constant normal force, and a release where both fall to nothing; after any
-    other the rest of the trial is faulty, and moved back by the jumps to estimate the friction from.
-
-    `bad_s` are spans, in seconds, that are known to be wrong.
+    Faults are: values that are no force (`MOST_FORCE_N`); values that a noisy sensor repeats; clipped tops; spikes; and
+    the samples between jumps at which the image rests, until the force is back: the jumps cancel, or one change of
+    signs, scales or axes undoes both. A jump without a way back is a slip where the tangential force falls at constant
+    normal force, and a release where both fall to nothing; after any other the rest of the trial is faulty, and moved
+    back by the jumps to estimate the friction from. `bad_s` are spans, in seconds, that are known to be wrong.
 
     References
     ----------
@@ -131,8 +121,8 @@ def screen_forces(
     screened = _leave_out(forces, codes, shift)
     _, slips_s = _classify_jumps(screened.forces, image_moves=image_moves)
     doubts = tuple(
-        f"the tangential force falls at {at_s:.2f} s while the normal force stays and the image rests, which was taken "
-        "for a slip; if the sensor was knocked, mark the frames from there on as bad and give the friction with --mu"
+        f"the tangential force falls at {at_s:.2f} s while the image rests, which was taken for a slip; if "
+        "the sensor was knocked, mark the frames from there on as bad and give the friction with --mu"
         for at_s in slips_s
         if not image_moves(at_s, 0.0)
     )
@@ -149,10 +139,7 @@ def screen_trial(
     slip_s: float | None = None,
     rng: np.random.Generator,
 ) -> tuple[Screened, Lag]:
-    """Screen the forces of a trial, comparing their jumps with the image, and estimate the lag if it is None.
-
-    A jump at `slip_s`, the slip that was set by hand, in seconds, is no fault.
-    """
+    """Screen the forces of a trial by its image, and estimate the lag if None; a jump at `slip_s` is no fault."""
     bad_time_s = frame_time_s - (0.0 if lag is None else lag.lag_s)
     bad_s = [(float(bad_time_s[first]), float(bad_time_s[last])) for first, last in bad_frames]
     screened = screen_forces(forces, image_moves=lambda _t, _n: True, bad_s=bad_s)
@@ -253,11 +240,7 @@ def _fit_count(forces: Forces) -> int:
 
 
 def _find_jumps(forces: Forces) -> list[tuple[int, float]]:
-    """Find the samples before which the force jumps, and the size of the jump, in newtons.
-
-    A jump is a change from one sample to the next that is too large for noise, or else a difference of the lines
-    through the samples before and after it, where both meet. Slow samples show no jump.
-    """
+    """Find the samples before which the force jumps, and the size of the jump, in newtons."""
     if not 0 < typical_step(forces.time_s) <= _SLOW_S:
         return []
     force, step, load_n = forces.force_n, typical_step(forces.time_s), _load(forces.force_n)
@@ -295,8 +278,7 @@ def _remove_jumps(forces: Forces) -> tuple[Forces, int]:
     return replace(forces, force_n=force), total
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Part:
+class _Part(NamedTuple):
     """Samples between two jumps, and the force at their ends."""
 
     start: int
@@ -307,25 +289,21 @@ class _Part:
     last_n: Axis
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Tolerance:
-    """Differences by which equal forces may differ in a trial."""
+class _Tolerance(NamedTuple):
+    """Difference of equal forces of a trial, and median rate at which the force changes."""
 
     near_n: Axis
-    """Between lines through a few samples, extended to meet."""
     rate_n_s: float
-    """Median rate at which the force changes."""
-
-    @classmethod
-    def of(cls, forces: Forces) -> "_Tolerance":
-        """Measure the tolerance of a trial."""
-        near = 6 * _noise(forces.force_n) + 0.5 * _JUMP_SHARE * _load(forces.force_n)
-        rates = np.linalg.norm(np.diff(forces.force_n, axis=0), axis=1) / np.diff(forces.time_s)
-        return cls(near_n=near, rate_n_s=float(np.median(rates)))
 
     def equal(self, difference_n: Axis, more_n: float = 0.0) -> bool:
         """Return True where a difference of two forces is no more than that of equal ones."""
         return bool(np.all(np.abs(difference_n) <= self.near_n + more_n))
+
+
+def _tolerance(forces: Forces) -> _Tolerance:
+    near = 6 * _noise(forces.force_n) + 0.5 * _JUMP_SHARE * _load(forces.force_n)
+    rates = np.linalg.norm(np.diff(forces.force_n, axis=0), axis=1) / np.diff(forces.time_s)
+    return _Tolerance(near, float(np.median(rates)))
 
 
 def _cut(forces: Forces, spans: Sequence[tuple[int, int]]) -> list[_Part]:
@@ -339,21 +317,17 @@ def _cut(forces: Forces, spans: Sequence[tuple[int, int]]) -> list[_Part]:
             else np.median(force[side], axis=0)
             for side, at_s in ((slice(count), time[0] - half), (slice(-count, None), time[-1] + half))
         ]
-        ends_s = {"start_s": float(time[0]), "end_s": float(time[-1])}
-        parts.append(_Part(start=start, end=end, **ends_s, first_n=levels[0], last_n=levels[1]))
+        parts.append(_Part(start, end, float(time[0]), float(time[-1]), levels[0], levels[1]))
     return parts
 
 
 def _find_steps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[Codes, Samples]:
-    """Find the stretches from a jump at which the image rests until the force is back; slips and releases are none.
-
-    The shift of a step without a way back is returned, too.
-    """
+    """Find the stretches from a jump at which the image rests until the force is back; slips and releases are none."""
     codes, shift = np.zeros(len(forces.time_s), dtype=np.int64), np.full(forces.force_n.shape, np.nan)
     breaks, _ = _classify_jumps(forces, image_moves=image_moves)
     if not breaks:
         return codes, shift
-    tolerance = _Tolerance.of(forces)
+    tolerance = _tolerance(forces)
     last, *parts = _cut(forces, list(pairwise([0, *breaks, len(forces.time_s)])))
     faulty: list[_Part] = []
     for part in parts:
@@ -396,12 +370,7 @@ def _returns(last: _Part, faulty: Sequence[_Part], part: _Part, tolerance: _Tole
 
 
 def _classify_jumps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[list[int], list[float]]:
-    """Find the samples before which the force jumps by a fault, and the times of slips.
-
-    A fall of the tangential force at constant normal force is a slip, a fall of both to nothing a release. Neither
-    returns, at once or with a later jump. Jumps at which the image moves are no faults. Jumps that one release may hold
-    are taken together.
-    """
+    """Find the samples before which the force jumps by a fault, and the times of slips."""
     jumps = _find_jumps(forces)
     resting = [at for at, size in jumps if not image_moves(float(forces.time_s[at]), size)]
     if not resting:
@@ -418,7 +387,7 @@ def _classify_jumps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[li
         else:
             groups.append([at])
     starts, ends = [0, *(group[-1] for group in groups)], [*(group[0] for group in groups), len(time)]
-    parts, tolerance = _cut(forces, list(zip(starts, ends, strict=True))), _Tolerance.of(forces)
+    parts, tolerance = _cut(forces, list(zip(starts, ends, strict=True))), _tolerance(forces)
     normal = axes.sign * turn_matrix(axes)[axes.normal_index]
     slips_s: list[float] = []
     harmless: set[int] = set()
@@ -426,32 +395,24 @@ def _classify_jumps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[li
     for place, group in enumerate(groups):
         if not any(at in resting for at in group):
             continue
-        fall = _measure_fall(forces, force, group, normal, tolerance)
+        unloads, slips = _measure_fall(forces, force, group, normal, tolerance)
         pairs = [(before, place) for before in faulty] + [(place, later) for later in range(place + 1, len(groups))]
-        if not fall.unloads or any(
+        if not unloads or any(
             _returns(parts[leaves], parts[leaves + 1 : comes + 1], parts[comes + 1], tolerance)
             for leaves, comes in pairs
         ):
             faulty.append(place)
             continue
         harmless |= set(group)
-        if fall.slips and group[0] in resting:
+        if slips and group[0] in resting:
             slips_s.append(float(time[group[0]]))
     return [at for at in resting if at not in harmless], slips_s
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Fall:
-    """Fall of the force over a group of jumps."""
-
-    unloads: bool
-    """True where it looks like a slip or a release."""
-    slips: bool
-    """True where the pull falls and the normal force stays."""
-
-
-def _measure_fall(forces: Forces, force_n: Samples, group: list[int], normal: Axis, tolerance: _Tolerance) -> _Fall:
-    """Compare the course of the force over a group of jumps with that of a slip and of a release."""
+def _measure_fall(
+    forces: Forces, force_n: Samples, group: list[int], normal: Axis, tolerance: _Tolerance
+) -> tuple[bool, bool]:
+    """Compare the force over a group of jumps with a slip or release; whether it unloads, and whether only the pull."""
     count, near = _fit_count(forces), float(np.linalg.norm(tolerance.near_n))
     start, end = max(1, group[0] - count), min(len(force_n) - 1, group[-1] + count)
     before = np.median(force_n[max(0, start - count) : start], axis=0)
@@ -469,17 +430,11 @@ def _measure_fall(forces: Forces, force_n: Samples, group: list[int], normal: Ax
     slips = abs(fallen[0]) <= limit
     released = float(np.linalg.norm(after)) <= near + _REST_SHARE * float(np.linalg.norm(before))
     if course[0, 0] <= near or not (falls and (slips or released)):
-        return _Fall(unloads=False, slips=False)
+        return False, False
     # kinetic friction is no more than static friction: a pull that is harder later shows that nothing slipped here
     later = np.lib.stride_tricks.sliding_window_view(force_n[start:], count, axis=0).mean(axis=-1) @ basis.T
     harder = later[:, 1] / np.maximum(later[:, 0], course[0, 0] / 2) > (course[0, 1] + near) / course[0, 0]
-    return _Fall(unloads=not harder.any(), slips=bool(slips and fallen[1] > _JUMP_SHARE * _load(forces.force_n)))
-
-
-_QUIET_S = 0.3  # time about a jump in which the image moves without it
-_MOVES_SHARE = 0.3  # of the image motion at such a change of the force elsewhere in the trial
-_MOVES_SIGMAS = 4.0
-_PULLED = 0.9  # quantile of the changes of the force at which the image motion is calibrated
+    return not harder.any(), bool(slips and fallen[1] > _JUMP_SHARE * _load(forces.force_n))
 
 
 def _make_motion_test(frame_time_s: Times, image_motion: Times, forces: Forces, lag: Lag) -> ImageMotionTest:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -10,42 +11,29 @@ from sliplens.errors import RecordingError
 from sliplens.recordings.labelling import Found, FrictionEstimate
 from sliplens.recordings.labels.axes import ContactForces, Samples, Times, magnitude, mean_force, typical_step
 
-_REACH_S = 0.08  # how far the break may lie from the rough guess
-_TRIES = 41  # breaks tried over that reach
+_REACH_S, _TRIES = 0.08, 41  # how far the break may lie from the rough guess, and breaks tried over that reach
 # lengths of the fall that are tried, from a sudden drop to that of a soft fingertip
 _FALLS_S = (0.005, 0.007, 0.01, 0.014, 0.02, 0.028, 0.04, 0.056, 0.08)
-_LEAST_BEFORE, _LEAST_AFTER = 6, 3  # samples that the two sides of a break need
-_LEAST_LINE = 4  # samples that a line up to a break needs
+_LEAST_BEFORE, _LEAST_AFTER, _LEAST_LINE = 6, 3, 4  # samples that the sides of a break, and a line up to it, need
 _PARAMETERS = 7  # degrees of freedom of a fit: five coefficients, the time of the break, the end of the fall
-_MEMORY = 0.2  # residuals that correlate by more are resampled together
-_LONGEST_BLOCK = 0.1  # longest block, as a share of the samples
+_MEMORY, _LONGEST_BLOCK = 0.2, 0.1  # residuals that correlate by more are resampled together; share of the samples
 
 
-@dataclass(frozen=True, kw_only=True)
-class Break:
+class Break(NamedTuple):
     """A line that rises to a break, falls, and goes on level."""
 
     time_s: float
-    level: float
-    """At the break."""
-    levels: Float[np.ndarray, " draws"]
-    """At the breaks of the bootstrap's draws."""
+    level: float  # at the break
+    levels: Float[np.ndarray, " draws"]  # at the breaks of the bootstrap's draws
     times_s: Float[np.ndarray, " draws"]
 
 
 def fit_break(
-    time_s: Samples,
-    values: Samples,
-    *,
-    about_s: float,
-    rng: np.random.Generator,
-    draws: int,
-    reach_s: float = _REACH_S,
+    time_s: Samples, values: Samples, *, about_s: float, rng: np.random.Generator, draws: int, reach_s: float = _REACH_S
 ) -> Break:
     """Fit a parabola that at a break goes over into a fall and then a line, by least squares.
 
-    Every break within reach and a few lengths of the fall are tried; the bootstrap resamples blocks of the residuals
-    and repeats the fit. With too few samples the break is a line up to somewhere between two of them.
+    The bootstrap resamples blocks of the residuals. With too few samples the break lies between two of them.
     """
     tried = [
         (moment, fall)
@@ -68,7 +56,7 @@ def fit_break(
     residuals = (residuals - residuals.mean()) * np.sqrt(len(values) / max(1, len(values) - _PARAMETERS))
     drawn = fitted[:, None] + residuals[_blocks(residuals, draws=draws, rng=rng)]
     chosen, levels = _best(bases, triangles, drawn)
-    return Break(time_s=float(moments[index]), level=float(level), levels=levels, times_s=moments[chosen])
+    return Break(float(moments[index]), float(level), levels, moments[chosen])
 
 
 def _bracket_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.random.Generator, draws: int) -> Break:
@@ -77,18 +65,16 @@ def _bracket_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.
     near = np.flatnonzero(time_s <= about_s + typical_step(time_s) / 2)
     before = near[max(0, len(near) - _LEAST_BEFORE) : np.argmax(values[near]) + 1] if len(near) else near
     if len(before) < _LEAST_LINE or before[-1] + 1 == len(time_s):
-        raise RecordingError(
-            f"only {np.sum(time_s < about_s)} samples before the slip at {about_s:.2f} s and "
-            f"{np.sum(time_s > about_s)} after it can be used; record the forces faster or give the friction with --mu"
+        few = (
+            f"only {np.sum(time_s < about_s)} samples before the slip at {about_s:.2f} s and {np.sum(time_s > about_s)}"
         )
+        raise RecordingError(f"{few} after it can be used; record the forces faster or give the friction with --mu")
     last_s, next_s = time_s[before[-1] : before[-1] + 2]
     line = np.polynomial.Polynomial.fit(time_s[before], values[before], 1)
     noise = np.std(values[before] - line(time_s[before]), ddof=2)
     times = rng.uniform(last_s, next_s, draws)
     middle = float(last_s + next_s) / 2
-    return Break(
-        time_s=middle, level=float(line(middle)), levels=line(times) + rng.normal(0, noise, draws), times_s=times
-    )
+    return Break(middle, float(line(middle)), line(times) + rng.normal(0, noise, draws), times)
 
 
 def _best(
@@ -122,31 +108,24 @@ def _blocks(residuals: Samples, *, draws: int, rng: np.random.Generator) -> Int[
     return (starts + np.arange(length)[:, None]).reshape(-1, draws)[:count]
 
 
-# times over which the forces are averaged to find roughly where the ratio breaks off: the longer finds faint falls
-_WINDOWS_S = (0.03, 0.1)
-_DROP_SIGMAS = 5.0  # a fall of the averaged ratio by so many standard deviations of its noise is significant
-_DROP_SHARE = 0.03  # and by so much of the ratio: less is a wobble of the hand that pulls
+_WINDOWS_S = (0.03, 0.1)  # over which forces are averaged to find a break roughly: the longer finds faint falls
+# a fall of the averaged ratio is significant by its noise, and by its size: less is a wobble of the hand that pulls
+_DROP_SIGMAS, _DROP_SHARE = 5.0, 0.03
 _DROP_S = 0.25  # time in which the ratio must have fallen: slip is sudden, a release is slow
-# where the normal force is this share of its largest: in a light touch the ratio is all noise
-_PRESSED_SHARE = 0.25
+_PRESSED_SHARE = 0.25  # of the largest normal force: in a lighter touch the ratio is all noise
 _STEP_S = 0.06  # time over which the ratio before and after a fall is compared to place it
-_NORMAL_SHARE = 0.5  # a fall across which less than this share of the normal force stays is a release, not slip
+_NORMAL_SHARE = 0.5  # of the normal force that stays in a slip; less stays in a release
 _SUDDEN = 1.5  # the fall of a slip is so many times that in as long a time before or after it
-# kinetic friction, and the dip of a puller that springs back, is a larger share of static friction than this; a pull
-# that is released falls to nothing
-_SLIDING_SHARE = 0.3
+_SLIDING_SHARE = 0.3  # of static friction: kinetic friction is more; a pull that is released falls to nothing
 _PULL_SHARE = 0.5  # share of the fall of the ratio that the pull falls by: a firmer press alone is no slip
 _APART_S = 0.1  # a load that is lost for less time is the same contact
-# time before its break in which the ratio is fitted: the longer is more exact, unless the pull was no parabola so long
-_BEFORE_S = (0.6, 0.25, 0.1)
-_AFTER_S = 0.2  # and after it
+# time about its break in which the ratio is fitted: the longer is more exact, unless the pull was no parabola so long
+_BEFORE_S, _AFTER_S = (0.6, 0.25, 0.1), 0.2
 _LIKE_SHARE, _LIKE_SIGMAS = 0.02, 5.0  # a parabola that ends this far from the largest mean ratio there was none
 _BEFORE_STEPS, _AFTER_STEPS = 12, 6  # and of slow samples at least so many
 _BAND = (0.16, 0.84)  # quantiles that hold 68 %
-_IMAGE_SIGMAS = 3.0  # an image that moves by so many standard deviations more than before shows the slip
-_QUIET_S = 0.5  # time before the onset in which the image moves without slip
-_LAW_SIGMAS = 3.0  # by more standard deviations a ratio contradicts the friction
-_LAW_SHARE = 0.01  # and by more of the friction: a break lies between samples, and its level is no more exact
+_IMAGE_SIGMAS, _QUIET_S = 3.0, 0.5  # image motion that shows the slip, against that of so long a time before
+_LAW_SIGMAS, _LAW_SHARE = 3.0, 0.01  # a ratio contradicts the friction by more of both: a break lies between samples
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,16 +133,35 @@ class ImageMotion:
     """Difference of each frame from the one before, at the times of the frames on the clock of the force sensor."""
 
     time_s: Float[np.ndarray, " frames"]
-    motion: Float[np.ndarray, " frames"]
-    """See `measure_motion`; the first value is not used."""
+    motion: Float[np.ndarray, " frames"]  #: See `measure_motion`; the first value is not used.
+
+
+class _Slip(NamedTuple):
+    """Onset of a slip, and the friction at it with its 68 % interval; None where the samples about it are too few."""
+
+    time_s: float
+    mu: float | None = None
+    low: float = np.nan
+    high: float = np.nan
+    sigma_s: float | None = None
+
+
+class _MeanRatio(NamedTuple):
+    """Forces averaged about each sample, and their ratio where something presses; 0 elsewhere."""
+
+    time_s: Samples
+    normal_n: Samples
+    tangential_n: Samples
+    ratio: Samples
+    sigma: Samples  # of the ratio's noise
+    least: Samples  # ratio less 5 standard deviations of its noise
+    tare_sigma: Samples  # of the ratio for the uncertainty of the tare
+    pressed: Bool[np.ndarray, " samples"]  # the normal force is large enough for a ratio
+    pulled: Bool[np.ndarray, " samples"]  # the tangential force is more than noise, too
 
 
 def find_contacts(forces: ContactForces, *, contact_threshold_n: float) -> tuple[tuple[float, float], ...]:
-    """Find the contacts: spans of time, in seconds, each from a touch to its release.
-
-    A load below a quarter of the largest is no contact of its own, and one that is lost for less than a tenth of a
-    second continues.
-    """
+    """Find the contacts: spans of time, in seconds, each from a touch to its release; light or short ones are none."""
     time = forces.time_s
     normal = mean_force(time, forces.normal_n, time, window_s=_STEP_S)
     edges = np.flatnonzero(np.diff(normal > contact_threshold_n, prepend=False, append=False))
@@ -191,18 +189,11 @@ def estimate_friction(
     A slip is a sudden fall of F_t / F_n while the normal force stays, from a height that the contact exceeds neither
     before nor after it. About the first slip the ratio is fitted by a line that breaks off: rising until the onset,
     falling after it; mu_s is its value at the break. Of several falls of a contact the first at which the image moves
-    counts, or else the first. Below `contact_threshold_n`, a normal force in newtons, the ratio is ignored.
-    `friction_change` is the relative standard deviation by which friction may change within the trial.
+    counts, or else the first. `friction_change` is the relative standard deviation of friction within the trial.
 
     Friction and slip are independent: where `slip_s` sets the onset, in seconds, the ratio breaks off there; where `mu`
     sets the friction, the slips are found as well. If the friction contradicts the forces, because the ratio exceeds it
     or slips elsewhere by more than 3 sigma, the difference counts as an error, and the notes give the numbers.
-
-    Raises
-    ------
-    RecordingError
-        If nothing slips and `mu` is None: the friction is larger than every ratio, and otherwise unknown. If too few
-        samples lie about the slip that is to give the friction, or nothing presses before it.
     """
     spans = find_contacts(forces, contact_threshold_n=contact_threshold_n)
     means = [_mean_ratio(forces, window_s=window_s, contact_threshold_n=contact_threshold_n) for window_s in _WINDOWS_S]
@@ -224,25 +215,21 @@ def estimate_friction(
         except RecordingError:
             if mu is None and not slips:
                 raise
-            slips.append(_Slip(time_s=time_s))  # the friction is known without it
+            slips.append(_Slip(time_s))  # the friction is known without it
     # the window that shows most surely how far the ratio reaches
     mean = max(means, key=lambda mean: float(mean.least.max()))
     highest = int(np.argmax(mean.least))
     if mu is not None:
         estimate = FrictionEstimate(mu=mu, low=mu, high=mu)
     elif not slips:
-        raise RecordingError(
-            f"the trial never slips (F_t / F_n reaches {mean.ratio[highest]:.2f} without breaking off), so its "
-            "friction is unknown; give it with --mu, or in the column mu of a manifest"
-        )
+        never = f"the trial never slips (F_t / F_n reaches {mean.ratio[highest]:.2f} without breaking off)"
+        raise RecordingError(f"{never}, so its friction is unknown; give it with --mu, or in a manifest")
     else:
         first, method = slips[0], "F_t / F_n at the slip set by hand"
         assert first.mu is not None  # a slip without a friction was refused above
         if first.low <= 0:
-            raise RecordingError(
-                f"the slip at {first.time_s:.2f} s gives a friction of {first.mu:.2g} with a 68 % interval from "
-                f"{first.low:.2g} to {first.high:.2g}, which is none; give the coefficient of friction with --mu"
-            )
+            interval = f"{first.mu:.2g} with a 68 % interval from {first.low:.2g} to {first.high:.2g}, which is none"
+            raise RecordingError(f"the slip at {first.time_s:.2f} s gives a friction of {interval}; give it with --mu")
         if first.time_s != slip_s:
             visible = (_image_sigmas(image, first.time_s) or 0) >= _IMAGE_SIGMAS
             method = "break of F_t / F_n" + (", seen in the image" if visible else "")
@@ -266,8 +253,8 @@ def estimate_friction(
 
 def _find_contradictions(
     friction: FrictionEstimate,
-    slips: "Sequence[_Slip]",
-    means: "_MeanRatio",
+    slips: Sequence[_Slip],
+    means: _MeanRatio,
     *,
     slip_s: float | None,
     friction_change: float,
@@ -275,15 +262,14 @@ def _find_contradictions(
     """Compare a friction with the forces; returns the contradictions, and the error of the friction for them."""
     mu, declared, ratio, time = friction.mu, friction.found is Found.DECLARED, means.ratio, means.time_s
     written = f"{mu:.2f}" if declared else f"{mu:.2f} ({friction.low:.2f} to {friction.high:.2f})"
-    notes, error = [], 0.0
+    notes, error, counts = [], 0.0, "whose difference counts as an error of the friction"
     if declared and slips and slips[0].mu is not None:
         first, apart = slips[0], abs(slips[0].mu - mu)
         if apart > max(_LAW_SIGMAS * (first.high - first.low) / 2, _LAW_SHARE * mu):
-            notes.append(
-                f"F_t / F_n is {first.mu:.2f} ({first.low:.2f} to {first.high:.2f}) at the slip at "
-                f"{first.time_s:.2f} s, and a friction of {written} was given: the difference counts as an error of "
-                "the friction; leave --mu out, or set the slip where F_t / F_n falls with --slip-s"
+            slip = (
+                f"F_t / F_n is {first.mu:.2f} ({first.low:.2f} to {first.high:.2f}) at the slip at {first.time_s:.2f} s"
             )
+            notes.append(f"{slip}, and a friction of {written} was given, {counts}; leave --mu out, or give --slip-s")
             error = apart
     highest = int(np.argmax(means.least))
     # the uncertainty of a friction that comes from these forces includes their tare
@@ -295,120 +281,68 @@ def _find_contradictions(
     if not notes and means.least[highest] > mu + max(_LAW_SIGMAS * sigma, _LAW_SHARE * mu):
         when = "before" if onset_s is None or time[highest] < onset_s else "after"
         where = "nothing slips" if onset_s is None else f"{when} the slip at {onset_s:.2f} s"
-        notes.append(
-            f"F_t / F_n reaches {ratio[highest]:.2f} at {time[highest]:.2f} s, {where}, and the friction is {written}: "
-            "the difference counts as an error of the friction; set the slip where F_t / F_n falls with --slip-s, or "
-            "give the friction with --mu"
-        )
+        reaches = f"F_t / F_n reaches {ratio[highest]:.2f} at {time[highest]:.2f} s, {where}"
+        notes.append(f"{reaches}, and the friction is {written}, {counts}; set the slip with --slip-s, or give --mu")
         error = float(ratio[highest]) - mu
     if slip_s is not None:
         before = ratio[(time > slip_s - _DROP_S) & (time <= slip_s) & means.pulled]
         after = ratio[(time > slip_s) & (time <= slip_s + 2 * _DROP_S) & means.pulled]
         if len(before) and len(after) and after.min() > (1 - _DROP_SHARE) * before.mean():
+            levels = f"it is {before.mean():.2f} before it and at least {after.min():.2f} after it"
             notes.append(
-                f"F_t / F_n does not fall at the slip that was set to {slip_s:.2f} s: it is {before.mean():.2f} before "
-                f"it and at least {after.min():.2f} after it; set the slip where F_t / F_n falls"
+                f"F_t / F_n does not fall at the slip that was set to {slip_s:.2f} s: {levels}; set it where it falls"
             )
     return notes, error
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Slip:
-    """Onset of a slip, and the friction at it; None where the samples about it are too few."""
-
-    time_s: float
-    mu: float | None = None
-    low: float = np.nan
-    high: float = np.nan
-    """Ends of the 68 % interval."""
-    sigma_s: float | None = None
 
 
 def _fit_slip(
     forces: ContactForces,
     rough_s: float,
     *,
-    means: "_MeanRatio",
+    means: _MeanRatio,
     contact_threshold_n: float,
     reach_s: float,
     rng: np.random.Generator,
     draws: int,
 ) -> _Slip:
     """Fit the break of the ratio about the rough time of a slip."""
-    options = {"contact_threshold_n": contact_threshold_n, "reach_s": reach_s, "rng": rng, "draws": draws}
-    fit, normal_n = _fit_near(forces, rough_s, before_s=_BEFORE_S[0], **options)
+    step = typical_step(forces.time_s)
+
+    def fit_near(before_s: float) -> tuple[Break, float]:
+        near = forces.time_s >= rough_s - max(before_s, _BEFORE_STEPS * step)
+        near &= forces.time_s <= rough_s + max(_AFTER_S, _AFTER_STEPS * step)
+        near &= forces.normal_n > contact_threshold_n
+        before = near & (forces.time_s <= rough_s)
+        if not before.any():
+            raise RecordingError(f"nothing presses before the slip at {rough_s:.2f} s; set it later")
+        pull = forces.tangential_n[before].mean(axis=0)
+        # along the direction of the pull: a projection is not biased by noise
+        ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
+        fit = fit_break(forces.time_s[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
+        return fit, float(forces.normal_n[near].mean())
+
+    fit, normal_n = fit_near(_BEFORE_S[0])
     for before_s in _BEFORE_S[1:]:
         top = np.abs(means.time_s - fit.time_s) <= _STEP_S
         apart = abs(fit.level - means.ratio[top].max(initial=0.0))
         if reach_s == 0 or apart <= _LIKE_SHARE * fit.level + _LIKE_SIGMAS * means.sigma[top].max(initial=0.0):
             break
-        fit, normal_n = _fit_near(forces, rough_s, before_s=before_s, **options)
+        fit, normal_n = fit_near(before_s)
     # no resampling of the slip can show the uncertainty of the tare
     (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
     tare = np.hypot(tangential, fit.level * normal)
     low, high = np.quantile(fit.levels + rng.normal(0, float(tare) / normal_n, draws), _BAND)
     early, late = np.quantile(fit.times_s, _BAND)
     return _Slip(
-        time_s=fit.time_s,
-        mu=fit.level,
-        low=float(min(low, fit.level)),
-        high=float(max(high, fit.level)),
-        sigma_s=float(late - early) / 2,
+        fit.time_s, fit.level, float(min(low, fit.level)), float(max(high, fit.level)), float(late - early) / 2
     )
-
-
-def _fit_near(
-    forces: ContactForces,
-    rough_s: float,
-    *,
-    before_s: float,
-    contact_threshold_n: float,
-    reach_s: float,
-    rng: np.random.Generator,
-    draws: int,
-) -> tuple[Break, float]:
-    """Fit the break to the ratio from some time before a slip on, and take the mean normal force there."""
-    step = typical_step(forces.time_s)
-    near = forces.time_s >= rough_s - max(before_s, _BEFORE_STEPS * step)
-    near &= forces.time_s <= rough_s + max(_AFTER_S, _AFTER_STEPS * step)
-    near &= forces.normal_n > contact_threshold_n
-    before = near & (forces.time_s <= rough_s)
-    if not before.any():
-        raise RecordingError(
-            f"nothing presses before the slip at {rough_s:.2f} s; set it later, or the contact earlier"
-        )
-    pull = forces.tangential_n[before].mean(axis=0)
-    # along the direction of the pull: a projection is not biased by noise
-    ratio = forces.tangential_n[near] @ (pull / np.linalg.norm(pull)) / forces.normal_n[near]
-    fit = fit_break(forces.time_s[near], ratio, about_s=rough_s, rng=rng, draws=draws, reach_s=reach_s)
-    return fit, float(forces.normal_n[near].mean())
-
-
-@dataclass(frozen=True, kw_only=True)
-class _MeanRatio:
-    """Forces averaged about each sample, and their ratio where something presses; 0 elsewhere."""
-
-    time_s: Samples
-    normal_n: Samples
-    tangential_n: Samples
-    ratio: Samples
-    sigma: Samples
-    """Standard deviation of the ratio's noise."""
-    least: Samples
-    """Ratio less 5 standard deviations of its noise."""
-    tare_sigma: Samples
-    """Standard deviation of the ratio for the uncertainty of the tare."""
-    pressed: Bool[np.ndarray, " samples"]
-    """True where the normal force is large enough for a ratio."""
-    pulled: Bool[np.ndarray, " samples"]
-    """True where the tangential force is more than noise, too."""
 
 
 def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: float) -> _MeanRatio:
     time = forces.time_s
     normal = mean_force(time, forces.normal_n, time, window_s=window_s)
-    noise = forces.noise_of_means_n(window_s)
-    tangential = magnitude(mean_force(time, forces.tangential_n, time, window_s=window_s), sigma_n=noise.tangential)
+    normal_noise, noise = forces.noise_of_means_n(window_s)
+    tangential = magnitude(mean_force(time, forces.tangential_n, time, window_s=window_s), sigma_n=noise)
     pressed = normal > max(contact_threshold_n, _PRESSED_SHARE * normal.max())
     # the window shrinks at the ends, where a single sample's noise is no fall
     pressed &= (time - time[0] >= window_s / 2) & (time[-1] - time >= window_s / 2)
@@ -416,20 +350,11 @@ def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: 
     pressed &= time >= (-np.inf if forces.axes.still_until_s is None else forces.axes.still_until_s)
     safe = np.where(pressed, normal, 1)
     ratio = np.where(pressed, tangential / safe, 0)
-    sigma = np.where(pressed, np.hypot(noise.tangential, ratio * noise.normal) / safe, 0)
+    sigma = np.where(pressed, np.hypot(noise, ratio * normal_noise) / safe, 0)
     normal_tare, tangential_tare = forces.tare_sigma_n(time)
     tare = np.where(pressed, np.hypot(tangential_tare, ratio * normal_tare) / safe, 0)
-    return _MeanRatio(
-        time_s=time,
-        normal_n=normal,
-        tangential_n=tangential,
-        ratio=ratio,
-        sigma=sigma,
-        least=ratio - _DROP_SIGMAS * sigma,
-        tare_sigma=tare,
-        pressed=pressed,
-        pulled=pressed & (tangential > 3 * noise.tangential),
-    )
+    least, pulled = ratio - _DROP_SIGMAS * sigma, pressed & (tangential > 3 * noise)
+    return _MeanRatio(time, normal, tangential, ratio, sigma, least, tare, pressed, pulled)
 
 
 def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_change: float) -> list[float]:

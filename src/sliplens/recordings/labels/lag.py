@@ -24,15 +24,18 @@ def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
 
 
 Intervals: TypeAlias = Float[np.ndarray, " intervals"]
-_STEPS_A_FRAME = 16  # lags tried in the time of a frame; between them the peak is a parabola's
-_LEAST_LAG_S = 5e-4  # a tenth of what a lag is known to: of a fast camera the lags would be too many
+# lags tried in the time of a frame, and least step between them; between them the peak is a parabola's
+_STEPS_A_FRAME, _LEAST_LAG_S = 16, 5e-4
 _BLOCKS = 24  # stretches of a trial that are resampled: long enough to hold a slip, many enough to draw from
-_LEAST_INTERVALS = 2 * _BLOCKS
-_LEAST_CORRELATION = 0.3
+_LEAST_INTERVALS, _LEAST_CORRELATION = 2 * _BLOCKS, 0.3
 _OVERLAP = 0.7  # share of the frames that must have forces for a lag to be tried
-_LOAD_WINDOW_S = 0.03  # time over which the load is averaged to find its release
-_PART = (0.25, 0.75)  # shares of the load in hold between which a release is timed
+_LOAD_WINDOW_S, _PART = 0.03, (0.25, 0.75)  # of the load whose release is timed between these shares of it
 _SUDDEN_STEPS = 2.0  # a fall between these within so many frames has a sharp time, however the gel yields
+_LOADED_SHARE = 0.15  # of the load of a trial: a larger force is a contact
+_APART_S = 0.3  # contacts that are closer are one, and the image may move as long about it
+_LEAST_FRAMES = 24  # of fewer, noise alone correlates by as much as a contact does
+# quantile of the image motion in the contacts, and the share of it that shows another contact in as many frames
+_MOVES, _LEAST_MOVES = (0.98, 0.5), 3
 
 
 def estimate_lag(
@@ -46,22 +49,16 @@ def estimate_lag(
 ) -> Lag:
     """Estimate the lag by cross-correlation of image motion and force rate, each frame keeping its own time.
 
-    For every lag tried, the force is averaged about the lagged time of each frame; the length of its change from frame
-    to frame is correlated with the motion of the image. The length depends on neither axes, signs nor tare, which may
-    all still be wrong. A contact yields the more the lighter it is loaded, so the image leads the force in a press and
-    trails it in a release; a release weighs no more than makes the two cancel. The uncertainty is the spread of the
-    peak when stretches of the trial are resampled.
-
-    `image_motion` is that of `measure_motion`, its first value not used; `longest_s` the longest lag tried, either way.
-    Frames that no lag brings to the forces, as of a camera that ran on, are ignored. With too few frames the lag is 0,
-    and its doubt says why. Forces without a frame are a `RecordingError`.
+    For every lag tried, the length of the change of the force from frame to frame is correlated with the motion of the
+    image; it depends on neither axes, signs nor tare. A contact yields the more the lighter it is loaded, so the image
+    leads the force in a press and trails it in a release; a release weighs no more than makes the two cancel. The
+    uncertainty is the spread of the peak when stretches of the trial are resampled. With too few frames the lag is 0,
+    and its doubt says why. `longest_s` is the longest lag tried, either way.
     """
     reached = (frame_time_s >= forces.time_s[0] - longest_s) & (frame_time_s <= forces.time_s[-1] + longest_s)
     if not reached.any():
-        raise RecordingError(
-            f"no lag up to {longest_s:g} s lets the forces of {forces.source} cover the frames; "
-            "bring both clocks to the same zero on import"
-        )
+        covers = f"no lag up to {longest_s:g} s lets the forces of {forces.source} cover the frames"
+        raise RecordingError(f"{covers}; bring both clocks to the same zero on import")
     frame_time_s, image_motion = frame_time_s[reached], image_motion[reached]
     intervals = len(frame_time_s) - 1
     if intervals < _LEAST_INTERVALS:
@@ -81,23 +78,16 @@ def estimate_lag(
     if release is not None:
         # the same weights for every lag: a share that depends on the lag would prefer some
         top = int(np.argmax(_correlations(weights[:1], motion, changes=changes, covered=covered)[0]))
-        weights *= _balance(frame_time_s[1:] - lags[top], changes[top], release)
+        # a peak of rate r and duration T has a curvature of r^2 / T and an error of T, and r T is the load of both:
+        # press and release have the same influence on the lag where they weigh by r^2
+        time_s, (pressed_s, let_go_s) = frame_time_s[1:] - lags[top], release
+        press, fall = (float(changes[top][part].max(initial=0)) for part in (time_s <= pressed_s, time_s > let_go_s))
+        weights *= np.where(time_s > let_go_s, min(1.0, (press / max(fall, 1e-9)) ** 2), 1.0)
     curves = _correlations(weights, motion, changes=changes, covered=covered)
     peaks = np.array([_peak(lags, curve) for curve in curves])
     low, high = np.quantile(peaks[1:], (0.16, 0.84))
     lag, sigma, correlation = float(peaks[0]), float(high - low) / 2, float(curves[0].max())
     return Lag(lag_s=lag, sigma_s=sigma, correlation=correlation, doubt=_doubt(lag, sigma, correlation, lags))
-
-
-def _balance(time_s: Intervals, changes: Intervals, release: tuple[float, float]) -> Intervals:
-    """Return weights that give press and release the same influence on the lag.
-
-    A peak of rate r and duration T has a curvature of r^2 / T and an error of T, and r T is the load of both: so the
-    influence is r^2.
-    """
-    pressed_s, let_go_s = release
-    press, fall = (float(changes[part].max(initial=0)) for part in (time_s <= pressed_s, time_s > let_go_s))
-    return np.where(time_s > let_go_s, min(1.0, (press / max(fall, 1e-9)) ** 2), 1.0)
 
 
 def _find_release(forces: Forces, *, sudden_s: float) -> tuple[float, float] | None:
@@ -124,21 +114,13 @@ def force_changes(time_s: Float[np.ndarray, " frames"], forces: Forces) -> Float
     return np.linalg.norm(np.diff(force, axis=0), axis=1)
 
 
-_LOADED_SHARE = 0.15  # of the load of a trial: a larger force is a contact
-_APART_S = 0.3  # contacts that are closer are one, and the image may move as long about it
-_LEAST_FRAMES = 24  # of fewer, noise alone correlates by as much as a contact does
-_MOVES = (0.98, 0.5)  # quantile of the image motion in the contacts, and the share of it that shows another contact
-_LEAST_MOVES = 3  # frames
-
-
 def doubt_agreement(
     frame_time_s: Float[np.ndarray, " frames"], image_motion: Float[np.ndarray, " frames"], forces: Forces, lag: Lag
 ) -> tuple[str, ...]:
     """Describe the contacts in which the image does not move as the force changes, a sentence each.
 
-    A contact is a stretch in which the force departs from that of the untouched sensor; where it never does, the whole
-    trial is compared. Of the correlations of the values and of their logarithms the larger counts: the first is that of
-    press and slip, the second does not break where a single fast change falls between two frames.
+    Of the correlations of the values and of their logarithms the larger counts: the first is that of press and slip,
+    the second does not break where a single fast change falls between two frames.
     """
     time = frame_time_s - lag.lag_s
     change = np.append(np.nan, force_changes(time, forces))
@@ -154,8 +136,7 @@ def doubt_agreement(
         if correlation < _LEAST_CORRELATION:
             doubts.append(
                 f"image and force do not move together from {time[some][0]:.2f} to {time[some][-1]:.2f} s (correlation "
-                f"{correlation:.2f}, {_LEAST_CORRELATION} is needed); check that the forces are those of this video, "
-                "and that camera and force sensor ran"
+                f"{correlation:.2f}, {_LEAST_CORRELATION} is needed); check that the forces are those of this video"
             )
     idle = covered & ~np.any(near, axis=0)
     if near and not doubts and idle.any():

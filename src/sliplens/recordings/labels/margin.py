@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias, TypeVar
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -31,20 +31,15 @@ Frames: TypeAlias = Float[np.ndarray, " frames"]
 _NO_FLAG = 1e-6  # rounding of a mean of flags that are all 0
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameForces:
-    """Forces at the times of frames."""
+class FrameForces(NamedTuple):
+    """Forces at the times of frames, and their standard uncertainties from noise and tare."""
 
     normal_n: Frames
-    tangential_n: Frames
-    """Length of the tangential force."""
+    tangential_n: Frames  # length
     normal_sigma_n: Frames
-    """Standard uncertainty, from noise and tare."""
     tangential_sigma_n: Frames
-    missing: Bool[np.ndarray, " frames"]
-    """True where the neighbouring samples are too far apart, or missing on one side."""
-    out_of_range: Bool[np.ndarray, " frames"]
-    """True where a sample in the window of a frame reaches the end of the sensor's range."""
+    missing: Bool[np.ndarray, " frames"]  # the neighbouring samples are too far apart, or missing on one side
+    out_of_range: Bool[np.ndarray, " frames"]  # a sample in the window reaches the end of the sensor's range
 
 
 def interpolate_forces(
@@ -60,8 +55,9 @@ def interpolate_forces(
     # a shorter window averages less noise away, at worst none
     length = 2 * half_window(samples, np.clip(time_s, samples[0], samples[-1]), window_s=window_s, until_s=until_s)
     more = np.sqrt(window_s / np.maximum(length, 1e-9))
-    normal_noise = np.minimum(noise.normal * more, max(sample_noise.normal, noise.normal))
-    tangential_noise = np.minimum(noise.tangential * more, max(sample_noise.tangential, noise.tangential))
+    normal_noise, tangential_noise = (
+        np.minimum(mean * more, max(sample, mean)) for mean, sample in zip(noise, sample_noise, strict=True)
+    )
     normal_tare, tangential_tare = forces.tare_sigma_n(time_s)
     # the neighbours of a time on a sample are both that sample
     before = samples[np.maximum(np.searchsorted(samples, time_s, side="right") - 1, 0)]
@@ -79,13 +75,16 @@ def interpolate_forces(
     )
 
 
-_CONTACT_SIGMAS = 8.0  # least normal force of a contact, in standard deviations of its noise
-_CONTACT_SHARE = 0.05  # and as a share of the trial's largest: of a lighter touch the margin would be all noise
-LARGEST_SIGMA = 0.2
-"""Largest standard uncertainty of a valid margin: beyond, full stick and slip are hardly different."""
+# least normal force of a contact, by its noise and its largest: of a lighter touch the margin would be all noise
+_CONTACT_SIGMAS, _CONTACT_SHARE = 8.0, 0.05
+LARGEST_SIGMA = 0.2  #: Largest standard uncertainty of a valid margin: beyond, full stick and slip are hardly different
 _STUCK_SIGMAS = 2.0  # a margin nearer to 1 than so many standard deviations cannot be told from full stick
-# frames on either side over which the rate of the margin is measured: fewer would show the noise
-_RATE_STEPS = 3.0
+_RATE_STEPS = 3.0  # frames on either side over which the rate of the margin is measured: fewer would show the noise
+_MOST_LOST = 0.5  # share of the samples between touch and slip that may be faulty
+_PLAUSIBLE_FRICTION, _USUAL_FRICTION = (0.05, 4.0), 1.5  # of soft skins on anything; of dry rubber on glass
+# half way, by ratio, from equal lengths to one that is half the other: a rate is usually wrong by two or more
+_LIKE_SPANS = 0.7
+_NEAR_LAG_S = 0.12  # clocks that run alike fit best within some frames; others, if at all, far off
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +107,7 @@ class FoundLabels(Labels):
 def contact_threshold(forces: ContactForces, *, window_s: float) -> float:
     """Return the least normal force of a contact: well above the noise, and a small share of the largest force."""
     smooth = mean_force(forces.time_s, forces.normal_n, forces.time_s, window_s=window_s)
-    return float(max(_CONTACT_SIGMAS * forces.noise_of_means_n(window_s).normal, _CONTACT_SHARE * smooth.max(), 1e-9))
+    return float(max(_CONTACT_SIGMAS * forces.noise_of_means_n(window_s)[0], _CONTACT_SHARE * smooth.max(), 1e-9))
 
 
 def label_frames(
@@ -123,12 +122,10 @@ def label_frames(
 ) -> FoundLabels:
     """Label frames, each at its own time.
 
-    The force of a frame is the mean over its time of the line through the samples; no window reaches over the onset of
-    slip. Noise, tare, friction, lag and a change of the friction on the way to the slip all enter the uncertainty of
-    the margin, as independent of each other. A lag that is known but not applied counts as an error of its size.
-    Where the friction has no onset, gross slip begins with the first frame whose forces clearly lie outside the
-    friction cone. It lasts until the contact is released and loaded again. To apply a lag that is unknown or doubtful
-    is a `RecordingError`.
+    The force of a frame is the mean over its time; no window reaches over the onset of slip. Noise, tare, friction, lag
+    and a change of the friction enter the uncertainty of the margin, as independent of each other; a lag that is known
+    but not applied counts as an error of its size. Where the friction has no onset, gross slip begins with the first
+    frame whose forces clearly lie outside the friction cone, and lasts until the contact is loaded again.
     """
     apply_lag = settings.apply_lag or settings.lag_ms is not None
     if apply_lag and (lag is None or lag.doubt):
@@ -154,7 +151,10 @@ def label_frames(
     end = np.where(time < onset, np.minimum(time + reach, onset - window / 2), time + reach)
     early, late = (_used(forces_at(moment), friction, threshold) for moment in (end - 2 * reach, end))
     swing = (late - early) / 2 * unsure / reach
-    drift = settings.friction_change * _remaining(time, contact, until_s=onset)
+    drift = np.zeros(len(time))
+    if contact.any():  # distance in time from the slip, as a share of the time from touch to slip, at most 1
+        touch, last = time[np.argmax(contact)], min(onset, time[-1])
+        drift = settings.friction_change * np.clip(np.abs(last - time) / max(last - touch, 1e-9), 0, 1)
     sigma = np.sqrt(_variance(at, friction, threshold) + swing**2 + (used * drift) ** 2)
 
     fault = np.zeros(len(time), dtype=np.int64) if screened is None else screened.codes_at(time, window_s=window)
@@ -209,7 +209,7 @@ def label_frames(
 
 
 def _used(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Frames:
-    """Return the used share of the friction, F_t / (mu F_n), with at least the threshold for F_n."""
+    """Compute the used share of the friction, F_t / (mu F_n), with at least the threshold for F_n."""
     return at.tangential_n / (friction.mu * np.maximum(at.normal_n, threshold_n))
 
 
@@ -223,18 +223,10 @@ def _variance(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -
     )
 
 
-def _remaining(time_s: Frames, contact: Bool[np.ndarray, " frames"], *, until_s: float) -> Frames:
-    """Return the distance in time from the slip, as a share of the time from touch to slip, at most 1."""
-    if not contact.any():
-        return np.zeros(len(time_s))
-    touch, end = time_s[np.argmax(contact)], min(until_s, time_s[-1])
-    return np.clip(np.abs(end - time_s) / max(end - touch, 1e-9), 0, 1)
-
-
 def _after_slips(
     time_s: Frames, onsets_s: Sequence[float], contacts: Sequence[tuple[float, float]]
 ) -> Bool[np.ndarray, " frames"]:
-    """Return True for frames of a contact that has slipped, until it is released and loaded again."""
+    """Find the frames of a contact that has slipped, until it is released and loaded again."""
     slipped = np.zeros(len(time_s), dtype=bool)
     for onset_s in onsets_s:
         anew_s = next((start_s for start_s, _ in contacts if start_s > onset_s), np.inf)
@@ -269,12 +261,6 @@ def label_trial(
 
     The lag is estimated even if it is not applied, to compare the image with falls of the force, unless it is an
     argument or set in `settings`.
-
-    Raises
-    ------
-    RecordingError
-        If nothing touches, no tangential force was recorded, the trial never slips and its friction is unknown, a
-        doubtful lag is to be applied, or a setting lies outside the trial.
     """
     if lag is None and settings.lag_ms is not None:
         lag = Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0)
@@ -295,25 +281,15 @@ def require_inside(settings: LabelSettings, *, frames: int, time_s: Frames) -> N
     """Check that the settings lie within a trial of so many frames, with force samples at these times."""
     for first, last in settings.bad_frames:
         if not 0 <= first <= last < frames:
-            raise RecordingError(
-                f"frames {first} to {last} cannot be marked as bad: the trial has frames 0 to {frames - 1}; name the "
-                "first and the last of a span in it"
-            )
+            raise RecordingError(f"frames {first} to {last} cannot be marked as bad: name them from 0 to {frames - 1}")
     if settings.reference_frame is not None and not 0 <= settings.reference_frame < frames:
-        raise RecordingError(
-            f"the reference is frame {settings.reference_frame} of {frames}; name one from 0 on that is there"
-        )
+        raise RecordingError(f"the reference is frame {settings.reference_frame} of {frames}; name one from 0 on")
     begin, end = float(time_s[0]), float(time_s[-1])
     for event, at_s in (("contact", settings.contact_s), ("slip", settings.slip_s)):
         if at_s is not None and not begin <= at_s <= end:
-            raise RecordingError(
-                f"the {event} is set to {at_s:.2f} s, and the forces are from {begin:.2f} to {end:.2f} s; set it within"
-            )
+            raise RecordingError(f"the {event} is set to {at_s:.2f} s; set it from {begin:.2f} to {end:.2f} s")
     if settings.contact_s is not None and settings.slip_s is not None and settings.slip_s <= settings.contact_s:
-        raise RecordingError(
-            f"the slip is set to {settings.slip_s:.2f} s and the contact to {settings.contact_s:.2f} s, after it; set "
-            "the contact first"
-        )
+        raise RecordingError(f"the slip is set to {settings.slip_s:.2f} s, before the contact; set the contact first")
 
 
 def _label_screened(
@@ -338,11 +314,8 @@ def _label_screened(
     contact = apply_axes(forces, axes)
     if not np.ptp(contact.tangential_n, axis=0).any():
         # a sensor that measures it has noise, a simulated pull changes
-        raise RecordingError(
-            f"{forces.source} has no tangential force (both axes but {axes.normal} never change), and a safety margin "
-            "needs it; name the columns of all axes with --force-columns, or go without margins: sliplens track "
-            "follows the markers"
-        )
+        never = f"{forces.source} has no tangential force (both axes but {axes.normal} never change)"
+        raise RecordingError(f"{never}, and a margin needs it; name the columns of all axes with --force-columns")
     threshold = settings.contact_threshold
     if threshold is None:
         threshold = contact_threshold(contact, window_s=typical_step(frame_time_s))
@@ -360,10 +333,7 @@ def _label_screened(
         pull = (screened.recorded.time_s > begin) & (screened.recorded.time_s < friction.onset_s)
         lost = np.isin(screened.recorded.time_s[pull], forces.time_s, invert=True)
         if lost.sum() > _MOST_LOST * len(lost):
-            raise RecordingError(
-                "most samples between touch and slip are faulty, so the contact may have slipped before; give "
-                "the coefficient of friction with --mu, or record the trial again"
-            )
+            raise RecordingError("most samples between touch and slip are faulty; give the friction with --mu")
     return label_frames(
         frame_time_s,
         contact,
@@ -380,29 +350,21 @@ def _label_screened(
     )
 
 
-_MOST_LOST = 0.5  # share of the samples between touch and slip that may be faulty
-_PLAUSIBLE_FRICTION = (0.05, 4.0)  # of soft skins on anything dry, wet or greased
-_USUAL_FRICTION = 1.5  # dry rubber on glass hardly exceeds it
-
-
 def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n: float) -> tuple[str, ...]:
     """Describe what no fingertip does: an implausible friction, a contact that pulls more than it presses."""
     doubts = []
     low, high = _PLAUSIBLE_FRICTION
+    usual = f"that of a fingertip lies between {low:g} and {high:g}"
     if not low <= friction.mu <= high:
         if friction.found is Found.INFERRED:
             raise RecordingError(
-                f"the friction comes out as {friction.mu:.3g}, and that of a fingertip lies between {low:g} and "
-                f"{high:g}: the forces are wrong, or their axes; name the axis that presses with --normal-axis and its "
-                "sign with --normal-sign, or give the friction with --mu"
+                f"the friction comes out as {friction.mu:.3g}, and {usual}; give --normal-axis, or --mu"
             )
-        doubts.append(
-            f"a friction of {friction.mu:.3g} was given, and that of a fingertip lies between {low:g} and {high:g}"
-        )
+        doubts.append(f"a friction of {friction.mu:.3g} was given, and {usual}")
     elif friction.mu > _USUAL_FRICTION:
         doubts.append(
-            f"the friction is {friction.mu:.3g}, and that of a fingertip seldom exceeds {_USUAL_FRICTION:g}: check the "
-            "axis that presses, --normal-axis, and the coefficient, --mu"
+            f"the friction is {friction.mu:.3g}, and that of a fingertip seldom exceeds {_USUAL_FRICTION:g}: check "
+            "--normal-axis and --mu"
         )
     pulls, presses = (np.mean(side > threshold_n) for side in (-forces.normal_n, forces.normal_n))
     if pulls > presses:
@@ -413,11 +375,6 @@ def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n:
     return tuple(doubts)
 
 
-# half way, by ratio, from equal lengths to one that is half the other: a rate is usually wrong by two or more
-_LIKE_SPANS = 0.7
-_NEAR_LAG_S = 0.12  # clocks that run alike fit best within some frames; others, if at all, far off
-
-
 def _doubt_clocks(frame_time_s: Frames, forces: Forces, lag: Lag) -> tuple[str, ...]:
     """Describe frames and forces of different lengths, unless the image moves as the force changes."""
     frames_s, forces_s = float(np.ptp(frame_time_s)), float(np.ptp(forces.time_s))
@@ -425,7 +382,6 @@ def _doubt_clocks(frame_time_s: Frames, forces: Forces, lag: Lag) -> tuple[str, 
     if fits or min(frames_s, forces_s) >= _LIKE_SPANS * max(frames_s, forces_s):
         return ()
     return (
-        f"the frames last {frames_s:.2f} s and the forces {forces_s:.2f} s, and nothing shows that the images move as "
-        "the forces change; if a clock runs wrong, import it again with the rate of the frames (--frame-rate) or the "
-        "unit of the forces' times (--time-unit)",
+        f"the frames last {frames_s:.2f} s and the forces {forces_s:.2f} s, the image does not move with the force; "
+        "if a clock runs wrong, give --frame-rate or --time-unit on import",
     )
