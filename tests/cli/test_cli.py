@@ -64,13 +64,6 @@ def test_a_missing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert not (tmp_path / "out").exists()
 
 
-def test_frames_and_data_at_once(
-    difference_run: Path, difference_folder: Path, small_dataset: Dataset, tmp_path: Path, capsys
-):
-    words = ("explain", difference_run, small_dataset.folder, "--frames", difference_folder, "-o", tmp_path / "out")
-    assert "name either a data set or --frames FOLDER" in refused(capsys, *words)
-
-
 @pytest.mark.parametrize(
     ("name", "pixels", "message"),
     [

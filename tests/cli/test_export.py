@@ -88,7 +88,7 @@ def test_what_others_made_is_never_replaced(small_dataset: Dataset, tmp_path: Pa
 
 def test_the_wrong_kind_of_source_is_told(difference_run: Path, small_dataset: Dataset, tmp_path: Path):
     data, out = small_dataset.folder, tmp_path / "a.onnx"
-    refused("is not a run", "onnx", data, "-o", out)
+    refused("does not exist; make it with", "onnx", data, "-o", out)
     refused("does not exist|is no data set|make a data set", "lerobot", difference_run, "-o", out)
     refused("does not end in .onnx", "onnx", difference_run, "-o", tmp_path / "a")
     refused("has no trial nobody; it has train-dry-0, .*, test-wet-7$", "mcap", data, "-o", out, "--trials", "nobody")

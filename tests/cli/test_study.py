@@ -72,7 +72,7 @@ def test_two_networks_of_one_input_are_refused(
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (("--method", "guess"), "no explainer named 'guess'"),
+        (("--method", "guess"), "no method named 'guess'"),
         (("--random-orders", 0), "at least 1"),
         (("--on", "cloud"), "no executor named 'cloud'"),
     ],

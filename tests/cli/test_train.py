@@ -25,7 +25,9 @@ SMALL = ("--image-size", "32", "--epochs", "3", "--batch-size", "11", "--head", 
 
 
 def train(data: Path, output: Path, *more: str) -> int:
-    return main(["train", str(data), "-o", str(output), *SMALL, *more])
+    small = dict(zip(SMALL[::2], SMALL[1::2], strict=True))
+    options = [word for name, value in small.items() if name not in more for word in (name, value)]
+    return main(["train", str(data), "-o", str(output), *options, *more])
 
 
 def refused(capsys: pytest.CaptureFixture[str], data: Path, output: Path, *more: str) -> str:

@@ -67,7 +67,12 @@ def call_command(words: list[str]) -> list[str]:
         raise InputError(f"there is no command {words[0]}; {meant}`sliplens --help` lists all")
     function, options = adapt(COMMANDS[name])
     app = cyclopts.App(
-        name=f"sliplens {name}", help_format="plaintext", version_flags=(), console=OUT, result_action="return_value"
+        name=f"sliplens {name}",
+        help_format="plaintext",
+        version_flags=(),
+        console=OUT,
+        result_action="return_value",
+        suppress_keyboard_interrupt=False,
     )
     app.default(function)
     app["--help"].show = False

@@ -507,19 +507,8 @@ def run_export_dataset(call: Any) -> None:
     "sliplens explain runs/mine/train runs/mine/data -o runs/mine/explain",
     ("source", "--frames"),
 )
-def run_explain(call: Any, *, list_methods: bool = False) -> None:
-    """Write the maps.
-
-    Parameters
-    ----------
-    list_methods
-        Print the table of explainers and end.
-    """
-    if list_methods:
-        from sliplens.explainers.table import EXPLAINERS
-
-        print_table("Explainers", ("method", "name"), [(name, row.title) for name, row in EXPLAINERS.items()])
-        return
+def run_explain(call: Any) -> None:
+    """Write the maps."""
     if "out" not in call.keywords:
         raise InputError("name the folder of the maps with -o FOLDER")
     call()
