@@ -36,7 +36,7 @@ from sliplens.explainers.attribution import (
     top_overlap,
 )
 from sliplens.explainers.cam import capture, find_layers
-from sliplens.explainers.frames import frames_from_dataset, frames_from_folder
+from sliplens.explainers.frames import FrameSelection, frames_from_dataset, frames_from_folder
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.files import machine, versions
 from sliplens.models import Network

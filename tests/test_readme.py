@@ -56,7 +56,7 @@ def folder(
     small = replace(RECIPES["default"], image_size=IMAGE_SIZE, batch_size=16)
     monkeypatch.setitem(RECIPES._rows, "default", small)
     for option in ("random_orders", "trials"):
-        monkeypatch.setitem(StudyConfig.__init__.__kwdefaults__, option, 1)
+        monkeypatch.setitem(StudyConfig.__init__.__kwdefaults__ or {}, option, 1)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
