@@ -92,6 +92,8 @@ def run_demo(
     """
     folder = Path(out)
     real = find_real_frames(real_frames)
+    if train_minutes is not None and train_minutes <= 0:
+        raise InputError(f"train_minutes must be above 0, got {train_minutes:g}")
     _open_folder(folder, _Settings(train_minutes=train_minutes, image_size=image_size, real_frames=real, seed=seed))
 
     def show(*waiting: str) -> Path:

@@ -59,6 +59,7 @@ def test_the_gain_of_the_true_effects_is_their_ordered_sum(run):
     score = faithfulness.score("maps")
     assert score.srg.estimate == pytest.approx(curve.symmetric_gain.mean())
     assert all(score.srg.estimate > other.srg.estimate for other in faithfulness.scores if other.control)
+    assert score.lead_over_controls is not None
     assert score.lead_over_controls.gap.estimate > 0
     assert not any("gains" in alarm for alarm in faithfulness.alarms)
     assert faithfulness.frame().num_rows == len(faithfulness.scores) * 3 * len(AREAS)
@@ -90,6 +91,7 @@ def test_several_methods_are_scored_together_and_as_each_alone(run):
     scored = sliplens.score(run, both, random_orders=1, steps=5)
     assert {score.method for score in scored.scores if not score.control} == set(both.methods)
     assert [(gap.first, gap.second) for gap in scored.comparisons] == [("occlusion", "integrated-gradients")]
+    assert scored.deletion is not None
     assert set(scored.deletion.methods) == {*both.methods, "random"}
 
 
@@ -100,6 +102,7 @@ def test_a_map_the_wrong_way_round_loses_to_every_control(run):
 
 def test_deletion_removes_the_most_salient_first_and_a_random_order_beside(run):
     scores = sliplens.score(run, FRAMES, EFFECTS, random_orders=1, steps=5).deletion_scores
+    assert scores is not None
     base = 0.9 + EFFECTS.sum(axis=(1, 2))
     curve = scores.curves["maps"]
     # grey replaces what a pixel was by a half
@@ -203,7 +206,7 @@ def test_an_array_of_captum_and_our_explanation_score_alike(curved: Network, cap
         if score.control:
             assert score.srg.estimate == by_record.score(score.method).srg.estimate
     if by_array.deletion is not None:
-        first, second = (by.deletion_scores.curves for by in (by_array, by_record))
+        first, second = (by.deletion_scores.curves for by in (by_array, by_record) if by.deletion_scores is not None)
         np.testing.assert_allclose(first["maps"].predictions, second["integrated-gradients"].predictions, atol=1e-3)
 
 

@@ -48,7 +48,8 @@ from sliplens.progress import (
     report_file,
     reporting,
 )
-from sliplens.recordings import Dataset, Recording
+from sliplens.recordings import Dataset, Recording, load_dataset
+from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.results.explanation import Explanation, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, part
@@ -188,6 +189,8 @@ def _choose(
     sensor: SensorProfile | Path | str | None,
     labels_in_names: bool,
 ) -> ChosenFrames:
+    if isinstance(source, str | Path) and (Path(source) / DATASET_FILE).is_file():
+        source = load_dataset(source)
     if isinstance(source, Dataset):
         if sensor is not None:
             raise InputError("a data set's frames went through their profile on import; leave out --sensor")
