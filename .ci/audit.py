@@ -1,4 +1,4 @@
-"""Compare what is installed with what is pinned: versions with .ci/requirements.txt, files with the hashes of their wheels.
+"""Compare what is installed with .ci/requirements.txt: versions of packages, and files with the hashes of their wheels.
 
 Asks nobody. What is not pinned is listed; a version or a file that differs ends it with exit code 1. Known
 vulnerabilities are another matter: `pip-audit -r .ci/requirements.txt` asks a database for those.

@@ -12,7 +12,8 @@ import numpy as np
 import sliplens as sl
 
 # %%
-# The same 200 episodes for each controller: the cup gets wet where it is held. Predictions are looked up in the measured
+# The same 200 episodes for each controller: the cup gets wet where it is held. Predictions are looked up in the
+# measured
 # errors of the network. ``options=EpisodeOptions(rendered=True)`` of ``sliplens.grip.episodes`` closes the loop through
 # pixels, and takes half a minute an episode.
 grips = {
