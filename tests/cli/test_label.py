@@ -11,9 +11,7 @@ from command_line import refused, run
 from data_sets import contents, save_dataset
 from there import there
 
-from sliplens.images import write_png
 from sliplens.recordings import (
-    ContactState,
     Corrections,
     LabelSettings,
     Recording,
@@ -128,49 +126,6 @@ def test_changed_force_samples_are_found(tmp_path: Path, trial: Recording, relab
     shutil.copytree(relabelled, tmp_path / "data")
     forces_path(tmp_path / "data", trial.trial).write_bytes(b"PAR1")
     assert run("check", tmp_path / "data") == 2
-
-
-@pytest.fixture
-def thesis_lists(tmp_path: Path, rng: np.random.Generator) -> Path:
-    """Ten frames and their reference, in the lists of the thesis."""
-    folder = tmp_path / "lists"
-    folder.mkdir()
-    for number in range(11):
-        write_png(folder / f"image_{number}.png", rng.integers(0, 256, (16, 16, 3), dtype=np.uint8))
-    margins = [f"{margin:.2f}" for margin in np.linspace(1, 0, 10)]
-    lines = {
-        "set_images_L.txt": [f"image_{number}.png" for number in range(1, 11)],
-        "set_images_Lref.txt": ["image_0.png"] * 10,
-        "set_gamma.csv": margins,
-    }
-    for name, text in lines.items():
-        (folder / name).write_text("\n".join(text) + "\n")
-    return folder
-
-
-def test_the_lists_of_the_thesis_become_a_data_set(tmp_path: Path, thesis_lists: Path):
-    assert run("import", thesis_lists, "-o", tmp_path / "data", "--sensor", "chromatouch", "--frame-rate", 60) == 0
-    assert run("check", tmp_path / "data") == 0
-    data = load_dataset(tmp_path / "data")
-    back = data.load(data.trials[0])
-    np.testing.assert_array_equal(back.safety_margin, np.linspace(1, 0, 10).round(2))
-    np.testing.assert_allclose(back.time_s, np.arange(10) / 60)
-    assert np.isnan(back.normal_force_n).all()
-    assert back.contact_state[0] == ContactState.CONTACT
-    assert back.contact_state[-1] == ContactState.FULL_SLIP
-    assert set(back.contact_state[1:-1]) == {ContactState.INCIPIENT_SLIP}
-
-
-def test_labels_cannot_be_found_without_forces(tmp_path: Path, thesis_lists: Path, capsys: pytest.CaptureFixture[str]):
-    assert run("import", thesis_lists, "-o", tmp_path / "data", "--sensor", "chromatouch", "--no-audit") == 0
-    capsys.readouterr()
-    assert "has no forces, and without them there is no label" in refused(capsys, "label", tmp_path / "data")
-
-
-def test_a_source_that_does_not_tell_its_sensor_needs_it_told(
-    tmp_path: Path, thesis_lists: Path, capsys: pytest.CaptureFixture[str]
-):
-    assert "does not name its sensor" in refused(capsys, "import", thesis_lists, "-o", tmp_path / "data")
 
 
 def margins(folder: Path, trial: Recording) -> np.ndarray:

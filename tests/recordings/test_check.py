@@ -42,6 +42,14 @@ def test_a_changed_file_and_a_missing_one_are_found(tmp_path: Path, small_datase
     assert "trials/stray.parquet: is not in the table of the data set" in found
 
 
+def test_a_trial_in_two_splits_is_found(tmp_path: Path, recording: Recording):
+    folder = save_dataset(tmp_path, recording).folder
+    table = json.loads((folder / "dataset.json").read_text())
+    table["trials"].append({**table["trials"][0], "split": "test"})
+    (folder / "dataset.json").write_text(json.dumps(table))
+    assert "trial: is listed 2 times, in split test and train" in whats(folder)
+
+
 def test_a_table_that_lies_is_found(tmp_path: Path, recording: Recording):
     folder = save_dataset(tmp_path, recording).folder
     table = json.loads((folder / "dataset.json").read_text())

@@ -28,9 +28,8 @@ def export_lerobot(
 ) -> Export:
     """Write trials as a LeRobot v3.0 data set, one episode a trial, without loss.
 
-    `observation.force` is (F_t, 0, F_n) in newtons. LeRobot has one frame rate and counts time in frames of it; the
-    measured times are in `observation.time_s`. Trials of a split follow each other, because a split is a range of
-    episodes. `meta/sliplens` has the rest of each trial, from which `import_recordings` restores the data set.
+    `observation.force` is (F_t, 0, F_n) in newtons, `observation.time_s` has the measured times: LeRobot counts time in
+    frames of one rate. `meta/sliplens` has the rest of each trial, of which `import_recordings` restores the data set.
 
     Parameters
     ----------
@@ -63,8 +62,7 @@ def export_mcap(
     """Write trials as `TRIAL.mcap`, files of ROS 2 messages, without loss.
 
     Frames are PNG images in `/tactile/image`, labels are in `/tactile/labels` and forces in `/tactile/wrench`. Stamps
-    are the times of the trial, rounded to nanoseconds. ROS takes a stamp of 0 for none and has no negative ones: where
-    a trial begins before 1 s, all stamps are later by the whole seconds `stamp_offset_s` in the metadata of the file.
+    are the times of the trial, later by the whole seconds `stamp_offset_s` in the metadata where it begins before 1 s.
     Attachments have the rest of the trial, from which `import_recordings` restores it.
 
     Parameters

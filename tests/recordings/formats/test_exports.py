@@ -188,7 +188,7 @@ def test_definitions_that_a_bag_brings_are_not_used(data, tmp_path):
 def test_a_bag_or_an_episode_that_lacks_a_frame_is_refused(changed):
     if changed.name == "mcap":
         rewrite_bag(changed / "full.mcap", lambda table: table, images=39)
-        message = r"full\.mcap has 39 frames of 12 x 16 pixels, but trial full in .* has 40"
+        message = r"full\.mcap has not the frames of trial full in"
     else:
         edit_table(changed, lambda table: table["trials"].pop())
         message = "describes 2 trials beside the images of 3"

@@ -177,13 +177,6 @@ def test_a_key_frame_shown_after_the_episode_begins_loses_no_frame(tmp_path, fra
         np.testing.assert_array_equal(list(capture.read_frames()), shown)
 
 
-def test_images_in_parquet_are_read_too(tmp_path, frames, wrenches):
-    captures = read_lerobot(write_dataset(tmp_path / "a", frames, wrenches, images=True))
-    for capture, shown in zip(captures, split(frames), strict=True):
-        np.testing.assert_array_equal(list(capture.read_frames()), shown)
-        assert capture.notes == ()
-
-
 def test_a_damaged_image_in_parquet_is_refused(tmp_path, frames, wrenches):
     folder = write_dataset(tmp_path / "a", frames, wrenches, images=True)
     path = folder / "data" / "chunk-000" / "file-001.parquet"

@@ -216,6 +216,12 @@ def test_another_kind_of_compressed_image_is_refused(tmp_path, pixels):
         read_rosbag(write_bag(tmp_path / "alpha", [(CAMERA, alpha, 0)]))
 
 
+def test_frames_of_changing_size_are_refused(tmp_path, pixels, frames_of):
+    small = (CAMERA, raw_image(pixels[0, :-2], frame_ns(FRAMES)), frame_ns(FRAMES) + 2_000_000)
+    with pytest.raises(RecordingError, match=r"frame 5 of .* is of another size than those before it; cut"):
+        read_rosbag(write_bag(tmp_path / "trial", [*frames_of(), small]))
+
+
 @pytest.mark.parametrize(
     "claims",
     [

@@ -73,21 +73,6 @@ def test_after_gross_slip_the_margin_is_0_until_the_contact_is_loaded_anew(trial
     assert np.all(dipped.safety_margin[after & (dipped.normal_force_n > 1)] == 0)
 
 
-@pytest.mark.parametrize("mu", [None, STATIC])
-@pytest.mark.parametrize("slip_s", [None, SLIP_S])
-def test_what_is_given_changes_no_label_that_the_forces_show_too(
-    trial: Trial, rng: np.random.Generator, mu: float | None, slip_s: float | None
-):
-    settings = LabelSettings(mu=mu, slip_s=slip_s)
-    forces = trial.forces(noise_n=0.02, rng=rng)
-    labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=rng)
-    after = trial.frame_time_s > SLIP_S + 0.01
-    assert np.all(labels.safety_margin[after] == 0)
-    assert not labels.valid[after].any()
-    assert set(np.array(labels.reason)[after]) == {Reason.AFTER_GROSS_SLIP}
-    assert labels.basis.flags == ()
-
-
 @pytest.mark.parametrize(("mu", "slip_s"), [(0.3, None), (1.2, 5.2), (1.0, None)])
 def test_no_valid_label_follows_a_friction_that_contradicts_the_forces(
     trial: Trial, rng: np.random.Generator, mu: float, slip_s: float | None
