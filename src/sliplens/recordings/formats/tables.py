@@ -205,8 +205,8 @@ def unit_of(name: str, *, quantity: str, path: str) -> str | None:
     if bracket:
         unit = _find_unit(bracket[1].lower(), quantity)
         if unit is None:
-            known = f"is in {bracket[1]!r}, which is no known unit of {quantity} ({', '.join(UNITS[quantity])})"
-            raise RecordingError(f"{path}: {name!r} {known}; declare the right one with --{quantity}-unit")
+            unknown = f"is in {bracket[1]!r}, which is no known unit of {quantity} ({', '.join(UNITS[quantity])})"
+            raise RecordingError(f"{path}: {name!r} {unknown}; declare the right one with --{quantity}-unit")
         return unit
     words = _words(name)
     # "f_n" is a normal force, "fx_n" one along x in newtons
@@ -250,10 +250,10 @@ def guess_force_columns(table: TextTable) -> tuple[str, ...]:
             )
     alone = columns["z"] + columns["normal"]
     if alone and not columns["x"] + columns["y"] + columns["tangential"]:
-        one = f"{table.path} has a normal force ({alone[0]!r}) but no tangential force that is known by its name"
-        raise RecordingError(f"{one}, and a safety margin needs both; name its columns with {option}")
-    looked = "has no columns that look like forces (fx, fy, fz or fn, ft)"
-    raise RecordingError(f"{table.path} {looked} among {table.names}; name them with {option}")
+        lacks = f"{table.path} has a normal force ({alone[0]!r}) but no tangential force that is known by its name"
+        raise RecordingError(f"{lacks}, and a safety margin needs both; name its columns with {option}")
+    nothing = "has no columns that look like forces (fx, fy, fz or fn, ft)"
+    raise RecordingError(f"{table.path} {nothing} among {table.names}; name them with {option}")
 
 
 def guess_time_unit(time: Float[np.ndarray, " samples"]) -> str:
