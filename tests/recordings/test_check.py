@@ -135,4 +135,4 @@ def test_the_command_lists_what_is_wrong(tmp_path: Path, recording: Recording, c
     assert main(["check", str(save_dataset(tmp_path / "bad", bad).folder)]) == 2
     captured = capsys.readouterr()
     assert "frame 5" in captured.out
-    assert "has 1 thing wrong, listed above; mend or make these trials again" in captured.err
+    assert "has 1 error, listed above; correct or make these trials again" in captured.err
