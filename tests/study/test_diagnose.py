@@ -1,4 +1,4 @@
-"""Where a network fails: planted faults, planted kinds of explanations, and answers whose slope is known."""
+"""Where a network fails: planted faults, and answers whose slope is known."""
 
 import sys
 from dataclasses import replace
@@ -15,27 +15,20 @@ from sliplens.errors import InputError
 from sliplens.files import output_folder
 from sliplens.intervals import Difference
 from sliplens.models import Manifest, Network
-from sliplens.plots.style import signed
 from sliplens.recordings import Dataset, load_dataset
-from sliplens.results.evaluation import ErrorSlice, ErrorTable, ExplainedErrors, FrictionTable
+from sliplens.results.evaluation import ErrorSlice, ErrorTable, FrictionTable
 from sliplens.simulation import SimulationRecipe, simulate_dataset
 from sliplens.study import diagnose as diagnosing
 from sliplens.study.diagnose import (
-    cluster_explanations,
     excess_error,
     find_slices,
     friction_slopes,
-    hold_against,
     hold_out,
     say_errors,
-    say_kinds,
     say_limits,
     say_slices,
     say_slope,
-    say_told,
-    tell_friction,
 )
-from sliplens.study.truth import reliability_of
 
 TRIALS, FRAMES = 40, 12
 
@@ -59,7 +52,7 @@ def table_of_errors(rng: np.random.Generator, **columns: np.ndarray) -> ErrorTab
         "contact_y": np.full(count, np.nan),
         "slice": np.full(count, -1),
         "withheld": np.full(count, ""),
-        **dict.fromkeys(("time_s", "sigma", "low_90", "high_90"), np.full(count, np.nan)),
+        **dict.fromkeys(("time_s", "sigma", "low_90", "high_90", "limit"), np.full(count, np.nan)),
     }
     return ErrorTable(**{**made, **columns})
 
@@ -125,29 +118,12 @@ def test_wet_objects_that_are_slippery_alone_are_no_worse_than_dry_ones_of_their
     assert "which may be chance" in alike
 
 
-def explain_planted(errors: ErrorTable, **columns: np.ndarray) -> ExplainedErrors:
-    """Errors with nothing known of their explanations but what is given."""
-    unknown = ("agreement", "reliability", "network_slipping", "reading_slipping", "told", "limit")
-    columns = dict.fromkeys(unknown, np.full(len(errors), np.nan)) | columns
-    return ExplainedErrors(**vars(errors), cluster=np.zeros(len(errors), int), example=errors.slice, **columns)
-
-
 def test_an_error_is_held_against_what_the_picture_leaves_open(errors, rng):
     for limit, verdict in ((0.05, "not told from"), (0.02, "above"), (0.12, "below")):
-        dry, wet = say_limits(explain_planted(errors, limit=np.full(len(errors), limit)), rng)
+        dry, wet = say_limits(replace(errors, limit=np.full(len(errors), limit)), rng)
         assert f"It is {verdict} the {100 * limit:.1f} points" in dry
         assert wet.startswith("On wet objects the root mean squared error in 240 frames of 20 trials is ")
-    assert say_limits(explain_planted(errors), rng) == []
-
-
-def test_what_friction_that_is_told_takes_off_the_error_is_said(errors, rng):
-    told = errors.safety_margin + 0.01
-    (said,) = say_told(explain_planted(errors, told=told), rng)
-    assert said.count("off by 1.0 points on") == 2
-    for condition in ("dry", "wet"):
-        wrong = np.abs(errors.error[errors.condition == condition]).mean()
-        assert f"on {condition} objects, untold off by {100 * wrong:.1f}: {signed(100 * (0.01 - wrong), 1)} (" in said
-    assert say_told(explain_planted(errors), rng) == []
+    assert say_limits(errors, rng) == []
 
 
 def test_a_group_is_compared_with_the_rest_as_trials_drawn_again_do(errors, rng):
@@ -165,41 +141,6 @@ def test_a_group_is_compared_with_the_rest_as_trials_drawn_again_do(errors, rng)
     # two ways to draw: alike within a fourth of their width
     assert (gap.low, gap.high) == pytest.approx((low, high), abs=0.25 * (high - low))
     assert excess_error(errors, np.ones(len(errors), dtype=bool), rng).estimate == 0
-
-
-def test_kinds_of_explanations_are_recovered_whatever_their_size(rng):
-    patterns = np.eye(3, 12) - np.eye(3, 12, k=5)
-    planted = rng.permutation(np.repeat(np.arange(3), 8))
-    rows = (patterns[planted] + rng.normal(0, 0.02, (24, 12))) * rng.uniform(0.1, 10, (24, 1))
-    sizes = np.array([0.1, 0.3, 0.2])[planted]
-    kinds, examples, silhouette = cluster_explanations(rows, sizes, seed=0)
-    # the largest error first
-    np.testing.assert_array_equal(kinds, np.array([2, 0, 1])[planted])
-    assert silhouette is not None
-    assert silhouette > 0.8
-    assert kinds[examples].tolist() == [0, 0, 1, 1, 2, 2]
-    assert cluster_explanations(np.ones((4, 3)), sizes[:4], seed=0)[2] is None
-
-
-def test_contributions_are_held_against_those_of_the_best_reading():
-    state = np.array([1, 1, 2, 0])
-    values = np.array([0.3, -0.1, 0.4, 5.0])
-    sure = np.zeros(4)
-    same = hold_against(values, sure, values, state)
-    assert same.agreement == pytest.approx(1)
-    assert same.network_slipping == same.reading_slipping == pytest.approx(0.4 / 0.8)
-    # signed: what works the other way round disagrees
-    assert hold_against(-values, sure, values, state).agreement == pytest.approx(-1)
-    # an answer that no marker moves ranks none
-    assert np.isnan(hold_against(0 * values, sure, values, state).agreement)
-    assert same.reliability == 1
-
-
-def test_the_reliability_is_how_two_estimates_correlate(rng: np.random.Generator):
-    values, errors = rng.normal(size=4000), np.full(4000, 0.7)
-    first, second = (values + errors * rng.normal(size=4000) for _ in range(2))
-    # a correlation of 4000 pairs is sure to (1 - r^2) / sqrt(4000) = 0.009
-    assert reliability_of(first, errors) == pytest.approx(np.corrcoef(first, second)[0, 1], abs=0.03)
 
 
 def frictions(slope: float, best: float, *, trials: int = 12) -> FrictionTable:
@@ -264,9 +205,7 @@ def test_simulated_frames_are_explained_and_filmed_anew(simulated, tmp_path, mon
     monkeypatch.setattr(diagnosing, "LEVELS", (0.5,))
     found = sl.diagnose(network, data, tmp_path, trials=1)
     assert found.left_out == ""
-    assert np.isfinite(found.explained.agreement).all()
-    assert (found.explained.limit > 0).all()
-    assert np.isnan(found.explained.told).all()  # this network takes no friction
+    assert (found.errors.limit > 0).sum() == 1
     for own in found.frictions.groups("frame_id").values():
         # the forces stay: 1 - margin is inverse to the friction
         np.testing.assert_allclose((1 - own.safety_margin) * own.friction, (1 - own.safety_margin[0]) * own.friction[0])
@@ -291,7 +230,7 @@ def test_simulated_frames_are_explained_and_filmed_anew(simulated, tmp_path, mon
     assert [label.get_text() for label in ax.get_yticklabels()] == ["wet objects"]
     assert ax.lines[0].get_xdata() == pytest.approx([5, 15])  # percentage points
     # kept: the same call reads it
-    monkeypatch.setattr(diagnosing, "find_contributions", None)
+    monkeypatch.setattr(diagnosing, "refilm", None)
     assert sl.diagnose(network, data, tmp_path, trials=1).sentences == found.sentences
     page = sl.write_report(tmp_path).page.read_text(encoding="utf-8")
     assert "Where the network fails" in page
@@ -302,20 +241,8 @@ def test_recordings_say_what_is_left_out(difference_run: Path, fine_dataset: Dat
     found = sl.diagnose(difference_run, fine_dataset, tmp_path, trials=2)
     assert "known of simulated frames alone" in found.left_out
     assert len(found.frictions) == len(found.slopes) == len(found.other_frictions) == 0
-    assert np.isnan(found.explained.agreement).all()
-    # but errors and kinds are told: of each condition the trials that were asked for, three frames each
-    assert len(found.explained) == 3 * (2 + 1)
-    assert (found.explained.example >= 0).sum() == len(found.pictures) == len(found.maps)
-    assert found.sentences[-1] == say_kinds(found.explained, None) or "kinds (silhouette" in found.sentences[-1]
+    assert np.isnan(found.errors.limit).all()
     assert found.left_out.rstrip(".") in sl.write_report(tmp_path).page.read_text(encoding="utf-8")
-
-
-def test_a_network_that_takes_friction_is_told_that_of_each_frame(rng):
-    taught, inputs = sl.load("chromatouch-difference"), torch.rand(2, 3, 224, 224)
-    answers = tell_friction(taught, inputs, np.array([0.3, 0.9]))
-    for at, friction in enumerate((0.3, 0.9)):
-        assert answers[at] == pytest.approx(taught.estimate(inputs[at : at + 1], friction=friction).margin[0], abs=0.02)
-    assert np.isnan(tell_friction(taught, inputs, np.array([0.3, np.nan]))).all()
 
 
 def test_what_is_missing_or_impossible_is_refused(difference_run, fine_dataset, monkeypatch):
@@ -331,5 +258,5 @@ def test_the_command_says_what_was_found_and_draws_the_page(difference_run, fine
     captured = capsys.readouterr()
     said = " ".join((captured.out + captured.err).split())
     assert "the answer is off by" in said
-    assert "is left out" in said
+    assert "are left out" in said
     assert (tmp_path / "runs" / "report.html").is_file()

@@ -35,6 +35,7 @@ from sliplens.study.truth import (
     shuffle_half,
     stage_frames,
     true_curves,
+    reliability_of,
 )
 
 SIZE = 112
@@ -447,3 +448,10 @@ def test_frames_of_other_data_are_refused(given, maps, small_dataset):
         refuse(replace(explained, weights_sha256="of others"))
     with pytest.raises(InputError, match="no fill named 'pink'"):
         judge(trained, explained, data, maps=maps, fills=("pink",))
+
+
+def test_the_reliability_is_how_two_estimates_correlate(rng: np.random.Generator):
+    values, errors = rng.normal(size=4000), np.full(4000, 0.7)
+    first, second = (values + errors * rng.normal(size=4000) for _ in range(2))
+    # a correlation of 4000 pairs is sure to (1 - r^2) / sqrt(4000) = 0.009
+    assert reliability_of(first, errors) == pytest.approx(np.corrcoef(first, second)[0, 1], abs=0.03)

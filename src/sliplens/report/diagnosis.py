@@ -1,12 +1,8 @@
-"""Page of a diagnosis: slices of the error, other frictions, and kinds of explanations."""
+"""Page of a diagnosis: slices of the error, and other frictions."""
 
 from collections.abc import Iterable
 from dataclasses import fields
 
-import numpy as np
-
-from sliplens.plots.contact_sheet import brighten
-from sliplens.plots.saliency import SIGN_COLOURS, full_colour, overlay_relevance
 from sliplens.plots.style import (
     BLACK,
     CONDITION_COLOURS,
@@ -14,14 +10,11 @@ from sliplens.plots.style import (
     decimals,
     drawing_style,
     input_name,
-    percent,
-    place_axes,
     signed,
     tell_ends,
 )
-from sliplens.progress import number_of
 from sliplens.report.charts import make_charts
-from sliplens.report.plates import Cell, Plate, draw_grid, named_columns, picture_brightness, rows_of
+from sliplens.report.plates import Plate, named_columns, rows_of
 from sliplens.report.tables import Table, make_table
 from sliplens.results.evaluation import Diagnosis, FrictionTable
 
@@ -31,7 +24,6 @@ def show_diagnosis(diagnosis: Diagnosis) -> Iterable[Table | Plate]:
     yield table_slices(diagnosis)
     if len(diagnosis.frictions):
         yield plate_frictions(diagnosis)
-    yield plate_kinds(diagnosis)
 
 
 def table_slices(diagnosis: Diagnosis) -> Table:
@@ -86,46 +78,4 @@ def plate_frictions(diagnosis: Diagnosis) -> Plate:
         "Best: the slope of the best reading of the markers, which knows how far frictions and loads range: far below "
         "1 where the picture hardly shows the friction.",
         numbers=named_columns(names, rows_of(*(getattr(diagnosis.frictions, name) for name in names))),
-    )
-
-
-def plate_kinds(diagnosis: Diagnosis) -> Plate:
-    """Show the frames most like each kind of explanation beside their maps, in one scale of colours."""
-    table, maps = diagnosis.explained, diagnosis.maps
-    factor, name = picture_brightness(diagnosis.input, diagnosis.pictures)
-    pictures, top = brighten(diagnosis.pictures, factor), full_colour(maps)
-    rows, chosen, columns = [], [], ("kind", "frames", "trials", "error", "bias", "safety_margin", "friction")
-    for kind in np.unique(table.cluster).tolist():
-        frames = table.where(table.cluster == kind)
-        means = [
-            float(values.mean())
-            for values in (np.abs(frames.error), frames.error, frames.safety_margin, frames.friction)
-        ]
-        rows.append((kind + 1, len(frames), len(np.unique(frames.trial)), *means))
-        cells = []
-        for example in np.sort(frames.example[frames.example >= 0]).tolist():
-            record = frames.where(frames.example == example)
-            ((margin, answer, condition),) = rows_of(record.safety_margin, record.prediction, record.condition)
-            words = f"Γ {percent(margin)}, read {percent(answer)}"
-            picture = pictures[example]
-            painted = overlay_relevance(picture, maps[example] / top)
-            cells += [Cell(picture=picture, words=words), Cell(picture=painted, words=condition)]
-        chosen.append(
-            (f"Kind {kind + 1}: {number_of(len(frames), 'frame')}, off by {100 * means[0]:.1f} points", cells)
-        )
-    heads = [name, "parts"] * (max(len(cells) for _, cells in chosen) // 2)
-    grid = draw_grid(chosen, heads=heads, below_in=0.6)
-    with drawing_style():
-        bar = place_axes(grid.figure, 1.25, grid.bottom_in + 0.12, 4.2, 0.14)
-        ends = (-100 * top, 100 * top, 0, 1)
-        bar.imshow(np.linspace(-1, 1, 256)[None], cmap=SIGN_COLOURS, extent=ends, aspect="auto")
-        bar.set(yticks=[], xlabel="Part in the answer (percentage points of Γ): lowers it, raises it")
-    return Plate(
-        name=f"diagnosis-kinds-{diagnosis.input}",
-        figure=grid.figure,
-        alt=f"Examples of each kind of explanation: {'; '.join(words for words, _ in chosen)}",
-        caption=f"Kinds of explanations, that of the largest error first (k-means on {diagnosis.method}, each frame's "
-        "divided by the sum of their sizes), and the frames nearest to the middle of each.",
-        numbers=named_columns(columns, rows),
-        pixels=True,
     )

@@ -243,8 +243,7 @@ SECTIONS: tuple[Section, ...] = (
         short_title="Why it fails",
         intro="Slices of the trials in which the error is large, tested on trials they were not found on; how much of "
         "the error no reader of one frame could spare; what the network says of the same press and pull where friction "
-        "alone differs; what it looked at, and what the best reading of the markers needed; and the kinds of "
-        "explanations.",
+        "alone differs.",
         apart=True,
         build=_diagnosis,
         needs=lambda results: results.diagnoses,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
+from jaxtyping import Float64, Int64, Shaped, UInt8
 from msgspec import Meta
 
 from sliplens.codec import UNKNOWN, Columns
@@ -314,6 +314,8 @@ class ErrorTable(ScoredFrames):
     """Middle of the contact, right and down, as shares of the image's width and height."""
     slice: Annotated[Int64[np.ndarray, " frames"], PLACE]
     """Place in `Diagnosis.slices`; -1 where no held-out frame is."""
+    limit: Annotated[Float64[np.ndarray, " frames"], AMOUNT, UNKNOWN]
+    """Least standard deviation of an unbiased reader of the markers of one frame, in margin units."""
 
     @property
     def error(self) -> Float64[np.ndarray, " frames"]:
@@ -339,27 +341,6 @@ class ErrorSlice:
     def holds(self) -> bool:
         """True where the error is larger beyond the interval, on enough held-out trials."""
         return self.trials >= FEWEST_UNITS and self.excess.above_zero
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExplainedErrors(ErrorTable):
-    """Frames that were explained; what needs the truth of each marker is NaN without it."""
-
-    agreement: Annotated[Float64[np.ndarray, " frames"], CORRELATION, UNKNOWN]
-    """Signed rank correlation, marker by marker, of the Shapley values for the answer and for the best reading."""
-    reliability: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
-    """Correlation that another estimate of the Shapley values from as many scenes would have with these."""
-    network_slipping: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
-    reading_slipping: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
-    """Share on slipping markers, of the sizes of these values on markers in contact."""
-    told: Annotated[Float64[np.ndarray, " frames"], ANSWER, UNKNOWN]
-    """Answer where the network is told the friction that holds; NaN of one that cannot be told."""
-    limit: Annotated[Float64[np.ndarray, " frames"], AMOUNT, UNKNOWN]
-    """Standard deviation, in margin units, below which no unbiased reader of the markers of one frame comes."""
-    cluster: Annotated[Int64[np.ndarray, " frames"], AMOUNT]
-    """Kind of explanation, that of the largest error first."""
-    example: Annotated[Int64[np.ndarray, " frames"], PLACE]
-    """Place in `Diagnosis.pictures` of the frames that are most like their kind, else -1."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -390,7 +371,7 @@ class FrictionSlope:
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis(OfNetwork):
-    """Where a network fails and why: slices of its errors, its markers, other frictions, kinds of explanations."""
+    """Where a network fails and why: slices of its errors, the limit of one frame, and other frictions."""
 
     sentences: tuple[str, ...]
     """Findings, with figures."""
@@ -399,14 +380,8 @@ class Diagnosis(OfNetwork):
     slices: tuple[ErrorSlice, ...]
     """Leaves of the tree, the largest error first."""
     slopes: tuple[FrictionSlope, ...]
-    method: str
-    """Quantity that the maps show."""
     errors: ErrorTable
-    explained: ExplainedErrors
     frictions: FrictionTable
-    pictures: UInt8[np.ndarray, "examples size size 3"]
-    maps: Annotated[Float32[np.ndarray, "examples size size"], ANSWER]
-    """Examples of each kind as the network saw them, and their maps in margin units."""
     shown_frame: str
     other_frictions: UInt8[np.ndarray, "shown size size 3"]
     """Frame that is shown with each of its frictions in `frictions`, as the network would see it; empty without any."""
