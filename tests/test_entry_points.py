@@ -16,17 +16,11 @@ from sliplens.live.sinks import SINKS
 from sliplens.live.sources import SOURCES
 from sliplens.markers import KINDS
 from sliplens.markers.estimators import ESTIMATORS
-from sliplens.models.backbones import BACKBONES
-from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings.formats import FORMATS
 from sliplens.simulation import PRESETS, SENSORS
 from sliplens.simulation.plan import PULLS
-from sliplens.training import RECIPES
-from sliplens.training.data import AUGMENTATIONS
 
 TABLES = {
-    "sliplens.backbones": BACKBONES,
-    "sliplens.encodings": ENCODINGS,
     "sliplens.conditions": CONDITIONS,
     "sliplens.controllers": CONTROLLERS,
     "sliplens.explainers": EXPLAINERS,
@@ -35,8 +29,6 @@ TABLES = {
     "sliplens.gripper_messages": ROS_MESSAGES,
     "sliplens.sinks": SINKS,
     "sliplens.sources": SOURCES,
-    "sliplens.augmentations": AUGMENTATIONS,
-    "sliplens.recipes": RECIPES,
     "sliplens.markers": KINDS,
     "sliplens.estimators": ESTIMATORS,
     "sliplens.sensors": SENSORS,

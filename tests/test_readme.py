@@ -54,7 +54,7 @@ def folder(
         torch.manual_seed(0)
         save_checkpoint(tmp_path / DEFAULT_NETWORK, build_model(head="histogram", colours=6).eval(), manifest)
     small = replace(RECIPES["default"], image_size=IMAGE_SIZE, batch_size=16)
-    monkeypatch.setitem(RECIPES._rows, "default", small)
+    monkeypatch.setitem(RECIPES, "default", small)
     for option in ("random_orders", "trials"):
         monkeypatch.setitem(StudyConfig.__init__.__kwdefaults__ or {}, option, 1)
     monkeypatch.chdir(tmp_path)

@@ -99,12 +99,9 @@ def made_up_evaluation(predictions: ScoredFrames, *, name: str = "difference", s
         split="test",
         known_trials=0,
         conditions={one: score_predictions(rows) for one, rows in by_condition.items()},
-        days={},
         trials={one: score_predictions(rows) for one, rows in by_trial.items()},
         reliability={
-            one: Reliability(
-                coverage={"0.5": 0.48, "0.9": 0.88 if one == "dry" else 0.6} if sure else {}, mean_width_90=None
-            )
+            one: Reliability(coverage={"0.5": 0.48, "0.9": 0.88 if one == "dry" else 0.6} if sure else {})
             for one in by_condition
         },
         wet_auroc=0.97 if sure else None,

@@ -62,7 +62,7 @@ def save_untrained(
     folder.mkdir(parents=True, exist_ok=True)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = build_model(head=head, colours=ENCODINGS.pick(kind).colours)
+        model = build_model(head=head, colours=ENCODINGS[kind].colours)
     prepare(model)
     manifest = Manifest(
         backbone="shufflenet_v2_x1_0",

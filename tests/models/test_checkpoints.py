@@ -45,18 +45,6 @@ def test_half_precision_weights_are_read_as_the_numbers_they_are(run: Path, tmp_
         torch.testing.assert_close(values, halves[name].to(values.dtype), rtol=0, atol=0)
 
 
-def test_predictions_do_not_depend_on_the_batch_size(run: Path):
-    inputs = torch.rand(5, 3, 32, 32, generator=torch.Generator().manual_seed(0))
-    trained = load_checkpoint(run)
-    # float32 sums in another order
-    torch.testing.assert_close(trained.predict(inputs, batch_size=2), trained.predict(inputs), atol=1e-5, rtol=1e-5)
-
-
-def test_a_missing_run_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match=r"the run .*nothing does not exist"):
-        load_checkpoint(tmp_path / "nothing")
-
-
 def test_changed_weights_are_refused(run: Path):
     weights = run / "model.safetensors"
     weights.write_bytes(weights.read_bytes()[:-4])
@@ -76,12 +64,6 @@ def test_a_pickle_in_place_of_weights_is_refused_unopened(run: Path):
         load_checkpoint(run)
 
 
-def test_a_manifest_of_another_backbone_is_refused(run: Path):
-    edit_manifest(run, backbone="resnet18")
-    with pytest.raises(CheckpointError, match="does not hold a resnet18 with a point head"):
-        load_checkpoint(run)
-
-
 def test_an_incomplete_manifest_is_refused(run: Path):
     manifest = json.loads((run / "manifest.json").read_text())
     del manifest["frame_size"]
@@ -97,13 +79,6 @@ def test_frames_of_another_sensor_are_refused(run: Path):
         trained.encode(frames, frames[0])
 
 
-def test_images_that_are_no_8_bit_rgb_are_refused(run: Path):
-    trained = load_checkpoint(run)
-    height, width = trained.manifest.frame_size
-    with pytest.raises(ImageError, match="multiply them by 255"):
-        trained.encode(np.zeros((1, height, width, 3), dtype=np.float32), None)
-
-
 def test_images_of_the_other_kind_are_noticed(run: Path, raw_run: Path):
     size = load_checkpoint(run).manifest.frame_size
     difference, frame = np.zeros((*size, 3), dtype=np.uint8), np.full((*size, 3), 120, dtype=np.uint8)
@@ -117,17 +92,6 @@ def test_images_of_the_other_kind_are_noticed(run: Path, raw_run: Path):
         network = replace(raw, manifest=replace(raw.manifest, input=seen))
         with pytest.raises(ImageError, match="as dark as a difference image"):
             network.require_kind(difference, what="a.png")
-
-
-def test_frames_of_another_sensor_are_told_those_of_another_piece_are_not(run: Path):
-    edit_manifest(run, sensor="chromatouch-1")
-    trained = load_checkpoint(run)
-    assert trained.doubt("chromatouch-7") is None
-    assert trained.doubt("") is None
-    told = trained.doubt("tip")
-    assert told is not None
-    assert "chromatouch-1" in told
-    assert "tip" in told
 
 
 def test_what_is_no_network_is_refused():

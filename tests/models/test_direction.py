@@ -7,14 +7,12 @@ import pytest
 from pulled import pulled_frames
 
 import sliplens as sl
-from sliplens.images import absolute_difference
 from sliplens.live import LiveFrame
 from sliplens.live.frame_reader import FrameReader
 from sliplens.live.health import HealthMonitor
 from sliplens.live.reading import Reading
 from sliplens.live.sources import open_live
 from sliplens.models import Network
-from sliplens.recordings.sensor import SensorProfile
 from sliplens.shear import FULL_CIRCLE
 
 TURNS = {
@@ -86,29 +84,6 @@ def test_a_network_of_all_directions_withholds_none(pulled_down: Network, live: 
     for directions in (FULL_CIRCLE, None):
         network = replace(pulled_down, manifest=replace(pulled_down.manifest, pull_direction_deg=directions))
         assert not any(withheld_by(network, reference, frames, live=live))
-
-
-def test_difference_images_hide_the_direction_and_a_note_says_so():
-    network = sl.load("chromatouch-difference")
-    reference, frames = turned_frames(270.0, "as it is", margins=(0.02,))
-    compared = absolute_difference(frames, reference)
-    limited = replace(network, manifest=replace(network.manifest, pull_direction_deg=(75.0, 105.0)))
-    told = [note for note in sl.predict(limited, compared, engine="torch").notes if "75 to 105 degrees" in note]
-    assert len(told) == 1
-    everywhere = replace(network, manifest=replace(network.manifest, pull_direction_deg=FULL_CIRCLE))
-    assert not any("degrees" in note for note in sl.predict(everywhere, compared, engine="torch").notes)
-
-
-@pytest.mark.parametrize(("seat_deg", "fits"), [(90.0, True), (70.0, True), (0.0, False), (270.0, False), (None, True)])
-def test_a_profile_that_sits_otherwise_is_told_once_where_it_is_opened(
-    pulled_down: Network, seat_deg: float | None, fits: bool
-):
-    profile = SensorProfile(name="chromatouch-9", pull_direction_deg=seat_deg)
-    reference, frames = turned_frames(90.0, "as it is", margins=(0.5,))
-    notes = sl.predict(pulled_down, frames, reference=reference, sensor=profile, engine="torch").notes
-    doubts = sl.LiveReader(frames, pulled_down, reference=reference, sensor=profile).doubts
-    for told in (notes, doubts):
-        assert sum("chromatouch-9" in sentence and "75 to 105" in sentence for sentence in told) == (not fits)
 
 
 @pytest.mark.parametrize("directions", [(105.0, 75.0), (-10.0, 20.0), (0.0, 400.0), (370.0, 380.0)])

@@ -3,7 +3,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from sliplens.errors import ImageError, InputError
+from sliplens.errors import ImageError
 from sliplens.models.encodings import ENCODINGS
 
 
@@ -45,14 +45,6 @@ def test_frame_and_untouched_sensor_are_made_small_as_one_image_of_six_channels(
     assert torch.equal(ENCODINGS["pair"].compare_small(np.stack(frames), reference, image_size=17), whole)
 
 
-def test_a_difference_forgets_its_amplitude(frames: np.ndarray):
-    black = np.zeros_like(frames[0])
-    halves = frames // 2 * 2  # even, so that half of it is exact
-    difference = ENCODINGS["difference"]
-    full, half = (difference.encode(images, black, image_size=16) for images in (halves, halves // 2))
-    torch.testing.assert_close(full, half)
-
-
 def test_halving_the_size_averages_neighbours_in_the_middle(frames: np.ndarray):
     # a tent of half-width 2 on a ratio of 2: weights 1/8, 3/8, 3/8, 1/8 in each direction
     resized = ENCODINGS["raw"].resize(frames, image_size=8)[0, 1, 3, 4].item()
@@ -67,11 +59,6 @@ def test_frames_of_another_size_than_the_reference_are_refused(frames: np.ndarra
             encoding.encode(frames, frames[0, :8], image_size=8)
 
 
-def test_an_unknown_input_lists_those_there_are():
-    with pytest.raises(InputError, match="no input named 'depth'; choose one of difference, raw"):
-        ENCODINGS.pick("depth")
-
-
 def test_a_signed_difference_tells_up_from_down_and_leaves_equal_pixels_alone(rng: np.random.Generator):
     reference = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
     frame = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
@@ -82,10 +69,3 @@ def test_a_signed_difference_tells_up_from_down_and_leaves_equal_pixels_alone(rn
     true = (frame.astype(float) - reference) / 2 / 255 + 128 / 255
     # each of the two images is halved and rounded down: at most half a step apart
     np.testing.assert_allclose(told, true, atol=0.5 / 255 + 1e-6)
-
-
-def test_an_amplitude_is_kept():
-    reference = np.zeros((8, 8, 3), dtype=np.uint8)
-    frames = np.stack([np.full((8, 8, 3), level, dtype=np.uint8) for level in (10, 20, 200)])
-    told = ENCODINGS["amplitude"].encode(frames, reference, image_size=8)
-    torch.testing.assert_close(told.amax(dim=(1, 2, 3)), torch.tensor([10.0, 20.0, 200.0]) / 255)

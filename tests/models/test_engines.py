@@ -3,7 +3,6 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -64,14 +63,6 @@ def test_predictions_come_in_the_order_of_the_batches(name: str, tiny: nn.Module
     torch.testing.assert_close(torch.cat(answers), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_predictions_outlive_the_next_call(name: str, networks: dict[str, Network], images: Tensor):
-    engine = make_engine(name, networks["histogram"])
-    first = engine.estimate(networks["histogram"], images)
-    before = first.margin.copy()
-    engine.estimate(networks["histogram"], torch.zeros_like(images))
-    np.testing.assert_array_equal(first.margin, before)
-
-
 def test_features_come_with_the_predictions(name: str):
     network = load("chromatouch-pair")
     assert network.novelty is not None
@@ -119,28 +110,6 @@ def test_an_engine_with_other_predictions_is_not_used(images: Tensor):
     assert make(Branches(), images).name == "torch"
     with pytest.raises(ModelError, match=r"openvino cannot run Branches \(its predictions differ by .*; choose torch"):
         make(Branches(), images, engine="openvino")
-
-
-def with_hook(model: nn.Module) -> nn.Module:
-    model.register_forward_hook(lambda _module, _arguments, output: 2 * output)  # pyright: ignore[reportOperatorIssue]
-    return model
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (with_hook, "the model has hooks.*; remove them, or choose torch"),
-        (nn.Module.double, r"it runs float32, not torch\.float64; choose torch"),
-    ],
-)
-def test_openvino_says_why_it_cannot_run_a_network(
-    change: Callable[[nn.Module], nn.Module], message: str, tiny: nn.Module, images: Tensor
-):
-    model = change(tiny)
-    some = images.to(next(model.parameters()).dtype)
-    with pytest.raises(InputError, match=f"the engine openvino cannot be used: {message}"):
-        make(model, some, engine="openvino")
-    assert make(model, some).name == "torch"
 
 
 def test_an_engine_that_is_not_there_is_refused_with_the_cure(networks: dict[str, Network], monkeypatch):

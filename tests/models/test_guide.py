@@ -55,24 +55,3 @@ def test_the_file_is_read_without_sliplens(
         assert estimate.sigma is not None
         assert names["sigma"] == pytest.approx(estimate.sigma[0], abs=5e-3)
         assert "give or take" in out
-
-
-def test_the_library_is_used_as_it_says(
-    *,
-    blocks: list[str],
-    runs: dict[str, Path],
-    small_dataset: Dataset,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    networks: dict[str, Network],
-):
-    pytest.importorskip("onnxscript")
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs" / "mine").mkdir(parents=True)
-    (tmp_path / "runs" / "mine" / "train").symlink_to(runs["point"])
-    recording = small_dataset.load(small_dataset.select(split="test")[0])
-    names: dict = {"frames": recording.frames, "untouched": recording.reference}
-    exec(compile(blocks[1], str(GUIDE), "exec"), names)
-    expected = networks["point"].estimate(networks["point"].encode(recording.frames, recording.reference))
-    # float32 sums in another order, through some 60 layers
-    np.testing.assert_allclose(names["estimate"].margin, expected.margin, atol=1e-4)

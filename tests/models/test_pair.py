@@ -8,14 +8,10 @@ import pytest
 import torch
 
 import sliplens as sl
-from sliplens.errors import InputError, ModelError
-from sliplens.faithfulness.fills import FILLS, get_fill
+from sliplens.errors import InputError
 from sliplens.models import Network, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import REFERENCE_SIGNS, with_reference
 from sliplens.recordings import Dataset, Recording
-from sliplens.training import get_recipe
-from sliplens.training.data import get_augmentation
-from sliplens.training.fitting import require_same_kind
 
 
 def begun(folder: Path) -> Network:
@@ -48,25 +44,6 @@ def test_without_weight_on_the_reference_it_answers_as_a_raw_network(raw_run: Pa
     assert torch.equal(pair.predict(pair.encode(frames, other)), pair.predict(pair.encode(frames, reference)))
 
 
-def test_begun_with_differences_the_untouched_sensor_is_no_difference(difference_run: Path, recording: Recording):
-    reference = recording.reference
-    difference, pair = load_checkpoint(difference_run), begun(difference_run)
-    torch.testing.assert_close(
-        pair.predict(pair.encode(reference[None], reference)),
-        difference.predict(difference.encode(reference[None], reference)),
-        atol=1e-5,
-        rtol=0,
-    )
-
-
-def test_it_begins_with_a_network_whose_first_layer_means_as_much(raw_run: Path, difference_run: Path):
-    config = replace(get_recipe("default"), head="point")
-    for folder in (raw_run, difference_run):
-        require_same_kind(load_checkpoint(folder), config, "pair")
-    with pytest.raises(ModelError, match="has the input pair, and raw is to be trained"):
-        require_same_kind(begun(raw_run), config, "raw")
-
-
 def test_it_does_without_no_reference(raw_run: Path, recording: Recording):
     with pytest.raises(InputError, match="name its image with --reference IMAGE"):
         sl.predict(begun(raw_run), recording.frames)
@@ -96,23 +73,3 @@ def test_from_training_to_an_explanation(small_dataset: Dataset, raw_run: Path, 
     with sl.LiveReader(frames, again, reference=reference, engine="torch", health=None, slip=None) as reader:
         *_, last = reader.readings()
     assert last.margin == pytest.approx(np.clip(own[-1], 0, 1), abs=1e-4)
-
-
-@pytest.mark.parametrize("name", list(FILLS))
-def test_what_is_removed_is_the_frame(name: str):
-    images = torch.rand(2, 6, 16, 16, generator=torch.Generator().manual_seed(0))
-    gone = torch.zeros(2, 16, 16, dtype=torch.bool)
-    gone[:, 4:9, 4:9] = True
-    painted = get_fill(name)(images, torch.cat([images[:, 3:]] * 2, dim=1), 0)(torch.arange(2), gone)
-    assert torch.equal(painted[:, 3:], images[:, 3:])
-    alone = get_fill(name)(images[:, :3], images[:, 3:], 0)(torch.arange(2), gone)
-    torch.testing.assert_close(painted[:, :3], alone)
-
-
-def test_white_balance_and_place_change_frame_and_reference_alike():
-    augmentation = get_augmentation("default")
-    assert augmentation is not None
-    half = torch.rand(4, 3, 16, 16, generator=torch.Generator().manual_seed(0))
-    still = replace(augmentation, noise_sd=0.0)
-    changed = still(torch.cat([half, half], dim=1), generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(changed[:, :3], changed[:, 3:])

@@ -14,21 +14,19 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from there import there
 
 import sliplens as sl
 from sliplens.codec import TABLE_SUFFIXES
 from sliplens.errors import ImageError, InputError, PartError, RecordingError
 from sliplens.images import absolute_difference, write_png
 from sliplens.markers.camera import CAMERA_REASON
-from sliplens.models import Network, load_checkpoint
+from sliplens.models import Network
 from sliplens.models.checkpoint import STRANGE_REASON
 from sliplens.models.predictions import Predictions
 from sliplens.models.predictions import predict as predict_source
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import trial_path
-from sliplens.recordings.exporting import export_lerobot
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import ContactState
 from sliplens.runner import read_status
@@ -111,29 +109,6 @@ def test_a_data_set_is_predicted_frame_by_frame(
     np.testing.assert_allclose(rows["prediction"][12:], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
 
 
-def test_how_sure_the_network_is_comes_from_its_distribution(
-    trained: Network, small_dataset: Dataset, wet: Recording, tmp_path: Path
-):
-    rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet", split="test")
-    estimate = trained.estimate(trained.encode(wet.frames, wet.reference))
-    interval = there(estimate.interval(0.9))
-    for name, values in zip(("sigma", "low_90", "high_90"), (there(estimate.sigma), *interval), strict=True):
-        np.testing.assert_allclose(rows[name][12:], values, atol=1e-5)  # as above
-    assert np.all(np.array(rows["low_90"]) <= rows["high_90"])
-
-
-def test_how_far_the_network_knows_each_frame_is_told(trials: dict[str, Recording]):
-    trial, network = trials["chromatouch"], sl.load("chromatouch-difference")
-    bright = np.clip(trial.frames[20:22] * 1.5, 0, 255).astype(np.uint8)
-    frames = np.concatenate([trial.frames[18:23], bright])
-    predictions = sl.predict(network, frames, reference=trial.reference, engine="torch", batch_size=3)
-    estimate = network.estimate(network.encode(frames, trial.reference))
-    assert estimate.known is not None
-    np.testing.assert_allclose(predictions.frame()["known"].to_numpy(), estimate.known, atol=1e-3)
-    strange = estimate.known < 0.01
-    assert predictions.withheld == {STRANGE_REASON: strange.sum()} == {STRANGE_REASON: 2}
-
-
 NETWORK_COLUMNS = ("prediction", "sigma", "low_90", "high_90", "traction_ratio", "traction_ratio_sigma")
 
 
@@ -159,14 +134,6 @@ def test_a_trial_whose_margins_are_all_withheld_has_no_lowest(foreign: Recording
     assert trial.withheld == trial.touching == np.isnan(trial.margin).sum() > 10
 
 
-def test_a_network_with_one_number_tells_nothing_of_it(
-    networks: dict[str, Network], small_dataset: Dataset, tmp_path: Path
-):
-    rows = predict(small_dataset.folder, networks["point"], tmp_path / "a.parquet", split="test")
-    assert {*rows["sigma"], *rows["low_90"], *rows["high_90"]} == {None}
-    assert None not in rows["prediction"]
-
-
 @pytest.mark.parametrize("batch_size", [1, 7, 64])
 def test_predictions_do_not_depend_on_the_batch(
     batch_size: int, trained: Network, small_dataset: Dataset, tmp_path: Path
@@ -175,11 +142,6 @@ def test_predictions_do_not_depend_on_the_batch(
     second = predict(small_dataset.folder, trained, tmp_path / "b.parquet", batch_size=batch_size)
     np.testing.assert_allclose(first["prediction"], second["prediction"], atol=1e-5)  # as above
     assert first["frame"] == second["frame"]
-
-
-def test_all_trials_are_predicted_unless_a_split_is_named(trained: Network, small_dataset: Dataset, tmp_path: Path):
-    rows = predict(small_dataset.folder, trained, tmp_path / "a.parquet")
-    assert list(dict.fromkeys(rows["trial"])) == [info.trial for info in small_dataset.trials]
 
 
 def test_the_lowest_margin_is_of_a_frame_that_touches(trained: Network, wet: Recording):
@@ -208,12 +170,6 @@ def test_a_folder_of_frames_and_its_differences_are_the_same(trained: Network, w
     np.testing.assert_allclose(first["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
 
 
-def test_images_have_times_where_their_rate_is_told(trained: Network, wet: Recording, tmp_path: Path):
-    frames = write_frames(tmp_path / "frames", wet.frames)
-    rows = predict(frames, trained, tmp_path / "a.parquet", reference_frame=0, options=ReadOptions(frame_rate=8.0))
-    assert rows["time_s"] == [index / 8 for index in range(12)]
-
-
 def test_a_video_is_compared_with_a_frame_of_it_or_an_image(trained: Network, wet: Recording, tmp_path: Path):
     video = write_video(tmp_path / "touch.mkv", wet.frames)
     write_png(tmp_path / "third.png", wet.frames[3])
@@ -224,39 +180,6 @@ def test_a_video_is_compared_with_a_frame_of_it_or_an_image(trained: Network, we
     # Matroska keeps milliseconds
     np.testing.assert_allclose(first["time_s"], np.arange(12) / 25, atol=6e-4)
     np.testing.assert_allclose(first["prediction"], one_by_one(trained, wet.frames, wet.frames[3]), atol=1e-5)
-
-
-def test_raw_frames_need_no_reference(raw_run: Path, wet: Recording, tmp_path: Path):
-    trained = load_checkpoint(raw_run)
-    frames = write_frames(tmp_path / "frames", wet.frames)
-    rows = predict(frames, trained, tmp_path / "a.parquet")
-    again = predict(write_video(tmp_path / "touch.mkv", wet.frames), trained, tmp_path / "b.parquet")
-    np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
-    assert rows["prediction"] == again["prediction"]
-
-
-def test_what_the_images_were_taken_for_is_noted(trained: Network, wet: Recording, tmp_path: Path):
-    frames = write_frames(tmp_path / "frames", wet.frames)
-    assert "taken for difference images" in predict_source(trained, frames).notes[0]
-    assert not predict_source(trained, frames, reference_frame=0).notes
-    video = write_video(tmp_path / "touch.mkv", wet.frames)
-    assumed, named = predict_source(trained, video), predict_source(trained, video, reference_frame=0)
-    assert "its first frame was taken for the untouched sensor" in assumed.notes[-1]
-    assert assumed.notes[:-1] == named.notes
-    assert assumed.frame()["prediction"] == named.frame()["prediction"]
-
-
-@pytest.mark.parametrize("kind", ["difference", "raw"])
-def test_grey_frames_are_noted_where_the_network_learned_from_colours(
-    difference_run: Path, raw_run: Path, wet: Recording, kind: str
-):
-    trained = load_checkpoint({"difference": difference_run, "raw": raw_run}[kind])
-    untouched = None if kind == "raw" else 0
-    grey = np.repeat(wet.frames[..., :1], 3, axis=-1)
-    for learned, frames, noted in ((True, grey, 1), (True, wet.frames, 0), (False, grey, 0), (None, grey, 0)):
-        run = replace(trained, manifest=replace(trained.manifest, colour=learned))
-        notes = predict_source(run, frames, reference_frame=untouched).notes
-        assert sum("the frames are grey, and the network was trained on colours" in one for one in notes) == noted
 
 
 def refused(source: Path, trained: Network, kind: type[Exception], message: str, **options: object) -> None:
@@ -374,24 +297,6 @@ def test_rows_in_memory_are_those_of_the_file(trained: Network, small_dataset: D
     assert "prediction: double" in repr(kept)
     (tmp_path / "a.parquet").unlink()  # to name it nobody has to read it
     assert repr(written) == f"Predictions of 24 frames by {written.engine}, in {tmp_path / 'a.parquet'}"
-
-
-def test_an_array_is_a_trial(trained: Network, wet: Recording):
-    rows = predict_source(trained, wet.frames, reference=wet.reference).frame().to_pydict()
-    np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
-    assert "file" not in rows
-
-
-def test_a_recording_brings_its_own_reference_and_labels_unless_told_otherwise(
-    trained: Network, small_dataset: Dataset, wet: Recording, tmp_path: Path
-):
-    made = tmp_path / "lerobot"
-    export_lerobot(small_dataset, made, trials=[info.trial for info in small_dataset.select(condition="wet")])
-    rows = predict(made, trained, tmp_path / "a.parquet")
-    np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.reference), atol=1e-5)
-    assert rows["safety_margin"] == [None, *wet.safety_margin[1:].tolist()]
-    rows = predict(made, trained, tmp_path / "b.parquet", reference_frame=2)
-    np.testing.assert_allclose(rows["prediction"], one_by_one(trained, wet.frames, wet.frames[2]), atol=1e-5)
 
 
 def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_them(

@@ -7,16 +7,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from data_sets import save_dataset
 from there import there
 
 import sliplens as sl
-from sliplens.errors import CheckpointError, InputError, SliplensError
+from sliplens.errors import CheckpointError, InputError
 from sliplens.live.contract import LiveOptions
 from sliplens.models import Network, load_checkpoint, save_checkpoint
 from sliplens.models.calibration import Calibration
 from sliplens.models.checkpoint import Estimate
-from sliplens.models.sequence import GAP_S, SequenceHead
 from sliplens.recordings import Dataset
 from sliplens.recordings.source import open_source
 from sliplens.recordings.trial import ContactState
@@ -78,16 +76,6 @@ def test_memory_counts_and_ends_with_the_contact(run: Network):
     assert lifted[6] == estimate.margin[0]
 
 
-def test_a_clock_that_runs_back_begins_anew(run: Network):
-    estimate, follower = answers(6), run.follow()
-    touches = np.ones(6, dtype=bool)
-    first = follower.update(estimate, 5 + np.arange(6) / 30, touches)
-    again = follower.update(estimate, np.arange(6) / 30, touches)
-    np.testing.assert_allclose(
-        again.margin, first.margin, atol=1e-6
-    )  # times differ by a shift, whose differences round
-
-
 def test_after_a_gap_the_rest_of_a_contact_is_read_frame_by_frame(run: Network):
     estimate, follower = answers(18), run.follow()
     times, touches = np.arange(18) / 10, np.ones(18, dtype=bool)
@@ -126,21 +114,6 @@ def test_frames_read_one_by_one_after_a_gap_keep_their_own_intervals(run: Networ
     assert np.array_equal(there(read.at(after).interval(0.9))[0], own[0][5:])
 
 
-@pytest.mark.parametrize(("step_s", "lost"), [(0.5, False), (GAP_S, False), (GAP_S + 0.01, True)])
-def test_memory_holds_as_long_as_was_taught(run: Network, step_s: float, lost: bool):
-    estimate, follower = answers(5), run.follow()
-    read = follower.update(estimate, 7 + step_s * np.arange(5), np.ones(5, dtype=bool)).margin
-    assert follower.lost == lost
-    assert np.isclose(read, estimate.margin)[1:].all() == lost
-
-
-def test_a_head_that_learnt_nothing_leaves_answers_as_they_are(run: Network):
-    untaught = replace(run, sequence=SequenceHead(EDGES, RATIO_EDGES).eval())
-    estimate = answers(5)
-    # bins of less than 1e-6 are lifted to it, 60 of them at most, and floats have 24 bits
-    np.testing.assert_allclose(follow(untaught, estimate), estimate.margin, atol=1e-4)
-
-
 def test_frames_are_read_as_the_head_was_taught(run: Network):
     """Training has whole contacts at once, in torch; reading has one frame after another, in numpy."""
     estimate, head = answers(12), there(run.sequence)
@@ -152,24 +125,6 @@ def test_frames_are_read_as_the_head_was_taught(run: Network):
     read = run.follow().update(estimate, np.arange(12) / 10, np.ones(12, dtype=bool))
     # floats have 24 bits, and sums of up to 80 of them are added in another order
     np.testing.assert_allclose(read.margin, logits[0].softmax(-1).numpy() @ head.centres, atol=1e-5)
-
-
-def test_the_gradient_of_a_fresh_head_points_from_the_answer_to_the_label():
-    head = SequenceHead(EDGES, RATIO_EDGES, dropout=0.0)
-    estimate = answers(8)
-    margin = torch.from_numpy(estimate.probabilities).float()[None]
-    label = torch.full((8,), 20)
-    logits = head(torch.ones(1, 8, 8), margin)
-    torch.nn.functional.cross_entropy(logits[0], label).backward()
-    expected = margin[0].clamp_min(1e-6)
-    expected = (expected / expected.sum(-1, keepdim=True)).mean(0) - torch.eye(60)[20]
-    torch.testing.assert_close(head.correction.bias.grad, expected, atol=1e-6, rtol=1e-4)
-
-
-def test_one_frame_is_read_as_before(run: Network, small_dataset: Dataset):
-    trial = small_dataset.load(small_dataset.trials[0])
-    alone = sl.predict(replace(run, sequence=None), trial.frames, reference=trial.reference)
-    assert sl.predict(run, trial.frames, reference=trial.reference).frame().equals(alone.frame())
 
 
 def test_a_recording_is_read_as_the_follower_reads_it(run: Network, small_dataset: Dataset, tmp_path: Path):
@@ -185,15 +140,6 @@ def test_a_recording_is_read_as_the_follower_reads_it(run: Network, small_datase
     np.testing.assert_allclose(rows["low_90"].to_numpy(), low, atol=1e-5)
     written = sl.predict(run, small_dataset, split="train", sequence=True, out=tmp_path / "margins").frame()
     assert written["prediction"].equals(table["prediction"])
-
-
-def test_a_table_says_that_it_was_read_in_order(run: Network, small_dataset: Dataset):
-    in_order, alone = (sl.predict(run, small_dataset, split="test", sequence=one) for one in (True, False))
-    metadata = in_order.frame().schema.metadata
-    assert metadata[b"sliplens.sequence"].decode() == there(run.manifest.sequence).weights_sha256
-    assert any("read in order" in sentence for sentence in in_order.notes)
-    assert b"sliplens.sequence" not in alone.frame().schema.metadata
-    assert not any("read in order" in sentence for sentence in alone.notes)
 
 
 def test_the_rows_of_a_long_trial_are_written_as_they_come(
@@ -243,13 +189,6 @@ def test_frames_that_come_too_seldom_are_refused(run: Network, small_dataset: Da
     reader = sl.LiveReader(seldom, run, options=slow, reference=reference, sequence=True, engine="torch")
     with pytest.raises(InputError, match="has a frame each 1 s"), reader:
         pass
-
-
-def test_each_trial_is_asked_whether_its_frames_come_often_enough(run: Network, small_dataset: Dataset, tmp_path: Path):
-    first, second = (small_dataset.load(info) for info in small_dataset.trials[:2])
-    data = save_dataset(tmp_path, first, replace(second, time_s=30 * second.time_s))
-    with pytest.raises(SliplensError, match=rf"{second.trial} has a frame each 1 s"):
-        sl.predict(run, data, sequence=True)
 
 
 def test_a_damaged_head_is_refused(run: Network, tmp_path: Path):

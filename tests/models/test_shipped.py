@@ -19,10 +19,6 @@ from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 from sliplens.simulation.plan import PULLS
 
 
-def test_the_networks_that_come_with_the_package():
-    assert shipped_names() == ["chromatouch-difference", "chromatouch-pair", "thesis-difference", "thesis-raw"]
-
-
 @pytest.mark.parametrize("name", shipped_names())
 def test_every_network_of_the_package_loads_and_says_what_it_learned_from(name: str):
     trained = sliplens.load(name)
@@ -107,27 +103,11 @@ def test_a_network_that_is_not_there_is_refused():
         find_run(Path("nowhere"))
 
 
-def test_a_folder_counts_before_a_network_of_the_package(difference_run: Path):
-    assert find_run(difference_run) == difference_run
-
-
-def test_nothing_else_is_found_by_asking_the_package():
-    with pytest.raises(AttributeError, match="has no attribute 'weights_of_the_world'"):
-        _ = sliplens.weights_of_the_world  # pyright: ignore[reportAttributeAccessIssue]
-
-
 def test_networks_are_loaded_without_the_compiler_and_pandas():
     script = "import sys, sliplens.models.predictions; print([name for name in sys.argv[1:] if name in sys.modules])"
     words = ["torch._dynamo", "torch._inductor", "pandas", "scipy.special", "matplotlib"]
     told = subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, check=True)
     assert told.stdout.strip() == "[]"
-
-
-def test_a_network_is_told_in_ten_lines():
-    told = repr(sliplens.load("chromatouch-difference"))
-    assert len(told.splitlines()) <= 10
-    assert "difference images" in told
-    assert "224 x 224 px" in told
 
 
 def test_the_network_may_be_left_out():

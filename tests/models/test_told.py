@@ -40,18 +40,6 @@ def test_more_than_friction_holds_is_no_margin():
     assert (told(EVEN, ratio_about(0.7, 0.02), Friction(0.4)) @ MARGINS)[0] < 0.02
 
 
-def test_nothing_pulls_is_a_full_margin_whatever_the_friction():
-    stick = np.diff(stats.norm.cdf(EDGES, 1.0, 0.02))[None]
-    for friction in (Friction(0.2), Friction(1.1), Friction.between(0.2, 1.0)):
-        assert (told(stick / stick.sum(), ratio_about(0, 0.015), friction) @ MARGINS)[0] > 0.95
-
-
-def test_rougher_holds_more():
-    ratio = ratio_about(0.25, 0.04)
-    means = [(told(EVEN, ratio, Friction(mu)) @ MARGINS)[0] for mu in (0.3, 0.4, 0.6, 0.9)]
-    assert np.all(np.diff(means) > 0.05)
-
-
 def test_told_what_the_training_had_the_margin_stays():
     margin = np.diff(stats.norm.cdf(EDGES, 0.5, 0.06))[None]
     margin /= margin.sum()
@@ -88,10 +76,8 @@ def test_a_network_of_two_answers_takes_friction(networks: dict[str, Network], i
     untold, exact = trained.estimate(images), trained.estimate(images, friction=0.6)
     assert untold.ratio is not None
     assert untold.ratio.probabilities.shape == (5, 80)
-    ratio_interval, interval = untold.ratio.interval(0.9), exact.interval(0.9)
-    assert ratio_interval is not None
+    interval = exact.interval(0.9)
     assert interval is not None
-    assert np.all(ratio_interval[0] <= ratio_interval[1])
     assert np.all((interval[0] >= 0) & (interval[1] <= 1))
     assert str(exact.friction) == "0.6, exact"
     again = trained.estimate(images, friction="0.6")

@@ -23,12 +23,6 @@ def test_the_same_state_gives_the_same_images():
     assert not torch.equal(Augmentation()(images, generator=seeded(1)), Augmentation()(images, generator=seeded(2)))
 
 
-def test_every_image_is_turned_by_an_angle_of_its_own():
-    images = torch.rand(1, 3, 32, 32, generator=seeded()).expand(4, -1, -1, -1)
-    turned = replace(NOTHING, rotation_deg=10.0)(images, generator=seeded())
-    assert not torch.allclose(turned[0], turned[1], atol=1e-3)
-
-
 def test_shifts_move_the_picture_by_no_more_than_the_share():
     images = torch.zeros(64, 1, 32, 32)
     images[..., 16, 16] = 1
@@ -49,13 +43,6 @@ def test_colours_change_channel_by_channel_within_bounds():
     torch.testing.assert_close(changed, (0.5 * factors)[:, :, None, None].expand_as(changed))
     assert 0.9 <= factors.min() < 0.92
     assert 1.08 < factors.max() <= 1.1
-
-
-def test_augmented_images_stay_in_range():
-    images = torch.rand(4, 3, 16, 16, generator=seeded()).round()
-    out = Augmentation(noise_sd=0.5, blur_probability=1.0)(images, generator=seeded())
-    assert out.min() >= 0
-    assert out.max() <= 1
 
 
 def dots(*centres: tuple[float, float]) -> torch.Tensor:

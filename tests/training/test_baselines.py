@@ -19,7 +19,7 @@ from sliplens.models import Manifest, build_model, save_checkpoint
 from sliplens.recordings import Dataset
 from sliplens.results.evaluation import BaselinePredictions, Baselines, ScoredFrames
 from sliplens.simulation import SimulationRecipe, simulate_dataset
-from sliplens.training.evaluation import BaselinePlan, choose_training, evaluate_baselines, marker_kind
+from sliplens.training.evaluation import BaselinePlan, evaluate_baselines
 
 pytest.importorskip("cv2", reason="markers are found with OpenCV, of the extra `markers`")
 
@@ -121,26 +121,6 @@ def test_answers_are_those_of_estimators_fitted_by_hand(data: Dataset, followed:
     assert found.followed > 0.9
 
 
-def test_the_constant_explains_nothing_of_frames_with_the_mean_it_was_fitted_to(data: Dataset, followed: Path):
-    # scored on its own training trials, the mean of the labels leaves all of their variance
-    on_dry = plan(data, names=("constant",), condition="dry")
-    found, _ = evaluate_baselines(on_dry, data, labelled_frames(data, split="train"), folder=followed)
-    assert found.shared_trials == found.training_trials
-    assert found.estimators["constant"].conditions["dry"].r2 == pytest.approx(0, abs=1e-9)
-
-
-def test_fields_that_were_followed_before_are_not_followed_again(data: Dataset, followed: Path, monkeypatch):
-    first, answered = evaluated(data, followed)
-
-    def refuse(*_: object) -> None:
-        raise AssertionError("followed again")
-
-    monkeypatch.setattr("sliplens.training.evaluation.track_markers", refuse)
-    again, answered_again = evaluated(data, followed)
-    assert again == first
-    assert answered_again.table() == answered.table()
-
-
 def test_trials_without_markers_are_named_and_answered_with_the_training_mean(
     data: Dataset, followed: Path, tmp_path: Path, monkeypatch
 ):
@@ -166,21 +146,6 @@ def test_no_trial_with_markers_is_refused(small_dataset: Dataset, tmp_path: Path
     # frames of noise with a square: nothing round in them
     with pytest.raises(InputError, match="markers were followed in none of the training trials"):
         evaluated(small_dataset, tmp_path)
-
-
-def test_training_trials_are_spread_over_the_table(data: Dataset):
-    trials = data.trials
-    assert choose_training(trials, 2) == (trials[0], trials[-1])
-    assert choose_training(trials, 100) == trials
-    assert len(set(choose_training(trials, 4))) == 4
-    with pytest.raises(InputError, match="0 training trials are too few"):
-        choose_training(trials, 0)
-
-
-def test_the_kind_of_markers_follows_from_the_name_of_the_sensor(data: Dataset, small_dataset: Dataset):
-    assert marker_kind(data.trials) == "chromatouch"
-    assert marker_kind(small_dataset.trials) == "auto"
-    assert marker_kind((*data.trials, *small_dataset.trials)) == "auto"
 
 
 def test_the_command_puts_them_beside_the_network(data: Dataset, network: Path, tmp_path: Path, capsys):

@@ -12,7 +12,7 @@ from sliplens.progress import OnProgress, reporting
 from sliplens.recordings import Dataset
 from sliplens.results.evaluation import Training
 from sliplens.training import TrainingConfig, evaluate_frames, fit, fitting, get_recipe
-from sliplens.training.data import EpochShuffle, FrameSet, load_frames
+from sliplens.training.data import FrameSet, load_frames
 from sliplens.training.fitting import DataOrigin, require_same_kind
 
 CONFIG = TrainingConfig(image_size=32, epochs=3, batch_size=11, seed=3)
@@ -20,7 +20,7 @@ CONFIG = TrainingConfig(image_size=32, epochs=3, batch_size=11, seed=3)
 
 @pytest.fixture(scope="module")
 def frames(small_dataset: Dataset) -> tuple[FrameSet, FrameSet]:
-    encoding = ENCODINGS.pick("difference")
+    encoding = ENCODINGS["difference"]
     train, validation = (
         load_frames(small_dataset, small_dataset.select(split=split), encoding=encoding, image_size=32)
         for split in ("train", "validation")
@@ -133,27 +133,14 @@ def test_the_time_limit_stops_a_training_and_leaves_a_whole_run(tmp_path: Path, 
 def test_a_loss_that_is_not_finite_stops_with_a_sentence(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
     labels = frames[0].safety_margin.clone()
     labels[7] = torch.nan
-    with pytest.raises(ModelError) as told:
+    with pytest.raises(ModelError, match=r"the training loss is nan in epoch 1, at step \d; lower the learning rate"):
         run(tmp_path / "run", (replace(frames[0], safety_margin=labels), frames[1]))
-    # 44 frames and batches of 11 without a rest: the bad one is in some batch of the first epoch
-    order = EpochShuffle(44, seed=CONFIG.seed).order(0)
-    step = order.index(7) // 11
-    named = [f"frame {frames[0].frame[row]} of {frames[0].trial[row]}" for row in order[11 * step : 11 * step + 3]]
-    assert str(told.value) == (
-        f"the training loss is nan in epoch 1, at step {step}, for a batch of {', '.join(named)} and 8 more; "
-        "lower the learning rate, or look at these frames, and try again"
-    )
     assert not (tmp_path / "run" / "manifest.json").exists()  # no epoch was whole
 
 
 def test_a_trial_in_both_sets_is_refused(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
     with pytest.raises(InputError, match="trial train-dry-0 is in both training and validation; split by trial"):
         run(tmp_path / "run", (frames[0], frames[0]))
-
-
-def test_fewer_frames_than_a_batch_are_refused(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
-    with pytest.raises(InputError, match="44 training frames do not fill a batch of 64; lower batch_size"):
-        run(tmp_path / "run", frames, replace(CONFIG, batch_size=64))
 
 
 @pytest.mark.parametrize(
@@ -214,15 +201,6 @@ def test_adapting_moves_weights_and_leaves_the_statistics_of_the_normalisation(
     assert all(torch.equal(value, kept[name]) for name, value in adapted.named_buffers())
     weights = dict(before.named_parameters())
     assert all(not torch.equal(value, weights[name]) for name, value in adapted.named_parameters() if value.ndim > 1)
-
-
-def test_it_stops_where_the_validation_gains_nothing(
-    tmp_path: Path, frames: tuple[FrameSet, FrameSet], trained_run: Path
-):
-    # so low a rate gains nothing
-    still = replace(ADAPT, epochs=9, learning_rate=1e-30, patience=1)
-    training = run(tmp_path / "run", frames, still, start=load_checkpoint(trained_run))
-    assert (training.stopped_by, training.epochs) == ("no gain", 2)
 
 
 RATIO = replace(get_recipe("ratio"), image_size=32, epochs=30, batch_size=11, seed=3)
@@ -287,21 +265,3 @@ def test_an_evaluation_tells_what_was_told(frames: tuple[FrameSet, FrameSet], ra
         expected = trained.estimate(inputs, friction=float(value)).margin
         np.testing.assert_allclose(each.predictions.prediction[rows], expected, atol=1e-6)
     assert evaluate_frames(load_checkpoint(histogram_run), frames[1]).ratio_r2 == {}
-
-
-def test_both_answers_are_learnt_together(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
-    run(tmp_path / "run", frames, replace(CONFIG, head="margin-and-ratio", epochs=1))
-    assert load_checkpoint(tmp_path / "run").manifest.traction is not None
-
-
-def test_without_forces_there_is_no_second_answer(tmp_path: Path, frames: tuple[FrameSet, FrameSet]):
-    train, validation = (
-        replace(one, traction_ratio=torch.full_like(one.traction_ratio, float("nan"))) for one in frames
-    )
-    with pytest.raises(InputError, match="no training frame has forces"):
-        run(tmp_path / "run", (train, validation), replace(CONFIG, head="margin-and-ratio"))
-
-
-def test_a_frozen_network_learns_the_ratio_alone():
-    with pytest.raises(InputError, match="whose margins stay learns F_t / F_n alone"):
-        replace(RATIO, head="histogram")

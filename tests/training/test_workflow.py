@@ -1,19 +1,15 @@
 """Training and evaluation as calls of the library, from a data set to a record."""
 
-import gc
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from there import there
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.models.backbones import last_layer
 from sliplens.progress import OnProgress
 from sliplens.recordings import Dataset
 
@@ -84,43 +80,7 @@ def test_a_network_that_is_adapted_stays_of_its_kind(small_dataset: Dataset):
         sl.train(small_dataset, recipe="adapt")
 
 
-@pytest.mark.parametrize("forces", [True, False])
-def test_adapting_says_what_is_lost_of_the_network_to_start_from(
-    small_dataset: Dataset, sequence_run: Path, monkeypatch: pytest.MonkeyPatch, forces: bool
-):
-    if not forces:
-        names = ("normal_force_n", "tangential_force_n", "friction_coefficient")
-        unknown = dict.fromkeys(names, np.full(12, np.nan))
-        for name in ("load", "read_labels"):
-            read = getattr(Dataset, name)
-            monkeypatch.setattr(
-                Dataset, name, lambda *args, read=read, **named: replace(read(*args, **named), **unknown)
-            )
-    start, notes = sl.load(sequence_run), Notes()
-    short: dict[str, Any] = {"epochs": 1, "epoch_frames": 32, "learning_rate": 1e-12}
-    run = sl.train(small_dataset, recipe="adapt", start_from=start, **short, on_progress=notes)
-    assert run.sequence is None
-    assert run.manifest.head == ("margin-and-ratio" if forces else "histogram")
-    assert (run.manifest.traction is not None) == forces
-    lost = "its own with --recipe sequence" if forces else "it takes neither --friction nor --sequence"
-    assert sum(lost in sentence for sentence in notes.sentences) == 1
-    assert len(notes.sentences) == 2  # and how many trials there are
-    # so low a rate leaves the weights as they were: of the last layer the rows of the margin were taken
-    after, before = last_layer(run.model).weight, last_layer(start.model).weight
-    assert len(after) == (len(before) if forces else 60)
-    torch.testing.assert_close(after, before[: len(after)], rtol=0, atol=1e-9)
-
-
 def test_several_processes_need_a_folder(small_dataset: Dataset):
     options: dict[str, Any] = SMALL | {"batch_size": 12}
     with pytest.raises(InputError, match="several processes need a folder that all can see; name one with out"):
         sl.train(small_dataset, **options, accelerator="cpu", devices=2)
-
-
-def test_a_simulation_without_a_folder_lives_as_long_as_its_data_set():
-    data = sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20)
-    folder = data.folder
-    assert len(data.load(data.trials[0]).frames) == 20
-    del data
-    gc.collect()
-    assert not folder.exists()

@@ -3,7 +3,7 @@
 import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from importlib import import_module
 from threading import get_ident
 from types import ModuleType
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import ModelError
-from sliplens.extras import Table
+from sliplens.extras import pick
 
 
 def _import_torchvision() -> ModuleType:
@@ -58,9 +58,7 @@ _WIDTH_RATIO = 0.75
 class HistogramRegressor(nn.Module):
     """Network with a histogram over the safety margin as its output; it returns the mean (HL-Gauss).
 
-    `backbone`: takes (batch, 3, height, width) and returns (batch, `bins`) logits; `bins`, `lowest`, `highest`: bins of
-    one width, and the margins between which they lie. With `ratio` it has a second histogram, over the
-    traction ratio F_t / F_n; the backbone returns `RATIO_BINS` logits more then.
+    `backbone` returns (batch, `bins`) logits, and `RATIO_BINS` more if `ratio`, for a histogram over F_t / F_n.
 
     Imani & White, *Improving Regression Performance with Distributional Losses* (2018); Farebrother et al., *Stop
     Regressing* (2024), whose width of a label is taken.
@@ -128,41 +126,20 @@ class HistogramRegressor(nn.Module):
 
 
 @contextmanager
-def watch_features(
-    model: nn.Module, layer: str, then: Callable[[], None] = lambda: None
-) -> Iterator[list[Float[Tensor, "batch features"]]]:
-    """Record the mean over the image of each channel of a layer, batch by batch, while this thread runs the model.
-
-    `then` is called after each batch.
-    """
+def watch_features(model: nn.Module, layer: str) -> Iterator[list[Float[Tensor, "batch features"]]]:
+    """Record the mean over the image of each channel of a layer, batch by batch, while this thread runs the model."""
     features: list[Tensor] = []
     thread = get_ident()
 
     def record(_: nn.Module, __: object, output: Any) -> None:  # no tensor while torch traces it
         if get_ident() == thread:  # another thread may explain the network of a running sensor meanwhile
             features.append(output.mean(dim=(2, 3)))
-            then()
 
     handle = model.get_submodule(layer).register_forward_hook(record)
     try:
         yield features
     finally:
         handle.remove()
-
-
-class _Watched(nn.Module):
-    """Backbone that also returns the features of one of its layers, in the same pass."""
-
-    def __init__(self, backbone: nn.Module, layer: str | None) -> None:
-        super().__init__()
-        self.backbone, self.layer = backbone, layer
-
-    def forward(self, image: Any) -> tuple[Any, ...]:  # nor here
-        if self.layer is None:
-            return (self.backbone(image),)
-        with watch_features(self.backbone, self.layer) as features:
-            answer = self.backbone(image)
-        return answer, *features
 
 
 class Answers(nn.Module):
@@ -173,18 +150,16 @@ class Answers(nn.Module):
 
     def __init__(self, model: nn.Module, layer: str | None = None) -> None:
         super().__init__()
-        self.model = model
-        if isinstance(model, HistogramRegressor):
-            self.watched = _Watched(model.backbone, layer and layer.removeprefix("backbone."))
-        else:
-            self.watched = _Watched(model, layer)
+        self.model, self.layer = model, layer
 
     def forward(self, image: Float[Tensor, "batch *input"]) -> tuple[Any, ...]:
         """Compute margins (batch,); probabilities (batch, bins) of the margin, then of the ratio, if it has them.
 
         Then features (batch, channels of `layer`), if there is a layer.
         """
-        answer, *features = self.watched(image)
+        backbone = self.model.backbone if isinstance(self.model, HistogramRegressor) else self.model
+        with watch_features(self.model, self.layer) if self.layer else nullcontext([]) as features:
+            answer = backbone(image)
         if not isinstance(self.model, HistogramRegressor):
             return answer.flatten(), *features
         logits, ratio_logits = self.model.split(answer)
@@ -254,11 +229,7 @@ def last_layer(model: nn.Module) -> nn.Linear:
 
 
 def fill_head(model: nn.Module, weights: Mapping[str, Tensor]) -> nn.Module:
-    """Fill a network that has one output more, or one less, than that of these weights; margins stay the same.
-
-    Rows of the last layer for a new ratio are zero: every ratio is equally likely. Rows for a dropped ratio are left
-    out.
-    """
+    """Fill a network that has one output more or less than these weights; rows for a new ratio are zero."""
     state = model.state_dict()
     for name in state.keys() & weights.keys():
         value, target = weights[name], state[name]
@@ -290,23 +261,13 @@ def _set_channels(model: nn.Module, colours: int) -> None:
     setattr(model.get_submodule(parent), attribute, nn.Conv2d(colours, **options, bias=first.bias is not None))
 
 
-def head_outputs(head: str) -> int:
-    """Return the number of outputs that a head needs of its backbone."""
-    if head not in HEADS:
-        raise ModelError(f"there is no head named {head!r}; choose one of {', '.join(HEADS)}")
-    return HEADS[head]
-
-
 DEFAULT_BACKBONE = "shufflenet_v2_x1_0"
 
 
-BACKBONES: Table[Callable[..., nn.Module]] = Table(
-    "backbone",
-    "sliplens.backbones",
-    {name: _classifiers.get_model_builder(name) for name in _classifiers.list_models(_classifiers)},
-)
-"""Builders of classifiers, called with `num_classes`: TorchVision's, and those that installed packages add by the entry
-point `sliplens.backbones`."""
+BACKBONES: dict[str, Callable[..., nn.Module]] = {
+    name: _classifiers.get_model_builder(name) for name in _classifiers.list_models(_classifiers)
+}
+"""Builders of TorchVision's classifiers, called with `num_classes`."""
 
 
 def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point", colours: int = 3) -> nn.Module:
@@ -314,15 +275,7 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point", colour
 
     It takes (batch, colours, height, width) and returns (batch, 1), untrained, drawn from torch's current random state.
 
-    Parameters
-    ----------
-    backbone
-        Row of `BACKBONES`; `ModelError` if there is none of that name.
-    head
-        `point` for one number, `histogram` for the mean of a distribution (`HistogramRegressor`), `margin-and-ratio`
-        for a second distribution beside it, over F_t / F_n.
-    colours
-        Channels of the input, see `Encoding.colours`.
+    `head` is a row of `HEADS`; `colours` the channels of the input, see `Encoding.colours`.
 
     References
     ----------
@@ -338,7 +291,7 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point", colour
     """
     if backbone not in BACKBONES:
         raise ModelError(f"there is no backbone named {backbone!r}; choose a TorchVision classifier such as resnet18")
-    model = BACKBONES[backbone](num_classes=head_outputs(head))
+    model = BACKBONES[backbone](num_classes=pick(HEADS, head, noun="head"))
     if colours != 3:
         _set_channels(model, colours)
     return model if head == "point" else HistogramRegressor(model, ratio=head == "margin-and-ratio")

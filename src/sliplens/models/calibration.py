@@ -124,8 +124,6 @@ def conformal_offset(
 ) -> float:
     """Compute by how much intervals must widen to hold for a share of the frames, one more counted as missed.
 
-    `low`, `high`: intervals of validation frames; equal for a single number.
-
     Romano et al. (2019), eq. 6 and 7.
     """
     missed = np.sort(np.maximum(low - margins, margins - high))
@@ -143,16 +141,7 @@ def calibrate_histogram(
 ) -> tuple[Calibration, Float[np.ndarray, "frames bins"]]:
     """Fit the temperature of a histogram in place; return its calibration and its probabilities.
 
-    Parameters
-    ----------
-    logits, labels
-        Outputs and labels of validation frames.
-    edges
-        Edges of the bins.
-    temperature
-        Temperature of the histogram, changed in place.
-    calibration
-        Earlier calibration that is to stay, with its temperature; fitted if None.
+    `calibration`: an earlier one that is to stay, with its temperature; fitted if None.
     """
     if calibration is None:
         temperature.fill_(fit_temperature(logits, histogram_targets(labels, edges.cpu())))
@@ -211,16 +200,7 @@ def condition_on_friction(
     closed form alone, Gamma = 1 - rho / mu cut to [0, 1], for outputs that contradict the friction: a ratio above the
     friction is a margin of 0.
 
-    Parameters
-    ----------
-    margin, ratio
-        Probabilities of each frame, over the margin and over F_t / F_n; rows sum to 1.
-    edges, ratio_edges
-        Edges of their bins, each of one width.
-    friction
-        Known friction.
-    trained_friction
-        Evenly spaced quantiles of the friction coefficients in the training, from the least to the largest.
+    `trained_friction`: evenly spaced quantiles of the friction coefficients in the training.
     """
     fits, alone = _kernels(friction, tuple(edges), tuple(ratio_edges), tuple(trained_friction))
     posterior = margin * (ratio @ fits) + _DOUBT * (ratio @ alone)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from sliplens.codec import load_record, load_result, save_record
 from sliplens.errors import CheckpointError, ImageError, InputError
-from sliplens.extras import require_device
+from sliplens.extras import pick, require_device
 from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import LEARNT, Friction, FrictionLike, as_friction
 from sliplens.images import MOST_PIXELS, has_colour, require_rgb
@@ -133,15 +133,14 @@ class Network:
     @property
     def encoding(self) -> Encoding:
         """Encoding that the network was trained on."""
-        return ENCODINGS.pick(self.manifest.input)
+        return pick(ENCODINGS, self.manifest.input, noun="input")
 
     def encode(
         self, frames: Shaped[np.ndarray, "batch height width 3"], reference: Shaped[np.ndarray, "_ _ 3"] | None
     ) -> Float[Tensor, "batch colours size size"]:
         """Encode frames as the network was trained on them.
 
-        `reference`: the sensor untouched; None for frames that were compared before, or that need not be. `ImageError`
-        for frames of another size than those of the network's sensor, or not of 8 bits.
+        `reference`: the sensor untouched; None for frames that were compared before, or that need not be.
         """
         require_rgb(frames)
         self.require_frame_size(frames.shape[1:3])
@@ -152,9 +151,8 @@ class Network:
         if tuple(size) != tuple(self.manifest.frame_size):
             raise ImageError(
                 f"{what} are {size[0]} x {size[1]} pixels but the network was trained on "
-                f"{self.manifest.frame_size[0]} x {self.manifest.frame_size[1]}; use frames of "
-                "its sensor, or fit these to it with a profile (`sliplens sensor new --from VIDEO -o tip.toml`, "
-                "--sensor tip.toml)"
+                f"{' x '.join(map(str, self.manifest.frame_size))}; use frames of its sensor, or fit these to it with "
+                "a profile (`sliplens sensor new --from VIDEO -o tip.toml`, --sensor tip.toml)"
             )
 
     def require_kind(self, frame: UInt8[np.ndarray, "height width 3"], *, what: str) -> None:
@@ -176,10 +174,7 @@ class Network:
             )
 
     def doubt(self, sensor: str) -> str | None:
-        """Warn of frames of another sensor than those it was trained on; None if they are of its sensor.
-
-        Sensors are of one kind if their names differ in a number at the end, such as chromatouch-1 and chromatouch-2.
-        """
+        """Warn of frames of another kind of sensor than those it was trained on; None if they are of its kind."""
         trained = self.manifest.sensor
         if not sensor or not trained or sensor_kind(sensor) == sensor_kind(trained):
             return None
@@ -260,10 +255,7 @@ class Network:
         friction: FrictionLike | None = None,
         batch_size: int = 64,
     ) -> "Estimate":
-        """Predict the safety margin of encoded frames, with its uncertainty.
-
-        `friction`: coefficient of friction, as `predict` takes it.
-        """
+        """Predict the safety margin of encoded frames, with its uncertainty; `friction` as `predict` takes it."""
         return self.estimate_batches(inputs.split(batch_size), friction=friction)
 
     def estimate_batches(self, batches: Iterable[Tensor], *, friction: FrictionLike | None = None) -> "Estimate":
@@ -285,19 +277,13 @@ class Network:
         """Make an estimate of outputs of the network (`Answers`), and of a friction if it is known."""
         names = answer_names(self.model, self.feature_layer)
         values = {name: answer.double().cpu().numpy() for name, answer in zip(names, answers, strict=True)}
-        traction, of_ratio = self.manifest.traction, ratio_edges(self.model)
+        of_ratio = ratio_edges(self.model)
         estimate = Estimate(
             margin=values["margin"],
             probabilities=values.get("probabilities"),
             edges=bin_edges(self.model),
             calibration=self.manifest.calibration,
-            ratio=None
-            if of_ratio is None
-            else Ratio(
-                probabilities=values["ratio_probabilities"],
-                edges=of_ratio,
-                calibration=None if traction is None else traction.calibration,
-            ),
+            ratio=None if of_ratio is None else Ratio(probabilities=values["ratio_probabilities"], edges=of_ratio),
         )
         if self.novelty is not None:  # before friction narrows the answer
             estimate = replace(estimate, known=self.novelty.known(values["features"], estimate.sigma))
@@ -309,10 +295,7 @@ class Network:
         )
 
     def follow(self, *, friction: object = None) -> Follower:
-        """Make a corrector of predictions for the frames of a sensor in order.
-
-        `InputError` for a network without a head for several frames, and with a `friction`, which the head estimates.
-        """
+        """Make a corrector of predictions for the frames of a sensor in order; it takes no `friction`."""
         manifest = self.manifest.sequence
         if friction is not None:
             raise InputError("--sequence estimates the friction, and --friction sets it; leave out one of them")
@@ -324,10 +307,7 @@ class Network:
         return Follower(self.sequence, manifest)
 
     def require_ratio(self, *, learns: bool = False) -> Traction:
-        """Return the calibration of F_t / F_n; `InputError` for a network that predicts the margin alone.
-
-        `learns`: if True, the friction is to be learnt from slips, for the message.
-        """
+        """Return the calibration of F_t / F_n; `learns` says in the message that friction is learnt from slips."""
         if self.manifest.traction is None:
             why = "--same-object learns friction from F_t / F_n" if learns else "friction was told"
             raise InputError(
@@ -344,7 +324,6 @@ class Ratio:
     probabilities: Float[np.ndarray, "frames bins"]
     edges: Float[np.ndarray, " edges"]
     """Edges of the bins, as ratios."""
-    calibration: Calibration | None = None
 
     @property
     def mean(self) -> Float[np.ndarray, " frames"]:
@@ -355,14 +334,6 @@ class Ratio:
     def sigma(self) -> Float[np.ndarray, " frames"]:
         """Standard deviation of each distribution."""
         return spread(self.mean, self.probabilities, self.edges)
-
-    def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
-        """Return an interval for each ratio at a level of confidence, not negative; None if not calibrated."""
-        if self.calibration is None:
-            return None
-        offset = self.calibration.offset(level)
-        low, high = raw_interval(self.mean, self.probabilities, self.edges, level)
-        return np.maximum(low - offset, 0), np.maximum(high + offset, 0)
 
 
 STRANGE = 0.01
@@ -496,10 +467,7 @@ def condition_each(
 def save_checkpoint(
     folder: Path, model: nn.Module, manifest: Manifest, *, sequence: SequenceHead | None = None
 ) -> None:
-    """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last.
-
-    `sequence`: the head for several frames, of a manifest with one.
-    """
+    """Write weights and manifest into a folder; the manifest, which makes it a checkpoint, comes last."""
     if manifest.sequence is not None and sequence is not None:
         hashed = _save_weights(folder / SEQUENCE_FILE, sequence)
         manifest = replace(manifest, sequence=replace(manifest.sequence, weights_sha256=hashed))
@@ -515,14 +483,12 @@ def _save_weights(path: Path, model: nn.Module) -> str:
 
 
 def load_checkpoint(folder: Path, *, device: str = "cpu") -> Network:
-    """Load a checkpoint written by `save_checkpoint`.
-
-    `InputError` if the folder or its manifest is missing; `CheckpointError` if the manifest is of another schema, the
-    weights were changed or damaged, or they do not fit the backbone.
-    """
+    """Load a checkpoint written by `save_checkpoint`; `CheckpointError` for damaged files and unknown schemas."""
     require_folder(folder, what="the run")
     manifest = read_manifest(folder)
-    model = build_model(manifest.backbone, head=manifest.head, colours=ENCODINGS.pick(manifest.input).colours)
+    model = build_model(
+        manifest.backbone, head=manifest.head, colours=pick(ENCODINGS, manifest.input, noun="input").colours
+    )
     what = f"a {manifest.backbone} with a {manifest.head} head"
     _load_weights(folder / WEIGHTS_FILE, model, what=what, sha256=manifest.weights_sha256)
     if manifest.novelty is not None and manifest.novelty.layer not in dict(model.named_modules()):
@@ -578,13 +544,6 @@ def load(run: str | Path, *, device: str = "cpu") -> Network:
         One of `shipped_names`, such as `chromatouch-pair`, or a folder that training wrote.
     device
         Where to put it: cpu, cuda or cuda:1.
-
-    Raises
-    ------
-    InputError
-        If there is none, which lists the names there are, or the device is not known or not there.
-    CheckpointError
-        If the folder is damaged.
 
     Examples
     --------

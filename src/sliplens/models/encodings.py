@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from sliplens.errors import InputError
-from sliplens.extras import Table
 from sliplens.images import absolute_difference, require_rgb, require_same_size, signed_difference
 
 Frames = UInt8[np.ndarray, "batch height width 3"]
@@ -99,7 +98,7 @@ def _keep(frames: Frames, reference: Reference) -> Frames:
     return frames
 
 
-_ROWS = {
+ENCODINGS = {
     # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; T_n - T_0; |T_n - T_0| with its amplitude;
     # T_n and T_0, on one scale
     "difference": Encoding(name="difference", compare=absolute_difference, empty_is_black=True),
@@ -110,5 +109,3 @@ _ROWS = {
     "amplitude": Encoding(name="amplitude", compare=absolute_difference, empty_is_black=True, own_maximum=False),
     "pair": Encoding(name="pair", compare=_keep, empty_is_black=False, own_maximum=False, beside=True),
 }
-ENCODINGS = Table("input", "sliplens.encodings", _ROWS)
-"""Encodings by name; an installed package adds its own by the entry point `sliplens.encodings`."""

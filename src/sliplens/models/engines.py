@@ -51,16 +51,9 @@ class Engine:
         *,
         friction: FrictionLike | None = None,
     ) -> Estimate:
-        """Predict the safety margins of encoded frames, with their uncertainty.
+        """Predict the safety margins of encoded frames, or of batches of them, with their uncertainty.
 
-        Parameters
-        ----------
-        network
-            Network of this engine, which encoded the frames.
-        inputs
-            All frames, or batches of them; a batch may be encoded while the one before is worked on.
-        friction
-            Coefficient of friction, as `predict` takes it.
+        A batch may be encoded while the one before is worked on. `network` is that of this engine.
         """
         batches = inputs.split(self.batch_size) if isinstance(inputs, Tensor) else inputs
         answers = zip(*self.answers(batches), strict=True)
@@ -99,8 +92,6 @@ def prepare(
 
     Parameters
     ----------
-    model
-        Network in evaluation mode, one number an image.
     images, predictions
         Images of the size to come, and the network's predictions for them.
     passes
@@ -108,20 +99,11 @@ def prepare(
     engine
         One of `ENGINES`; `auto` takes OpenVINO where it is installed, the network runs on the processor and its
         conversion pays, else torch.
-    batch_size
-        Images in a batch; by default as many as suit the engine.
     streams
         Batches that OpenVINO works on at once, by one thread each; by default one a thread, the fastest for many
         passes. With 1 all threads share one batch, which answers soonest.
     layer
         Layer of the network whose features come last among the outputs (`Answers`).
-
-    Raises
-    ------
-    InputError
-        If there is no such engine, or the named one cannot be used here.
-    ModelError
-        If the named engine cannot run the network, or its predictions differ by more than `TOLERANCE`.
     """
     if engine not in {"auto", *ENGINES}:
         raise InputError(f"there is no engine named {engine!r}; choose one of auto, {', '.join(ENGINES)}")
@@ -151,23 +133,8 @@ def make_engine(
 ) -> Engine:
     """Make an engine for a trained network, and check it on black, white and noise.
 
-    Parameters
-    ----------
-    name
-        One of `ENGINES`, or `auto`.
-    network
-        The network, on the device where it is to run.
-    frames
-        Number of frames to come, for `auto`: a few do not pay for a conversion.
-    batch_size, streams
-        As `prepare` takes them; a batch of 1 and a stream of 1 for a running camera.
-
-    Raises
-    ------
-    InputError
-        If there is no engine of that name, or it cannot be used here.
-    ModelError
-        If the engine cannot run the network, or its predictions differ.
+    `name` is one of `ENGINES`, or `auto`, which decides by `frames`, the number of frames to come; a running camera
+    wants a batch of 1 and a stream of 1.
 
     Examples
     --------

@@ -1,7 +1,6 @@
 """Novelty: strangeness of an input, by its features' distance from the training's and the spread of the prediction."""
 
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
-from sliplens.models.backbones import Answers, bin_edges, watch_features
+from sliplens.models.backbones import Answers, bin_edges
 from sliplens.models.calibration import spread
 
 _STRIDE = 8
@@ -84,12 +83,9 @@ class Novelty:
     def known(
         self, features: Float[np.ndarray, "frames features"], sigma: Float[np.ndarray, " frames"] | None
     ) -> Float[np.ndarray, " frames"]:
-        """Return the share of the validation frames that were as strange or stranger, from 0 to 1.
+        """Return the share of the validation frames that were as strange or stranger, as p values are.
 
-        Frames like those of the validation are below a share p with probability p, as p values are. Beyond the
-        strangest half percent the logarithm continues with the same slope.
-
-        `sigma`: standard deviation of each prediction, in margin units; None for a single number.
+        Beyond the strangest half percent the logarithm continues with the same slope.
         """
         levels, shares = np.array(self.strangeness), np.log(_SHARES)
         strange = self.measure_strangeness(features, sigma)
@@ -98,22 +94,12 @@ class Novelty:
         return np.exp(np.where(strange > levels[-1], beyond, np.interp(strange, levels, shares)))
 
 
-class _Enough(Exception):  # noqa: N818 (no error: it ends a pass early)
-    """End a pass after the layer of interest."""
-
-
 @torch.no_grad()
 def read_features(
     model: nn.Module, layer: str, images: Float[Tensor, "batch colours height width"]
 ) -> Float[np.ndarray, "batch features"]:
-    """Compute the mean over the image of each channel of a layer; later layers are not run."""
-
-    def stop() -> None:
-        raise _Enough
-
-    with watch_features(model, layer, stop) as features, suppress(_Enough):
-        model(images.to(next(model.parameters()).device))
-    return features[0].double().cpu().numpy()
+    """Compute the mean over the image of each channel of a layer."""
+    return Answers(model, layer)(images.to(next(model.parameters()).device))[-1].double().cpu().numpy()
 
 
 @torch.no_grad()
@@ -138,28 +124,25 @@ def find_layer(model: nn.Module, images: Float[Tensor, "batch colours height wid
 
 
 def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[Tensor]) -> Novelty | None:
-    """Fit the features of training frames, and set the limits by validation frames of other trials.
+    """Fit the features of batches of training frames, and set the limits by validation frames of other trials.
 
-    `model` is in evaluation mode; `train`, `validation`: batches of encoded frames, (batch, 3, size, size). None where
-    the network has no suitable layer, or there are too few frames.
+    None where the network has no suitable layer, or there are too few frames.
     """
     batches, others = list(train), list(validation)
     layer = find_layer(model, batches[0][:1]) if batches else None
-    if layer is None:
+    if layer is None or min(sum(map(len, batches)), sum(map(len, others))) < _LEAST_FRAMES:
         return None
-    features, validation_features = (
-        np.concatenate([read_features(model, layer, batch) for batch in part] or [np.zeros((0, 1))])
-        for part in (batches, others)
-    )
-    if min(len(features), len(validation_features)) < _LEAST_FRAMES:
-        return None
+    features = np.concatenate([read_features(model, layer, batch) for batch in batches])
+    margins, *probabilities, validation_features = _outputs(model, layer, others)
+    edges = bin_edges(model)
+    sigma = None if edges is None else spread(margins, probabilities[0], edges)
     if not np.isfinite(features).all():
         raise ModelError(f"the layer {layer} of {type(model).__name__} returns NaN or infinity; train it again")
     mean, scale = features.mean(axis=0), features.std(axis=0)
     scale = np.maximum(scale, 1e-6 + 1e-3 * float(scale.max()))  # channels that are constant
     unit = (features - mean) / scale
-    _, spread, directions = np.linalg.svd(unit, full_matrices=False)
-    variances = spread**2 / len(unit)
+    _, singular, directions = np.linalg.svd(unit, full_matrices=False)
+    variances = singular**2 / len(unit)
     count = min(_MOST_DIRECTIONS, len(variances) - 1)
     begun = Novelty(
         layer=layer,
@@ -171,7 +154,6 @@ def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[
         limit=np.inf,
         frames=len(validation_features),
     )
-    sigma = _spread(model, others)
     usual = 1 - _SHARES[-1]
     limited = replace(
         begun,
@@ -183,14 +165,11 @@ def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[
 
 
 @torch.no_grad()
-def _spread(model: nn.Module, batches: Iterable[Tensor]) -> Float[np.ndarray, " frames"] | None:
-    """Compute the standard deviation of the predictions, in margin units; None for a single number."""
-    edges, device = bin_edges(model), next(model.parameters()).device
-    if edges is None:
-        return None
-    answers = [Answers(model)(batch.to(device)) for batch in batches]
-    margins, probabilities = (torch.cat([answer[at] for answer in answers]).double().cpu().numpy() for at in (0, 1))
-    return spread(margins, probabilities, edges)
+def _outputs(model: nn.Module, layer: str, batches: Sequence[Tensor]) -> list[np.ndarray]:
+    """Compute the outputs of `Answers` for batches of encoded frames."""
+    answers, device = Answers(model, layer), next(model.parameters()).device
+    parts = zip(*(answers(batch.to(device)) for batch in batches), strict=True)
+    return [torch.cat(part).double().cpu().numpy() for part in parts]
 
 
 def _rounded(values: np.ndarray) -> tuple[float, ...]:

@@ -60,13 +60,6 @@ def export_onnx(run: Network | Path | str, out: Path | str, *, overwrite: bool =
         File to write; its name ends in `.onnx`.
     overwrite
         If True, replace a file of that name.
-
-    Raises
-    ------
-    InputError
-        If a package or the run is missing, or the file exists or has another suffix.
-    ModelError
-        If torch cannot export the network, or a prediction differs by more than `TOLERANCE`.
     """
     path = Path(out)
     require_new_file(path, suffix=".onnx", overwrite=overwrite)

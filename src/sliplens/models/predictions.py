@@ -21,7 +21,7 @@ from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import LEAST_TOUCH, picture_change, soften
 from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
-from sliplens.models.checkpoint import Estimate, Network, open_run, sensor_kind
+from sliplens.models.checkpoint import Estimate, Network, open_run
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
 from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_progress, reporting
@@ -366,7 +366,7 @@ def _require_comparable(network: Network, trial: Capture) -> Iterator[str]:
     encoding = network.encoding
     doubt = network.doubt(trial.sensor)
     if doubt is not None:
-        yield doubt + _compare_markers(network, trial)
+        yield doubt
     untouched = trial.read_reference
     if untouched is not None or encoding.name == "raw":  # difference images are black where nothing moved
         grey = network.doubt_colour(next(trial.read_frames()) if untouched is None else untouched())
@@ -387,31 +387,7 @@ def _require_comparable(network: Network, trial: Capture) -> Iterator[str]:
             f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
             "name its image with --reference IMAGE, or a frame of it with --reference-frame N"
         )
-    hidden = (
-        f", which hide the direction of the pull; the network was trained on {range_words(directions)} (90 is down)"
-    )
-    hidden = "" if directions == FULL_CIRCLE else hidden
-    yield f"{trial.name}: no reference was given, so its images were taken for difference images{hidden}."
-
-
-def _compare_markers(network: Network, trial: Capture) -> str:
-    """Compare the spacing of the markers with that of the simulated sensor that a network was trained on."""
-    # together they take seconds to import, and most frames need none of them
-    from scipy.spatial import KDTree  # noqa: PLC0415
-
-    from sliplens.markers.gel import marker_spacing  # noqa: PLC0415
-    from sliplens.simulation.sensor import SENSORS  # noqa: PLC0415
-
-    kind = sensor_kind(network.manifest.sensor)
-    if kind not in SENSORS or trial.read_reference is None:
-        return ""
-    geometry = SENSORS[kind].geometry
-    markers = geometry.project(geometry.marker_positions())
-    trained_px = float(np.median(KDTree(markers).query(markers, k=2)[0][:, 1]))
-    spacing_px = marker_spacing(trial.read_reference())
-    if np.isnan(spacing_px):
-        return "; no markers were found, and it learned from how markers move: do not trust it here"
-    return f"; markers are {spacing_px:.1f} pixels apart, those it learned from {trained_px:.1f}"
+    yield f"{trial.name}: no reference was given, so its images were taken for difference images, which hide the pull."
 
 
 def _schema(network: Network, trials: Sequence[Capture], metadata: dict[str, str]) -> pa.Schema:

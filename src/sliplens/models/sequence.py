@@ -54,13 +54,6 @@ class SequenceHead(nn.Module):
     untrained head corrects nothing. `Follower` takes its steps one at a time.
 
     Cho et al., *Learning Phrase Representations using RNN Encoder-Decoder* (2014), for the gated recurrent unit.
-
-    Parameters
-    ----------
-    edges, ratio_edges
-        Edges of the bins of both distributions of the network.
-    dropout
-        Share of the memory that is dropped in training.
     """
 
     edges: Tensor
@@ -97,19 +90,10 @@ class SequenceHead(nn.Module):
     def make_inputs(
         summary: Float32[np.ndarray, "frames 5"], elapsed_s: Float[np.ndarray, " frames"], *, peak: float = _LEAST_PEAK
     ) -> Float32[np.ndarray, "frames 8"]:
-        """Make the inputs of the head for consecutive frames.
+        """Make the inputs of the head for consecutive frames, `peak` being the largest F_t / F_n before them.
 
         They are the numbers of `summarize`, that ratio over the largest so far (friction falls as a contact begins to
         slide), the largest ratio, and the time since the last step of memory.
-
-        Parameters
-        ----------
-        summary
-            Numbers of `summarize`.
-        elapsed_s
-            Time since the last step of memory, in seconds.
-        peak
-            Largest F_t / F_n of the frames before these.
         """
         inputs = np.empty((len(summary), 8), dtype=np.float32)
         inputs[:, :4], inputs[:, 6] = summary[:, :4], summary[:, 4]
@@ -194,16 +178,7 @@ class Follower:
         gap (`GAP_S`) the rest of the contact keeps its predictions too: what happened meanwhile is unknown, and without
         the largest pull a sliding contact looks like a held one.
 
-        Parameters
-        ----------
-        estimate
-            Prediction for each frame alone, without a friction.
-        time_s
-            Time of each frame, in seconds.
-        touches
-            True where something touches the sensor.
-        believed
-            False for frames whose margin is withheld: they keep their prediction and are not remembered.
+        `believed`: False for frames whose margin is withheld: they keep their prediction and are not remembered.
         """
         assert estimate.probabilities is not None
         assert estimate.ratio is not None

@@ -152,8 +152,6 @@ class Reliability:
 
     coverage: dict[str, Annotated[float, SHARE]]
     """Share of the labels inside the interval of each level; empty without a calibration."""
-    mean_width_90: Annotated[float, SHARE] | None
-    """Mean width of the intervals that should hold 90 %, in margin units."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -273,8 +271,6 @@ class Evaluation:
     known_trials: int
     """Trials that trained or validated this network; its scores flatter it where there are any."""
     conditions: dict[str, RegressionScores]
-    days: dict[str, RegressionScores]
-    """Scores by condition and day."""
     trials: dict[str, RegressionScores]
     reliability: dict[str, Reliability]
     """Coverage of the intervals by condition."""

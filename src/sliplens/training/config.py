@@ -12,15 +12,15 @@ from typing import Literal, TypedDict
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from sliplens.errors import InputError
-from sliplens.extras import Table, missing_packages
-from sliplens.models.backbones import DEFAULT_BACKBONE, head_outputs
+from sliplens.extras import missing_packages, pick
+from sliplens.models.backbones import DEFAULT_BACKBONE, HEADS
 from sliplens.models.checkpoint import LARGEST_INPUT
 from sliplens.training.data import get_augmentation
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
-    """Settings of a training; `InputError` for an impossible value, `ModelError` for an unknown head."""
+    """Settings of a training; `InputError` for an impossible value."""
 
     recipe: str = "default"
     """Name of the recipe, for the manifest."""
@@ -53,7 +53,7 @@ class TrainingConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("image_size", "epochs", "batch_size", "learning_rate", "epoch_frames", "patience"):
+        for name in ("image_size", "epochs", "batch_size", "learning_rate", "max_minutes", "epoch_frames", "patience"):
             value = getattr(self, name)
             if value is not None and not (isfinite(value) and value > 0):
                 raise InputError(f"{name} must be positive, got {value}")
@@ -61,21 +61,16 @@ class TrainingConfig:
             raise InputError(f"image_size must be 32 to {LARGEST_INPUT} pixels, got {self.image_size}")
         if self.batch_size < 2:
             raise InputError("batch_size must be at least 2, since batch normalisation needs more than one image")
-        if self.max_minutes is not None and not self.max_minutes > 0:
-            raise InputError(f"max_minutes must be positive, got {self.max_minutes}")
         if not 0 <= self.untouched_share <= 1:
             raise InputError(f"untouched_share must lie in [0, 1], got {self.untouched_share:g}")
         if self.optimizer not in {"adamw", "ranger21"}:
             raise InputError(f"there is no optimizer named {self.optimizer!r}; choose adamw or ranger21")
         wrong = self.head != "margin-and-ratio" or self.optimizer != "adamw" or self.augmentation != "none"
         if self.learns == "ratio" and (wrong or self.weight_decay):
-            raise InputError(
-                "a network whose margins stay learns F_t / F_n alone, by AdamW without weight decay and augmentation; "
-                "leave out --head, --optimizer and --augmentation"
-            )
+            raise InputError("to learn F_t / F_n alone, leave out --head, --optimizer, --augmentation and weight_decay")
         if self.learns == "sequence" and (self.max_minutes is not None or self.optimizer != "adamw"):
             raise InputError("a head of several frames is trained by AdamW; leave out --max-minutes and --optimizer")
-        head_outputs(self.head)
+        pick(HEADS, self.head, noun="head")
         get_augmentation(self.augmentation)
 
 
@@ -99,7 +94,7 @@ class TrainingChanges(TypedDict, total=False):
     seed: int | None
 
 
-_RECIPES = {
+RECIPES = {
     "default": TrainingConfig(head="histogram"),
     "thesis": TrainingConfig(
         recipe="thesis",
@@ -133,7 +128,6 @@ _RECIPES = {
         patience=6,
     ),
 }
-RECIPES = Table("recipe", "sliplens.recipes", _RECIPES)
 """`thesis` is that of Polak, section 4: ShuffleNetV2 x1.0 from scratch, one output, Ranger21 with its defaults, mean
 squared error, 25 epochs, batches of 124, 224 x 224 pixels, a learning rate of 8e-4, mixed precision, the best
 checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md has the reasons. `ratio` teaches
@@ -142,8 +136,8 @@ few trials, all in minutes."""
 
 
 def get_recipe(name: str) -> TrainingConfig:
-    """Look up a recipe by name; `InputError` lists those there are."""
-    return RECIPES.pick(name)
+    """Look up a recipe by name."""
+    return pick(RECIPES, name, noun="recipe")
 
 
 PROJECT = "sliplens"
@@ -189,18 +183,15 @@ LOGGERS: dict[str, tuple[tuple[str, ...], Callable[[Path, str], Logger]]] = {
 def open_logger(
     name: str, folder: Path, *, run_name: str, recipe: Mapping[str, str | float | None]
 ) -> Iterator[Logger | None]:
-    """Open a logger that keeps its files in the run's folder, and close it so that the folder can take its name.
+    """Open a logger that keeps its files in the run's folder, and close it so that the folder can be renamed.
 
-    TensorBoard and MLflow write there, MLflow elsewhere if `MLFLOW_TRACKING_URI` says so. Weights & Biases too writes
-    there alone, for `wandb sync` to send, unless `WANDB_MODE` is `online`: nothing leaves the machine by default. `csv`
-    opens none, for `metrics.csv` is always written.
+    Nothing leaves the machine unless `WANDB_MODE` is `online` or `MLFLOW_TRACKING_URI` is set. `csv` opens none, for
+    `metrics.csv` is always written.
     """
     if name == "csv":
         yield None
         return
-    if name not in LOGGERS:
-        raise InputError(f"there is no logger named {name!r}; choose one of csv, {', '.join(LOGGERS)}")
-    packages, make = LOGGERS[name]
+    packages, make = pick(LOGGERS, name, noun="logger")
     if missing := missing_packages(*packages, extra="tracking"):
         raise InputError(f"--logger {name} needs {missing}, or leave --logger away, for metrics.csv is always written")
     try:

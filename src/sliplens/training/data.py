@@ -19,7 +19,7 @@ from torch.utils.data import Dataset as TorchDataset
 from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import RecordingError
-from sliplens.extras import Table
+from sliplens.extras import pick
 from sliplens.models.backbones import last_layer
 from sliplens.models.encodings import Encoding
 from sliplens.progress import track
@@ -87,7 +87,7 @@ class Augmentation:
         return images.add_(noise.mul_(uniform(batch, 1, 1, 1) * self.noise_sd)).clamp_(0, 1)
 
 
-_AUGMENTATIONS = {
+AUGMENTATIONS = {
     "none": None,
     "thesis": Augmentation(shift=0.0, colour=0.0),
     "noise": Augmentation(rotation_deg=0.0, shift=0.0, colour=0.0, blur_probability=0.0),
@@ -95,15 +95,14 @@ _AUGMENTATIONS = {
     # the corners of a turned square lie outside of it; mirrored skin is more like skin than its last pixel drawn out
     "all-directions": Augmentation(rotation_deg=180.0, zoom=0.03, mirror=True, padding="reflection"),
 }
-AUGMENTATIONS = Table("augmentation", "sliplens.augmentations", _AUGMENTATIONS)
 """Augmentations by name. `thesis` has rotation, noise and blur, in amounts of ours; Polak gives none. `noise` has noise
 alone. `all-directions` turns images by any angle, mirrors and magnifies them, for networks that may be pulled in any
 direction."""
 
 
 def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:
-    """Look up an augmentation by name, for inputs with a neutral level; None for none."""
-    augmentation = AUGMENTATIONS.pick(name)
+    """Look up an augmentation by name, for inputs with a neutral level."""
+    augmentation = pick(AUGMENTATIONS, name, noun="augmentation")
     return None if augmentation is None else replace(augmentation, neutral=neutral)
 
 
@@ -132,11 +131,9 @@ class FrameSet(TorchDataset):
     """Where each row comes from, for tables by trial, condition and day."""
 
     def __len__(self) -> int:
-        """Count the frames."""
         return len(self.images)
 
     def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return one input, its margin and its traction ratio."""
         images, margins, ratios = self.__getitems__([index])
         return images[0], margins[0], ratios[0]
 
@@ -144,11 +141,6 @@ class FrameSet(TorchDataset):
         """Return a batch of inputs, their margins and their ratios; torch's loader asks for it by this name."""
         rows = torch.as_tensor(indices)
         return self.encoding.normalise(self.images[rows]), self.safety_margin[rows], self.traction_ratio[rows]
-
-    def name(self, row: int) -> str:
-        """Return the name of a frame, for messages."""
-        frame = "the reference frame" if self.frame[row] == UNTOUCHED else f"frame {self.frame[row]}"
-        return f"{frame} of {self.trial[row]}"
 
     def batches(self, size: int, *, report: bool = False) -> Iterator[Tensor]:
         """Iterate over the inputs of all frames, in their order; if `report`, report each batch as done."""
@@ -164,7 +156,6 @@ class FeatureSet(FrameSet):
     images: Float32[Tensor, "frames features"]  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __getitems__(self, indices: Sequence[int] | Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return a batch of features, their margins and their ratios."""
         rows = torch.as_tensor(indices)
         return self.images[rows], self.safety_margin[rows], self.traction_ratio[rows]
 
@@ -215,12 +206,9 @@ def load_frames(
 ) -> FrameSet:
     """Load trials, encode them, and keep the frames that have a label; frames without contact have none.
 
-    Frames that would take more than half of the free memory go into a file in the folder `scratch`, if there is one,
-    which is read as needed and deleted with the frames.
-
-    `untouched_share`, for training alone, adds the untouched sensor itself, with the label 1, this often for each
-    labelled frame and at least once a trial. Without a pull the safety margin is 1 however light the touch, so 1 is its
-    limit; and a network trained on the untouched sensor gives explanations a meaningful reference.
+    Frames that would take more than half of the free memory go into a file in the folder `scratch`, deleted with them.
+    `untouched_share` adds the untouched sensor, with the label 1 (the limit of light touches), this often for each
+    labelled frame and at least once a trial: a network trained on it gives explanations a meaningful reference.
     """
     sizes = {(info.height, info.width) for info in trials}
     if len(sizes) > 1:
@@ -287,64 +275,41 @@ def _free_memory() -> int:
 class EpochShuffle(Sampler[int]):
     """Random order for each epoch that depends on the seed and the epoch alone, so that resuming repeats it.
 
-    Of one order that all processes draw alike, each takes every `processes`-th frame, so that together the n-th batches
-    of all processes are the n-th batch of one. Those that do not divide are left out of this epoch.
+    Each process takes every `processes`-th frame of one order, so that the n-th batches of all processes together are
+    the n-th batch of one. Frames that do not divide are left out of this epoch.
     """
 
     def __init__(self, count: int, *, seed: int, drawn: int | None = None, rank: int = 0, processes: int = 1) -> None:
-        self.count = count
-        self.drawn = drawn or count
-        self.seed = seed
-        self.rank = rank
-        self.processes = processes
-        self.epoch = 0
+        self.count, self.drawn, self.seed = count, drawn or count, seed
+        self.rank, self.processes, self.epoch = rank, processes, 0
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch; Lightning calls this before each epoch."""
         self.epoch = epoch
 
     def __len__(self) -> int:
-        """Count the frames of this process."""
         return self.drawn // self.processes
 
     def __iter__(self) -> Iterator[int]:
-        """Yield the indices of this process."""
-        return iter(self.order(self.epoch)[self.rank :: self.processes][: len(self)])
-
-    def batch(self, epoch: int, number: int, *, size: int) -> list[int]:
-        """Return the indices of a batch of this process."""
-        return self.order(epoch)[self.rank :: self.processes][number * size : (number + 1) * size]
-
-    def order(self, epoch: int) -> list[int]:
-        """Return the indices of an epoch in order: each once, or as many as are drawn, none again before all others."""
-        rng = np.random.default_rng((self.seed, epoch))
+        """Yield the indices of this process: each frame once, or as many as are drawn, none again before all others."""
+        rng = np.random.default_rng((self.seed, self.epoch))
         rounds = [rng.permutation(self.count) for _ in range(-(-self.drawn // self.count))]
-        return np.concatenate(rounds)[: self.drawn].tolist()
+        order = np.concatenate(rounds)[: self.drawn]
+        return iter(order[self.rank :: self.processes][: len(self)].tolist())
 
 
-class EvenShares(Sampler[list[int]]):
-    """Batches of every frame once over all processes, equally many in each: they take every step together."""
-
-    def __init__(self, count: int, *, batch_size: int, rank: int = 0, processes: int = 1) -> None:
-        largest_share = -(-count // processes)
-        rows = np.arange(count)[rank::processes]
-        # shares differ by one frame at most, so that none of these is empty
-        self.batches = [part.tolist() for part in np.array_split(rows, -(-largest_share // batch_size))]
-
-    def __len__(self) -> int:
-        """Count the batches, the same in every process."""
-        return len(self.batches)
-
-    def __iter__(self) -> Iterator[list[int]]:
-        """Yield the batches of this process."""
-        return iter(self.batches)
+def even_shares(count: int, *, batch_size: int, rank: int = 0, processes: int = 1) -> list[list[int]]:
+    """Make the batches of one process over every frame once, equally many in each: they take every step together."""
+    # shares differ by one frame at most, so that no batch is empty
+    batches = math.ceil(math.ceil(count / processes) / batch_size)
+    return [part.tolist() for part in np.array_split(np.arange(count)[rank::processes], batches)]
 
 
 def make_loaders(
     train: FrameSet, validation: FrameSet, *, shuffle: EpochShuffle, batch_size: int
 ) -> tuple[DataLoader, DataLoader]:
     """Make the loaders of this process; `batch_size` is its share of the batch."""
-    shares = EvenShares(len(validation), batch_size=batch_size, rank=shuffle.rank, processes=shuffle.processes)
+    shares = even_shares(len(validation), batch_size=batch_size, rank=shuffle.rank, processes=shuffle.processes)
     # a last small batch would make batch normalisation noisy
     shuffled = DataLoader(train, sampler=shuffle, batch_size=batch_size, drop_last=True, collate_fn=_as_is)
     return shuffled, DataLoader(validation, batch_sampler=shares, collate_fn=_as_is)

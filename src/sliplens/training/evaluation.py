@@ -33,7 +33,7 @@ from sliplens.results.evaluation import (
     ScoredFrames,
 )
 from sliplens.training.data import FrameSet, load_frames
-from sliplens.training.metrics import auroc, coverage, find_lead_times, risk_coverage, score_predictions
+from sliplens.training.metrics import auroc, find_lead_times, risk_coverage, score_predictions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,15 +201,6 @@ def evaluate(
         If True, replace a folder `out` of other settings.
     on_progress
         Callback for progress.
-
-    Raises
-    ------
-    InputError
-        If the network, the trials or an estimator cannot be found, or OpenCV is missing for baselines.
-    ImageError
-        If the frames are not of the size the network's sensor has.
-    RecordingError
-        If no frame has a label.
     """
     network = open_run(run)
     prior = None if friction is None else EACH if friction == EACH else as_friction(friction)
@@ -257,12 +248,7 @@ def evaluate(
             "split": split,
             "friction": prior.digest if isinstance(prior, Friction) else prior,
             "sequence": network.manifest.sequence if sequence else None,
-            "baselines": plan
-            and {
-                "estimators": plan.estimators,
-                "markers": plan.markers,
-                "trials": [trial.trial for trial in plan.training],
-            },
+            "baselines": plan,
         }
         recipe = {name: value for name, value in recipe.items() if value is not None}
         with output_folder(Path(out), stage="evaluate", config=recipe, overwrite=overwrite) as output:
@@ -290,10 +276,7 @@ def _plan_baselines(
     import_cv2()
     offered = tuple(trial for trial in data.trials if trial.split == "train")
     if not offered:
-        raise InputError(
-            f"{data.folder} has no training trials to fit baselines on; leave out --baselines, or share out its "
-            "trials with sliplens split"
-        )
+        raise InputError(f"{data.folder} has no training trials to fit baselines on; divide it with `sliplens split`")
     training = choose_training(offered, count)
     kind = marker_kind((*training, *trials)) if markers is None else KINDS.pick(markers).name
     return BaselinePlan(estimators=names, training=training, offered_trials=len(offered), markers=kind)
@@ -308,27 +291,9 @@ def evaluate_frames(
     sequence: bool = False,
     batch_size: int = 64,
 ) -> Evaluation:
-    """Predict frames, and score the predictions for each condition, day and trial.
+    """Predict the frames of `load_frames`, and score the predictions for each condition and trial.
 
-    Parameters
-    ----------
-    network
-        Network to evaluate.
-    frames
-        Labelled frames in the network's encoding and size, from `load_frames`.
-    split
-        Name of the frames in the result.
-    friction
-        Coefficient of friction, as `evaluate` takes it.
-    sequence
-        If True, predict the frames of each trial in order.
-    batch_size
-        Frames in a batch.
-
-    Raises
-    ------
-    RecordingError
-        If there is no frame, or `friction` is `each` and that of a trial is unknown.
+    `friction` and `sequence` as `evaluate` takes them.
     """
     if not len(frames):
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
@@ -339,9 +304,7 @@ def evaluate_frames(
     if friction == EACH:
         traction = network.require_ratio()
         if not np.isfinite(frames.friction).all():
-            raise RecordingError(
-                "not every trial has a coefficient of friction; set it with --friction, or leave it out"
-            )
+            raise RecordingError("not every trial has a coefficient of friction; set it with --friction")
         quantiles = np.array(traction.friction)
         estimate = network.estimate_batches(batches)
         estimate = condition_each(estimate, frames.friction, trained_friction=quantiles, calibration=traction.told)
@@ -366,12 +329,8 @@ def evaluate_frames(
         high_90=high_90,
         withheld=np.array([reason or "" for reason in estimate.withheld(np.ones(len(frames), dtype=bool))]),
     )
+    labels = predictions.safety_margin
     conditions = {name: predictions.condition == name for name in sorted(set(frames.condition))}
-    days = {
-        f"{name}, day {day}": rows & (predictions.day == day)
-        for name, rows in conditions.items()
-        for day in sorted(set(predictions.day[rows].tolist()))
-    }
     trials = {name: predictions.trial == name for name in dict.fromkeys(frames.trial)}
     wet, dry = conditions.get("wet"), conditions.get("dry")
 
@@ -379,17 +338,14 @@ def evaluate_frames(
         return {name: score_predictions(predictions.where(rows)) for name, rows in groups.items()}
 
     def reliability(rows: Bool[np.ndarray, " frames"]) -> Reliability:
-        labels = predictions.safety_margin[rows]
-        shares = {level: coverage(low[rows], high[rows], labels) for level, (low, high) in intervals.items()}
-        width = float((high_90 - low_90)[rows].mean()) if intervals else None
-        return Reliability(coverage=shares, mean_width_90=width)
+        covered = {level: (low <= labels) & (labels <= high) for level, (low, high) in intervals.items()}
+        return Reliability(coverage={level: float(inside[rows].mean()) for level, inside in covered.items()})
 
     return Evaluation(
         input=network.manifest.input,
         split=split,
         known_trials=0,
         conditions=score(conditions),
-        days=score(days),
         trials=score(trials),
         reliability={name: reliability(rows) for name, rows in conditions.items()},
         wet_auroc=None if sigma is None or wet is None or dry is None else auroc(sigma[wet], sigma[dry]),

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from typing import Literal, TypedDict, Unpack
+from typing import Literal, Unpack
 
 import lightning
 import numpy as np
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
+from sliplens.extras import pick
 from sliplens.files import output_folder, partial_folder, scratch_folder, versions
 from sliplens.images import has_colour
 from sliplens.models import Manifest, Network, build_model, load_checkpoint, save_checkpoint
@@ -34,7 +35,7 @@ from sliplens.models.backbones import (
 from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
 from sliplens.models.checkpoint import Estimate, Ratio, condition_each, load, sensor_kind
 from sliplens.models.encodings import ENCODINGS, Encoding
-from sliplens.models.novelty import Novelty, fit_novelty
+from sliplens.models.novelty import fit_novelty
 from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
@@ -73,8 +74,6 @@ _KIND = {
     "sequence": ("backbone", "head", "image_size"),
 }
 """Properties that a network keeps from the network it starts from, by `TrainingConfig.learns`."""
-_STAYS = {"ratio", "sequence"}
-"""Values of `TrainingConfig.learns` that leave the predictions of the network as they are."""
 _SEQUENCE_TAKES = {"epochs", "batch_size", "learning_rate", "weight_decay", "seed"}
 """Settings that apply to the training of a head for several frames."""
 _DIRECTION_TRIALS, _DIRECTION_FRAMES, _LEAST_DIRECTIONS = 40, 5, 3
@@ -86,19 +85,17 @@ _NOVELTY_FRAMES = 2000
 """Largest number of frames that `Novelty` is fitted on."""
 
 
-class _Devices(TypedDict, total=False):
+class _Options(TrainingChanges, total=False):
+    """Options of `train` besides its own parameters."""
+
     accelerator: Literal["auto", "cpu", "gpu"]
     devices: int
     num_nodes: int
 
 
-class _Options(TrainingChanges, _Devices, total=False):
-    """Options of `train` besides its own parameters."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class DataOrigin:
-    """Facts of the training data, for the manifest of a network; see `Manifest`."""
+    """Facts of the training data, for the manifest of a network."""
 
     frame_size: tuple[int, int]
     sensor: str
@@ -160,32 +157,28 @@ def train(
     ModelError
         If the network to start from is of another kind, or the loss is no longer finite.
     """
-    devices: _Devices = {
-        "accelerator": options.pop("accelerator", "auto"),
-        "devices": options.pop("devices", 1),
-        "num_nodes": options.pop("num_nodes", 1),
-    }
+    accelerator, devices, nodes = (
+        options.pop("accelerator", "auto"), options.pop("devices", 1), options.pop("num_nodes", 1)
+    )  # fmt: skip
     changes: TrainingChanges = {name: value for name, value in options.items() if value is not None}  # pyright: ignore[reportAssignmentType]
     start = load(start_from) if isinstance(start_from, str | Path) else start_from
     config = _configure(recipe, changes, start)
     input = input or ("difference" if start is None else start.manifest.input)
-    trainer = make_trainer(config, **devices)
+    trainer = make_trainer(config, accelerator=accelerator, devices=devices, num_nodes=nodes)
     share_of_batch(config.batch_size, trainer.world_size)
     if start is not None:
         require_same_kind(start, config, input)
-    if config.learns == "sequence":
-        if trainer.world_size > 1:
-            raise InputError("a head of several frames is trained by one process; leave out --devices and --num-nodes")
-        if logger != "csv":
-            raise InputError(
-                f"a head of several frames writes its epochs to metrics.csv alone; leave out --logger {logger}"
-            )
+    if config.learns == "sequence" and (trainer.world_size > 1 or logger != "csv"):
+        raise InputError(
+            "a head of several frames is trained by one process and writes metrics.csv alone; leave out --devices and "
+            "--logger"
+        )
     data = data if isinstance(data, Dataset) else load_dataset(data)
-    encoding, trials = ENCODINGS.pick(input), _choose_trials(data, condition)
-    _require_varied_labels(data, trials[0])
-    if start is not None and "head" not in changes:
-        config = _without_ratio(config, data, trials)
-    # what shapes the result besides the recipe
+    encoding, trials = pick(ENCODINGS, input, noun="input"), _choose_trials(data, condition)
+    if start is not None and "head" not in changes and config.head == "margin-and-ratio" and not _stays(config):
+        # the second output is left out where the labels do not show the ratio
+        labelled = all(any(has_ratio(data.read_labels(info)) for info in some) for some in trials)
+        config = config if labelled else replace(config, head="histogram")
     origin = {"input": encoding.name, "condition": condition, "data_hash": data.hash}
     if start is not None:
         origin["started_from"] = start.manifest.weights_sha256
@@ -194,8 +187,7 @@ def train(
         _fit_trials, config, data, trials, encoding=encoding, condition=condition, start=start, trainer=trainer
     )
     if not trainer.is_global_zero and out is not None:
-        # the target appears when a training is over, which no process leaves before the others: all see the same here,
-        # and where it is there the first process has nothing to do, or refuses
+        # the target appears when a training is over, which no process leaves before the others: all see the same here
         if overwrite or not Path(out).exists():
             # in silence; the output folder is the first process's to write, and on a cluster this disk is nearer
             with suppress(KeyboardInterrupt, DivergedError):
@@ -239,7 +231,6 @@ def _fit_trials(
     scratch: Path,
     logger: Logger | None = None,
 ) -> Training:
-    """Load the frames and fit, in every process."""
     if config.learns == "sequence":
         assert start is not None
         return replace(fit_sequence(config, start, data, trials, folder), condition=condition)
@@ -269,15 +260,20 @@ def _configure(recipe: str, changes: TrainingChanges, start: Network | None) -> 
             raise InputError(f"the recipe {recipe} teaches an existing network; name it with --start-from")
         return config
     fixed = {name: getattr(start.manifest, name) for name in _KIND[config.learns]}
-    for name, value in sorted(changes.items()) if config.learns in _STAYS else ():
+    for name, value in sorted(changes.items()) if _stays(config) else ():
         expected = fixed.get(name, value)
         if value != expected or (config.learns == "sequence" and name not in _SEQUENCE_TAKES | fixed.keys()):
             why = f"whose {name} is {expected}" if name in fixed else "and takes no such option"
+            option = f"--{name.replace('_', '-')}"
             raise InputError(
-                f"the recipe {recipe} leaves the network of --start-from as it is, {why}; leave out "
-                f"--{name.replace('_', '-')}"
+                f"the recipe {recipe} leaves the network of --start-from as it is, {why}; leave out {option}"
             )
     return replace(config, **fixed | changes)
+
+
+def _stays(config: TrainingConfig) -> bool:
+    """Return True if the predictions of the network to start from stay as they are."""
+    return config.learns in {"ratio", "sequence"}
 
 
 def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]:
@@ -286,19 +282,17 @@ def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInf
     except RecordingError as error:
         cure = "divide it" if condition is None else "name another --condition, or divide it"
         raise RecordingError(f"{error}; {cure} with `sliplens split`") from None
-    sizes = sorted({(info.height, info.width) for info in (*train, *validation)})
-    if len(sizes) > 1:
-        words = " and ".join(f"{height} x {width}" for height, width in sizes)
-        raise RecordingError(f"{data.folder} mixes frames of {words} pixels; train on one sensor at a time")
+    if len({(info.height, info.width) for info in (*train, *validation)}) > 1:
+        raise RecordingError(f"{data.folder} mixes frames of several sizes; train on one sensor at a time")
+    labels = [data.read_labels(info) for info in train]
+    margins = np.concatenate([some.safety_margin[some.labelled] for some in labels])
+    # rounding of margins that were computed from constant forces
+    if len(margins) and np.ptp(margins) < 1e-6:
+        raise RecordingError(
+            f"all {len(margins)} labels that {data.folder} has to train on are {100 * margins[0]:.0f} %, and of a "
+            "constant there is nothing to learn; check that its forces hold the pull, and record trials until they slip"
+        )
     return train, validation
-
-
-def _without_ratio(config: TrainingConfig, data: Dataset, trials: Sequence[Sequence[TrialInfo]]) -> TrainingConfig:
-    """Leave out the second output where all outputs change and the labels do not show the ratio."""
-    if config.head != "margin-and-ratio" or config.learns in _STAYS:
-        return config
-    labelled = all(any(has_ratio(data.read_labels(info)) for info in some) for some in trials)
-    return config if labelled else replace(config, head="histogram")
 
 
 def trained_directions(
@@ -308,7 +302,7 @@ def trained_directions(
 
     None where too few trials show a direction: no margin is then withheld for its direction.
     """
-    if start is not None and config.learns in _STAYS:
+    if start is not None and _stays(config):
         return start.manifest.pull_direction_deg
     augmentation = get_augmentation(config.augmentation)
     turned_deg = getattr(augmentation, "rotation_deg", 0.0)
@@ -323,10 +317,7 @@ def trained_directions(
 
 
 def pull_direction(trial: Recording) -> float | None:
-    """Estimate the direction in which a labelled trial is pulled, in degrees, by the estimator of `predict`.
-
-    It is that of the mean shear of the frames with the lowest margins; None where they show no shear.
-    """
+    """Estimate the direction of the mean shear at the lowest margins, in degrees; None without shear."""
     pulled = np.flatnonzero(trial.labelled & (trial.safety_margin < _PULLED))
     lowest = pulled[np.argsort(trial.safety_margin[pulled], kind="stable")][:_DIRECTION_FRAMES]
     estimator = ShearEstimator(trial.reference, sensor_kind(trial.sensor))
@@ -346,39 +337,16 @@ def _advise(
     """Advise on the number of trials, and on abilities of the network to start from that will be lost."""
     count = len(train) + len(validation)
     if config.learns == "weights":
-        enough = f"record {_ENOUGH_TRIALS} or more" if count < _ENOUGH_TRIALS else "that is a good beginning"
         yield (
             f"{count} labelled trials, {len(validation)} of them held out; on simulated sensors {_ENOUGH_TRIALS} had "
-            f"about nine tenths of the R2 of 100 on dry objects, so {enough}: on several days, to the slip, and on "
-            "slippery objects if it is to hold those"
+            "about nine tenths of the R2 of 100: record as many, on several days, to the slip"
         )
     elif start is None and count < _FEW_TRIALS:
-        yield (
-            f"{count} labelled trials are few for a network with random weights; start from a trained one: "
-            "--recipe adapt --start-from chromatouch-pair"
-        )
+        yield (f"{count} labelled trials are few for random weights; use --recipe adapt --start-from chromatouch-pair")
     if start is not None and start.manifest.head == "margin-and-ratio" and config.head == "histogram":
-        yield (
-            "the labels have no forces and friction, so that the network learns the margin alone: it takes neither "
-            "--friction nor --sequence afterwards"
-        )
+        yield "the labels have no forces and friction, so the network learns the margin alone: it takes no --friction"
     elif start is not None and start.sequence is not None and config.learns != "sequence":
-        yield (
-            "the network to start from has a head for several frames, which fits its own predictions alone; train the "
-            "new network its own with --recipe sequence"
-        )
-
-
-def _require_varied_labels(data: Dataset, trials: Sequence[TrialInfo]) -> None:
-    """Check that the safety margin to be learnt varies between frames."""
-    labels = [data.read_labels(info) for info in trials]
-    margins = np.concatenate([some.safety_margin[some.labelled] for some in labels])
-    # rounding of margins that were computed from constant forces
-    if len(margins) and np.ptp(margins) < 1e-6:
-        raise RecordingError(
-            f"all {len(margins)} labels that {data.folder} has to train on are {100 * margins[0]:.0f} %, and of a "
-            "constant there is nothing to learn; check that its forces hold the pull, and record trials until they slip"
-        )
+        yield "the head for several frames of the network to start from is left out; train another by --recipe sequence"
 
 
 @torch.no_grad()
@@ -392,19 +360,8 @@ def calibrate(
 ) -> tuple[Calibration, Traction | None]:
     """Fit the temperatures of the distributions, which are set in the model, and the offsets of the intervals.
 
-    Parameters
-    ----------
-    model
-        Network to calibrate.
-    validation
-        Frames that it was not trained on.
-    batch_size
-        Frames in a batch.
-    trained_friction
-        Coefficients of friction of the training frames, for a network of two outputs; without them the second result
-        is None.
-    margin_calibration
-        Calibration of the margin, if it is to stay as it is.
+    `trained_friction`: friction of the training frames, for a network of two outputs; without it the second result is
+    None. `margin_calibration`: calibration of the margin, if it is to stay.
     """
     was_training, device = model.training, next(model.parameters()).device
     model.eval()
@@ -465,30 +422,17 @@ def fit(
 
     Parameters
     ----------
-    config
-        Settings of the training.
+    config, origin
+        Settings of the training, and facts of the data for the manifest.
     train, validation
         Encoded frames, of trials that do not overlap.
     folder
         Gets `model.safetensors`, `manifest.json` and `metrics.csv`; while training runs also checkpoints, from which a
         call with the same folder continues. All processes must see it.
-    origin
-        Facts of the data, for the manifest.
     start
         Network whose weights it starts from, instead of random ones; it is left as it is.
-    trainer
-        Trainer made by `make_trainer`, used once; by default of one device, a GPU if there is one.
-    logger
-        Lightning's logger, for the first process.
-
-    Raises
-    ------
-    InputError
-        If the training set is smaller than one batch, a trial is in both sets, the batch does not divide among the
-        processes, or a checkpoint cannot be saved.
-    ModelError
-        If the network to start from has another input, backbone or head, the backbone is unknown, or the loss is no
-        longer finite. The best network so far is saved before.
+    trainer, logger
+        Trainer of `make_trainer`, used once, and Lightning's logger.
     """
     trainer = trainer or make_trainer(config)
     rank, processes, first = trainer.global_rank, trainer.world_size, trainer.is_global_zero
@@ -513,7 +457,6 @@ def fit(
         config=config,
         augmentation=get_augmentation(config.augmentation, neutral=train.encoding.neutral),
         progress=progress,
-        batch_rows=lambda epoch, batch: [train.name(row) for row in shuffle.batch(epoch, batch, size=share)],
     )
     best = ModelCheckpoint(dirpath=folder / "checkpoints", filename="best", monitor="validation_mse")
     # of every epoch: `save_last` writes one only where the best is written too
@@ -542,8 +485,10 @@ def fit(
             model.load_state_dict(network.state_dict(), strict=False)
             last_layer(model).load_state_dict(last_layer(network).state_dict())
         model.eval()
-        # where the last layer alone was trained, the early layers stay as they were
-        novelty = _fit_novelty(model, config, *frames) if learnt is None else learnt.manifest.novelty
+        if learnt is None:
+            novelty = fit_novelty(model, *(_sample_batches(some, batch_size=config.batch_size) for some in frames))
+        else:  # the last layer alone was trained: the early layers stay as they were
+            novelty = learnt.manifest.novelty
         manifest = Manifest(
             backbone=config.backbone,
             head=config.head,
@@ -624,20 +569,15 @@ def _last_layer_alone(
     return alone, *features
 
 
-def _fit_novelty(model: nn.Module, config: TrainingConfig, *frames: FrameSet) -> Novelty | None:
-    return fit_novelty(model, *(_sample_batches(some, batch_size=config.batch_size) for some in frames))
-
-
 def _check_frames(config: TrainingConfig, train: FrameSet, validation: FrameSet, processes: int) -> None:
     if (config.epoch_frames or len(train)) < config.batch_size:
         raise InputError(f"{len(train)} training frames do not fill a batch of {config.batch_size}; lower batch_size")
     if config.head == "margin-and-ratio":
         for name, frames in (("training", train), ("validation", validation)):
             if not (torch.isfinite(frames.traction_ratio).numpy() & np.isfinite(frames.friction)).any():
-                other = "" if config.learns == "ratio" else ", or choose another --head"
                 raise InputError(
-                    f"no {name} frame has forces and friction, from which F_t / F_n is learnt; import them with the "
-                    f"forces{other}"
+                    f"no {name} frame has forces and friction, from which F_t / F_n is learnt; import the trials with "
+                    "their forces, or choose another --head"
                 )
     if len(validation) < processes:
         raise InputError(f"{len(validation)} validation frames are too few for {processes} processes; lower --devices")
@@ -652,7 +592,7 @@ def require_same_kind(start: Network, config: TrainingConfig, encoding: str) -> 
         existing = getattr(start.manifest, name)
         # a second answer can be learnt beside the first or left out, and the reference be seen beside the frame; not
         # by a last layer alone: the first answer would stay as it was for other images
-        paired = value == "pair" and existing in REFERENCE_SIGNS and config.learns not in _STAYS
+        paired = value == "pair" and existing in REFERENCE_SIGNS and not _stays(config)
         changed = {existing, value} == {"histogram", "margin-and-ratio"}
         if existing != value and not (paired or changed):
             raise ModelError(

@@ -9,25 +9,16 @@ from sliplens.errors import RecordingError
 from sliplens.results.evaluation import BinScore, LeadTimes, RegressionScores, RiskCoverage, ScoredFrames
 
 
-def coverage(
-    low: Float[np.ndarray, " frames"], high: Float[np.ndarray, " frames"], labels: Float[np.ndarray, " frames"]
-) -> float:
-    """Share of the labels that lie in their intervals, ends included."""
-    return float(np.mean((labels >= low) & (labels <= high)))
-
-
 def auroc(positive: Float[np.ndarray, " _"], negative: Float[np.ndarray, " _"]) -> float | None:
     """Area under the receiver operating characteristic: how often a positive scores above a negative; ties count half.
 
-    Hanley & McNeil, *Radiology* 143 (1982) 29: the Mann-Whitney statistic over the number of pairs. None where a class
-    is empty.
+    None where a class is empty.
     """
     if not (len(positive) and len(negative)):
         return None
-    ordered = np.sort(negative)
-    below = np.searchsorted(ordered, positive, side="left")
-    not_above = np.searchsorted(ordered, positive, side="right")
-    return float((below + not_above).mean() / 2 / len(negative))
+    from scipy.stats import mannwhitneyu  # noqa: PLC0415 (it takes long to import)
+
+    return float(mannwhitneyu(positive, negative).statistic) / (len(positive) * len(negative))
 
 
 _COVERED = tuple(round(1 - step / 20, 2) for step in range(20))
@@ -38,13 +29,8 @@ def risk_coverage(
 ) -> RiskCoverage:
     """Compute the mean absolute error of the remaining frames, as more and more of the least trusted are withheld.
 
-    Parameters
-    ----------
-    errors
-        Absolute error of each frame, in margin units.
-    trust
-        Trust in each frame, by name; the least trusted frames are withheld first. None for a measure that the network
-        lacks. `perfect`, the negative error, is always added.
+    `trust` is that in each frame, by name; None for a measure that the network lacks. `perfect`, the negative error, is
+    always added.
 
     References
     ----------
@@ -77,16 +63,9 @@ def lead_times(
     *,
     threshold: float = THRESHOLD,
 ) -> LeadTimes:
-    """Measure warnings on the labelled frames of some trials.
+    """Measure warnings, predictions below a threshold, on the labelled frames of some trials.
 
     A slip is the first frame of a trial with margin 0; what comes after is left out.
-
-    Parameters
-    ----------
-    trial, time_s, labels, predictions
-        Name of each frame's trial, time in seconds, true and predicted margin in margin units.
-    threshold
-        A prediction below it is an alarm; in margin units.
     """
     names = np.array(trial)
     leads, ideals, slips, false, minutes = [], [], 0, 0, 0.0

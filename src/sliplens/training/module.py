@@ -5,7 +5,7 @@ import math
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,13 +14,11 @@ from typing import Any, Literal
 import lightning
 import numpy as np
 import torch
-from jaxtyping import Float
 from lightning.fabric.plugins import TorchCheckpointIO
-from lightning.fabric.plugins.environments.torchelastic import TorchElasticEnvironment
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback, EarlyStopping, Timer
 from pytorch_optimizer import Ranger21
-from torch import Tensor, distributed, nn
+from torch import Tensor, nn
 from torch.utils.data import DataLoader
 from torchmetrics import MeanSquaredError
 
@@ -31,9 +29,6 @@ from sliplens.progress import report_progress
 from sliplens.results.evaluation import LearningCurve
 from sliplens.training.config import TrainingConfig
 from sliplens.training.data import Augmentation
-
-_MOST_ROWS = 3
-"""Largest number of frames of a batch in a message."""
 
 
 class DivergedError(ModelError):
@@ -56,14 +51,9 @@ class Regressor(lightning.LightningModule):
         config: TrainingConfig,
         augmentation: Augmentation | None,
         progress: "Progress",
-        batch_rows: Callable[[int, int], Sequence[str]],
     ) -> None:
         super().__init__()
-        self.model = model
-        self.config = config
-        self.augmentation = augmentation
-        self.progress = progress
-        self.batch_rows = batch_rows
+        self.model, self.config, self.augmentation, self.progress = model, config, augmentation, progress
         # sums and counts, added up over the processes: exact however the frames are shared
         self.train_mse = MeanSquaredError()
         self.validation_mse = MeanSquaredError()
@@ -75,10 +65,6 @@ class Regressor(lightning.LightningModule):
             # without weight decay, a row without a slope stays as it is to the bit
             for value in last_layer(model).parameters():
                 value.register_hook(lambda slope: torch.cat([torch.zeros_like(slope[:BINS]), slope[BINS:]]))
-
-    def forward(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, " batch"]:
-        """Predict the safety margin."""
-        return self.model(images).reshape(len(images))
 
     def on_train_epoch_start(self) -> None:
         """Keep the statistics of batch normalisation where the configuration says so."""
@@ -96,29 +82,18 @@ class Regressor(lightning.LightningModule):
             generator = torch.Generator(device=images.device).manual_seed(seed)
             images = self.augmentation(images, generator=generator)
         loss, margins = margin_loss(self.model, images, labels, ratios)
-        finite = bool(torch.isfinite(loss))
         # all stop or none: a process that goes on alone waits for ever
-        if not self.trainer.strategy.reduce_boolean_decision(finite):
-            self._refuse(loss.item(), batch_idx, finite=finite)
+        if not self.trainer.strategy.reduce_boolean_decision(bool(torch.isfinite(loss))):
+            raise DivergedError(
+                f"the training loss is {loss.item()} in epoch {self.current_epoch + 1}, at step {self.global_step}; "
+                "lower the learning rate and try again"
+            )
         self.train_mse.update(margins.detach(), labels)
         self.log("train_mse", self.train_mse, on_step=False, on_epoch=True)
         if self.trainer.loggers:
             rate = self.trainer.optimizers[0].param_groups[0]["lr"]
             self.log("learning_rate", rate, on_step=True, on_epoch=False)
         return loss
-
-    def _refuse(self, loss: float, batch_idx: int, *, finite: bool) -> None:
-        """Stop with an error that lists the frames, of any process, whose loss is not finite."""
-        mine: tuple[float, Sequence[str]] = (loss, () if finite else self.batch_rows(self.current_epoch, batch_idx))
-        losses = [mine] * self.trainer.world_size
-        if self.trainer.world_size > 1:
-            distributed.all_gather_object(losses, mine)
-        value, rows = next(shared for shared in losses if shared[1])
-        more = f" and {len(rows) - _MOST_ROWS} more" if len(rows) > _MOST_ROWS else ""
-        raise DivergedError(
-            f"the training loss is {value} in epoch {self.current_epoch + 1}, at step {self.global_step}, for a batch "
-            f"of {', '.join(rows[:_MOST_ROWS])}{more}; lower the learning rate, or look at these frames, and try again"
-        )
 
     def validation_step(self, batch: tuple[Tensor, Tensor, Tensor], batch_idx: int) -> None:
         """Log the validation error; of a network with two outputs, over both."""
@@ -253,29 +228,15 @@ class Patience(EarlyStopping):
 def make_trainer(
     config: TrainingConfig, *, accelerator: Literal["auto", "cpu", "gpu"] = "auto", devices: int = 1, num_nodes: int = 1
 ) -> lightning.Trainer:
-    """Make the trainer of this process, with its number among all processes (`global_rank`); nothing runs yet.
-
-    Parameters
-    ----------
-    config
-        Settings of the training.
-    accelerator, devices, num_nodes
-        As Lightning takes them: devices of each node, a process each.
-
-    Raises
-    ------
-    InputError
-        If this machine lacks the devices, or torchrun or a cluster started another number of processes.
-    """
+    """Make the trainer of this process; `devices` is the number of processes of each node, as Lightning takes it."""
     half = config.mixed_precision and accelerator != "cpu" and torch.cuda.is_available()
-    shared = devices * num_nodes > 1 or TorchElasticEnvironment.detect()
     try:
         with quiet_lightning():
-            trainer = lightning.Trainer(
+            return lightning.Trainer(
                 accelerator=accelerator,
                 devices=devices,
                 num_nodes=num_nodes,
-                strategy="ddp" if shared else "auto",
+                strategy="ddp" if devices * num_nodes > 1 else "auto",
                 plugins=[WholeCheckpoints()],
                 max_epochs=config.epochs,
                 logger=False,
@@ -289,29 +250,19 @@ def make_trainer(
                 gradient_clip_val=1.0 if config.optimizer == "adamw" else None,
                 precision="16-mixed" if half else "32-true",
             )
-        environment = getattr(trainer.strategy, "cluster_environment", None)
-        if environment is not None:
-            environment.validate_settings(num_devices=devices, num_nodes=num_nodes)
     except (MisconfigurationException, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
         raise InputError(
-            f"this machine cannot train on {devices} x {accelerator} ({reason}); "
-            "change --devices, --num-nodes or --accelerator"
+            f"this machine cannot train on {devices} x {accelerator} ({reason}); change --devices or --accelerator"
         ) from None
-    return trainer
 
 
 def share_of_batch(batch_size: int, processes: int) -> int:
     """Return the number of images of a batch that each process takes."""
-    share, rest = divmod(batch_size, processes)
-    if rest:
+    share = max(2, batch_size // processes)  # batch normalisation needs more than one image
+    if share * processes != batch_size:
         raise InputError(
-            f"batch_size {batch_size} does not divide among {processes} processes; choose {max(2, share) * processes}"
-        )
-    if share < 2:
-        raise InputError(
-            f"batch_size {batch_size} leaves one image to each of {processes} processes, and batch normalisation needs "
-            f"more; choose {2 * processes} or more"
+            f"batch_size {batch_size} does not divide among {processes} processes; choose {share * processes}"
         )
     return share
 
@@ -324,8 +275,6 @@ class WholeCheckpoints(TorchCheckpointIO):
 
     def save_checkpoint(self, checkpoint: dict, path: str | Path, storage_options: object = None) -> None:
         """Write a checkpoint."""
-        if storage_options is not None:
-            raise TypeError("this way of saving takes no storage_options")
         try:
             with whole_file(Path(path)) as part:
                 torch.save(checkpoint, part)
@@ -347,36 +296,17 @@ def run_trainer(
                 # returns when the first process has come so far: by then it has decided whether to go on or begin anew
                 trainer.strategy.setup_environment()
             trainer.fit(module, *loaders, ckpt_path=str(last) if last.is_file() else None, weights_only=True)
-        except DivergedError:
+        except BaseException as error:
+            # processes that Lightning started here would wait for this one; a gentler signal does not reach them
+            if not isinstance(error, DivergedError) and trainer.strategy.launcher is not None:
+                trainer.strategy.launcher.kill(getattr(signal, "SIGKILL", signal.SIGTERM))
+            if isinstance(error, SystemExit):
+                # Lightning exits and goes deaf to Ctrl-C; what happens next is the caller's to decide
+                signal.signal(signal.SIGINT, on_interrupt)
+                raise KeyboardInterrupt from None
+            if isinstance(error, torch.OutOfMemoryError):
+                raise ModelError("the memory of the GPU is full; lower --batch-size or --image-size") from None
             raise
-        except SystemExit:
-            # Lightning exits and goes deaf to Ctrl-C; what happens next is the caller's to decide
-            signal.signal(signal.SIGINT, on_interrupt)
-            _end_others(trainer)
-            raise KeyboardInterrupt from None
-        except torch.OutOfMemoryError:
-            _end_others(trainer)
-            raise ModelError("the memory of the GPU is full; lower --batch-size or --image-size") from None
-        except RuntimeError as error:
-            _end_others(trainer)
-            lost = ("gloo", "connection closed", "connection reset", "broken pipe")
-            is_lost = isinstance(error, torch.distributed.DistError) or any(word in str(error).lower() for word in lost)
-            if trainer.world_size > 1 and is_lost:
-                raise ModelError(
-                    "another process of this training was lost; give the same command again, it goes on after the last "
-                    "whole epoch"
-                ) from None
-            raise
-        except BaseException:
-            _end_others(trainer)
-            raise
-
-
-def _end_others(trainer: lightning.Trainer) -> None:
-    """End the processes that Lightning started here: they would wait for this one, and write nothing."""
-    launcher = trainer.strategy.launcher
-    if launcher is not None:
-        launcher.kill(getattr(signal, "SIGKILL", signal.SIGTERM))  # the gentler one does not reach a process that waits
 
 
 @contextmanager
