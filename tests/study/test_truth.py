@@ -32,10 +32,10 @@ from sliplens.study.truth import (
     meta_test,
     rank_correlation,
     redrawing,
+    reliability_of,
     shuffle_half,
     stage_frames,
     true_curves,
-    reliability_of,
 )
 
 SIZE = 112
