@@ -214,7 +214,6 @@ def test_simulated_frames_are_explained_and_filmed_anew(simulated, tmp_path, mon
         rows = (found.errors.trial == trial) & (found.errors.frame == int(frame))
         at = np.abs(own.safety_margin - found.errors.safety_margin[rows]).argmin()
         assert own.prediction[at] == pytest.approx(found.errors.prediction[rows][0], abs=1e-6)
-    assert len(found.other_frictions) == (found.frictions.frame_id == found.shown_frame).sum()
     # the middle of the contact, as the labels' map has it
     recording = data.load(data.find(str(found.errors.trial[0])))
     assert recording.truth is not None
@@ -240,7 +239,7 @@ def test_simulated_frames_are_explained_and_filmed_anew(simulated, tmp_path, mon
 def test_recordings_say_what_is_left_out(difference_run: Path, fine_dataset: Dataset, tmp_path):
     found = sl.diagnose(difference_run, fine_dataset, tmp_path, trials=2)
     assert "known of simulated frames alone" in found.left_out
-    assert len(found.frictions) == len(found.slopes) == len(found.other_frictions) == 0
+    assert len(found.frictions) == len(found.slopes) == 0
     assert np.isnan(found.errors.limit).all()
     assert found.left_out.rstrip(".") in sl.write_report(tmp_path).page.read_text(encoding="utf-8")
 

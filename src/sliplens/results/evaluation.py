@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float64, Int64, Shaped, UInt8
+from jaxtyping import Float64, Int64, Shaped
 from msgspec import Meta
 
 from sliplens.codec import UNKNOWN, Columns
@@ -378,6 +378,3 @@ class Diagnosis(OfNetwork):
     slopes: tuple[FrictionSlope, ...]
     errors: ErrorTable
     frictions: FrictionTable
-    shown_frame: str
-    other_frictions: UInt8[np.ndarray, "shown size size 3"]
-    """Frame that is shown with each of its frictions in `frictions`, as the network would see it; empty without any."""

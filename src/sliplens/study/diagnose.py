@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int64, UInt8
+from jaxtyping import Bool, Float, Float64, Int64
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError
-from sliplens.explainers.attribution import frame_of
 from sliplens.explainers.explain import join_maps
 from sliplens.explainers.frames import frames_at
 from sliplens.extras import require_packages
@@ -121,11 +120,11 @@ def _diagnose(run: Network, data: Dataset, answers: ScoredFrames, *, trials: int
     except InputError as error:
         left_out = f"The limit of one frame, and what other frictions would change, are left out: {error}."
         add_note(left_out)
-        frictions, pictures, example = tabulate_frictions([]), explained.pictures[:0], ""
+        frictions = tabulate_frictions([])
     else:
         errors.limit[rows] = [reading_limit(frame.scene, frame.number) for frame in frames]
         with open_stage("Filming with other frictions"):
-            frictions, pictures, example = refilm(run, frames, some.condition.tolist())
+            frictions = refilm(run, frames, some.condition.tolist())
     slopes = friction_slopes(frictions, rng)
     return Diagnosis(
         input=run.manifest.input,
@@ -138,8 +137,6 @@ def _diagnose(run: Network, data: Dataset, answers: ScoredFrames, *, trials: int
         slopes=slopes,
         errors=errors,
         frictions=frictions,
-        shown_frame=example,
-        other_frictions=pictures,
     )  # fmt: skip
 
 
@@ -281,14 +278,9 @@ def _spread_rows(errors: ErrorTable, trials: int) -> Int64[np.ndarray, " rows"]:
     return np.array(rows)
 
 
-def refilm(
-    run: Network, frames: Sequence[StagedFrame], conditions: Sequence[str]
-) -> tuple[FrictionTable, UInt8[np.ndarray, "shown size size 3"], str]:
-    """Film frames anew with other frictions, and ask the network; gives the table, pictures of one frame, and its name.
-
-    That frame is of the last condition, in the middle of the margin.
-    """
-    rows, pictures, films, last = [], {}, [], None
+def refilm(run: Network, frames: Sequence[StagedFrame], conditions: Sequence[str]) -> FrictionTable:
+    """Film frames anew with other frictions, and predict them."""
+    rows, films, last = [], [], None
     for frame, condition in track(list(zip(frames, conditions, strict=True))):
         at, scene = frame.number, frame.scene
         if scene is not last:  # frames of a trial stand together
@@ -297,13 +289,10 @@ def refilm(
         valid = [film for film in films if np.isfinite(film.loading.safety_margin[at])]
         drawn = np.concatenate([film.film.draw(slice(at, at + 1)).numpy() for film in valid])
         inputs = run.encode(drawn, frame.reference).to(run.device)
-        pictures[frame.id] = (255 * frame_of(inputs)).round().byte().permute(0, 2, 3, 1).cpu().numpy()
         for film, answer in zip(valid, run.predict(inputs).tolist(), strict=True):
             truth = (film.loading.friction_coefficient[at], film.loading.safety_margin[at])
             rows.append((frame.id, frame.trial, condition, frame.day, *truth, answer, reading_slope(film, at)))
-    of_last = [frame for frame, condition in zip(frames, conditions, strict=True) if condition == conditions[-1]]
-    chosen = min(of_last, key=lambda frame: abs(frame.safety_margin - 0.5)).id
-    return tabulate_frictions(rows), pictures[chosen], chosen
+    return tabulate_frictions(rows)
 
 
 def tabulate_frictions(rows: Sequence[tuple[Any, ...]]) -> FrictionTable:
