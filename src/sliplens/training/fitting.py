@@ -65,8 +65,7 @@ from sliplens.training.module import (
 from sliplens.training.sequence import fit_sequence
 
 _ENOUGH_TRIALS, _FEW_TRIALS = 10, 30
-"""Labelled trials with which adapting has about nine tenths of the R2 of a hundred, and below which a network with
-random weights learns less or, on the flat gel, no more; both on dry objects, measured by `benchmarks/adapt.py`."""
+"""Labelled trials that adapting needs, and that random weights need, as measured by `benchmarks/adapt.py`."""
 _KIND = {
     "all": ("backbone", "head"),
     "weights": ("backbone", "head", "image_size"),
