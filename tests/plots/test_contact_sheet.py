@@ -1,7 +1,6 @@
 import re
 from dataclasses import replace
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 from drawn import misplaced, pictures, pulled_trial
@@ -47,13 +46,6 @@ def with_truth(trial: Recording, *, displacement: str = "half-space") -> Recordi
 
 def texts(figure: Figure) -> list[str]:
     return [found.get_text().replace("\N{NO-BREAK SPACE}", " ") for found in figure.findobj(Text)]
-
-
-def factor_told(figure: Figure) -> float:
-    """The one factor that the sheet tells; it must not tell two."""
-    told = {found for text in texts(figure) for found in re.findall(r"\N{MULTIPLICATION SIGN} ([\d.]+)", text)}
-    assert len(told) == 1
-    return float(told.pop().rstrip("."))
 
 
 @pytest.mark.parametrize("pull", [11, 41, 700])
@@ -104,39 +96,24 @@ def test_no_frame_stands_in_two_columns():
     assert len(set(found)) == len(found)
 
 
-def test_sheet_tells_each_margin_shown_and_each_that_is_missing():
-    figure = draw_contact_sheet([pulled_trial(lowest=0.52, pull=25)])
+def test_sheet_names_each_margin_and_each_that_is_missing():
+    found = texts(draw_contact_sheet([pulled_trial(lowest=0.52, pull=25)], title="A title"))
 
-    found = texts(figure)
-    assert [text for text in found if re.fullmatch(r"Γ \d+ %", text)] == ["Γ 100 %", "Γ 80 %", "Γ 60 %"]
+    assert [text for text in found if re.match(r"Γ \d", text)] == [
+        "Γ 100 %\n0.3 s, contact", "Γ 80 %\n0.8 s, incipient slip", "Γ 60 %\n1.2 s, incipient slip"
+    ]  # fmt: skip
     assert [text for text in found if "no frame" in text] == [f"no frame\nnear {left} %" for left in (40, 20, 0)]
-    assert [len(axes) for axes in pictures(figure)] == [4, 4]
+    assert {"A title", "day1-dry-001\ndry, day 1, test-sensor\n34 frames in 1.3 s"} < set(found)
 
 
-def test_sheet_tells_who_when_and_what():
-    told = "\n".join(texts(draw_contact_sheet([pulled_trial()], title="A title")))
-
-    for words in (
-        "A title",
-        "day1-dry-001",
-        "dry, day 1",
-        "test-sensor",
-        "1.10–1.20 N",  # noqa: RUF001 (an en dash is meant)
-        "$\\mu$ 0.50",
-        "53 frames in 2.1 s",
-    ):
-        assert words in told
-
-
-def test_difference_is_the_absolute_one_times_the_factor_told():
+def test_difference_is_the_absolute_one_times_the_factor():
     trials = [pulled_trial(bright=60), pulled_trial(bright=20, pull=21)]
     figure = draw_contact_sheet(trials)
 
-    factor, below = factor_told(figure), pictures(figure)[1]
+    [factor] = {float(text.split()[-1]) for text in texts(figure) if text.startswith("difference")}
     rows = [(trial, index) for trial in trials for index in (choose_untouched(trial), *choose_margins(trial))]
-    assert any("one factor for the whole sheet" in text for text in texts(figure))
     assert factor > 2
-    for ax, (trial, index) in zip(below, rows, strict=True):
+    for ax, (trial, index) in zip(pictures(figure)[1], rows, strict=True):
         signed = trial.frames[index].astype(float) - trial.reference
         # halves may be rounded either way
         assert np.abs(np.asarray(ax.images[0].get_array()) - np.minimum(255, factor * np.abs(signed))).max() <= 0.51
@@ -170,20 +147,9 @@ def test_brightened_levels_do_not_wrap():
     np.testing.assert_array_equal(brighten(np.array([0, 100, 128, 255], dtype=np.uint8), 2.0), [0, 200, 255, 255])
 
 
-@pytest.mark.parametrize("size", [(24, 32), (32, 24), (16, 90), (90, 16)])
-def test_pixels_are_square(size):
-    figure = draw_contact_sheet([pulled_trial(size=size)])
-    figure.draw_without_rendering()
-
-    for ax in [ax for axes in pictures(figure) for ax in axes]:
-        box = ax.get_window_extent()
-        # the figure's edges fall on whole dots
-        assert box.height / box.width == pytest.approx(size[0] / size[1], rel=0.01)
-
-
 def test_marks_stand_where_the_frames_were_taken():
     trial = pulled_trial(lowest=0.5, pull=26)
-    charts = [ax for ax in draw_contact_sheet([trial]).axes if ax.get_ylabel()]
+    charts = [ax for ax in draw_contact_sheet([trial]).axes if ax.get_ylabel() in {"Force (N)", "Γ (%)"}]
 
     taken = [index for index in (choose_untouched(trial), *choose_margins(trial)) if index is not None]
     assert [ax.get_ylabel() for ax in charts] == ["Force (N)", "Γ (%)"]
@@ -195,7 +161,7 @@ def test_marks_stand_where_the_frames_were_taken():
 
 def test_charts_draw_forces_in_newtons_and_the_margin_in_percent():
     trial = pulled_trial()
-    forces, margin = [ax for ax in draw_contact_sheet([trial]).axes if ax.get_ylabel()]
+    forces, margin = [ax for ax in draw_contact_sheet([trial]).axes if ax.get_ylabel() in {"Force (N)", "Γ (%)"}]
 
     drawn = {line.get_label(): line.get_ydata() for line in forces.lines}
     np.testing.assert_array_equal(drawn["$F_n$"], trial.normal_force_n)
@@ -216,46 +182,21 @@ def test_outlines_run_along_the_edges_of_contact_and_stick_zone():
     assert [spans(ax) for ax in above] == [set(), *[{contact, stick}] * 5, {contact}]
 
 
-@pytest.mark.parametrize(
-    ("trial", "names"),
-    [
-        (pulled_trial(), []),
-        (with_truth(pulled_trial()), ["outline of the contact", "outline of its stick zone"]),
-        (
-            with_truth(pulled_trial(), displacement="calibrated"),
-            ["outline of the contact", "outline of its stick zone (nominal)"],
-        ),
-    ],
-)
-def test_legend_names_outlines_where_there_are_any(trial, names):
-    (legend,) = draw_contact_sheet([trial]).legends
+def test_legend_names_outlines_where_there_are_any():
+    names = ["outline of the contact", "outline of its stick zone (nominal)"]
+    for trial, first in ((pulled_trial(), []), (with_truth(pulled_trial(), displacement="calibrated"), names)):
+        (legend,) = draw_contact_sheet([trial]).legends
 
-    found = [text.get_text() for text in legend.get_texts()]
-    assert found == [*names, "frame shown", "no contact", "contact", "incipient slip", "full slip"]
+        found = [text.get_text() for text in legend.get_texts()]
+        assert found == [*first, "frame shown", "no contact", "contact", "incipient slip", "full slip"]
 
 
 def test_no_text_lies_over_another_or_beyond_the_edge():
-    long = replace(
-        pulled_trial(size=(16, 60)),
-        trial="a_trial_with_a_name_as_$long$ as a sentence that goes on and on and on",
-        sensor="Some Sensor Mini 2 no 31",
-    )
+    long = replace(pulled_trial(size=(16, 60)), trial="a_trial_as_$long$ as a sentence that goes on and on and on")
     slow = pulled_trial(size=(40, 30))
     slow = replace(slow, time_s=400 * slow.time_s)
-    figure = draw_contact_sheet(
-        [long, slow, with_truth(pulled_trial(lowest=0.5, pull=26), displacement="calibrated")], title="All"
-    )
-    assert misplaced(figure) == ([], [])
-
-
-@pytest.mark.parametrize("suffix", [".png", ".PDF", ".svg"])
-def test_file_is_complete_and_alone(tmp_path, suffix):
-    path = tmp_path / "new" / f"preview{suffix}"
-
-    write_contact_sheet([pulled_trial()], path)
-
-    assert [found.name for found in path.parent.iterdir()] == [path.name]
-    assert path.stat().st_size > 10_000
+    truth = with_truth(pulled_trial(lowest=0.5, pull=26), displacement="calibrated")
+    assert misplaced(draw_contact_sheet([long, slow, truth], title="All")) == ([], [])
 
 
 def test_no_trial_is_no_sheet():
@@ -263,7 +204,7 @@ def test_no_trial_is_no_sheet():
         draw_contact_sheet([])
 
 
-def test_one_frame_and_no_label_can_be_drawn():
+def test_one_frame_and_no_label_can_be_drawn(tmp_path):
     trial = pulled_trial()
     signals = ("time_s", "normal_force_n", "tangential_force_n", "friction_coefficient", "safety_margin", "stick_ratio")
     one = replace(
@@ -273,15 +214,7 @@ def test_one_frame_and_no_label_can_be_drawn():
         **{name: getattr(trial, name)[:1] for name in signals},
     )
 
-    figure = draw_contact_sheet([one])
-    figure.draw_without_rendering()
+    write_contact_sheet([one], tmp_path / "new" / "preview.svg")
 
-    assert sum("no frame" in text for text in texts(figure)) == len(MARGIN_LEVELS)
-
-
-def test_drawing_leaves_matplotlib_as_it_was(tmp_path):
-    before = dict(mpl.rcParams)
-
-    write_contact_sheet([pulled_trial()], tmp_path / "preview.png")
-
-    assert dict(mpl.rcParams) == before
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["preview.svg"]
+    assert sum("no frame" in text for text in texts(draw_contact_sheet([one]))) == len(MARGIN_LEVELS)

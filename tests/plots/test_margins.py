@@ -107,7 +107,7 @@ def test_colours_tell_the_sign_and_nothing_is_coloured_where_nothing_speaks(stri
 def test_the_chart_has_units_and_marks_the_moments_with_pictures(strip):
     figure = draw_strip(strip)
     chart = next(ax for ax in figure.axes if ax.get_xlabel() == "Time (s)")
-    assert chart.get_ylabel() == "Safety margin (%)"
+    assert chart.get_ylabel() == "Safety margin Γ (%)"
     assert {text.get_text() for text in chart.texts} == {"1", "2"}
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from textwrap import fill
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -22,11 +22,8 @@ from sliplens.plots.style import (
     ORANGE,
     SKY,
     VERMILLION,
-    decimals,
     drawing_style,
     percent,
-    place_axes,
-    place_text,
     require_picture_path,
     save_page,
     write_over,
@@ -93,19 +90,12 @@ def outline_handles(recordings: Sequence[Recording]) -> list[Line2D]:
 _REACHED_WITHIN = 0.1 - 1e-9  # half the distance between two columns: no frame stands in both
 _ALIKE = 0.005  # margins that are equal in whole percents
 
-# inches, from left to right: facts of the trial, pictures, charts
-_WIDTH, _EDGE, _INFO, _GAP, _AXIS, _CHART = 16.0, 0.2, 1.9, 0.07, 0.62, 2.9
-_PICTURE = (_WIDTH - 2 * _EDGE - _INFO - _AXIS - _CHART) / (1 + len(MARGIN_LEVELS)) - _GAP
-# from top to bottom; charts need some height, and very long or very high pictures are reduced
-_HEAD, _TIME, _FOOT, _LEGEND, _LEAST, _PICTURE_HEIGHT = 0.42, 0.42, 0.18, 0.75, 2.6, (0.8, 2.4)
-
 
 def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = None) -> Figure:
-    """Draw one band a trial: frames from the untouched sensor to full slip, their differences, and the forces.
+    """Draw two rows a trial: frames from the untouched sensor to full slip, and their differences; forces at the right.
 
-    A band shows the frames of `choose_untouched` and `choose_margins`, beneath each its absolute difference image,
-    brightened by one factor for the whole sheet so that trials compare, and at the right forces and safety margin over
-    time. Outlines of the true contact and its stick zone lie over the camera frames of simulated trials.
+    Frames are those of `choose_untouched` and `choose_margins`; difference images are brightened by one factor, so that
+    trials compare. Outlines of the true contact and stick zone lie over the frames of simulated trials.
     """
     if not recordings:
         raise InputError("a contact sheet needs a trial; give at least one recording")
@@ -116,22 +106,24 @@ def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = N
             for recording, row in zip(recordings, rows, strict=True)
         ]
     )
-    aspects = [recording.reference.shape[0] / recording.reference.shape[1] for recording in recordings]
-    heights = [float(np.clip(_PICTURE * aspect, *_PICTURE_HEIGHT)) for aspect in aspects]
-    bands = [_HEAD + max(2 * height + _GAP, _LEAST) + _FOOT for height in heights]
-    top = 0.1 if title is None else 0.55
     with drawing_style():
-        figure = Figure(figsize=(_WIDTH, top + sum(bands) + _LEGEND))
-        if title is not None:
-            place_text(figure, _EDGE, 0.16, title, fontsize=14, fontweight="bold", parse_math=False)
-        for recording, row, height, band in zip(recordings, rows, heights, bands, strict=True):
-            _draw_pictures(figure, recording, row, top=top + _HEAD, height=height, factor=factor)
-            chosen = [at for at in row[1:] if at is not None]
-            _write_facts(figure, recording, chosen, top=top + _HEAD)
-            marked = chosen if row[0] is None else [row[0], *chosen]
-            _draw_charts(figure, recording, marked, top=top + _HEAD, height=band - _HEAD - _TIME - _FOOT)
-            top += band
-        _explain(figure, recordings, factor)
+        figure = Figure(figsize=(16, 3.9 * len(recordings) + 0.9), layout="constrained")
+        figure.suptitle(title or "", x=0.01, ha="left", fontsize=14, fontweight="bold", parse_math=False)
+        grid = figure.add_gridspec(2 * len(rows), len(rows[0]) + 1, width_ratios=[*[1.0] * len(rows[0]), 1.8])
+        for band, (recording, row) in enumerate(zip(recordings, rows, strict=True)):
+            for column, index in enumerate(row):
+                pair = [figure.add_subplot(grid[2 * band + line, column]) for line in (0, 1)]
+                _draw_pictures(recording, index, pair, factor=factor, nominal=[None, *MARGIN_LEVELS][column])
+            for line, plot in enumerate((plot_forces, plot_margin)):
+                ax = plot(recording, ax=figure.add_subplot(grid[2 * band + line, -1]))
+                for time_s in recording.time_s[[at for at in row if at is not None]]:
+                    ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1)
+        mark = Line2D([], [], color=BLACK, linewidth=0.7, label="frame shown")
+        states = [
+            Patch(linewidth=0, label=str(state), color=STATE_COLOURS[state], alpha=STATE_TINTS[state])
+            for state in NAMED_STATES
+        ]
+        figure.legend(handles=[*outline_handles(recordings), mark, *states], ncols=7, loc="outside lower left")
     return figure
 
 
@@ -170,83 +162,35 @@ def choose_untouched(recording: Recording) -> int | None:
 
 
 def _draw_pictures(
-    figure: Figure, recording: Recording, row: list[int | None], *, top: float, height: float, factor: float
+    recording: Recording, index: int | None, axes: Sequence[Axes], *, factor: float, nominal: float | None
 ) -> None:
-    first, second = _EDGE + _INFO, top + height + _GAP
-    for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
-        turned = {"rotation": 90, "ha": "right", "va": "center", "multialignment": "center"}
-        place_text(figure, first - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
-    for column, index in enumerate(row):
-        x = first + column * (_PICTURE + _GAP)
-        camera, below = (place_axes(figure, x, y, _PICTURE, height) for y in (top, second))
-        for ax in (camera, below):
-            ax.set(xticks=[], yticks=[])
-            ax.spines[:].set_visible(False)
-        if index is None and column:
-            camera.spines[:].set(visible=True, color="#E5E7EB")
-            write_over(camera, f"no frame\nnear {percent(MARGIN_LEVELS[column - 1])}")
-            continue
-        frame = recording.reference if index is None else recording.frames[index]
-        camera.imshow(frame)
-        below.imshow(brighten(absolute_difference(frame, recording.reference), factor))
-        if index is not None and recording.truth is not None:
-            _plot_outlines(recording.truth.contact_map[index], ax=camera)
-        name = f"Γ {percent(float(recording.safety_margin[index]))}" if index is not None and column else "untouched"
-        when = "reference" if index is None else f"{recording.time_s[index]:.1f} s, {recording.contact_state[index]}"
-        for words, up, settings in ((name, 0.2, {"weight": "bold"}), (when, 0.05, {"fontsize": 8, "color": GREY})):
-            place_text(figure, x + _PICTURE / 2, top - up, words, ha="center", va="bottom", **settings)
-
-
-def _plot_outlines(contact: UInt8[np.ndarray, "height width"], *, ax: Axes) -> None:
-    touches, sticks = contact != OUTSIDE, contact == STICKS
-    # dark rims first, then wide under narrow, so that outlines that run together both show
-    lines = ((touches, BLACK, 2.2), (sticks, BLACK, 1.6), (touches, "white", 1.5), (sticks, SKY, 0.9))
-    for zone, colour, width in lines:
-        if zone.any() and not zone.all():  # else there is no line to draw
-            ax.contour(zone, levels=[0.5], colors=[colour], linewidths=width)
-
-
-def _draw_charts(figure: Figure, recording: Recording, marked: list[int], *, top: float, height: float) -> None:
-    x, tall, gap = _WIDTH - _EDGE - _CHART, 0.56 * height, 0.1
-    forces = plot_forces(recording, ax=place_axes(figure, x, top, _CHART, tall))
-    forces.tick_params(labelbottom=False)
-    margin = plot_margin(recording, ax=place_axes(figure, x, top + tall + gap, _CHART, height - tall - gap))
-    for ax in (forces, margin):
-        for time_s in recording.time_s[marked]:
-            ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1)
-    margin.plot(recording.time_s[marked], 100 * recording.safety_margin[marked], "o", color=BLACK, markersize=5)
-    figure.align_ylabels([forces, margin])
-
-
-def _write_facts(figure: Figure, recording: Recording, chosen: list[int], *, top: float) -> None:
-    # a dollar sign in a name begins no formula
-    name = fill(recording.trial, 17, max_lines=3, placeholder="…")
-    place_text(figure, _EDGE, top, name, fontsize=10, fontweight="bold", parse_math=False)
-    top += 0.19 * len(name.splitlines()) + 0.05
-    facts = (f"{recording.condition}, day {recording.day}", recording.sensor)
-    length = f"{number_of(len(recording), 'frame')} in {np.ptp(recording.time_s):.1f} s"
-    lines = "\n".join(fill(fact, 20, max_lines=2, placeholder="…") for fact in (*facts, length))
-    place_text(figure, _EDGE, top, lines, fontsize=9.5, linespacing=1.5, parse_math=False)
-    top += 0.205 * len(lines.splitlines()) + 0.08
-    force, friction = recording.normal_force_n[chosen], recording.friction_coefficient[chosen]
-    place_text(figure, _EDGE, top, f"$F_n$ {_range(force)} N\n$\\mu$ {_range(friction)}", fontsize=9.5, linespacing=1.5)
-
-
-def _range(values: Float[np.ndarray, " frames"]) -> str:
-    ends = [decimals(end, 2) for end in (np.nanmin(values), np.nanmax(values))] if np.isfinite(values).any() else ["?"]
-    return "–".join(dict.fromkeys(ends))  # noqa: RUF001 (an en dash is meant)
-
-
-def _explain(figure: Figure, recordings: Sequence[Recording], factor: float) -> None:
-    bottom = float(figure.get_size_inches()[1])
-    words = (
-        f"Frames nearest to Γ = {', '.join(f'{100 * nominal:.0f}' for nominal in MARGIN_LEVELS)} %; at the left the "
-        "ranges of their $F_n$ and $\\mu$. Differences are $|T_n - T_0|$ against the untouched sensor, brightened "
-        f"{TIMES} {factor:g}: one factor for the whole sheet, so pictures compare."
-    )
-    place_text(figure, _EDGE, bottom - 0.65, words, fontsize=9)
-    mark = Line2D([], [], color=BLACK, linewidth=0.7, marker="o", markersize=5, label="frame shown")
-    tints = [(state, {"color": STATE_COLOURS[state], "alpha": STATE_TINTS[state]}) for state in NAMED_STATES]
-    states = [Patch(linewidth=0, label=str(state), **tint) for state, tint in tints]
-    place = {"loc": "lower left", "bbox_to_anchor": (_EDGE / _WIDTH, 0.1 / bottom), "borderaxespad": 0, "borderpad": 0}
-    figure.legend(handles=[*outline_handles(recordings), mark, *states], ncols=7, **place)
+    """Draw a frame and its difference image; the first column, without a nominal margin, has the facts of the trial."""
+    for ax in axes:
+        ax.set(xticks=[], yticks=[])
+        ax.spines[:].set_visible(False)
+    camera, below = axes
+    if index is None and nominal is not None:
+        write_over(camera, f"no frame\nnear {percent(nominal)}")
+        return
+    frame = recording.reference if index is None else recording.frames[index]
+    camera.imshow(frame)
+    below.imshow(brighten(absolute_difference(frame, recording.reference), factor))
+    when = "reference" if index is None else f"{recording.time_s[index]:.1f} s, {recording.contact_state[index]}"
+    if nominal is None:
+        name = fill(recording.trial, 26, max_lines=2, placeholder="…")
+        length = f"{number_of(len(recording), 'frame')} in {np.ptp(recording.time_s):.1f} s"
+        facts = f"{name}\n{recording.condition}, day {recording.day}, {recording.sensor}\n{length}"
+        # a dollar sign in a name begins no formula
+        camera.set_ylabel(facts, fontsize=8, parse_math=False)
+        below.set_ylabel(f"difference {TIMES} {factor:g}", fontsize=8)
+        camera.set_title(f"untouched\n{when}", fontsize=8.5)
+    elif index is not None:
+        camera.set_title(f"Γ {percent(float(recording.safety_margin[index]))}\n{when}", fontsize=8.5)
+    if index is not None and recording.truth is not None:
+        contact = recording.truth.contact_map[index]
+        touches, sticks = contact != OUTSIDE, contact == STICKS
+        # dark rims first, then wide under narrow, so that outlines that run together both show
+        lines = ((touches, BLACK, 2.2), (sticks, BLACK, 1.6), (touches, "white", 1.5), (sticks, SKY, 0.9))
+        for zone, colour, width in lines:
+            if zone.any() and not zone.all():  # else there is no line to draw
+                camera.contour(zone, levels=[0.5], colors=[colour], linewidths=width)

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import MaxNLocator
 
+from sliplens.plots.margins import MARGIN_LABEL, plot_margins
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -25,20 +26,15 @@ from sliplens.plots.style import (
     method_line,
     method_name,
     methods_in_order,
-    place_axes,
-    place_text,
     require_picture_path,
     save_page,
-    shade_withheld,
     short_input_name,
     write_over,
 )
-from sliplens.progress import number_of
 from sliplens.results.evaluation import (
     BaselineScores,
     BinScore,
     Evaluation,
-    RegressionScores,
     Reliability,
     RiskCoverage,
     ScoredFrames,
@@ -46,9 +42,7 @@ from sliplens.results.evaluation import (
 )
 from sliplens.results.faithfulness import CHANCE, DeletionCurve
 
-MARGIN_LABEL = "Safety margin Γ (%)"
 _MSE_LABEL, _EPOCH_LABEL = "MSE (Γ as a fraction, squared)", "Epoch (passes over the training frames)"
-_DOTS: Any = {"linewidths": 0, "rasterized": True}  # thousands of dots as vectors would swell the page
 
 
 def plot_bins(bins: Mapping[str, tuple[BinScore, ...]], *, ax: Axes) -> Axes:
@@ -75,11 +69,18 @@ def _draw_bins(rows: Sequence[tuple[str, str, Sequence[BinScore]]], *, ax: Axes)
         ax.bar(at, heights, width=width, color=colour, label=name)
 
 
-def plot_predictions(predictions: ScoredFrames, *, colour: str, ax: Axes) -> Axes:
-    """Draw prediction against label of every frame, in percent, with the line of perfect predictions."""
-    ax.plot([0, 100], [0, 100], color=BLACK, linewidth=1, linestyle="--", label="perfect", zorder=3)
-    label, read = 100 * predictions.safety_margin, 100 * predictions.prediction
-    ax.scatter(label, read, s=9, color=colour, alpha=0.45, label="one frame", **_DOTS)
+def plot_predictions(predictions: ScoredFrames, *, ax: Axes, colour: str | None = None) -> Axes:
+    """Draw prediction against label of every frame, in percent, in one colour, or in one a condition."""
+    groups = {"one frame": predictions} if colour is not None else {}
+    for name in conditions_in_order(predictions.condition) if colour is None else ():
+        groups[name] = predictions.where(predictions.condition == name)
+    ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
+    for name, frames in groups.items():
+        some = frames.where(np.arange(0, len(frames), max(1, len(frames) // _MOST_DOTS)))
+        size = np.clip(3000 / max(len(some), 1), 5, 30)  # few dots are seen as well as many
+        dots: Any = {"s": size, "alpha": 0.45, "color": colour or CONDITION_COLOURS.get(name, GREEN), "label": name}
+        # thousands of dots as vectors would swell the page
+        ax.scatter(100 * some.safety_margin, 100 * some.prediction, linewidths=0, rasterized=True, **dots)
     ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), ylim=_limits(predictions.prediction))
     ax.legend(loc="best")
     return ax
@@ -89,8 +90,9 @@ def plot_learning_curves(trainings: Mapping[str, Training], *, ax: Axes) -> Axes
     """Draw the error on the training and validation frames by epoch, one colour an input."""
     for name in inputs_in_order(trainings):
         curve, colour, label = trainings[name].curve, INPUT_COLOURS.get(name, PURPLE), short_input_name(name)
-        ax.plot(curve.epoch, curve.train_mse, color=colour, linestyle=":", label=f"{label}, training")
-        ax.plot(curve.epoch, curve.validation_mse, color=colour, label=f"{label}, validation")
+        dot = "." if len(curve.epoch) <= 40 else ""  # one epoch alone makes no line
+        ax.plot(curve.epoch, curve.train_mse, color=colour, linestyle=":", marker=dot, label=f"{label}, training")
+        ax.plot(curve.epoch, curve.validation_mse, color=colour, marker=dot, label=f"{label}, validation")
     ax.set(xlabel=_EPOCH_LABEL, ylabel=_MSE_LABEL, yscale="log")
     ax.legend()
     return ax
@@ -123,9 +125,7 @@ def _limits(prediction: np.ndarray) -> tuple[float, float]:
     return min(-5.0, 100 * float(prediction.min()) - 3), max(105.0, 100 * float(prediction.max()) + 3)
 
 
-_WIDTH, _HEIGHT, _LEFT, _TOP, _GAP, _CHART = 12.0, 7.5, 0.75, 1.25, 0.95, (3.05, 2.25)
 _MOST_DOTS = 4000
-_ESTIMATOR = 0.36  # inches of a row
 _LOWEST_R2 = -0.3  # of the axis; numbers are written beside the bars
 
 
@@ -138,40 +138,30 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     """
     require_picture_path(path, example="evaluation.png")
     conditions = conditions_in_order(evaluation.conditions)
+    predictions, trials = evaluation.predictions, evaluation.trials
     estimators = {} if evaluation.baselines is None else evaluation.baselines.estimators
     with drawing_style():
-        figure = Figure(figsize=(_WIDTH, _HEIGHT + (0.9 + _ESTIMATOR * (len(estimators) + 1) if estimators else 0)))
-        columns, tops = [_LEFT + at * (_CHART[0] + _GAP) for at in range(3)], (_TOP, _TOP + _CHART[1] + 1.05)
-        charts = [place_axes(figure, column, top, *_CHART) for top in tops for column in columns]
-        predictions = evaluation.predictions
-        plot_answers(predictions, conditions, ax=charts[0])
+        heights = [7.5, 0.9 + 0.36 * (len(estimators) + 1)] if estimators else [7.5]
+        figure = Figure(figsize=(12, sum(heights)), layout="constrained")
+        figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", parse_math=False)
+        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).ravel()
+        answers, errors, biases, coverage, risk, typical = above.subplots(2, 3).ravel()
+        plot_predictions(predictions, ax=answers).set_title("Predictions")
         bins = [(name, CONDITION_COLOURS.get(name, GREEN), evaluation.conditions[name].bins) for name in conditions]
-        _draw_bins(bins, ax=charts[1])
-        charts[1].set(xlabel="True Γ, lower edge of the bin (%)", ylabel=_MSE_LABEL, title="Error by margin")
-        charts[1].set_xticks(range(10), [str(10 * edge) for edge in range(10)])
-        charts[1].legend(fontsize=8)
-        _plot_trials(predictions, conditions, ax=charts[2])
-        _plot_coverage(evaluation.reliability, conditions, ax=charts[3])
-        _plot_risk(evaluation.risk, ax=charts[4])
-        _plot_typical(predictions, evaluation.trials, ax=charts[5])
-        if estimators:
-            _plot_estimators(figure, {"network": evaluation, **estimators}, conditions, top=_HEIGHT + 0.25)
-        place_text(figure, _LEFT - 0.5, 0.2, title, fontsize=13, fontweight="bold", parse_math=False)
-        place_text(figure, _LEFT - 0.5, 0.52, _summary(evaluation, conditions), fontsize=9, color=GREY)
-    save_page(figure, path)
-
-
-def plot_answers(predictions: ScoredFrames, conditions: list[str], *, ax: Axes) -> None:
-    """Draw prediction against label of every frame, in percent, a colour a condition."""
-    for name in conditions:
-        rows = np.flatnonzero(predictions.condition == name)
-        rows = rows[:: max(1, len(rows) // _MOST_DOTS)]
-        label, read = 100 * predictions.safety_margin[rows], 100 * predictions.prediction[rows]
-        size = np.clip(3000 / max(len(rows), 1), 5, 30)  # few dots are seen as well as many
-        ax.scatter(label, read, s=size, alpha=0.5, color=CONDITION_COLOURS.get(name, GREEN), label=name, **_DOTS)
-    ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
-    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), title="Predictions")
-    ax.legend(markerscale=2, fontsize=8, loc="upper left")
+        _draw_bins(bins, ax=errors)
+        errors.set(xlabel="True Γ, lower edge of the bin (%)", ylabel=_MSE_LABEL, title="Error by margin")
+        errors.set_xticks(range(10), [str(10 * edge) for edge in range(10)])
+        errors.legend()
+        _plot_trials(predictions, conditions, ax=biases)
+        _plot_coverage(evaluation.reliability, conditions, ax=coverage)
+        _plot_risk(evaluation.risk, ax=risk)
+        ranked = sorted(trials, key=lambda name: trials[name].mse)
+        rows = predictions.where(predictions.trial == ranked[(len(ranked) - 1) // 2])
+        plot_margins(rows.where(np.argsort(rows.time_s, kind="stable")).table(), ax=typical)
+        typical.set_xlabel("Time (s), in the trial of median error")
+        for part in below:
+            _plot_estimators({"network": evaluation, **estimators}, conditions, axes=part.subplots(1, 2).tolist())
+        save_page(figure, path)
 
 
 def _plot_trials(predictions: ScoredFrames, conditions: list[str], *, ax: Axes) -> None:
@@ -217,48 +207,21 @@ def _plot_risk(risk: RiskCoverage | None, *, ax: Axes) -> None:
     ax.legend(fontsize=8)
 
 
-def _plot_typical(predictions: ScoredFrames, trials: Mapping[str, RegressionScores], *, ax: Axes) -> None:
-    ranked = sorted(trials, key=lambda name: trials[name].mse)
-    trial = ranked[(len(ranked) - 1) // 2]
-    rows = np.flatnonzero(predictions.trial == trial)
-    frames = predictions.where(rows[np.argsort(predictions.time_s[rows], kind="stable")])
-    shade_withheld(frames.time_s, frames.withheld.tolist(), ax=ax)
-    read, low, high = (
-        np.where(frames.withheld == "", 100 * values, np.nan)
-        for values in (frames.prediction, frames.low_90, frames.high_90)
-    )
-    if np.isfinite(low).any():
-        interval = {"color": VERMILLION, "alpha": 0.2, "linewidth": 0, "label": "90 % interval"}
-        ax.fill_between(frames.time_s, low, high, **interval)
-    if np.isfinite(read).any():
-        ax.plot(frames.time_s, read, color=VERMILLION, label="predicted")
-    ax.plot(frames.time_s, 100 * frames.safety_margin, color=BLACK, linestyle="--", label="true")
-    ax.set(xlabel="Time (s)", ylabel="Γ (%)")
-    ax.set_title(f"Median error: {trial if len(trial) <= 18 else f'…{trial[-17:]}'}", parse_math=False)
-    ax.legend(fontsize=8)
-
-
 def _plot_estimators(
-    figure: Figure, estimators: Mapping[str, Evaluation | BaselineScores], conditions: list[str], *, top: float
+    estimators: Mapping[str, Evaluation | BaselineScores], conditions: list[str], *, axes: Sequence[Axes]
 ) -> None:
     """Draw bars of R2 and of the mean absolute error, a row an estimator."""
-    start, gap = 2.35, 0.5
-    size = (_WIDTH - start - gap - 0.5) / 2, _ESTIMATOR * len(estimators)
-    first, second = (place_axes(figure, start + at * (size[0] + gap), top, *size) for at in range(2))
-    thick = 0.8 / max(1, len(conditions))
+    thick, (first, second) = 0.8 / max(1, len(conditions)), axes
     for index, name in enumerate(conditions):
         scores = [estimator.conditions[name] for estimator in estimators.values()]
         at = np.arange(len(estimators)) + (index - (len(conditions) - 1) / 2) * thick
         r2 = np.array([np.nan if score.r2 is None else score.r2 for score in scores])
-        mae = np.array([100 * score.mae for score in scores])
-        for ax, values, digits in ((first, r2, 2), (second, mae, 1)):
-            ax.barh(
-                at, np.maximum(values, _LOWEST_R2), height=thick, color=CONDITION_COLOURS.get(name, GREEN), label=name
-            )
-            for place, value in zip(at, values, strict=True):
-                if np.isfinite(value):
-                    # -0.00 would look like less than nothing
-                    ax.text(max(value, 0), place, f" {round(value, digits) + 0.0:.{digits}f}", va="center", fontsize=7)
+        mae, colour = np.array([100 * score.mae for score in scores]), CONDITION_COLOURS.get(name, GREEN)
+        for ax, values, form in ((first, r2, " {:.2f}"), (second, mae, " {:.1f}")):
+            bars = ax.barh(at, np.maximum(values, _LOWEST_R2), height=thick, color=colour, label=name)
+            # adding 0 makes 0 of -0; a missing number has no bar and no label
+            labels = [form.format(round(value, 2) + 0.0) if np.isfinite(value) else "" for value in values]
+            ax.bar_label(bars, labels, fontsize=7)
     first.axvline(0, color=BLACK, linewidth=1)
     first.set(xlabel="R²", title="Network, and estimators from the markers alone")
     first.set_xlim(max(first.get_xlim()[0], _LOWEST_R2), 1.08)
@@ -267,51 +230,22 @@ def _plot_estimators(
         ax.set_yticks(range(len(estimators)), names)
         ax.set_ylim(len(estimators) - 0.4, -0.6)
         ax.grid(visible=False, axis="y")
-    second.legend(fontsize=8, loc="lower right")
-
-
-def _summary(evaluation: Evaluation, conditions: list[str]) -> str:
-    parts = []
-    for name in conditions:
-        scores, lead = evaluation.conditions[name], evaluation.lead_times[name]
-        r2 = "none" if scores.r2 is None else f"{scores.r2:.3f}"
-        words = f"{name}: {number_of(scores.frames, 'frame')}, MSE {scores.mse:.4f}, R² {r2}, "
-        words += f"MAE {100 * scores.mae:.1f} points"
-        slipping = f"{number_of(lead.trials, 'trial')} that slip"
-        if lead.median_ms is not None:
-            words += f", warns in {lead.warned} of {slipping}, {lead.median_ms:.0f} ms before"
-            words += f" (the true Γ: {lead.ideal_ms:.0f} ms)"
-        elif lead.trials:
-            words += f", warns in none of {slipping}"
-        parts.append(f"{words}, {lead.false_per_minute:.1f} false alarms a minute")
-    return "\n".join(parts)
 
 
 def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
     """Save the errors of a training by epoch, on a logarithmic scale, with the epoch whose weights were kept."""
-    curve = training.curve
-    epoch, train, validation = curve.epoch, curve.train_mse, curve.validation_mse
-    best = int(np.argmin(validation))
-    # few epochs have a dot each: one alone makes no line
-    colour, dot = INPUT_COLOURS.get(training.input, BLUE), "o" if len(epoch) <= 40 else ""
-    ring: Any = {"markersize": 10, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": VERMILLION}
-    errors = np.concatenate([train, validation])
+    curve, best = training.curve, int(np.argmin(training.curve.validation_mse))
+    error = curve.validation_mse[best]
     with drawing_style():
-        figure = Figure(figsize=(7.0, 4.4))
-        ax = place_axes(figure, 0.95, 0.75, 5.8, 3.05)
-        ax.plot(epoch, train, color=colour, linestyle=":", marker=dot, markersize=3, label="training, augmented")
-        ax.plot(epoch, validation, color=colour, marker=dot, markersize=3, label="validation")
-        ax.plot(epoch[best], validation[best], marker="o", linestyle="", label="kept", **ring)
-        ax.set(xlabel=_EPOCH_LABEL, ylabel=_MSE_LABEL, yscale="log", xlim=(0, 1.03 * max(1.0, float(epoch[-1]))))
+        figure = Figure(figsize=(7.0, 4.4), layout="constrained")
+        ax = plot_learning_curves({training.input: training}, ax=figure.subplots())
+        ring: Any = {"markersize": 10, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": VERMILLION}
+        ax.plot(curve.epoch[best], error, marker="o", linestyle="", label="kept", **ring)
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-        # room above and below, so that a curve that hardly falls looks like one
-        ax.set_ylim(0.7 * float(errors.min()), 1.4 * float(errors.max()))
-        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5, 7)))
         ax.yaxis.set_major_formatter("{x:g}")
-        ax.yaxis.set_minor_locator(NullLocator())
         ax.legend()
-        place_text(figure, 0.25, 0.15, title, fontsize=12, fontweight="bold", parse_math=False)
-        summary = f"kept: epoch {epoch[best]:.4g}, validation MSE {validation[best]:.4g}"
-        summary += f", root mean square error {100 * np.sqrt(validation[best]):.1f} points of Γ"
-        place_text(figure, 0.25, 0.42, summary, fontsize=9, color=GREY)
+        summary = f"kept: epoch {curve.epoch[best]:.4g}, validation MSE {error:.4g}"
+        summary += f", root mean square error {100 * np.sqrt(error):.1f} points of Γ"
+        figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", parse_math=False)
+        ax.set_title(summary, fontsize=9, fontweight="normal", color=GREY)
         save_page(figure, path)

@@ -17,7 +17,7 @@ from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, require_new_file, whole_file
 from sliplens.intervals import Difference
 from sliplens.markers.gel import SensorProposal, propose_profile
-from sliplens.plots.errors import plot_answers, plot_faithfulness, plot_learning_curves
+from sliplens.plots.errors import plot_faithfulness, plot_learning_curves, plot_predictions
 from sliplens.plots.margins import column, plot_grip_force, plot_hold, plot_margins, plot_readings
 from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import (
@@ -39,8 +39,6 @@ from sliplens.results.evaluation import Diagnosis
 from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, is_control
 from sliplens.results.study import Study, Truth
-
-__all__ = ["draw_proposal", "plot", "write_proposal"]
 
 
 def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
@@ -174,10 +172,6 @@ def _study(study: Study, ax: Axes, index: int) -> None:
     _faithfulness(study.faithfulness[sorted(study.faithfulness)[0]], ax, index)
 
 
-def _margins(predictions: pa.Table, ax: Axes, index: int) -> None:
-    plot_margins(_rows_of_trial(predictions, index), ax=ax)
-
-
 def _tracking(tracking: Any, ax: Axes, index: int) -> None:
     rows = _rows_of_trial(tracking.frame(), index)
     frame, right, down = (column(rows, name) for name in ("frame", "dx_px", "dy_px"))
@@ -205,7 +199,7 @@ def _of(count: int, index: int) -> int:
 
 
 DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
-    "Evaluation": lambda result, ax, _: plot_answers(result.predictions, sorted(result.conditions), ax=ax),
+    "Evaluation": lambda result, ax, _: plot_predictions(result.predictions, ax=ax),
     "Training": lambda result, ax, _: plot_learning_curves({result.input: result}, ax=ax),
     "Explanation": _explanation,
     "DeletionScores": _deletion,
@@ -213,8 +207,8 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Study": _study,
     "Truth": _truth,
     "Diagnosis": _diagnosis,
-    "Predictions": lambda result, ax, index: _margins(result.frame(), ax, index),
-    "ScoredFrames": lambda result, ax, index: _margins(result.table(), ax, index),
+    "Predictions": lambda result, ax, index: plot_margins(_rows_of_trial(result.frame(), index), ax=ax),
+    "ScoredFrames": lambda result, ax, index: plot_margins(_rows_of_trial(result.table(), index), ax=ax),
     "Tracking": _tracking,
     "Grip": lambda result, ax, _: plot_grip_force(result.trace.table(), ax=ax).set_title(result.setup.controller),
     "Hold": lambda result, ax, _: plot_hold(result.steps.table(), ax=ax).set_title(result.controller),
@@ -223,39 +217,29 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
 """Functions that draw a record, by the name of its class."""
 
 
-def draw_proposal(proposal: SensorProposal) -> Figure:
-    """Draw the camera's frame with gel, crop and markers, and beside it the frame that the profile makes of it."""
-    profile, frame = proposal.profile, proposal.frame
-    with drawing_style():
+def write_proposal(proposal: SensorProposal, path: Path) -> None:
+    """Save the camera's frame with gel, crop and markers beside the frame that the profile makes of it, as PNG."""
+    profile, frame, markers = proposal.profile, proposal.frame, proposal.markers_px
+    with drawing_style(), written_whole(path) as part:
         figure = Figure(figsize=(9.6, 4.6), layout="constrained")
         camera, made = figure.subplots(1, 2, width_ratios=(frame.shape[1] / frame.shape[0], 1.0))
         camera.imshow(frame)
-        for box, colour, words in (
-            (proposal.gel_px, BLUE, "gel"),
-            (profile.crop_px or (0, 0, frame.shape[1], frame.shape[0]), VERMILLION, "crop_px"),
-        ):
-            x, y, width, height = box
-            corner = (x - 0.5, y - 0.5)
-            camera.add_patch(Rectangle(corner, width, height, fill=False, color=colour, linewidth=1.6, label=words))
-        if len(proposal.markers_px):
-            camera.plot(
-                *proposal.markers_px.T, "o", mfc="none", mec="white", ms=9,
-                label=f"{len(proposal.markers_px)} markers ({profile.markers})",
-            )  # fmt: skip
+        crop = profile.crop_px or (0, 0, frame.shape[1], frame.shape[0])
+        for (x, y, *size), colour, words in ((proposal.gel_px, BLUE, "gel"), (crop, VERMILLION, "crop_px")):
+            box = {"fill": False, "color": colour, "linewidth": 1.6, "label": words}
+            camera.add_patch(Rectangle((x - 0.5, y - 0.5), *size, **box))
+        if len(markers):
+            words = f"{len(markers)} markers ({profile.markers})"
+            camera.plot(*markers.T, "o", mfc="none", mec="white", ms=9, label=words)
         camera.set(title="camera", xlabel="x in pixels", ylabel="y in pixels")
-        camera.legend(
-            loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3, frameon=True, facecolor="0.7"
-        )  # rings are white
-        result = profile.apply(frame)
-        made.imshow(result)
-        made.set(title=f"{profile.name}, after the profile", xlabel="x in pixels", ylabel="y in pixels")
-        if np.isfinite(proposal.spacing_px):
-            made.text(
-                0.5, -0.22, f"markers {proposal.spacing_px:.1f} pixels apart", ha="center", transform=made.transAxes
-            )
+        below = {"bbox_to_anchor": (0.5, -0.16), "facecolor": "0.7"}  # rings are white
+        camera.legend(loc="upper center", ncols=3, frameon=True, **below)
+        made.imshow(profile.apply(frame))
+        apart = f" (markers {proposal.spacing_px:.1f} apart)" if np.isfinite(proposal.spacing_px) else ""
+        made.set(title=f"{profile.name}, after the profile", xlabel=f"x in pixels{apart}", ylabel="y in pixels")
         for axes in (camera, made):
             axes.grid(visible=False)
-    return figure
+        figure.savefig(part, dpi=120, format="png")
 
 
 def make_profile(
@@ -302,9 +286,3 @@ def make_profile(
         part.write_text(profile_text(proposal.profile, notes=proposal.notes), encoding="utf-8")
     write_proposal(proposal, path.with_suffix(".png"))
     return proposal
-
-
-def write_proposal(proposal: SensorProposal, path: Path) -> None:
-    """Write the picture as PNG; it appears when complete."""
-    with written_whole(path) as part:
-        draw_proposal(proposal).savefig(part, dpi=120, format="png")

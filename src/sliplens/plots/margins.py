@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from sliplens.errors import InputError
-from sliplens.plots.errors import MARGIN_LABEL
 from sliplens.plots.saliency import SIGN_COLOURS, full_colour, overlay_relevance
 from sliplens.plots.style import (
     BLACK,
@@ -27,14 +26,13 @@ from sliplens.plots.style import (
     VERMILLION,
     drawing_style,
     method_name,
-    place_axes,
-    place_text,
     require_picture_path,
     save_page,
     shade_withheld,
 )
 from sliplens.results.explanation import Strip
 
+MARGIN_LABEL = "Safety margin Γ (%)"
 MOST_TRIALS = 6
 """Trials on one page."""
 _FORCES = (("normal_force_n", "normal", GREEN), ("tangential_force_n", "tangential", ORANGE))
@@ -64,10 +62,14 @@ def draw_margins(rows: pa.Table, path: Path, *, title: str) -> int:
             if forced:
                 below = axes[len(heights) * number + 1]
                 below.sharex(chart)
-                _plot_forces(trial, ax=below)
+                across, label = _across(trial)
+                for force, words, colour in _FORCES:
+                    line = "-" if words == "normal" else "--"
+                    below.plot(across, column(trial, force), color=colour, label=words, linestyle=line)
+                below.set(xlabel=label, ylabel="Force (N)")
+                below.legend(loc="upper left", ncols=2)
                 chart.set_xlabel("")
                 chart.tick_params(labelbottom=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
     save_page(figure, path)
     return len(drawn)
 
@@ -79,16 +81,12 @@ def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
     """
     across, label = _across(rows)
     shade_withheld(across, rows["withheld"].to_pylist(), ax=ax)
-    if "low_90" in rows.column_names:
-        low, high = 100 * column(rows, "low_90"), 100 * column(rows, "high_90")
-        if np.isfinite(low).any():  # a network that was never calibrated has none
-            ax.fill_between(across, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
-    # few frames have a dot each: one alone makes no line
-    dot = "o" if len(across) <= 40 else ""
-    if np.isfinite(read := 100 * column(rows, "prediction")).any():
-        ax.plot(across, read, color=BLUE, marker=dot, markersize=3, label="predicted")
-    if "safety_margin" in rows.column_names and np.isfinite(true := column(rows, "safety_margin")).any():
-        ax.plot(across, 100 * true, color=BLACK, linestyle="--", label="true")
+    nothing = np.full(len(rows), np.nan)
+    prediction, low, high, true = (
+        column(rows, name) if name in rows.column_names else nothing
+        for name in ("prediction", "low_90", "high_90", "safety_margin")
+    )
+    _plot_prediction(across, prediction, low, high, true, ax=ax)
     ax.axhline(0, color=GREY, linewidth=0.8)
     ax.set(xlabel=label, ylabel=MARGIN_LABEL)
     if label == "Frame":
@@ -101,14 +99,6 @@ def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
     return ax
 
 
-def _plot_forces(rows: pa.Table, *, ax: Axes) -> None:
-    across, label = _across(rows)
-    for name, words, colour in _FORCES:
-        ax.plot(across, column(rows, name), color=colour, label=words, linestyle="-" if words == "normal" else "--")
-    ax.set(xlabel=label, ylabel="Force (N)")
-    ax.legend(loc="upper left", ncols=2)
-
-
 def _across(rows: pa.Table) -> tuple[Float[np.ndarray, " frames"], str]:
     timed = "time_s" in rows.column_names and rows["time_s"].null_count == 0
     return (column(rows, "time_s"), "Time (s)") if timed else (column(rows, "frame"), "Frame")
@@ -119,56 +109,44 @@ def column(rows: pa.Table, name: str) -> Float[np.ndarray, " frames"]:
     return rows[name].to_numpy().astype(np.float64)
 
 
-_WIDTH_IN, _MARGIN_IN, _GAP_IN, _CHART_IN = 10.0, 0.75, 0.08, 2.2
-
-
 def draw_strip(strip: Strip) -> Figure:
     """Draw a trial from stick to slip.
 
     Above, camera frames at a few moments under their maps, on one scale: blue where a pixel raises the predicted
     margin, orange where it lowers it. Below, the true and the predicted margin over time, with the 90 % interval.
     """
-    count = len(strip.shown)
-    cell = (_WIDTH_IN - _MARGIN_IN - 1.0 - _GAP_IN * (count - 1)) / count
-    height = 1.05 + cell + 0.45 + _CHART_IN + 0.6
     # the map's own units are too small to read: points of the margin for every hundredth of the picture
-    points = strip.relevance * strip.relevance[0].size
-    limit = full_colour(points)
+    points, readings = strip.relevance * strip.relevance[0].size, strip.readings
+    limit, count = full_colour(points), len(strip.shown)
     with drawing_style():
-        figure = Figure(figsize=(_WIDTH_IN, height))
-        head = f"A {strip.condition} grip from stick to slip ({SOURCE_NAMES[strip.source]})"
-        place_text(figure, 0.1, 0.1, head, fontsize=13, fontweight="bold")
-        place_text(figure, 0.1, 0.36, _subtitle(strip), fontsize=9.5, color="#4B5563")
+        figure = Figure(figsize=(10, 4.6 + 8.2 / count), layout="constrained")
+        network = INPUT_NAMES.get(strip.input, strip.input).lower()
+        figure.suptitle(
+            f"A {strip.condition} grip from stick to slip ({SOURCE_NAMES[strip.source]})\nFrames under the map of "
+            f"{method_name(strip.method)}, network on {network}: orange lowers its margin, blue raises it",
+            x=0.01, ha="left", fontsize=11,
+        )  # fmt: skip
+        grid = figure.add_gridspec(2, count, height_ratios=(8.2 / count, 2.6))
+        axes = [figure.add_subplot(grid[0, number]) for number in range(count)]
         for number, (frame, picture, relevance) in enumerate(zip(strip.shown, strip.pictures, points, strict=True)):
-            ax = place_axes(figure, _MARGIN_IN + number * (cell + _GAP_IN), 1.05, cell, cell)
-            ax.imshow(overlay_relevance(picture, relevance / limit))
-            ax.set_axis_off()
-            readings = strip.readings
-            read, true = _percent(readings.prediction[frame]), _percent(readings.safety_margin[frame])
+            axes[number].imshow(overlay_relevance(picture, relevance / limit))
+            axes[number].set_axis_off()
+            read, true = (_percent(values[frame]) for values in (readings.prediction, readings.safety_margin))
             words = f"{number + 1}: {'withheld' if readings.withheld[frame] else f'{read} predicted'}\n{true} true"
-            ax.set_title(words, fontsize=9.5, loc="center", fontweight="normal")
-        bar = place_axes(figure, _WIDTH_IN - 0.9, 1.05, 0.13, cell)
-        figure.colorbar(ScalarMappable(Normalize(-limit, limit), SIGN_COLOURS), cax=bar)
-        bar.set_ylabel("points of margin\nper 1 % of the image", fontsize=8)
-        bar.tick_params(labelsize=8)
-        chart = place_axes(figure, _MARGIN_IN, 1.05 + cell + 0.4, _WIDTH_IN - _MARGIN_IN - 1.0, _CHART_IN)
-        plot_readings(strip, ax=chart)
+            axes[number].set_title(words, fontsize=9.5, loc="center", fontweight="normal")
+        bar = figure.colorbar(ScalarMappable(Normalize(-limit, limit), SIGN_COLOURS), ax=axes, aspect=15)
+        bar.set_label("points of margin\nper 1 % of the image", fontsize=8)
+        plot_readings(strip, ax=figure.add_subplot(grid[1, :]))
     return figure
 
 
 def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
     """Draw the true and the predicted margin over time, with the interval and the moments of the pictures."""
-    readings = strip.readings
+    readings, time_s = strip.readings, strip.readings.time_s
     touched = np.isfinite(readings.safety_margin)
-    time_s = readings.time_s
-    read, low, high = (
-        np.where(touched, 100 * value, np.nan) for value in (readings.prediction, readings.low, readings.high)
-    )
     shade_withheld(time_s, readings.withheld.tolist(), ax=ax)
-    if np.isfinite(low).any():  # a network that was never calibrated has none
-        ax.fill_between(time_s, low, high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
-    ax.plot(time_s, read, color=BLUE, label="predicted")
-    ax.plot(time_s, 100 * readings.safety_margin, color=BLACK, linestyle="--", label="true")
+    values = (readings.prediction, readings.low, readings.high)
+    _plot_prediction(time_s, *(np.where(touched, value, np.nan) for value in values), readings.safety_margin, ax=ax)
     for number, frame in enumerate(strip.shown, start=1):
         ax.axvline(time_s[frame], color="#9CA3AF", linewidth=0.8, zorder=0)
         ax.annotate(str(number), (time_s[frame], 106), ha="center", fontsize=9, annotation_clip=False)
@@ -176,17 +154,23 @@ def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
     if slipping.any():
         ends = float(time_s[slipping][0]), float(time_s[-1])
         ax.axvspan(*ends, color=VERMILLION, alpha=0.15, linewidth=0, label="from the first full slip")
-    ax.set(xlabel="Time (s)", ylabel="Safety margin (%)", ylim=(-4, 104), xlim=(time_s[0], time_s[-1]))
+    ax.set(xlabel="Time (s)", ylabel=MARGIN_LABEL, ylim=(-4, 104), xlim=(time_s[0], time_s[-1]))
     ax.legend(loc="lower left")
     return ax
 
 
-def _subtitle(strip: Strip) -> str:
-    network = INPUT_NAMES.get(strip.input, strip.input).lower()
-    return (
-        f"Frames under the map of {method_name(strip.method)}, network on {network}: "
-        "orange lowers its margin, blue raises it"
-    )
+def _plot_prediction(
+    across: np.ndarray, prediction: np.ndarray, low: np.ndarray, high: np.ndarray, true: np.ndarray, *, ax: Axes
+) -> None:
+    """Draw shares in percent: a prediction with its interval, and the label; each where it has any number."""
+    if np.isfinite(low).any():  # a network that was never calibrated has none
+        ax.fill_between(across, 100 * low, 100 * high, color=BLUE, alpha=0.18, linewidth=0, label="90 % interval")
+    # few frames have a dot each: one alone makes no line
+    dot = "o" if len(across) <= 40 else ""
+    if np.isfinite(prediction).any():
+        ax.plot(across, 100 * prediction, color=BLUE, marker=dot, markersize=3, label="predicted")
+    if np.isfinite(true).any():
+        ax.plot(across, 100 * true, color=BLACK, linestyle="--", label="true")
 
 
 def _percent(value: float) -> str:

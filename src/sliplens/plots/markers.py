@@ -51,8 +51,9 @@ def plot_field(
     sure = field.confidence > SURE
     length = np.linalg.norm(field.displacement_px, axis=-1)
     top = longest_px or max(float(np.nanmax(np.where(sure, length, 0))), STILL_PX)
-    (first, last), (top_edge, bottom) = _ends(field.x_px), _ends(field.y_px)
-    extent = (first, last, bottom, top_edge)
+    across, down = ((at[1] - at[0]) / 2 for at in (field.x_px, field.y_px))  # halves of a cell of the grid
+    ends = float(field.x_px[0] - across), float(field.x_px[-1] + across)
+    extent = (*ends, float(field.y_px[-1] + down), float(field.y_px[0] - down))
     ax.set_facecolor("#D1D5DB")
     norm = Normalize(0, top)
     ax.imshow(np.where(sure, length, np.nan), cmap=FIELD_COLOURS, norm=norm, extent=extent, interpolation="nearest")
@@ -64,12 +65,3 @@ def plot_field(
     ax.set(xlim=(-0.5, size[1] - 0.5), ylim=(size[0] - 0.5, -0.5), aspect="equal", xlabel="x (px)", ylabel="y (px)")
     ax.grid(visible=False)
     return ScalarMappable(norm, FIELD_COLOURS)
-
-
-def _ends(places: Float[np.ndarray, " places"]) -> tuple[float, float]:
-    """Return the outer edges of the cells of an even grid."""
-    half = (places[1] - places[0]) / 2
-    return float(places[0] - half), float(places[-1] + half)
-
-
-__all__ = ["ARROWS", "FIELD_COLOURS", "plot_arrows", "plot_field"]
