@@ -23,15 +23,9 @@ PAGE = pytest.mark.parametrize(
 
 
 NO_MODULES = (
-    {
-        f"sliplens.{name}"
-        for name in ("fills", "formats", "encodings", "backbones", "executors", "controllers", "conditions")
-    }
-    | {
-        f"sliplens.{name}"
-        for name in ("manifest", "input", "output", "recipes", "augmentations", "sources", "estimators")
-    }
-    | {"sliplens.sensors", "sliplens.presets", "sliplens.pulls", "sliplens.sinks", "sliplens.gripper_messages"}
+    {f"sliplens.{name}" for name in ("fills", "formats", "encodings", "backbones", "executors", "controllers")}
+    | {f"sliplens.{name}" for name in ("manifest", "input", "output", "recipes", "augmentations", "sources")}
+    | {"sliplens.sinks"}
 )
 """Groups of entry points, and keys in the metadata of an ONNX file."""
 _CODE = re.compile(r"^```(\w*)\n(.*?)^```", flags=re.MULTILINE | re.DOTALL)

@@ -10,30 +10,17 @@ from sliplens.explainers.table import EXPLAINERS
 from sliplens.extras import Table
 from sliplens.faithfulness.fills import FILLS
 from sliplens.grip.controllers import CONTROLLERS
-from sliplens.grip.gripper import ROS_MESSAGES
-from sliplens.grip.scripts import CONDITIONS
 from sliplens.live.sinks import SINKS
 from sliplens.live.sources import SOURCES
-from sliplens.markers import KINDS
-from sliplens.markers.estimators import ESTIMATORS
 from sliplens.recordings.formats import FORMATS
-from sliplens.simulation import PRESETS, SENSORS
-from sliplens.simulation.plan import PULLS
 
 TABLES = {
-    "sliplens.conditions": CONDITIONS,
     "sliplens.controllers": CONTROLLERS,
     "sliplens.explainers": EXPLAINERS,
     "sliplens.fills": FILLS,
     "sliplens.formats": FORMATS,
-    "sliplens.gripper_messages": ROS_MESSAGES,
     "sliplens.sinks": SINKS,
     "sliplens.sources": SOURCES,
-    "sliplens.markers": KINDS,
-    "sliplens.estimators": ESTIMATORS,
-    "sliplens.sensors": SENSORS,
-    "sliplens.presets": PRESETS,
-    "sliplens.pulls": PULLS,
 }
 
 

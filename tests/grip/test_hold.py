@@ -243,11 +243,6 @@ def test_a_gripper_that_measures_no_force_from_the_start_is_refused_and_keeps_it
     assert set(gripper.sent) == {"F 2.000"}
 
 
-def test_a_reader_that_was_not_entered_is_refused():
-    with pytest.raises(InputError, match="enter the reader first"):
-        sl.hold_grip(plain_reader(Frames()), "dry-run", controller="fixed", seconds=0.1)
-
-
 def test_a_hold_is_kept_and_no_other_takes_its_place(tmp_path: Path):
     steps: list[HoldStep] = []
 

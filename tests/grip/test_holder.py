@@ -41,17 +41,6 @@ def test_a_margin_counts_with_the_force_of_its_own_moment():
     np.testing.assert_array_equal(controller.observations[-1].margin, [[0.5, 0.5]])
 
 
-def test_two_fingers_read_each_its_margin_and_one_suffices():
-    controller = Constant()
-    holder, now_s = holder_of(controller, forces=np.linspace(1.0, 2.0, 91), fingers=2)
-    holder.update_reading(reading_of(0.4), taken_s=80 * PERIOD_S)
-    assert holder.grip_force(now_s, 2.0).margin == 0.4
-    np.testing.assert_array_equal(controller.observations[-1].margin, [[0.4, np.nan]])
-    holder.update_reading(reading_of(0.6), taken_s=90 * PERIOD_S, finger=1)
-    assert holder.grip_force(now_s, 2.0).margin == pytest.approx(0.5)
-    assert controller.observations[-1].force_n == pytest.approx(1.0 + 85 / 90)
-
-
 @pytest.mark.parametrize("reading", [None, reading_of(None), reading_of(0.9)], ids=["none", "withheld", "stale"])
 def test_nothing_is_loosened_without_a_margin_whatever_a_controller_says(reading: Reading | None):
     controller = Constant(force_n=2.0)
@@ -143,17 +132,6 @@ def test_time_begins_at_the_touch_and_what_a_slow_gripper_missed_is_not_made_up_
         holder.grip_force(now_s := now_s + step_s, 1.0)
     assert [item.time_s for item in controller.observations[-3:]] == pytest.approx([0.0, PERIOD_S, PERIOD_S + 0.3])
     assert [item.since_s for item in controller.observations[-3:]] == pytest.approx([PERIOD_S, PERIOD_S, 3 * PERIOD_S])
-
-
-def test_a_force_grows_as_fast_at_any_rate_of_commands():
-    def grown(period_s: float) -> float:
-        law = MarginLaw()
-        seen = {"force_n": np.array([2.0]), "load_n": np.zeros(1), "slip": np.zeros(1, dtype=bool)}
-        seen |= {"margin": np.full((1, 2), 0.5), "low": np.full((1, 2), 0.5), "since_s": period_s}
-        [force_n] = law.command(Observation(time_s=2.0, command_n=np.array([1.0]), **seen))
-        return (force_n - 1.0) / period_s
-
-    assert grown(1 / 120) == pytest.approx(grown(1 / 60)) == pytest.approx(MarginLaw.up_n_s)
 
 
 def test_laws_aim_at_the_margin_itself_as_soon_as_readings_know_the_friction():

@@ -63,21 +63,6 @@ def test_it_is_careful_where_it_hears_nothing(source: GripSource):
     assert course[-1].why.startswith("no margin:")
 
 
-def test_a_reading_that_stays_the_same_grows_old(source: GripSource):
-    frames = source.frames()
-    run(source, frames, 4.0)
-    course = run(source, frames, 20.0, tells=False)
-    assert course[-1].force_n == pytest.approx(MarginLaw.safe_n, rel=0.02)
-    assert course[-1].why.startswith("no margin:")
-
-
-def test_a_slip_that_the_markers_tell_is_answered_once(source: GripSource):
-    frames = source.frames()
-    before = run(source, frames, 6.0)[-1].force_n
-    after = run(source, frames, 0.5, slip=SlipState.SLIP)
-    assert after[-1].force_n == pytest.approx(1.5 * before, rel=0.1)
-
-
 def test_skin_that_springs_back_as_the_grip_is_loosened_is_no_slip(source: GripSource):
     frames = source.frames()
     run(source, frames, 2.8)  # lifted with 2 N, far more than it needs

@@ -2,13 +2,10 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
 from sliplens.errors import ImageError, InputError
 from sliplens.markers import KINDS, MarkerKind, detect_markers
-from sliplens.markers.detect import measure_spots
 
 KIND = {"chromatouch": "chromatouch", "flat-gel": "gelsight-mini"}
 
@@ -38,21 +35,6 @@ def test_every_contrast_is_found_and_measured(kind, colours, dots, grid, rng):
     np.testing.assert_allclose(found.radius_px, 5.0, rtol=0.06)
 
 
-@given(x=st.floats(-0.5, 0.5), y=st.floats(-0.5, 0.5))
-def test_a_clean_dot_moved_by_a_fraction_is_found_moved_by_it(x, y):
-    rows, columns = np.mgrid[:41, :41]
-    signal = 100 / (1 + np.exp((np.hypot(columns - 20 - x, rows - 20 - y) - 5) / 0.6))
-    shape = measure_spots(signal.astype(np.float32), np.array([[20.0, 20.0]]), radius_px=5.0)
-    np.testing.assert_allclose(shape.centre_px[0], (20 + x, 20 + y), atol=0.02)
-
-
-def test_a_slope_of_the_light_does_not_move_a_dot():
-    rows, columns = np.mgrid[:41, :41]
-    signal = 100 / (1 + np.exp((np.hypot(columns - 20.3, rows - 19.8) - 5) / 0.6)) + 1.5 * columns - 0.7 * rows
-    shape = measure_spots(signal.astype(np.float32), np.array([[20.0, 20.0]]), radius_px=5.0)
-    np.testing.assert_allclose(shape.centre_px[0], (20.3, 19.8), atol=0.02)
-
-
 @pytest.mark.parametrize("name", ["chromatouch", "flat-gel"])
 def test_simulated_centres_are_within_the_goal_and_none_is_missed_or_invented(name, trials):
     trial = trials[name]
@@ -66,13 +48,6 @@ def test_simulated_centres_are_within_the_goal_and_none_is_missed_or_invented(na
         assert np.all(distance.min(axis=1)[found.whole] < 2)
         errors.append((found.centre_px[distance.argmin(axis=0)] - places)[inside])
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.15
-
-
-def test_markers_that_the_edge_cuts_are_marked(dots, grid):
-    # discs of 5 px whose blurred edges the frame cuts, and the next ones far from it
-    found = detect_markers(dots(grid(at=(5.0, 26.0))), "gelsight-mini")
-    np.testing.assert_array_equal(found.whole, found.centre_px[:, 0] > 15.0)
-    assert (~found.whole).sum() == 5
 
 
 def test_a_frame_without_markers_is_answered_with_none_once_their_look_is_known(dots, grid):
@@ -91,11 +66,6 @@ def test_a_frame_without_markers_is_answered_with_none_once_their_look_is_known(
 def test_frames_without_markers_are_refused_in_one_sentence(frame, told):
     with pytest.raises(ImageError, match=told):
         detect_markers(frame, "auto")
-
-
-def test_three_dots_are_no_pattern(dots):
-    with pytest.raises(ImageError, match="fewer than 4 markers"):
-        detect_markers(dots([(40, 40), (80, 80), (120, 60)]), "auto")
 
 
 def noise(rng: np.random.Generator, *, blur_px: float) -> np.ndarray:

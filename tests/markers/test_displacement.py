@@ -43,17 +43,6 @@ def test_confidence_is_that_of_a_mean_of_many_and_falls_to_none_far_away():
     assert far.confidence[0, 0] < 0.01
 
 
-def test_markers_without_a_displacement_play_no_part():
-    rng = np.random.default_rng(3)
-    places, values = rng.uniform(0, 60, (20, 2)), rng.normal(0, 1, (20, 2))
-    gone = values.copy()
-    gone[:5] = np.nan
-    kept = interpolate_field(places[5:], values[5:], size=(60, 60), reach_px=15.0)
-    np.testing.assert_allclose(
-        interpolate_field(places, gone, size=(60, 60), reach_px=15.0).displacement_px, kept.displacement_px
-    )
-
-
 def test_fields_that_cannot_be_are_refused(grid):
     places = grid()
     with pytest.raises(InputError, match="2 markers have a displacement"):

@@ -4,14 +4,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError
-from sliplens.markers import track_markers
 from sliplens.markers.estimators import (
     ESTIMATORS,
     FieldTrial,
     affine_parts,
-    displacement_entropy,
     edge_over_centre,
-    field_trial,
     find_hold,
     find_holds,
     get_estimator,
@@ -82,14 +79,6 @@ def test_markers_that_stay_behind_are_residual_and_leave_the_stick_area():
     np.testing.assert_allclose(mean_shear(trial)[1, 0], 2 * trial.inner.mean())
 
 
-def test_entropy_is_none_for_one_motion_and_that_of_two_for_two():
-    one = np.tile([2.1, 0.0], (36, 1))
-    two = np.where(np.arange(36)[:, None] % 2, [2.1, 0.0], [4.1, 0.0])
-    entropy = displacement_entropy(pressed_and_moved([one, two]))
-    np.testing.assert_allclose(entropy[:, 0], [0, 0, np.log(2)], atol=1e-12)
-    np.testing.assert_allclose(entropy[:, 1], [0, 0, np.log(2)], atol=1e-12)
-
-
 def test_edge_over_centre_is_the_ratio_of_their_motions():
     still = pressed_and_moved([np.zeros_like(PLACES)])
     moved = np.where(still.inner[:, None], [4.0, 0.0], [1.0, 0.0])
@@ -110,12 +99,6 @@ def test_eccentricity_recovers_the_law_it_is_built_on():
     np.testing.assert_allclose(
         get_estimator("ikeda-eccentricity").fit([trial], [margins]).estimate(harder)[1:], margins[1:], atol=0.03
     )
-
-
-def test_the_constant_says_the_mean_of_the_training_labels():
-    trial = pressed_and_moved([np.zeros_like(PLACES)] * 3)
-    answer = get_estimator("constant").fit([trial], [np.array([np.nan, 0.2, 0.4, 0.9])]).estimate(trial)
-    np.testing.assert_allclose(answer, 0.5)
 
 
 @pytest.mark.parametrize("name", [name for name in ESTIMATORS if name != "constant"])
@@ -181,22 +164,6 @@ def test_what_is_causal_says_the_same_of_a_frame_whatever_comes_after(made, name
     np.testing.assert_array_almost_equal(before[0], after[0], decimal=12)
     # where all is known that the whole trial knows, it is the same as the other but for what was fitted
     assert np.abs(np.array(before[1]) - after[1]).max() > 0.01
-
-
-def test_the_hold_is_found_near_the_last_frame_of_full_stick(made):
-    errors = [trial.hold - int(np.flatnonzero(margin >= 1 - 1e-9)[-1]) for _, trial, margin in made]
-    # a pull shows once it has moved the markers by more than their noise
-    assert np.median(errors) <= 4
-    assert min(errors) >= -3
-
-
-def test_tracked_markers_give_a_trial(trials):
-    trial = trials["chromatouch"]
-    tracks = track_markers(trial.frames, trial.reference, "chromatouch")
-    field = field_trial(tracks)
-    assert len(field) == len(trial)
-    assert len(field.rest_px) == tracks.from_reference.sum()
-    assert np.nanmax(field.spread) > 0.02
 
 
 def test_what_cannot_be_fitted_is_refused(made):

@@ -12,7 +12,7 @@ from sliplens.plots.clip import clip_frames, paint_outlines, write_clip
 from sliplens.plots.contact_sheet import brighten, brightening
 from sliplens.plots.style import SKY
 from sliplens.progress import reporting
-from sliplens.recordings import ContactState, GroundTruth, Recording
+from sliplens.recordings import ContactState, Recording
 
 av = pytest.importorskip("av")
 
@@ -140,30 +140,6 @@ def test_outlines_do_not_hide_each_other_or_leave_their_side():
     assert not (blue & ~inside).any()
     assert (picture[240, 240] == picture[5, 5]).all()
     assert (picture[5, 5] == 77).all()
-
-
-def test_outlines_are_in_the_clip_where_the_truth_is_known(trial, written, tmp_path):
-    contact = np.zeros(trial.frames.shape[:3], dtype=np.uint8)
-    contact[:, 4:20, 4:28] = 1
-    rest = np.zeros((1, 2), dtype=np.float32)
-    truth = GroundTruth(
-        recipe="none",
-        displacement="half-space",
-        marker_rest_px=rest,
-        marker_px=np.repeat(rest[None], len(trial), axis=0),
-        static_friction=np.ones(len(trial)),
-        contact_radius_m=np.ones(len(trial)),
-        stick_radius_m=np.zeros(len(trial)),
-        contact_map=contact,
-    )
-
-    write_clip(replace(trial, truth=truth), tmp_path / "known.mp4")
-
-    known, unknown = (read(path)[0][0].astype(int) for path in (tmp_path / "known.mp4", written[0]))
-    # two pixels of white above the contact's first row, on a sensor of grey level 30
-    row, column = 4 * 20 - 1, 16 * 20
-    assert known[row - 1 : row + 1, column].mean() > 150
-    assert unknown[row - 1 : row + 1, column].mean() < 50
 
 
 @pytest.mark.parametrize("name", ["trial", "trial.mp4.mkv"])

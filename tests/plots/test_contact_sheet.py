@@ -11,7 +11,6 @@ from there import there
 
 from sliplens.errors import InputError
 from sliplens.plots.contact_sheet import (
-    brighten,
     brightening,
     choose_margins,
     choose_untouched,
@@ -88,14 +87,6 @@ def test_margin_is_missing_where_no_frame_is_within_ten_points(lowest, missing):
     assert [index is None for index in found] == [False] * (6 - missing) + [True] * missing
 
 
-def test_no_frame_stands_in_two_columns():
-    trial = pulled_trial(lowest=0.5, pull=6)
-
-    found = [index for index in choose_margins(trial) if index is not None]
-
-    assert len(set(found)) == len(found)
-
-
 def test_sheet_names_each_margin_and_each_that_is_missing():
     found = texts(draw_contact_sheet([pulled_trial(lowest=0.52, pull=25)], title="A title"))
 
@@ -127,24 +118,11 @@ def test_camera_frame_is_shown_as_it_is():
         np.testing.assert_array_equal(ax.images[0].get_array(), trial.frames[index])
 
 
-def test_reference_stands_in_where_every_frame_touches():
-    trial = pulled_trial()
-    touched = replace(trial, contact_state=tuple(CONTACT if s == NO_CONTACT else s for s in trial.contact_state))
-    above, below = pictures(draw_contact_sheet([touched]))
-
-    np.testing.assert_array_equal(above[0].images[0].get_array(), trial.reference)
-    assert not np.any(below[0].images[0].get_array())
-
-
 @pytest.mark.parametrize(("level", "factor"), [(51, 5.0), (255, 1.0), (0, 255.0), (250, 1.0)])
 def test_brightening_makes_the_brightest_pixels_white(level, factor):
     difference = np.full((1, 8, 8, 3), level, dtype=np.uint8)
 
     assert brightening([difference[:, :4], difference // 2]) == factor
-
-
-def test_brightened_levels_do_not_wrap():
-    np.testing.assert_array_equal(brighten(np.array([0, 100, 128, 255], dtype=np.uint8), 2.0), [0, 200, 255, 255])
 
 
 def test_marks_stand_where_the_frames_were_taken():
@@ -157,17 +135,6 @@ def test_marks_stand_where_the_frames_were_taken():
         drawn = [np.asarray(line.get_xdata()) for line in ax.lines]
         marks = [x[0] for x in drawn if len(x) == 2]
         np.testing.assert_array_equal(marks, trial.time_s[taken])
-
-
-def test_charts_draw_forces_in_newtons_and_the_margin_in_percent():
-    trial = pulled_trial()
-    forces, margin = [ax for ax in draw_contact_sheet([trial]).axes if ax.get_ylabel() in {"Force (N)", "Γ (%)"}]
-
-    drawn = {line.get_label(): line.get_ydata() for line in forces.lines}
-    np.testing.assert_array_equal(drawn["$F_n$"], trial.normal_force_n)
-    np.testing.assert_array_equal(drawn["$F_t$"], trial.tangential_force_n)
-    np.testing.assert_array_equal(drawn[r"$\mu F_n$"], 0.5 * trial.normal_force_n)
-    np.testing.assert_array_equal(margin.lines[0].get_ydata(), 100 * trial.safety_margin)
 
 
 def test_outlines_run_along_the_edges_of_contact_and_stick_zone():

@@ -1,12 +1,10 @@
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from made_up import made_up_evaluation, write_workspace
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -17,7 +15,7 @@ from sliplens.plots.errors import (
     plot_learning_curves,
     plot_predictions,
 )
-from sliplens.plots.style import BLUE, GREEN, INPUT_COLOURS, ORANGE
+from sliplens.plots.style import ORANGE
 from sliplens.report import Results, load_results
 from sliplens.results.evaluation import Baselines, BaselineScores, Evaluation, ScoredFrames
 
@@ -79,22 +77,6 @@ def test_bars_have_the_height_of_their_bins(results, ax):
         [row.mse for row in results.evaluations[key].conditions["dry"].bins] for key in ("raw", "difference")
     ]
     assert [text.get_text() for text in ax.get_xticklabels()] == [str(edge) for edge in range(0, 101, 10)]
-
-
-def test_bars_of_two_inputs_do_not_overlap(results, ax):
-    draw("bins", results, ax)
-
-    bars = sorted((bar.get_x(), bar.get_x() + bar.get_width()) for group in ax.containers for bar in group)
-    assert all(end <= start + 1e-9 for (_, end), (start, _) in pairwise(bars))
-
-
-def test_an_input_keeps_its_colour_in_every_figure(results):
-    assert INPUT_COLOURS == {"raw": ORANGE, "difference": BLUE, "pair": GREEN}
-    bars = draw("bins", results, Figure().subplots())
-    learning = draw("learning", results, Figure().subplots())
-
-    assert [to_hex(group[0].get_facecolor()).upper() for group in bars.containers] == [ORANGE, BLUE]
-    assert [line.get_color() for line in learning.lines] == [ORANGE, ORANGE, BLUE, BLUE]
 
 
 def test_faithfulness_curve_is_the_mean_over_frames(results, ax):

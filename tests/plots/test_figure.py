@@ -1,6 +1,5 @@
 """One figure of whatever result."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -52,15 +51,6 @@ def test_what_raises_is_blue_and_what_lowers_is_orange(explanation):
     assert pixels[2, 3, 2] > pixels[2, 3, 0]
     assert pixels[6, 6, 0] > pixels[6, 6, 2]
     assert "why 20" in ax.get_title(loc="left")
-
-
-def test_axes_of_ones_own_are_drawn_on(results):
-    figure = Figure()
-    first, second = figure.subplots(1, 2)
-
-    assert sl.plot(results.explanations["raw", "simulated"], second) is figure
-    assert not first.images
-    assert len(second.images) == 1
 
 
 def test_a_number_that_is_not_there_is_told(explanation):

@@ -39,22 +39,11 @@ def test_withheld_frames_are_grey_up_to_half_way_to_their_neighbours():
     assert {"withheld: a", "withheld: b"} < set(words)
 
 
-def test_a_reason_stands_once_in_the_legend():
-    _, spans, words = drawn("a; cure", None, "a; cure", None)
-    assert len(spans) == 2
-    assert words.count("withheld: a") == 1
-
-
 def test_where_all_is_withheld_neither_margin_nor_interval_is_drawn():
     ax, [(left, right)], words = drawn("a; cure", "a; cure")
     assert (left, right) == pytest.approx((0, 0.1))
     assert words == ["withheld: a"]
     assert not any(isinstance(drawing, FillBetweenPolyCollection) for drawing in ax.collections)
-
-
-def test_one_frame_alone_has_a_width():
-    [(left, right)] = drawn("a; cure")[1]
-    assert left < 0 < right
 
 
 def test_the_interval_has_a_gap_where_it_is_withheld():

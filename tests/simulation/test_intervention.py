@@ -18,7 +18,6 @@ from sliplens.simulation import (
     Nuisances,
     Pulls,
     SimulationRecipe,
-    plan_trials,
     simulate_dataset,
 )
 from sliplens.simulation.filming import prepare_film
@@ -37,7 +36,6 @@ from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.motion import move_markers
 from sliplens.simulation.nuisances import Day, Grasp
 
-REACH_PX = 17
 """Of what is drawn of a marker: half of its patch of 32 pixels, and the rounding of its place."""
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=5)
 
@@ -78,13 +76,6 @@ def test_with_no_marker_put_back_a_frame_has_the_stored_bytes(trials, recordings
             np.testing.assert_array_equal(drawn, np.broadcast_to(recording.frames[frame], drawn.shape))
 
 
-def test_putting_back_what_did_not_move_changes_nothing(trials, recordings):
-    for trial, recording in zip(trials, recordings, strict=True):
-        assert np.isnan(trial.loading.safety_margin[0])
-        drawn = draw_with_markers_back(trial.film, 0, ~nobody(trial)).numpy()
-        np.testing.assert_array_equal(drawn[0], recording.frames[0])
-
-
 @pytest.mark.parametrize("sensor", [CHROMATOUCH, FLAT_GEL])
 def test_all_markers_back_and_no_touch_is_the_untouched_sensor(sensor):
     grasp = Grasp()
@@ -104,33 +95,6 @@ def test_all_markers_back_and_no_touch_is_the_untouched_sensor(sensor):
     np.testing.assert_array_equal(untouched, film.draw_reference().numpy())
     # the touch alone, its veil and sharper focus, is what is left of a frame whose markers are all put back
     assert np.any(changed.draw(slice(0, 1)).numpy()[0] != untouched)
-
-
-def test_a_change_stays_near_the_markers_old_and_new_place(trials, recordings):
-    trial, recording = trials[0], recordings[0]
-    frame, film = in_pull(trial), trials[0].film
-    rows, columns = np.mgrid[: recording.frames.shape[1], : recording.frames.shape[2]]
-    for marker in (0, 4, 20):
-        back = nobody(trial)
-        back[0, marker] = True
-        changed = (draw_with_markers_back(film, frame, back).numpy()[0] != recording.frames[frame]).any(axis=-1)
-        assert changed.any()
-        allowed = np.zeros_like(changed)
-        for x, y in (film.marker_rest_px[marker], film.marker_px[frame, marker]):
-            allowed |= (np.abs(columns - x) <= REACH_PX) & (np.abs(rows - y) <= REACH_PX)
-        assert not changed[~allowed].any()
-
-
-def test_markers_far_apart_are_put_back_as_if_alone(trials, recordings):
-    trial, recording = trials[0], recordings[0]
-    frame, back = in_pull(trial), nobody(trial, 3)
-    # on opposite sides of the second ring, and both
-    back[[0, 2], 7] = True
-    back[[1, 2], 13] = True
-    stored = recording.frames[frame].astype(int)
-    one, other, both = draw_with_markers_back(trial.film, frame, back).numpy() - stored
-    assert np.abs(one).max() > 20
-    np.testing.assert_array_equal(both, one + other)
 
 
 def test_a_frames_touch_moves_its_markers_as_the_trial_did(trials):
@@ -193,10 +157,6 @@ def test_what_was_not_simulated_so_is_refused(data: Dataset, recordings):
     frames[-1, 100, 100] ^= 64
     with pytest.raises(InputError, match="is drawn differently from its stored frames"):
         rebuild_trial(data.folder, replace(recordings[0], frames=frames))
-
-
-def test_trials_are_rebuilt_whatever_their_place_in_the_plan(trials):
-    assert [trial.plan.trial for trial in trials] == [plan.trial for plan in plan_trials(RECIPE)]
 
 
 def test_filmed_with_the_friction_it_had_a_trial_has_the_stored_bytes(trials, recordings):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from sliplens.errors import ContactError
 from sliplens.mechanics import stick_ratio
 from sliplens.recordings import ContactState
-from sliplens.simulation.loading import draw_pull, load_at_margins, load_grasp, slide, with_friction
+from sliplens.simulation.loading import load_at_margins, load_grasp, slide
 from sliplens.simulation.nuisances import Grasp, Nuisances, Pulls, draw_day, draw_grasp
 
 FRAMES = 800
@@ -103,25 +103,6 @@ def test_varied_pulls_have_speeds_over_a_decade_and_rest_jerk_and_are_let_back()
     assert min(kinds.values()) > 10
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_how_a_pull_goes_does_not_depend_on_when_it_is_looked_at(seed):
-    fine, coarse = np.linspace(0, 1, 1001), np.linspace(0, 1, 101)
-    one, other = (
-        draw_pull(Pulls(), progress=at, duration_s=2.0, rng=np.random.default_rng(seed)) for at in (fine, coarse)
-    )
-    for name in ("used", "let_back", "retaken"):
-        np.testing.assert_allclose(getattr(one, name)[::10], getattr(other, name), atol=1e-9)
-
-
-def test_the_same_forces_let_another_friction_back_by_another_share():
-    loading = next(one for one in (loaded(seed, pulls=Pulls()) for seed in range(20)) if one.let_back.any())
-    rougher = with_friction(loading, 2 * loading.static_friction)
-    turned = (loading.let_back > 0) & ~np.isnan(rougher.safety_margin)
-    assert turned.any()
-    np.testing.assert_allclose(rougher.let_back[turned], loading.let_back[turned] / 2)
-    np.testing.assert_allclose(1 - rougher.safety_margin[turned], (1 - loading.safety_margin[turned]) / 2)
-
-
 @FEW
 @given(seeds)
 def test_before_the_first_slip_the_stick_ratio_is_that_of_a_sphere(seed):
@@ -129,15 +110,6 @@ def test_before_the_first_slip_the_stick_ratio_is_that_of_a_sphere(seed):
     before = slice(0, first_slip(loading))
     np.testing.assert_array_equal(loading.stick_ratio[before], stick_ratio(loading.safety_margin[before]))
     assert np.all(loading.carried_friction[before] == 0)
-
-
-@FEW
-@given(seeds)
-def test_margins_are_evenly_spread_over_the_pull(seed):
-    margin = loaded(seed).safety_margin
-    counts, _ = np.histogram(margin[: np.argmax(margin == 0)], bins=5, range=(1e-9, 1 - 1e-9))
-    assert counts.min() > 0.1 * counts.sum()
-    assert counts.max() < 0.4 * counts.sum()
 
 
 @FEW
@@ -172,25 +144,6 @@ def test_stick_slip_is_a_sawtooth_with_its_frequency():
     assert np.all(sliding.used[sliding.slips] == 1)
 
 
-def test_without_stick_slip_the_contact_slides_evenly():
-    loading = load_grasp(Grasp(kinetic_ratio=0.8), frames=FRAMES, rng=np.random.default_rng(0))
-    slip = first_slip(loading)
-    assert np.all(loading.safety_margin[slip:] == 0)
-    np.testing.assert_allclose(loading.friction_coefficient[-20:], 0.8 * 0.775)
-
-
-def test_a_contact_that_sticks_again_sticks_wholly_before_it_creeps():
-    grasp = Grasp(kinetic_ratio=0.7, stick_slip_share=0.5, stick_slip_hz=2.0)
-    loading = load_grasp(grasp, frames=4 * FRAMES, rng=np.random.default_rng(0))
-    again = (loading.carried_friction > 0) & (loading.safety_margin > 0)
-    assert again.any()
-    # its margin is small, yet all of it sticks at first: margin and stick ratio are two things
-    at = np.flatnonzero(again)[0]
-    assert loading.stick_ratio[at] > 0.95
-    assert loading.safety_margin[at] < 0.3
-    assert np.all(loading.stick_ratio[loading.safety_margin == 0] == 0)
-
-
 @FEW
 @given(seeds)
 def test_a_release_ends_without_contact_and_slides_on_the_way(seed):
@@ -200,14 +153,6 @@ def test_a_release_ends_without_contact_and_slides_on_the_way(seed):
     falling = np.flatnonzero(np.diff(loading.normal_force_n) < -1e-3 * loading.normal_force_n.max())
     assert falling.size
     assert np.all(np.nan_to_num(loading.safety_margin[falling + 1], nan=0.0) == 0)
-
-
-@FEW
-@given(st.integers(20, 2000), seeds, st.booleans(), st.sampled_from([None, Pulls()]))
-def test_every_trial_has_every_state(frames, seed, release, pulls):
-    loading = loaded(seed, frames=frames, release=release, pulls=pulls)
-    assert set(loading.contact_state) == set(ContactState) - {ContactState.UNKNOWN}
-    assert len(loading.time_s) == frames
 
 
 @pytest.mark.parametrize(

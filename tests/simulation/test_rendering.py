@@ -63,12 +63,3 @@ def test_neighbours_and_colours_share_the_noise_they_should(noise, mixed):
     assert correlation(mixed[2, :, 2:], mixed[2, :, :-2]) == pytest.approx(0, abs=0.01)
     assert correlation(mixed[0], mixed[1]) == pytest.approx(noise.red_in_green, abs=0.01)
     assert correlation(mixed[0], mixed[2]) == pytest.approx(0, abs=0.01)
-
-
-def test_noise_of_different_frames_is_independent(mixed):
-    flat = mixed[1].reshape(FRAMES, -1)
-    correlations = np.corrcoef(flat)[np.triu_indices(FRAMES, k=1)]
-    # 4096 neighbouring pixels: one standard deviation is about 1 / sqrt(4096 / 2)
-    assert np.abs(correlations).mean() < 0.03
-    # two frames may share one field of the bank in nearly the same window: rare, and then half their noise
-    assert np.mean(np.abs(correlations) > 0.15) < 1e-3

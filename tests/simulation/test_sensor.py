@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from realism.scene import nominal_unit
 
 from sliplens.errors import ContactError
-from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SENSORS
-from sliplens.simulation.geometry import Dome, FlatPad, pixel_grid
+from sliplens.simulation import CHROMATOUCH, FLAT_GEL
+from sliplens.simulation.geometry import Dome, FlatPad
 from sliplens.simulation.sensor import MarkerLook, draw_look
 
 DOME, PAD = cast("Dome", CHROMATOUCH.geometry), cast("FlatPad", FLAT_GEL.geometry)
@@ -53,13 +53,6 @@ def test_rings_are_where_they_were_measured():
     assert sum(DOME.ring_counts) == 82
 
 
-@pytest.mark.parametrize("name", SENSORS)
-def test_every_marker_has_a_size_and_a_place(name):
-    geometry = SENSORS[name].geometry
-    assert geometry.marker_positions().shape == (geometry.markers, 3)
-    assert geometry.marker_scale().shape == (geometry.markers,)
-
-
 def drawn(look, *, touch=(0.0, 1.0), pressure=0.0, blur_px=0.0):
     still = (len(touch), DOME.markers)
     return draw_look(
@@ -79,23 +72,6 @@ def test_pressing_makes_markers_sharper_and_paler():
     assert np.all(look.edge_px[1] <= look.edge_px[0])
     sharp = drawn(replace(CHROMATOUCH.look, defocus_px=(0.0, 0.0, 0.0)))
     np.testing.assert_array_equal(sharp.edge_px[0], look.edge_px[1])
-
-
-def test_blur_adds_to_the_edge_in_quadrature():
-    look = drawn(FLAT_GEL.look, blur_px=1.0)
-    # the variance of a logistic distribution of width w is (pi w)^2 / 3
-    np.testing.assert_allclose((np.pi * look.edge_px) ** 2 / 3, (np.pi * 0.9) ** 2 / 3 + 1, rtol=0.01)
-
-
-def test_pressure_widens_red_most():
-    look = drawn(CHROMATOUCH.look, pressure=1.0)
-    growth = (look.radius_px / drawn(CHROMATOUCH.look).radius_px)[0, 0]
-    assert growth[0] > growth[1] > 1 > growth[2]
-
-
-def test_the_grid_of_pixels_is_x_then_y():
-    grid = pixel_grid(5)
-    assert grid[2, 4].tolist() == [4, 2]
 
 
 @pytest.mark.parametrize(

@@ -27,13 +27,6 @@ def data(tmp_path_factory) -> Dataset:
     return simulated(tmp_path_factory.mktemp("first") / "data", RECIPE)
 
 
-@pytest.mark.parametrize("change", [{"seed": 4}, {"series": "other"}])
-def test_another_seed_or_series_shares_nothing(data: Dataset, tmp_path: Path, change: dict):
-    shared = compare_datasets(data, simulated(tmp_path / "other", replace(RECIPE, **change)))
-    assert shared.by_seeds
-    assert (shared.trials, shared.days, shared.sensors) == ((), (), ())
-
-
 def test_the_same_seed_shares_what_both_have_though_no_file_is_the_same(data: Dataset, tmp_path: Path):
     other = simulated(tmp_path / "other", replace(RECIPE, dry_trials=3, frames_per_trial=22, sensors=1))
     shared = compare_datasets(data, other)

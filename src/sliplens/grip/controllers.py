@@ -77,8 +77,7 @@ class AssumedFriction:
         return np.maximum(force_n, self.start_n if observation.time_s < _SETTLED_S else 0.0)
 
 
-_SETTLED_S = 1.0
-"""Time until which the object is being lifted and no grip is loosened."""
+_SETTLED_S = 1.0  # time until which the object is being lifted and no grip is loosened
 
 
 @dataclass(kw_only=True)
@@ -168,12 +167,9 @@ class MarginGrip(ABC):
 _NOISE, _NOISE_SHARE = 0.06, 0.3
 """A margin that differs by less from the last one may be noise (two standard deviations), and moves it by this share:
 as a grip tightens fast and loosens slowly, noise would press harder."""
-_NO_MARGIN = -9.0
-"""Before the first margin, which counts in full."""
-_HIGHEST_ZERO = 0.6
-"""Largest margin at which a slip counts: with more it is a jolt that ended."""
-_SAME_SLIP_S = 0.15
-"""Time after a slip in which another one is the same."""
+_NO_MARGIN = -9.0  # before the first margin, which counts in full
+_HIGHEST_ZERO = 0.6  # largest margin at which a slip counts: with more it is a jolt that ended
+_SAME_SLIP_S = 0.15  # time after a slip in which another one is the same
 
 
 @dataclass(kw_only=True)
@@ -197,8 +193,7 @@ class ProportionalLaw(MarginGrip):
         return force_n + self.gain_n_s * (self.target - margin) * _HORIZON_S
 
 
-_HORIZON_S = 0.1
-"""Age of margins at a command, roughly: the law gives the force so long ahead."""
+_HORIZON_S = 0.1  # age of margins at a command, roughly: the law gives the force so long ahead
 
 
 @dataclass(kw_only=True)
@@ -262,11 +257,6 @@ def make_controller(
     friction_known
         If True, margins are those of a known friction, and laws start from `FRICTION_CONSTANTS`.
 
-    Raises
-    ------
-    InputError
-        If there is no such controller or constant.
-
     Examples
     --------
     >>> from sliplens.grip.controllers import make_controller
@@ -285,9 +275,3 @@ def make_controller(
     if settings.get("target", 0) >= 1 or settings.get("zero", 0) >= 1:
         raise InputError("margins are shares of the friction: give a target and a zero below 1")
     return kind(**settings)
-
-
-__all__ = [
-    "CONTROLLERS", "FRICTION_CONSTANTS", "AssumedFriction", "Controller", "FixedForce", "MarginGrip", "MarginLaw",
-    "Observation", "Oracle", "ProportionalLaw", "Reflex", "make_controller",
-]  # fmt: skip

@@ -34,13 +34,10 @@ from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_ta
 from sliplens.recordings.store import save_recording
 from sliplens.recordings.trial import ContactState, contact_states
 
-_BATCH = 500
-"""Episodes stepped together: few enough for a processor's caches."""
-_MEASURED = 32
-"""Fingertips by which the errors of a network without a table are measured."""
+_BATCH = 500  # episodes stepped together: few enough for a processor's caches
+_MEASURED = 32  # fingertips by which the errors of a network without a table are measured
 _TICKS = round(EPISODE_S / PERIOD_S)
-_LIFTED_S = LIFT_S + 0.1
-"""Time from which the least force counts: the object hangs in the hand."""
+_LIFTED_S = LIFT_S + 0.1  # time from which the least force counts: the object hangs in the hand
 MOMENTS_S = (0.4, 1.4, 2.8, 5.0)
 """Times, in seconds, at which a rendered episode is explained."""
 
@@ -463,6 +460,3 @@ def _save_trials(
         save_recording(recording, path)
         if number == 0 and finger == 0:
             write_clip(recording, folder / "clip.mp4")
-
-
-__all__ = ["MOMENTS_S", "EpisodeOptions", "run_episodes", "run_scripts"]

@@ -15,8 +15,7 @@ from sliplens.simulation.loading import load_at_margins, load_at_states
 from sliplens.simulation.nuisances import Day, Nuisances, draw_day, draw_grasp, draw_unit
 from sliplens.simulation.sensor import CHROMATOUCH, Sensor
 
-_TOUCH_N = 0.02
-"""Force of the lightest touch, as in the simulator's labels."""
+_TOUCH_N = 0.02  # force of the lightest touch, as in the simulator's labels
 
 
 class Fingertip:
@@ -174,8 +173,7 @@ class MarkerField:
 
 _FORCES_N = (_TOUCH_N, 0.1, 0.3, 0.6, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
 _MARGINS = (0.0, 0.03, 0.1, 0.25, 0.45, 0.7, 1.0)
-_MARKERS = 40
-"""Number of markers, those nearest to the middle: about 42 of the sensor's 82 lie within the frame."""
+_MARKERS = 40  # number of markers, those nearest to the middle: about 42 of the sensor's 82 lie within the frame
 
 
 @lru_cache(maxsize=256)
@@ -201,6 +199,3 @@ def place_in_grid(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.
     """Return the cell of a grid that each value lies in, and its position in it, 0 to 1."""
     at = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
     return at, np.clip((values - grid[at]) / (grid[at + 1] - grid[at]), 0, 1)
-
-
-__all__ = ["Fingertip", "MarkerField", "draw_film", "place_in_grid"]

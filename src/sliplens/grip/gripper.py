@@ -21,13 +21,11 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from sliplens.errors import InputError, SliplensError
-from sliplens.extras import Table
+from sliplens.extras import pick
 from sliplens.live.sinks import ZENOH_ADDRESS, ZenohRos, parse_zenoh
 
-_ANSWER_BYTES = 200
-"""Longest answer; longer lines are none."""
-_SILENCE_S = 2.0
-"""Time after which a serial gripper without numbers sends no more late answers."""
+_ANSWER_BYTES = 200  # longest answer; longer lines are none
+_SILENCE_S = 2.0  # time after which a serial gripper without numbers sends no more late answers
 
 
 class GripperError(SliplensError):
@@ -206,20 +204,8 @@ class RosCommand:
     """Text of the `.msg` file of a type that ROS itself does not bring."""
 
 
-_LEAST_EFFORT_N = 0.01
-"""Effort in place of 0, which some drivers take for no limit."""
-_MOVING_EFFORT_N = 2.0
-"""Effort sent with a width: it moves open fingers, and crushes little between them."""
-
-
-def _number(topic: str) -> RosCommand:
-    return RosCommand(topic=topic, kind="std_msgs/msg/Float64", fields=lambda value: {"data": value})
-
-
-def _controller(topic: str) -> RosCommand:
-    # forward controllers of ros2_control take a number a joint
-    kind, layout = "std_msgs/msg/Float64MultiArray", SimpleNamespace(dim=[], data_offset=0)
-    return RosCommand(topic=topic, kind=kind, fields=lambda value: {"layout": layout, "data": np.array([value])})
+_LEAST_EFFORT_N = 0.01  # effort in place of 0, which some drivers take for no limit
+_MOVING_EFFORT_N = 2.0  # effort sent with a width: it moves open fingers, and crushes little between them
 
 
 _COMMAND = partial(
@@ -228,21 +214,26 @@ _COMMAND = partial(
     kind="control_msgs/msg/GripperCommand",
     definition="float64 position\nfloat64 max_effort",
 )
-ROS_MESSAGES = Table(
-    "kind of gripper messages",
-    "sliplens.gripper_messages",
-    {
-        # closed as far as the effort brings it
-        "gripper-command": (
-            _COMMAND(fields=lambda force_n: {"position": 0.0, "max_effort": max(force_n, _LEAST_EFFORT_N)}),
-            _COMMAND(fields=lambda width_m: {"position": width_m, "max_effort": _MOVING_EFFORT_N}),
-        ),
-        "numbers": (_number("force"), _number("width")),
-        "controllers": (_controller("effort_controller/commands"), _controller("position_controller/commands")),
-    },
+_NUMBER = partial(RosCommand, kind="std_msgs/msg/Float64", fields=lambda value: {"data": value})
+_NUMBERS = partial(
+    RosCommand,
+    kind="std_msgs/msg/Float64MultiArray",
+    fields=lambda value: {"layout": SimpleNamespace(dim=[], data_offset=0), "data": np.array([value])},
 )
-"""Messages of grippers of ROS 2 by name, for a force and for a width; an installed package adds its own by the entry
-point `sliplens.gripper_messages`."""
+ROS_MESSAGES = {
+    # closed as far as the effort brings it
+    "gripper-command": (
+        _COMMAND(fields=lambda force_n: {"position": 0.0, "max_effort": max(force_n, _LEAST_EFFORT_N)}),
+        _COMMAND(fields=lambda width_m: {"position": width_m, "max_effort": _MOVING_EFFORT_N}),
+    ),
+    "numbers": (_NUMBER(topic="force"), _NUMBER(topic="width")),
+    # forward controllers of ros2_control take a number a joint
+    "controllers": (
+        _NUMBERS(topic="effort_controller/commands"),
+        _NUMBERS(topic="position_controller/commands"),
+    ),
+}
+"""Messages of grippers of ROS 2 by name, for a force and for a width."""
 _STATE_TOPIC, _STATE_KIND = "joint_states", "sensor_msgs/msg/JointState"
 _FIRST_STATE_S = 3.0
 
@@ -277,7 +268,7 @@ class RosGripper:
         joint: str | None = None,
         timeout_s: float = 0.1,
     ) -> None:
-        commands, key = ROS_MESSAGES.pick(messages), key.strip("/")
+        commands, key = pick(ROS_MESSAGES, messages, noun="kind of gripper messages"), key.strip("/")
         self._ros = ZenohRos(address, purpose="a gripper of ROS 2")
         self._topic, self._joint, self.timeout_s = f"{key}/{_STATE_TOPIC}", joint, timeout_s
         self._message, self._message_s, self._new = b"", -math.inf, threading.Condition()
@@ -365,13 +356,6 @@ def open_gripper(
         Longest time until an answer, in seconds.
     messages, joint
         Of a gripper of ROS 2, as in `RosGripper`.
-
-    Raises
-    ------
-    InputError
-        If the address is not valid, or packages are missing.
-    GripperError
-        If no gripper answers.
     """
     if address.startswith("zenoh:"):
         key, where = parse_zenoh(address.removeprefix("zenoh:"), purpose="zenoh")
@@ -524,9 +508,3 @@ class GuardedGripper:
             with self._lock:
                 if self.holding:
                     self._send()
-
-
-__all__ = [
-    "ROS_MESSAGES", "DryRun", "Gripper", "GripperError", "GripperState", "GuardedGripper", "LineGripper", "RosCommand",
-    "RosGripper", "open_gripper",
-]  # fmt: skip

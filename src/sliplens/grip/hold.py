@@ -196,11 +196,6 @@ class HoldLoop:
         Reader of each fingertip, to know when they end.
     controller, settings, ceiling_n
         As in `hold_grip`.
-
-    Raises
-    ------
-    GripperError
-        If the gripper measures no force to begin with: commands without it could open what is held.
     """
 
     def __init__(
@@ -382,6 +377,3 @@ def _require_fit(controller: Controller, readers: Sequence[LiveReader]) -> None:
                 raise InputError(f"this controller needs the true margin, which {name} does not have; choose margin")
         elif isinstance(controller, MarginGrip) and reader.network is None:
             raise InputError(f"this controller needs margins, and no network reads {name}; name one with --network")
-
-
-__all__ = ["GRIPPERS", "HoldLoop", "HoldStep", "hold_grip"]

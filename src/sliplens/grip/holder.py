@@ -15,12 +15,10 @@ from sliplens.live.reading import Reading, SlipState
 
 SPRINGS_BACK_S = 0.25
 """Time within which skin that springs back shows in the markers."""
-_CLOSING_S = 0.5
-"""Time after the first touch in which the markers move because the fingers close."""
+_CLOSING_S = 0.5  # time after the first touch in which the markers move because the fingers close
 STALE_S = 0.5
 """Age from which a reading does not count."""
-_TOUCH_N = 0.02
-"""Grip force that is a touch."""
+_TOUCH_N = 0.02  # grip force that is a touch
 _DIFFERS, _DIFFERS_N, _DIFFERS_S = 0.3, 0.1, 0.5
 """Share of the command, least force, and time from which a measured force that differs is a fault. An actuator with a
 lag of 50 ms that closes on a soft object (17 N/s) reaches any command within 0.3 s."""
@@ -245,6 +243,3 @@ class Holder:
         if isinstance(self.controller, MarginGrip):
             return f"aims at a margin of {100 * float(self.controller.aim[0]):.0f} %: {action}"
         return action
-
-
-__all__ = ["SPRINGS_BACK_S", "STALE_S", "GripCommand", "Holder", "SlipGate"]

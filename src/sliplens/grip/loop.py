@@ -74,11 +74,6 @@ class TableSensor:
         Factor on the network's errors and the half-widths of its interval.
     learners
         Friction of each episode, known in all or in none.
-
-    Raises
-    ------
-    InputError
-        If there are learners, and the network does not predict F_t / F_n.
     """
 
     def __init__(
@@ -163,8 +158,7 @@ def _margin_of_ratio(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLear
     return margin, margin - reach, margin + reach
 
 
-_GAUSSIAN_90 = 1.645
-"""Standard deviations to either side that hold 90 % of a Gaussian."""
+_GAUSSIAN_90 = 1.645  # standard deviations to either side that hold 90 % of a Gaussian
 
 
 class RenderedSensor:
@@ -296,8 +290,7 @@ class _GripSlip:
         return begins, slipped_s
 
 
-_STILL_FRAMES = 30
-"""Frames of the untouched fingertips before they close, for the noise of the markers."""
+_STILL_FRAMES = 30  # frames of the untouched fingertips before they close, for the noise of the markers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -393,6 +386,3 @@ def _darken(reading: FingertipReading, dark: Bool[np.ndarray, "episodes 2"] | No
         for hidden, places in zip(dark.T[..., None, None], reading.markers_px or (), strict=True)
     )
     return replace(reading, margin=margin, low=low, high=high, markers_px=(first, second))
-
-
-__all__ = ["FingertipReading", "FingertipSensor", "GripLoop", "RenderedSensor", "TableSensor", "Tick"]

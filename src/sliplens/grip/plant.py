@@ -12,7 +12,8 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sliplens.errors import ContactError, InputError
+from sliplens.errors import ContactError
+from sliplens.extras import pick
 from sliplens.mechanics import safety_margin
 
 GRAVITY_M_S2 = 9.81
@@ -49,9 +50,7 @@ OBJECTS = {
 
 def pick_object(name: str) -> GrippedObject:
     """Return the row of `OBJECTS` of a name that a user gave."""
-    if name not in OBJECTS:
-        raise InputError(f"there is no object named {name!r}; choose one of {', '.join(OBJECTS)}")
-    return OBJECTS[name]
+    return pick(OBJECTS, name, noun="object")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -230,9 +229,3 @@ def least_force(world: World, *, hand_acceleration_m_s2: float = 0.0) -> Episode
     """Compute the least grip force that holds, in newtons: (m (g + a) + pull) over the sum of both mu_s."""
     load = world.mass_kg * (GRAVITY_M_S2 + hand_acceleration_m_s2) + world.pull_n
     return np.maximum(load, 0) / world.friction.sum(axis=1)
-
-
-__all__ = [
-    "GRAVITY_M_S2", "OBJECTS", "PERIOD_S", "GrippedObject", "GripperModel", "Plant", "PlantState", "World",
-    "least_force", "pick_object",
-]  # fmt: skip

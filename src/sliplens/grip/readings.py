@@ -113,11 +113,6 @@ def measure_readings(run: Network, *, fingertips: int = 96, seed: int = 0, engin
         Number of fingertips, even; their seeds count from `seed`.
     engine
         `auto`, `torch` or `openvino`.
-
-    Raises
-    ------
-    InputError
-        If the network was never calibrated.
     """
     require_calibration(run)
     mu, force, gamma = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")
@@ -162,8 +157,7 @@ def measure_readings(run: Network, *, fingertips: int = 96, seed: int = 0, engin
     )
 
 
-_FOLDER = "readings"
-"""Folder beside a network's weights with its table."""
+_FOLDER = "readings"  # folder beside a network's weights with its table
 
 
 def load_readings(run: Network) -> ReadingTable | None:
@@ -175,6 +169,3 @@ def load_readings(run: Network) -> ReadingTable | None:
             if table.network == run.manifest.weights_sha256:
                 return table
     return None
-
-
-__all__ = ["ReadingTable", "load_readings", "measure_readings", "require_calibration"]

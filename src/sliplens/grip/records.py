@@ -156,6 +156,3 @@ class Hold:
     def frame(self) -> pa.Table:
         """Return a table with a row a command."""
         return self.steps.table()
-
-
-__all__ = ["EpisodeTable", "Grip", "GripSetup", "GripTrace", "Hold", "HoldSteps"]

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from sliplens.codec import Columns
 from sliplens.errors import InputError
-from sliplens.extras import Table
+from sliplens.extras import pick
 from sliplens.friction import GRASP_SPREAD
 from sliplens.grip.plant import GRAVITY_M_S2, GrippedObject, World, pick_object
 
@@ -111,27 +111,23 @@ def _jolt(scripts: Scripts, _: GrippedObject, rng: np.random.Generator) -> Scrip
     return replace(scripts, jolt_n=weight * rng.uniform(0.5, 1.5, count), jolt_at_s=rng.uniform(3, 5, count))
 
 
-CONDITIONS: Table[Draw] = Table(
-    "condition",
-    "sliplens.conditions",
-    {
-        "dry": lambda scripts, *_: scripts,
-        "wet": _wet,
-        "drifting": lambda scripts, _, rng: replace(scripts, drift=rng.uniform(-0.6, -0.2, len(scripts))),
-        "unknown": _unknown,
-        "patch": lambda scripts, _, rng: replace(
-            scripts, patch_factor=rng.uniform(0.4, 0.75, len(scripts)), patch_at_s=np.full(len(scripts), 2.5)
-        ),
-        "jolt": _jolt,
-        "poured": lambda scripts, gripped, rng: replace(
-            scripts,
-            mass_kg=np.full(len(scripts), gripped.mass_kg[0]),
-            water_kg=rng.uniform(0, 1, len(scripts)) * (gripped.mass_kg[1] - gripped.mass_kg[0]),
-            water_at_s=rng.uniform(2, 3, len(scripts)),
-        ),
-        "lamp": lambda scripts, _, rng: replace(scripts, lamp_at_s=rng.uniform(2, 4, len(scripts))),
-    },
-)
+CONDITIONS: dict[str, Draw] = {
+    "dry": lambda scripts, *_: scripts,
+    "wet": _wet,
+    "drifting": lambda scripts, _, rng: replace(scripts, drift=rng.uniform(-0.6, -0.2, len(scripts))),
+    "unknown": _unknown,
+    "patch": lambda scripts, _, rng: replace(
+        scripts, patch_factor=rng.uniform(0.4, 0.75, len(scripts)), patch_at_s=np.full(len(scripts), 2.5)
+    ),
+    "jolt": _jolt,
+    "poured": lambda scripts, gripped, rng: replace(
+        scripts,
+        mass_kg=np.full(len(scripts), gripped.mass_kg[0]),
+        water_kg=rng.uniform(0, 1, len(scripts)) * (gripped.mass_kg[1] - gripped.mass_kg[0]),
+        water_at_s=rng.uniform(2, 3, len(scripts)),
+    ),
+    "lamp": lambda scripts, _, rng: replace(scripts, lamp_at_s=rng.uniform(2, 4, len(scripts))),
+}
 """Conditions by name: dry objects of different friction; wet ones; falling friction; friction from a wide range; a wet
 patch at 2.5 s; a jolt; water poured in; a fingertip's lamp that goes out."""
 
@@ -161,11 +157,6 @@ def draw_scripts(
         Columns of `Scripts`, in their units (kilograms, seconds, newtons, ratios), that are the same in all episodes
         rather than drawn, such as `mass_kg`.
 
-    Raises
-    ------
-    InputError
-        If there is no such object or condition, or a value of the script cannot be.
-
     Examples
     --------
     >>> from sliplens.grip.scripts import draw_scripts
@@ -191,7 +182,7 @@ def draw_scripts(
         water_kg=nothing, water_at_s=never, lamp_at_s=never,
         fingertips=rng.integers(fingertips, size=episodes).astype(np.float64),
     )  # fmt: skip
-    scripts = CONDITIONS.pick(condition)(scripts, gripped, condition_rng)
+    scripts = pick(CONDITIONS, condition, noun="condition")(scripts, gripped, condition_rng)
     names, fixed = {field.name for field in fields(Scripts)}, script or {}
     for name, value in fixed.items():
         if name not in names:
@@ -214,6 +205,3 @@ def next_grasp(scripts: Scripts, *, rng: np.random.Generator) -> Scripts:
 
 
 _BOUNDS = {"mass_kg": 0, "friction": 0, "kinetic_ratio": 0, "patch_factor": 0, "drift": -1, "water_kg": -1e-9}
-
-
-__all__ = ["CONDITIONS", "EPISODE_S", "LIFT_S", "Scripts", "draw_scripts", "hand_motion", "next_grasp"]

@@ -26,11 +26,9 @@ _CEILING_N = 2.8
 """Largest force of the gripper: beyond it, frames are unknown to the network of the package, its margins withheld, and
 a grip that is never loosened blindly would stay there."""
 _MEMORY = 120
-_POURS_KG_S, _PULLS_N_S = 0.03, 2.0
-"""Rates at which a person pours and pulls."""
+_POURS_KG_S, _PULLS_N_S = 0.03, 2.0  # rates at which a person pours and pulls
 _FAINTEST_N = 0.02
-_WIDTHS_M = (0.09, 0.07)
-"""Opening of the fingers without and with an object between them (assumed)."""
+_WIDTHS_M = (0.09, 0.07)  # opening of the fingers without and with an object between them (assumed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,6 +257,3 @@ def usual_network(source: LiveSource | Path | str, profile: SensorProfile | None
         return profile.network
     simulated = isinstance(source, GripSource) or source in {"simulated", "simulated:chromatouch"}
     return DEFAULT_NETWORK if simulated else None
-
-
-__all__ = ["GripSource", "GripStatus", "open_grip", "usual_network"]

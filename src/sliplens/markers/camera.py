@@ -25,10 +25,8 @@ _LEAST_RADIUS = 0.62
 """Distance of a marker from the middle, in halves of the picture's shorter side, beyond which the model of a contact
 holds: nearer, the contact itself is seen."""
 _FEWEST = 10
-_PASSES, _SCALE_PX = 5, 0.3
-"""Of the robust fit: its passes, and the misfit at which the weight of a place is halved."""
-_LIGHT_PX = 0.5
-"""Motion below which a contact is left out of the fit: what it moves is then below every limit."""
+_PASSES, _SCALE_PX = 5, 0.3  # of the robust fit: its passes, and the misfit at which the weight of a place is halved
+_LIGHT_PX = 0.5  # motion below which a contact is left out of the fit: what it moves is then below every limit
 _MARKER_SHARES, _BORDER_SHARES = (0.3, 0.2, 0.1), (np.inf, np.inf, 0.5)
 """Shift, zoom and turn that a healthy contact passes for at most: shares of its own motion where markers show that, and
 multiples of the misfit where parts of the border do, by which a wide contact cannot be told from a shift or a zoom.
@@ -140,12 +138,9 @@ def block_means(plane: Plane, factor: int) -> Float32[np.ndarray, "rows columns"
 
 
 _BORDER = 0.14  # share of the side: what touches seldom reaches there
-_SCALES = 56, 112
-"""Blocks of pixels along the picture's side in which the border is compared, from coarse to fine."""
-_PARTS, _STRAYS = 8, 2
-"""Parts of the border, and how many of them may move otherwise than the others."""
-_TOUCH_BLOCKS = 28
-"""Blocks along the picture's side in which a contact is looked for."""
+_SCALES = 56, 112  # blocks of pixels along the picture's side in which the border is compared, from coarse to fine
+_PARTS, _STRAYS = 8, 2  # parts of the border, and how many of them may move otherwise than the others
+_TOUCH_BLOCKS = 28  # blocks along the picture's side in which a contact is looked for
 _REACH_PX = 24
 _STEPS = 2
 _TEXTURE = 3.0
@@ -320,14 +315,3 @@ class _Level:
         unlike = self._values - seen - ((motion - whole) * self._slopes).sum(axis=0)
         steps = [np.bincount(self._part, inverse * unlike, minlength=_PARTS) for inverse in self._inverse]
         return np.clip(steps[0], -1.5, 1.5) + 1j * np.clip(steps[1], -1.5, 1.5)
-
-
-__all__ = [
-    "CAMERA_LIMIT_PX",
-    "CAMERA_REASON",
-    "BorderMotion",
-    "CameraMotion",
-    "CameraWatch",
-    "block_means",
-    "marker_camera_motion",
-]

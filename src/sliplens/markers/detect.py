@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from sliplens.errors import ImageError, InputError
-from sliplens.extras import Table, import_cv2
+from sliplens.extras import import_cv2, pick
 from sliplens.images import require_rgb
 
 Contrast: TypeAlias = Literal["dark", "light", "colour"]
@@ -48,7 +48,7 @@ class Appearance:
     """Median over the markers, in weighted grey levels."""
 
 
-_KINDS = {
+KINDS = {
     "chromatouch": MarkerKind(
         name="chromatouch",
         contrasts=("dark",),
@@ -59,7 +59,6 @@ _KINDS = {
     "tactip": MarkerKind(name="tactip", contrasts=("light",), channels=(1.0, 1.0, 1.0)),
     "auto": MarkerKind(name="auto", contrasts=("dark", "light", "colour")),
 }
-KINDS = Table("kind of markers", "sliplens.markers", _KINDS)
 """Presets by name: the magenta dots of the ChromaTouch, the black ones of a GelSight Mini, the white pins of a TacTip;
 `auto` looks for whatever is round and stands out alike in many places."""
 
@@ -310,17 +309,11 @@ def detect_markers(
     appearance
         Appearance of the same sensor's markers in an earlier frame, in place of `kind`: saves time, and applies the
         same criteria through a recording. A frame without markers is then no error.
-
-    Raises
-    ------
-    ImageError
-        If no appearance is given and the frame is over- or underexposed, or shows fewer than 4 markers, or spots that
-        are neither alike nor in a pattern.
     """
     require_rgb(frame, what="levels of the frame")
     if appearance is not None:
         return _detect(frame, appearance)
-    first = find_appearance(frame, KINDS.pick(kind) if isinstance(kind, str) else kind)
+    first = find_appearance(frame, pick(KINDS, kind, noun="kind of markers") if isinstance(kind, str) else kind)
     # the first estimate of the size depends on where the threshold cuts the edge: measure, correct, measure again
     for _ in range(2):
         markers = _detect(frame, first)

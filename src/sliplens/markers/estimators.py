@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import InputError
-from sliplens.extras import Table
+from sliplens.extras import pick
 from sliplens.markers.tracks import Tracks
 
 _FEWEST = 6
@@ -68,10 +68,7 @@ class FieldTrial:
 def _ring(
     rest_px: Float[np.ndarray, "markers 2"], pressed_px: Float[np.ndarray, "markers 2"], low: float, high: float
 ) -> Bool[np.ndarray, " markers"]:
-    """Select markers between two shares of all, ranked by their distance from the fixed point of the press.
-
-    It is estimated by the affine fit, and is the middle of the markers where the skin is not stretched.
-    """
+    """Select markers between two shares of all, ranked by their distance from the fixed point of the press."""
     parts = affine_parts(rest_px, pressed_px[None])
     [rank] = rank_from_centre(rest_px[None], mean_px=parts[:, :2], divergence=parts[:, 2])
     return (rank >= low) & (rank < high)
@@ -168,8 +165,7 @@ def field_trial(tracks: Tracks, *, hold: int | None = None) -> FieldTrial:
 
 
 _BINS, _BIN_PX = 48, 0.25
-_STILL_PX = 0.05
-"""Added to motions in a denominator: half the noise of a marker."""
+_STILL_PX = 0.05  # added to motions in a denominator: half the noise of a marker
 
 
 def mean_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
@@ -418,7 +414,7 @@ def _hertz(ratio: Margins, full: float) -> Margins:
     return np.clip(1 - ratio / full, 0, 1) ** _HERTZ
 
 
-_ROWS: dict[str, Callable[[Trials, Margins], Reader]] = {
+ESTIMATORS: dict[str, Callable[[Trials, Margins], Reader]] = {
     "constant": _learn_mean,
     "mean-shear": partial(_learn_features, mean_shear),
     "shear-over-divergence": partial(_learn_features, shear_over_divergence),
@@ -431,7 +427,6 @@ _ROWS: dict[str, Callable[[Trials, Margins], Reader]] = {
     "khamis-edge-centre": partial(_learn_features, edge_over_centre),
     "helmholtz-hodge": partial(_learn_features, helmholtz_hodge),
 }
-ESTIMATORS = Table("estimator", "sliplens.estimators", _ROWS)
 """Fits of each estimator to trials and their margins: the first four trivial, the others named after papers.
 
 Causal ones use a frame and those before it; the others need the hold of the whole trial."""
@@ -439,10 +434,4 @@ Causal ones use a frame and those before it; the others need the hold of the who
 
 def get_estimator(name: str) -> MarginEstimator:
     """Create an unfitted estimator, a row of `ESTIMATORS`."""
-    return MarginEstimator(ESTIMATORS.pick(name))
-
-
-__all__ = [
-    "ESTIMATORS", "FieldTrial", "MarginEstimator", "affine_parts", "field_trial", "find_hold", "find_holds",
-    "get_estimator",
-]  # fmt: skip
+    return MarginEstimator(pick(ESTIMATORS, name, noun="estimator"))

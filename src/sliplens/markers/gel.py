@@ -61,11 +61,6 @@ def propose_profile(
     size_px
         Width and height of the frames it was trained on; None keeps the camera's resolution.
 
-    Raises
-    ------
-    InputError
-        If the source cannot be read, or its frames show no gel.
-
     Examples
     --------
     >>> import numpy as np
@@ -202,6 +197,3 @@ def _shaped(
         return None
     x, y = round(gel[0] + (gel[2] - width) / 2), round(gel[1] + (gel[3] - height) / 2)
     return min(max(x, 0), frame[0] - width), min(max(y, 0), frame[1] - height), width, height
-
-
-__all__ = ["SensorProposal", "marker_spacing", "propose_profile"]

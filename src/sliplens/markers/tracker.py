@@ -152,11 +152,7 @@ class Tracker:
         )
 
     def _select_sound(self, detected: Markers, spot: Int[np.ndarray, " markers"]) -> tuple[np.ndarray, ...]:
-        """Compare markers with their spots and neighbours.
-
-        Gives their shifts; True where a spot has changed too much, where the edge cuts it, and where a marker is sound;
-        and the shifts that their neighbours predict.
-        """
+        """Compare markers with their spots and neighbours."""
         paired = spot >= 0
         cut = np.zeros_like(paired)
         cut[paired] = ~detected.whole[spot[paired]]
@@ -191,13 +187,6 @@ def track_markers(
         The untouched sensor T_0.
     kind
         Row of `KINDS`, or another `MarkerKind`.
-
-    Raises
-    ------
-    ImageError
-        If the reference is over- or underexposed or shows fewer than 4 whole markers, or a frame has another size.
-    RecordingError
-        If there is no frame.
     """
     tracker = Tracker(reference, kind)
     tracked = [tracker.update(frame) for frame in frames]

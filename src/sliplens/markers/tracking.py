@@ -12,7 +12,7 @@ from jaxtyping import Float
 from sliplens._version import __version__
 from sliplens.codec import read_written, regrouped, write_tables
 from sliplens.errors import InputError
-from sliplens.extras import import_cv2
+from sliplens.extras import import_cv2, pick
 from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
@@ -133,7 +133,7 @@ def track(
     path = None if out is None else Path(out)
     if path is not None and path.suffix:
         require_new_table(path, suffix=".parquet", overwrite=overwrite)
-    KINDS.pick(markers)
+    pick(KINDS, markers, noun="kind of markers")
     import_cv2()
     if (sensor := source_options.get("sensor")) is not None:
         source_options["sensor"] = load_profile(sensor)

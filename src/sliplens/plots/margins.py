@@ -145,8 +145,10 @@ def plot_readings(strip: Strip, *, ax: Axes) -> Axes:
     readings, time_s = strip.readings, strip.readings.time_s
     touched = np.isfinite(readings.safety_margin)
     shade_withheld(time_s, readings.withheld.tolist(), ax=ax)
-    values = (readings.prediction, readings.low, readings.high)
-    _plot_prediction(time_s, *(np.where(touched, value, np.nan) for value in values), readings.safety_margin, ax=ax)
+    prediction, low, high = (
+        np.where(touched, value, np.nan) for value in (readings.prediction, readings.low, readings.high)
+    )
+    _plot_prediction(time_s, prediction, low, high, readings.safety_margin, ax=ax)
     for number, frame in enumerate(strip.shown, start=1):
         ax.axvline(time_s[frame], color="#9CA3AF", linewidth=0.8, zorder=0)
         ax.annotate(str(number), (time_s[frame], 106), ha="center", fontsize=9, annotation_clip=False)

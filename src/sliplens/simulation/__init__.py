@@ -3,12 +3,7 @@
 from sliplens.simulation.nuisances import Nuisances, Pulls
 from sliplens.simulation.plan import PRESETS, FrameTotals, SimulationRecipe, TrialPlan, make_recipe, plan_trials
 from sliplens.simulation.sensor import CHROMATOUCH, FLAT_GEL, SENSORS, Sensor
-from sliplens.simulation.trials import (
-    simulate,
-    simulate_dataset,
-    simulate_examples,
-    simulate_trial,
-)
+from sliplens.simulation.trials import simulate, simulate_dataset, simulate_examples, simulate_trial
 
 __all__ = [
     "CHROMATOUCH", "FLAT_GEL", "PRESETS", "SENSORS", "FrameTotals", "Nuisances", "Pulls", "Sensor",

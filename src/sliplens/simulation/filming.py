@@ -18,16 +18,11 @@ from sliplens.simulation.sensor import DrawnMarkers, Noise, Sensor, draw_look, m
 
 Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
 
-_BATCHES = {"cpu": 4, "cuda": 512}
-"""Frames drawn at once: few enough for a processor's caches, many enough for a GPU."""
-_PATCH = 32
-"""Side of the square in which a marker is drawn, in pixels: the edge of the widest marker fades within it."""
-_WHITE = 258.0
-"""Level that glare is limited to, a little above white: markers in it show, noise does not."""
-_GRAIN_PX = 2.2
-"""Size of the pressed skin's grain."""
-_GLOW_RADIUS = 0.935
-"""Radius at which the glow of the contact fades, over that of a nominal contact."""
+_BATCHES = {"cpu": 4, "cuda": 512}  # frames drawn at once: few enough for a processor's caches, many enough for a GPU
+_PATCH = 32  # side of the square in which a marker is drawn, in pixels: the edge of the widest marker fades within it
+_WHITE = 258.0  # level that glare is limited to, a little above white: markers in it show, noise does not
+_GRAIN_PX = 2.2  # size of the pressed skin's grain
+_GLOW_RADIUS = 0.935  # radius at which the glow of the contact fades, over that of a nominal contact
 
 
 @dataclass(frozen=True, kw_only=True)

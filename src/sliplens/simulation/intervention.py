@@ -33,8 +33,7 @@ Jacobian: TypeAlias = Float[np.ndarray, "coordinates unknowns"]
 
 MARGIN = "margin"
 """Unknown that is estimated."""
-_STEP = 1e-4
-"""Step of the central differences: their error grows with its square, that of rounding (1e-12 px) over it."""
+_STEP = 1e-4  # step of the central differences: their error grows with its square, that of rounding (1e-12 px) over it
 
 
 def _shift(field: str, axis: int | None = None, *, relative: bool = False) -> Callable[[Touch, float], Touch]:
@@ -189,8 +188,7 @@ def _log_sigma(limits: Range) -> float:
     return float(np.std(np.log(np.linspace(*limits, 10_001))))
 
 
-_ROUNDING = 1
-"""Grey levels by which another device or library may draw the same scene differently."""
+_ROUNDING = 1  # grey levels by which another device or library may draw the same scene differently
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,8 +334,7 @@ def marker_outlines(film: Film, frame: int) -> Outlines:
 
 NOISE_PX = 0.1
 """Standard deviation of each coordinate of a tracked marker in images of this noise (docs/limit.md)."""
-_NEAREST_END = 0.02
-"""Distance from 0 and 1 within which the gain of this margin is used: the ends have no derivative."""
+_NEAREST_END = 0.02  # distance from 0 and 1 within which the gain of this margin is used: the ends have no derivative
 
 
 def marker_readings(

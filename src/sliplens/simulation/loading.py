@@ -11,10 +11,8 @@ from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.simulation.geometry import Frames
 from sliplens.simulation.nuisances import Grasp, Pulls
 
-_FALL_S = 0.06
-"""Time in which friction falls from static to kinetic once the contact slips (assumed)."""
-_SLIP_SHARE = 0.2
-"""Share of a stick-slip cycle in which the contact slips (assumed)."""
+_FALL_S = 0.06  # time in which friction falls from static to kinetic once the contact slips (assumed)
+_SLIP_SHARE = 0.2  # share of a stick-slip cycle in which the contact slips (assumed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -323,10 +321,7 @@ def with_friction(loading: Loading, friction: Frames) -> Loading:
 def _phase_ends(
     frames: int, rng: np.random.Generator, *, release: bool, pulls: Pulls | None
 ) -> tuple[float, tuple[int, ...]]:
-    """Draw the length of the trial in seconds, and the first frame after each phase.
-
-    Lengths of the phases vary by a fifth; the pull takes the rest, or its own drawn time.
-    """
+    """Draw the length of the trial in seconds, and the first frame after each phase."""
     shares, trial_s = np.array((*_PHASES, *(_RELEASE if release else (0.0, 0.0)))), TRIAL_S
     factors = rng.uniform(0.8, 1.2, len(shares))
     if pulls is not None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sliplens._version import __version__
 from sliplens.errors import InputError
-from sliplens.extras import Table
+from sliplens.extras import pick
 from sliplens.files import hash_json, to_builtins
 from sliplens.simulation.loading import MINIMUM_FRAMES
 from sliplens.simulation.nuisances import Day, Nuisances, Pulls, draw_camera, draw_day, mount_camera
@@ -221,16 +221,16 @@ def make_recipe(
     >>> make_recipe("thesis", days=6).dry_trials
     191
     """
-    start = PRESETS.pick(preset)
+    start = pick(PRESETS, preset, noun="preset")
     fields: dict[str, object] = {name: value for name, value in changes.items() if value is not None}
     if "days" in fields and "dry_trials" not in fields:
         fields["dry_trials"] = int(np.sum(start.dry_trials))
     if fields.keys() & {"dry_trials", "wet_trials", "days", "test_days", "frames_per_trial"}:
         fields["frame_totals"] = None
     if sensor is not None:
-        fields["sensor"] = SENSORS.pick(sensor)
+        fields["sensor"] = pick(SENSORS, sensor, noun="sensor")
     if "pulls" in fields:
-        fields["pulls"] = PULLS.pick(cast("str", fields["pulls"]))
+        fields["pulls"] = pick(PULLS, cast("str", fields["pulls"]), noun="kind of pulls")
     if (friction := fields.pop("dry_friction", None)) is not None:
         fields["nuisances"] = replace(start.nuisances, dry_friction=friction)
     return replace(start, **fields)
@@ -343,9 +343,9 @@ def _seed(recipe: SimulationRecipe, *branch: int) -> int:
     return int(np.random.SeedSequence(recipe.seed, spawn_key=key).generate_state(2, np.uint64)[0])
 
 
-PULLS: Table[Pulls | None] = Table("kind of pulls", "sliplens.pulls", {"steady": None, "varied": Pulls()})
+PULLS: dict[str, Pulls | None] = {"steady": None, "varied": Pulls()}
 """`steady` pulls last about 5.8 s and the margin falls evenly; no two `varied` ones are alike."""
-_ROWS = {
+PRESETS = {
     "small": SimulationRecipe(dry_trials=96, wet_trials=8, frames_per_trial=48, days=12, series="small"),
     "thesis": SimulationRecipe(
         # 160 training, 20 validation and 21 test trials of about 800 frames
@@ -372,7 +372,6 @@ _ROWS = {
         ),
     ),
 }  # fmt: skip
-PRESETS = Table("preset", "sliplens.presets", _ROWS)
 """`small` fits a laptop and shows many days; `thesis` has the days, splits and number of frames of the thesis: Polak,
 *Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning*, which gives neither the number of
 trials nor the shares of dry and wet ones on the test day: both are assumed, from about 800 frames a trial. `varied` is

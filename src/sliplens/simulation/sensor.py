@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sliplens.errors import ContactError
-from sliplens.extras import Table
 from sliplens.mechanics import reduced_modulus
 from sliplens.simulation.geometry import Dome, FlatPad, Frames, Geometry, require_positive
 from sliplens.simulation.nuisances import Unit
@@ -19,8 +18,7 @@ Sizes: TypeAlias = Float[np.ndarray, "frames markers"]
 Rgb: TypeAlias = tuple[float, float, float]
 _NONE: Rgb = (0.0, 0.0, 0.0)
 _FIELDS = 32
-_PLAY_PX = 64
-"""How much larger than a frame the fields are: a frame's window lies anywhere in them."""
+_PLAY_PX = 64  # how much larger than a frame the fields are: a frame's window lies anywhere in them
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,5 +263,5 @@ FLAT_GEL = Sensor(
 """A flat gel like that of a GelSight Mini with dots: a square grid under an opaque skin lit from three sides. Its
 numbers are typical (assumed), not fitted to one device."""
 
-SENSORS = Table("sensor", "sliplens.sensors", {sensor.name: sensor for sensor in (CHROMATOUCH, FLAT_GEL)})
+SENSORS = {sensor.name: sensor for sensor in (CHROMATOUCH, FLAT_GEL)}
 """Sensors by name."""

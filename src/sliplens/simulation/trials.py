@@ -136,13 +136,7 @@ def simulate(
 
 
 def simulate_dataset(folder: Path, recipe: SimulationRecipe, *, device: str | torch.device = "cpu") -> Dataset:
-    """Simulate `trials/*.parquet` and, last, `dataset.json` into a folder; existing trials are kept.
-
-    Raises
-    ------
-    InputError
-        If an existing trial was made by another recipe.
-    """
+    """Simulate `trials/*.parquet` and, last, `dataset.json` into a folder; existing trials are kept."""
     plans, table = plan_trials(recipe), []
     for plan in track(plans, sizes=[plan.frames for plan in plans]):
         path = trial_path(folder, plan.trial)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError, RecordingError
-from sliplens.extras import import_cv2
+from sliplens.extras import import_cv2, pick
 from sliplens.files import output_folder, scratch_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.markers import KINDS, MarkerStatus, track_markers
@@ -278,7 +278,7 @@ def _plan_baselines(
     if not offered:
         raise InputError(f"{data.folder} has no training trials to fit baselines on; divide it with `sliplens split`")
     training = choose_training(offered, count)
-    kind = marker_kind((*training, *trials)) if markers is None else KINDS.pick(markers).name
+    kind = marker_kind((*training, *trials)) if markers is None else pick(KINDS, markers, noun="kind of markers").name
     return BaselinePlan(estimators=names, training=training, offered_trials=len(offered), markers=kind)
 
 
