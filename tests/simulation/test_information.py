@@ -5,7 +5,6 @@ from typing import cast
 
 import numpy as np
 import pytest
-from limit import margin_bound, sequence_bound
 
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, Nuisances
@@ -15,6 +14,7 @@ from sliplens.simulation.intervention import (
     NUISANCES,
     Sensitivity,
     Touch,
+    least_sigma,
     marker_sensitivity,
     prior_sigma,
     visible_markers,
@@ -26,6 +26,12 @@ MARGINS = np.array([0.1, 0.2, 0.5, 0.8, 0.95])
 TOUCH = Touch(grasp=Grasp(shear_exponent=0.6, normal_force_n=1.25))
 PRIOR = prior_sigma(Nuisances(), wet=False)
 SHEARED = replace(FLAT_GEL, effective_modulus_pa=20_000.0)
+
+
+def margin_bound(sensitivity: Sensitivity, *, noise_px: float, prior: dict[str, float]) -> np.ndarray:
+    return np.array(
+        [least_sigma(part, sensitivity.unknowns, noise_px=noise_px, prior=prior) for part in sensitivity.jacobian]
+    )
 
 
 def without(name):
@@ -95,21 +101,6 @@ class TestBothModels:
         # rounding in the least squares
         assert np.all(known <= prior * (1 + 1e-9))
         assert np.all(prior <= unknown * (1 + 1e-9))
-
-    def test_a_sequence_of_one_is_a_frame(self, sensitivity):
-        one = replace(sensitivity, jacobian=sensitivity.jacobian[2:3])
-        for known in (False, True):
-            assert sequence_bound(one, noise_px=0.1, prior=PRIOR, pull_known=known) == pytest.approx(
-                margin_bound(one, noise_px=0.1, prior=PRIOR)[0], rel=1e-9
-            )
-
-    def test_earlier_frames_and_a_clock_help(self, sensitivity):
-        backwards = replace(sensitivity, jacobian=sensitivity.jacobian[::-1])
-        alone = margin_bound(backwards, noise_px=0.1, prior=PRIOR)[-1]
-        path, clock = (
-            sequence_bound(backwards, noise_px=0.1, prior=PRIOR, pull_known=known) for known in (False, True)
-        )
-        assert clock < path < alone
 
 
 @pytest.mark.parametrize("wet", [False, True])

@@ -248,15 +248,6 @@ def make_controller(
 ) -> Controller:
     """Create a controller of `CONTROLLERS`.
 
-    Parameters
-    ----------
-    name
-        Row of `CONTROLLERS`.
-    settings
-        Constants to change, in their units (newtons, seconds, shares).
-    friction_known
-        If True, margins are those of a known friction, and laws start from `FRICTION_CONSTANTS`.
-
     Examples
     --------
     >>> from sliplens.grip.controllers import make_controller

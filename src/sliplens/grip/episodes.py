@@ -170,11 +170,15 @@ def run_episodes(
         network.require_ratio(learns=friction is None)
     if options.sequence:
         network.follow(friction=friction)
+    constants = dict(settings or {})
+    if not isinstance(controller, str) and is_dataclass(controller):
+        values = {item.name: getattr(controller, item.name) for item in fields(controller) if item.init}
+        constants = {name: float(value) for name, value in values.items() if isinstance(value, int | float)}
     setup = GripSetup(
         object=object,
         condition=condition,
         controller=controller if isinstance(controller, str) else type(controller).__name__,
-        settings=dict(settings or _constants(controller)),
+        settings=constants,
         network=network.manifest.weights_sha256[:12],
         friction="that of each episode as it begins" if each else None if friction is None else str(friction),
         grasps=options.grasps,
@@ -186,7 +190,12 @@ def run_episodes(
     )
     with reporting(on_progress):
         if not options.rendered and options.readings is None:
-            options = replace(options, readings=_readings_of(network))
+            readings = load_readings(network)
+            if readings is None:
+                add_note("The network's errors on grips were not measured before: this takes minutes.")
+                with open_stage("Measuring readings"):
+                    readings = measure_readings(network, fingertips=_MEASURED)
+            options = replace(options, readings=readings)
         job = _Job(
             setup=setup, gripped=gripped, scripts=scripts, controller=controller, network=network, friction=friction,
             options=options,
@@ -209,24 +218,6 @@ def run_episodes(
         summary = f"{number_of(len(grip.episodes), 'episode')}, {100 * grip.drop_rate:.1f} % dropped"
         report_file(Path(out), summary, kept=output.complete)
     return grip
-
-
-def _constants(controller: str | Controller) -> dict[str, float]:
-    """Return the numeric constants of a controller object that is a dataclass."""
-    if isinstance(controller, str) or not is_dataclass(controller):
-        return {}
-    values = {item.name: getattr(controller, item.name) for item in fields(controller) if item.init}
-    return {name: float(value) for name, value in values.items() if isinstance(value, int | float)}
-
-
-def _readings_of(network: Network) -> ReadingTable:
-    """Load the measured errors that come with a network, or measure them."""
-    readings = load_readings(network)
-    if readings is None:
-        add_note("The network's errors on grips were not measured before: this takes minutes.")
-        with open_stage("Measuring readings"):
-            readings = measure_readings(network, fingertips=_MEASURED)
-    return readings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -349,19 +340,7 @@ def run_scripts(
     condition: str | Sequence[str] = "",
     on_tick: Callable[[Tick], None] | None = None,
 ) -> EpisodeTable:
-    """Run episodes to their end in a given loop.
-
-    Parameters
-    ----------
-    loop
-        Plant, sensor and controller for as many episodes as there are scripts.
-    scripts
-        Events of each episode.
-    condition
-        Name of the condition for all of them, or one for each.
-    on_tick
-        Called with each turn of the loop.
-    """
+    """Run episodes to their end in a given loop."""
     count = len(scripts)
     force, least, lasted, under = np.zeros((4, count))
     peak, peak_least, friction = np.zeros(count), np.zeros(count), np.full(count, np.inf)

@@ -23,15 +23,6 @@ class Fingertip:
 
     The simulator's press and pull move the markers, at any force, friction and margin. Marks of an earlier slip in the
     skin are not simulated.
-
-    Parameters
-    ----------
-    seed
-        Seed of the sensor, the day, the touch and the noise.
-    nuisances
-        Ranges they are drawn from, without friction and force.
-    day
-        Day shared with another fingertip of the same gripper; drawn if None.
     """
 
     def __init__(
@@ -127,11 +118,6 @@ class MarkerField:
 
     Positions are interpolated between states of a grid in force and margin. The motion by the pull is proportional to
     the friction at a given margin (Cattaneo and Mindlin), and reverses with the pull.
-
-    Parameters
-    ----------
-    seeds
-        Seed of the first fingertip of each gripper; the second one has the next seed, and the same day.
     """
 
     def __init__(self, seeds: Sequence[int]) -> None:

@@ -424,15 +424,6 @@ class GuardedGripper:
     When no command comes for `watchdog_s`, or the gripper fails at one in whatever way, the guard holds the object: it
     repeats the last force until commands return, and never opens. A force of NaN holds, too; a width is refused while
     holding, for opening drops the object.
-
-    Parameters
-    ----------
-    gripper
-        Gripper to guard.
-    ceiling_n
-        Largest grip force, in newtons.
-    watchdog_s
-        Time without a command, in seconds, after which the guard holds.
     """
 
     def __init__(self, gripper: Gripper, *, ceiling_n: float = 4.0, watchdog_s: float = 0.2) -> None:

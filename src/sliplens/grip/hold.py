@@ -186,17 +186,7 @@ def hold_grip(
 
 
 class HoldLoop:
-    """Loop of a hold: measure, decide, command.
-
-    Parameters
-    ----------
-    guard
-        Gripper behind its guard.
-    readers
-        Reader of each fingertip, to know when they end.
-    controller, settings, ceiling_n
-        As in `hold_grip`.
-    """
+    """Loop of a hold: measure, decide, command."""
 
     def __init__(
         self,

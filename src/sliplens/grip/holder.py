@@ -85,19 +85,6 @@ class Holder:
     controller without `target`), the force never falls. Without a measured force, or where it differs from the command
     by more than 30 % for more than 0.5 s, the last command is repeated until the force follows again; a slip in that
     time counts afterwards. A controller that returns NaN holds.
-
-    Parameters
-    ----------
-    controller
-        Row of `CONTROLLERS`, with constants that suit readings with and without friction, or a controller object.
-    settings
-        Constants of a row to change, in its units (newtons, seconds, shares).
-    ceiling_n
-        Largest grip force.
-    command_n
-        Grip force commanded before.
-    fingers
-        Number of fingertips: 1 or 2.
     """
 
     def __init__(

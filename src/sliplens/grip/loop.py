@@ -4,7 +4,7 @@ import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeAlias, runtime_checkable
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -41,39 +41,10 @@ class FingertipReading:
     """Camera images, where any were drawn."""
 
 
-@runtime_checkable
-class FingertipSensor(Protocol):
-    """Measures both fingertips: from images and a network, or from a table of the network's errors."""
-
-    def still_markers(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
-        """Return the markers of both untouched fingertips: at rest, then as followed in some frames."""
-        ...
-
-    def measure(self, state: PlantState, slipping_s: Episodes) -> FingertipReading:
-        """Measure both fingertips of every episode.
-
-        `slipping_s` is the time since a slip that the markers have just confirmed; NaN without one.
-        """
-        ...
-
-
 class TableSensor:
     """Predictions looked up in the measured errors of a network, with noise.
 
     Where the friction is known, the margin is the expected value of 1 - ratio / mu over the distribution of mu.
-
-    Parameters
-    ----------
-    table
-        Measured errors.
-    fingertips
-        Pair of the table's fingertips that each episode holds with.
-    rng
-        Source of the noise.
-    error_scale
-        Factor on the network's errors and the half-widths of its interval.
-    learners
-        Friction of each episode, known in all or in none.
     """
 
     def __init__(
@@ -166,21 +137,6 @@ class RenderedSensor:
 
     While the network predicts one finger's frame, the other finger's markers are followed and frame is drawn, by one
     thread each: threads that share many short steps wait for each other.
-
-    Parameters
-    ----------
-    network
-        Network with a calibration.
-    seed
-        Seed of the fingertips.
-    engine
-        `auto`, `torch` or `openvino`, or an engine.
-    frames
-        Expected number of frames, by which `auto` chooses an engine.
-    learner
-        Friction of the object, and its updates by slips.
-    sequence
-        If True, predict each finger's frames in order, as `predict` does; with a known friction, one by one.
     """
 
     def __init__(
@@ -267,7 +223,7 @@ def _follow_frame(tracker: Tracker, frame: UInt8[np.ndarray, "height width 3"]) 
 class _GripSlip:
     """Slip of both fingers of each episode, by the detector and the gate of a real hold."""
 
-    def __init__(self, sensor: FingertipSensor) -> None:
+    def __init__(self, sensor: TableSensor | RenderedSensor) -> None:
         rest, *still = sensor.still_markers(_STILL_FRAMES)
         self._fingers = [(SlipBatch(places), SlipGate()) for places in rest]
         for number, frame in enumerate(still):
@@ -310,17 +266,6 @@ class Tick:
 class GripLoop:
     """Plant, fingertip sensor and controller in a loop of 60 Hz.
 
-    Parameters
-    ----------
-    plant
-        Plant to step.
-    sensor
-        `TableSensor`, or `RenderedSensor` for a single episode; None for a controller that needs no margin.
-    controller
-        Object with `command(observation)`.
-    latency_s
-        Time from an image to the command by it, rounded up to whole images; the actuator's lag comes on top.
-
     Examples
     --------
     Squeeze a cup that stands on the table:
@@ -339,7 +284,12 @@ class GripLoop:
     """
 
     def __init__(
-        self, plant: Plant, sensor: FingertipSensor | None, controller: Controller, *, latency_s: float = 0.02
+        self,
+        plant: Plant,
+        sensor: TableSensor | RenderedSensor | None,
+        controller: Controller,
+        *,
+        latency_s: float = 0.02,
     ) -> None:
         self.plant, self.sensor, self.controller = plant, sensor, controller
         delay = math.ceil(latency_s / PERIOD_S - 1e-9)

@@ -151,18 +151,6 @@ class Plant:
     object and hand as long as |f| <= mu_s F; beyond, it slides with mu_k F until it comes to rest against the object
     (an elasto-plastic slider). The grip force follows its command with a lag, no faster than the fingers close, in
     steps, and never above the ceiling.
-
-    Parameters
-    ----------
-    gripped
-        Object.
-    episodes
-        Number of grippers.
-    model
-        Fingers and actuator.
-    substeps
-        Steps of the integration (semi-implicit Euler) within one period; 16 keep the lightest object's oscillation on
-        the stiffest fingers within 5 % of the closed form.
     """
 
     def __init__(

@@ -104,15 +104,6 @@ def measure_readings(run: Network, *, fingertips: int = 96, seed: int = 0, engin
     """Measure the predictions of a network for fingertips at every friction, force and margin of the table.
 
     It takes some 2 s a fingertip on one core. The noise is that of 12 states of each fingertip, drawn twice.
-
-    Parameters
-    ----------
-    run
-        Network with a calibration, which gives its intervals.
-    fingertips
-        Number of fingertips, even; their seeds count from `seed`.
-    engine
-        `auto`, `torch` or `openvino`.
     """
     require_calibration(run)
     mu, force, gamma = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")

@@ -56,19 +56,6 @@ class GripSource(LiveSource):
     Without readings the gripper goes to its safe force. A dropped object is gripped again. With forces from outside
     (`set_force`), it is a `Gripper` without a controller.
 
-    Parameters
-    ----------
-    object
-        Row of `OBJECTS`.
-    controller
-        Row of `CONTROLLERS`.
-    friction
-        Coefficient of friction of the dry object.
-    rate_hz
-        Frames a second.
-    seed
-        Seed of the fingertip, its day and its touch.
-
     Examples
     --------
     >>> from sliplens.grip.source import GripSource

@@ -213,11 +213,6 @@ class CameraWatch:
     border show it otherwise. A contact shifts and magnifies the border too, but does not turn it: in a contact only a
     turn counts, and a shift or zoom measured before the contact holds until the contact ends.
 
-    Parameters
-    ----------
-    reference
-        The sensor untouched.
-
     Examples
     --------
     >>> import numpy as np

@@ -344,7 +344,8 @@ def marker_readings(
 
     Gives numbers of the markers, and the estimate less the estimate with that marker put back, in margin units.
     """
-    gain, _ = _best_reading(trial, frame)
+    sensitivity, prior = _sensitivity(trial, frame)
+    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
     motion, visible = trial.film.motion, visible_markers(trial.plan.recipe.sensor)
     moved = (motion.centres_px[frame] - motion.rest_px)[visible]
     return visible, (gain.reshape(-1, 2) * moved).sum(axis=1)
@@ -356,7 +357,8 @@ def reading_slope(trial: FilmedTrial, frame: int) -> float:
     Below 1 even the best estimator ascribes part of the markers' motion to the friction. With friction mu and the same
     forces d log(mu) = d Gamma / (1 - Gamma).
     """
-    gain, sensitivity = _best_reading(trial, frame)
+    sensitivity, prior = _sensitivity(trial, frame)
+    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
     moved = dict(zip(sensitivity.unknowns, sensitivity.jacobian[0].T, strict=True))
     used = max(1 - float(trial.loading.safety_margin[frame]), _NEAREST_END)
     return float(gain @ (moved[MARGIN] + moved["log_friction"] / used))
@@ -366,13 +368,6 @@ def reading_limit(trial: FilmedTrial, frame: int) -> float:
     """Compute the least standard deviation of an unbiased estimate from a frame's markers, wet or dry being known."""
     sensitivity, prior = _sensitivity(trial, frame)
     return least_sigma(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
-
-
-def _best_reading(trial: FilmedTrial, frame: int) -> tuple[np.ndarray, Sensitivity]:
-    """Compute the gain of the best linear estimate at a frame, and the sensitivity of its markers."""
-    sensitivity, prior = _sensitivity(trial, frame)
-    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
-    return gain, sensitivity
 
 
 def _sensitivity(trial: FilmedTrial, frame: int) -> tuple[Sensitivity, dict[str, float]]:
