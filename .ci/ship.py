@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sliplens.codec import RESULT_FILE, load_result, save_result
 from sliplens.files import RUN_FILE, scratch_folder
-from sliplens.grip.readings import ReadingTable
+from sliplens.grip.fingertip import ReadingTable
 from sliplens.models import Network, load, save_checkpoint
 from sliplens.recordings import Recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial

@@ -26,9 +26,9 @@ from sliplens.files import DEFAULT_NETWORK
 from sliplens.friction import GRASP_SPREAD, Friction, SlipLearner
 from sliplens.grip.controllers import make_controller
 from sliplens.grip.episodes import EpisodeOptions, run_episodes, run_scripts
+from sliplens.grip.fingertip import ReadingTable, load_readings
 from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor, Tick
 from sliplens.grip.plant import OBJECTS, Plant
-from sliplens.grip.readings import ReadingTable, load_readings
 from sliplens.grip.records import EpisodeTable
 from sliplens.grip.scripts import CONDITIONS, Scripts, draw_scripts
 from sliplens.models import load

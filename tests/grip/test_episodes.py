@@ -16,10 +16,18 @@ from sliplens.friction import GRASP_SPREAD, Friction, SlipLearner
 from sliplens.grip import episodes as episodes_module
 from sliplens.grip.controllers import Controller, MarginLaw, make_controller
 from sliplens.grip.episodes import EpisodeOptions, run_episodes
-from sliplens.grip.fingertip import Fingertip, MarkerField, draw_film
+from sliplens.grip.fingertip import (
+    FORCES_N,
+    FRICTIONS,
+    MARGINS,
+    Fingertip,
+    MarkerField,
+    ReadingTable,
+    draw_film,
+    load_readings,
+)
 from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor
 from sliplens.grip.plant import Plant, pick_object
-from sliplens.grip.readings import FORCES_N, FRICTIONS, MARGINS, ReadingTable, load_readings
 from sliplens.grip.records import Grip
 from sliplens.grip.scripts import EPISODE_S, draw_scripts, hand_motion
 from sliplens.models import Network

@@ -19,9 +19,9 @@ from sliplens.explainers.table import get_explainer
 from sliplens.files import DEFAULT_NETWORK, output_folder, remove, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import Controller, make_controller
+from sliplens.grip.fingertip import ReadingTable, load_readings, measure_readings, require_calibration
 from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor, Tick
 from sliplens.grip.plant import PERIOD_S, Episodes, GrippedObject, Plant, least_force, pick_object
-from sliplens.grip.readings import ReadingTable, load_readings, measure_readings, require_calibration
 from sliplens.grip.records import EpisodeTable, Grip, GripSetup, GripTrace
 from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion, next_grasp
 from sliplens.mechanics import stick_ratio
@@ -263,19 +263,23 @@ class _Job:
 
     def run_batch(self, number: int, scripts: Scripts, folder: Path | None) -> _Batch:
         """Run some episodes and further grasps of their objects; save images of the first grasps in the folder."""
-        setup, learners = self.setup, self._make_learners(scripts)
+        setup, learners = self.setup, list[SlipLearner]()
+        if self.friction is not None or setup.same_object:  # else it is neither given nor learnt
+            for mu in scripts.friction.tolist():
+                friction = Friction(mu) if isinstance(self.friction, str) else self.friction
+                learners.append(SlipLearner(friction, same_object=setup.same_object))
         tables, ticks = list[EpisodeTable](), list[Tick]()
         pictures, maps = np.zeros((0, 1, 1, 3), dtype=np.uint8), np.zeros((0, 1, 1), dtype=np.float32)
         for grasp in range(setup.grasps):
             seed = np.random.SeedSequence((setup.seed, number, *((grasp,) if grasp else ())))
             scripts_now = next_grasp(scripts, rng=np.random.default_rng(seed.spawn(1)[0])) if grasp else scripts
-            friction = np.full(len(scripts), np.nan)
+            known = np.full(len(scripts), np.nan)
             for row, learner in enumerate(learners):
-                friction[row] = learner.friction.mean if learner.friction else np.nan
+                known[row] = learner.friction.mean if learner.friction else np.nan
             parts: list[tuple[np.ndarray, EpisodeTable]] = []
             # constants and predictions differ where the friction is known
             for friction_known in (True, False):
-                rows = np.flatnonzero(np.isfinite(friction) == friction_known)
+                rows = np.flatnonzero(np.isfinite(known) == friction_known)
                 if not len(rows):
                     continue
                 chosen = scripts_now.where(rows)
@@ -287,7 +291,7 @@ class _Job:
                 loop = GripLoop(Plant(self.gripped, episodes=len(rows)), sensor, controller, latency_s=setup.latency_s)
                 traced = not grasp and (setup.rendered or number == 0)
                 table = run_scripts(loop, chosen, condition=setup.condition, on_tick=ticks.append if traced else None)
-                parts.append((rows, replace(table, grasp=table.grasp + grasp, known_friction=friction[rows])))
+                parts.append((rows, replace(table, grasp=table.grasp + grasp, known_friction=known[rows])))
                 if isinstance(sensor, RenderedSensor) and not grasp:
                     frames = np.stack([tick.reading.frames for tick in ticks if tick.reading.frames is not None])
                     if folder is not None:
@@ -302,15 +306,6 @@ class _Job:
             for learner in learners:
                 learner.release()
         return _Batch(episodes=EpisodeTable.joined(tables), trace=_trace(ticks), pictures=pictures, maps=maps)
-
-    def _make_learners(self, scripts: Scripts) -> list[SlipLearner]:
-        """Create the friction of each episode; none where it is neither given nor learnt."""
-        if self.friction is None and not self.setup.same_object:
-            return []
-        frictions = [
-            Friction(mu) if isinstance(self.friction, str) else self.friction for mu in scripts.friction.tolist()
-        ]
-        return [SlipLearner(friction, same_object=self.setup.same_object) for friction in frictions]
 
     def _make_sensor(
         self, scripts: Scripts, learners: list[SlipLearner], seed: np.random.SeedSequence

@@ -14,10 +14,9 @@ from torch import Tensor
 from sliplens.errors import InputError
 from sliplens.friction import SlipLearner
 from sliplens.grip.controllers import Controller, Observation
-from sliplens.grip.fingertip import Fingertip, MarkerField
+from sliplens.grip.fingertip import Fingertip, MarkerField, ReadingTable
 from sliplens.grip.holder import SPRINGS_BACK_S, SlipGate
 from sliplens.grip.plant import PERIOD_S, Episodes, Fingers, Plant, PlantState, World
-from sliplens.grip.readings import ReadingTable
 from sliplens.live.slip import SlipBatch
 from sliplens.markers import Tracker
 from sliplens.models import Engine, Network, make_engine
