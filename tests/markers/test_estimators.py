@@ -10,7 +10,6 @@ from sliplens.markers.estimators import (
     affine_parts,
     edge_over_centre,
     find_hold,
-    find_holds,
     get_estimator,
     mean_shear,
     rigid_residual,
@@ -143,14 +142,6 @@ def test_a_frame_in_which_nothing_was_followed_gets_the_mean_of_the_training_lab
 def cut(trial, frames):
     moved = trial.displacement_px[:frames]
     return FieldTrial(rest_px=trial.rest_px, displacement_px=moved, hold=find_hold(trial.rest_px, moved))
-
-
-def test_the_hold_that_a_frame_knows_is_that_of_the_trial_cut_there(made):
-    (_, trial, _), *_ = made
-    holds = find_holds(trial.rest_px, trial.displacement_px)
-    assert holds.tolist() == [cut(trial, frame + 1).hold for frame in range(len(trial))]
-    assert len(set(holds.tolist())) - 1 > 0  # it moves on while the skin is pressed
-    assert holds[-1] == trial.hold
 
 
 @pytest.mark.parametrize("name", ["shear-over-divergence", "ikeda-eccentricity"])

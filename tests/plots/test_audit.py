@@ -1,9 +1,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pytest
 from drawn import misplaced, pictures, pulled_trial
@@ -11,14 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from matplotlib.text import Text
-from there import there
 
-from sliplens.errors import InputError
-from sliplens.plots.audit import audit_facts, choose_along, draw_audit
+from sliplens.plots.audit import choose_along, draw_audit
 from sliplens.plots.contact_sheet import STATE_COLOURS
-from sliplens.plots.style import save_page
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.labelling import (
     ForceAxes,
@@ -206,28 +200,6 @@ def test_what_may_put_the_labels_in_doubt_is_marked(changes, head):
     assert head is None or f"▲ {head}" in words
 
 
-@pytest.mark.parametrize("doubtful", [True, False])
-def test_a_mark_has_its_reason_in_words(doubtful: bool):
-    basis = there(make_labelling().basis)
-    changes: dict[str, Any] = {"lag": Lag(lag_s=0.1, sigma_s=0.01, correlation=0.9)} if doubtful else {}
-    if doubtful:
-        changes["friction"] = replace(basis.friction, low=MU, high=MU, notes=("F_t / F_n reaches 0.62 at 3.10 s",))
-        changes["axes"] = replace(basis.axes, tare_found=Found.ASSUMED)
-    facts = audit_facts(make_trial(), make_labelling(**changes))
-    marked = {fact.head: fact.doubts for fact in facts if fact.doubts}
-    heads = {"Flags", "Tare assumed", "Friction found", "Lag not applied"}
-    assert set(marked) == (heads if doubtful else set())
-    assert all(reason in fact.lines for fact in facts for reason in fact.doubts)
-    words = told(draw_audit(make_trial(), make_labelling(**changes)))
-    assert ("F_t / F_n reaches 0.62 at 3.10 s" in words) == doubtful
-
-
-def test_reason_why_a_lag_cannot_be_told_is_given():
-    lag = Lag(lag_s=0.1, sigma_s=0.1, correlation=0.2, doubt="they correlate by 0.20 only")
-
-    assert "unknown: they correlate by 0.20 only" in told(draw_audit(make_trial(), make_labelling(lag=lag)))
-
-
 def test_charts_draw_forces_ratio_and_margin_of_the_frames():
     trial = make_trial()
     forces, ratio, margin = charts(draw_audit(trial, make_labelling()))
@@ -265,35 +237,12 @@ def test_band_is_one_sigma_either_way():
     assert corners[:, 0].max() == trial.time_s[-4]
 
 
-def test_no_band_without_a_sigma():
-    figure = draw_audit(replace(make_trial(), safety_margin_sigma=None), make_labelling())
-
-    assert not bands(charts(figure)[2])
-    assert "median" not in told(figure)
-
-
 @pytest.mark.parametrize(("applied", "seen"), [(False, 1.97), (True, 1.985)])
 def test_onset_is_marked_on_the_cameras_clock(applied, seen):
     figure = draw_audit(make_trial(), make_labelling(lag_applied=applied))
 
     for ax in charts(figure):
         assert onsets(ax) == [pytest.approx(seen)]
-
-
-def test_trial_that_never_slips_has_no_onset():
-    figure = draw_audit(make_trial(lowest=0.4), make_labelling(slip_s=None))
-
-    assert not [found for ax in charts(figure) for found in onsets(ax)]
-    assert "no slip found" in told(figure)
-
-
-@pytest.mark.parametrize(("low", "high", "ends"), [(0.517, 0.546, [0.517, 0.546]), (MU, MU, [])])
-def test_interval_of_friction_is_a_band_unless_it_is_exact(low, high, ends):
-    friction = replace(FRICTION, low=low, high=high)
-    ratio = charts(draw_audit(make_trial(), make_labelling(friction=friction)))[1]
-
-    found = [one for one in ratio.patches if one.get_label() == "its 68 % interval" and isinstance(one, Rectangle)]
-    assert [end for one in found for end in (one.get_y(), one.get_y() + one.get_height())] == pytest.approx(ends)
 
 
 def test_ratio_of_a_light_touch_does_not_squeeze_the_rest():
@@ -364,32 +313,6 @@ def test_margins_shown_are_evenly_spaced_down_to_the_slip(lowest):
     np.testing.assert_allclose(np.diff(margins), (lowest - 1) / 4, atol=0.06)
 
 
-def test_frames_of_a_trial_that_is_never_pulled_are_spread_over_it():
-    trial = slice_trial(make_trial(pull=60), slice(4, 64))
-    stuck = replace(trial, safety_margin=np.ones(60), contact_state=(CONTACT,) * 60, normal_force_n=np.ones(60))
-    late = replace(stuck, normal_force_n=np.linspace(1, 2, 60))
-
-    for one in (stuck, late):
-        assert len(set(choose_along(one))) == 5
-    assert max(later - sooner for sooner, later in pairwise(choose_along(late))) <= 20
-
-
-def test_difference_beneath_the_reference_is_its_drift():
-    trial = make_trial()
-    frames = trial.frames.copy()
-    frames[0] += 40
-    _, difference = pictures(draw_audit(replace(trial, frames=frames), make_labelling()))
-
-    assert np.all(np.asarray(difference[0].images[0].get_array()) > 0)
-
-
-def test_drift_is_told_of_untouched_frames_only():
-    touched = slice_trial(make_trial(), slice(4, None))
-
-    assert "untouched frame" not in told(draw_audit(touched, make_labelling()))
-    assert "untouched frame at 0.00 s" in told(draw_audit(make_trial(), make_labelling()))
-
-
 def test_marks_stand_where_the_frames_were_taken():
     trial = make_trial()
     figure = draw_audit(trial, make_labelling())
@@ -426,54 +349,3 @@ def test_no_words_lie_over_others_or_leave_the_page(size):
 
     assert not outside
     assert not pairs
-
-
-def test_numbers_that_are_not_known_are_dashes():
-    trial = replace(make_trial(), valid=None, safety_margin_sigma=None)
-    unknown = make_labelling(
-        reference=ReferenceChoice(index=2, method="named"),
-        axes=replace(AXES, still_until_s=None),
-        lag=replace(LAG, correlation=None),
-    )
-    figure = draw_audit(trial, unknown)
-
-    assert misplaced(figure) == ([], [])
-    assert "correlation –" in told(figure)  # noqa: RUF001 (an en dash is meant)
-    assert "drift – grey levels" in told(figure)  # noqa: RUF001 (the same)
-    assert len(pictures(figure)[0]) == 6
-
-
-@pytest.mark.parametrize("kept", [slice(0, 1), slice(0, 4), slice(6, 8)])
-def test_few_frames_are_all_shown(kept):
-    trial = slice_trial(make_trial(), kept)
-    told = make_labelling(reference=replace(REFERENCE, index=0), slip_s=None)
-    figure = draw_audit(trial, told)
-    figure.draw_without_rendering()
-
-    assert choose_along(trial) == list(range(len(trial)))
-    assert len(pictures(figure)[0]) == 1 + len(trial)
-
-
-@pytest.mark.parametrize("suffix", [".png", ".PDF", ".svg"])
-def test_file_is_complete_and_alone(tmp_path, suffix):
-    path = tmp_path / "new" / f"audit{suffix}"
-
-    save_page(draw_audit(make_trial(), make_labelling()), path)
-
-    assert [found.name for found in path.parent.iterdir()] == [path.name]
-    assert path.stat().st_size > 10_000
-
-
-def test_unwritable_place_is_told(tmp_path):
-    (tmp_path / "file").write_text("no folder")
-
-    with pytest.raises(InputError, match=r"cannot write .* choose another file"):
-        save_page(draw_audit(make_trial(), make_labelling()), tmp_path / "file" / "audit.png")
-
-
-def test_drawing_leaves_matplotlib_as_it_was(tmp_path):
-    before = dict(mpl.rcParams)
-
-    save_page(draw_audit(make_trial(), make_labelling()), tmp_path / "audit.png")
-
-    assert dict(mpl.rcParams) == before

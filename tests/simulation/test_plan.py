@@ -6,14 +6,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sliplens.errors import ContactError, InputError
-from sliplens.files import to_builtins
 from sliplens.simulation import (
     FLAT_GEL,
     PRESETS,
     Nuisances,
     Pulls,
     SimulationRecipe,
-    make_recipe,
     plan_trials,
 )
 from sliplens.simulation.nuisances import draw_grasp
@@ -45,15 +43,6 @@ def test_several_days_may_test(dry, wet, days, data):
     assert max(count) - min(count) <= 1
     if dry >= days:
         assert {plan.day for plan in plans if plan.condition == "dry"} == set(range(1, days + 1))
-
-
-def test_days_and_splits_follow_the_thesis():
-    plans = plan_trials(SimulationRecipe(dry_trials=32, wet_trials=4))
-    split = {day: [plan.split for plan in plans if plan.day == day] for day in (1, 2, 3, 4)}
-    assert split[1] == ["train"] * 8
-    assert split[4] == ["test"] * 12
-    assert (split[2] + split[3]).count("validation") == 4
-    assert (split[2] + split[3]).count("train") == 12
 
 
 def test_more_trials_leave_the_others_as_they_were():
@@ -177,13 +166,3 @@ def test_impossible_ranges_are_refused(change, message):
 def test_impossible_pulls_are_refused(change, message):
     with pytest.raises(ContactError, match=message):
         Pulls(**change)
-
-
-def test_recipes_without_pulls_leave_the_field_out():
-    steady, varied = make_recipe("small", pulls="steady"), make_recipe("small", pulls="varied")
-    assert steady == make_recipe("small")
-    assert "pulls" not in steady.to_dict()
-    assert varied.to_dict()["pulls"] == to_builtins(Pulls())
-    assert varied.hash != steady.hash
-    # the same days, sensors and grasps, pulled otherwise
-    assert [plan.seed for plan in plan_trials(varied)] == [plan.seed for plan in plan_trials(steady)]

@@ -66,14 +66,6 @@ def drawn(look, *, touch=(0.0, 1.0), pressure=0.0, blur_px=0.0):
     )
 
 
-def test_pressing_makes_markers_sharper_and_paler():
-    look = drawn(CHROMATOUCH.look)
-    assert np.all(look.contrast[1] < look.contrast[0])
-    assert np.all(look.edge_px[1] <= look.edge_px[0])
-    sharp = drawn(replace(CHROMATOUCH.look, defocus_px=(0.0, 0.0, 0.0)))
-    np.testing.assert_array_equal(sharp.edge_px[0], look.edge_px[1])
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
