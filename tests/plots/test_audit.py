@@ -86,14 +86,6 @@ def make_labelling(
     )
 
 
-def slice_trial(trial: Recording, kept: slice) -> Recording:
-    names = (
-        "frames time_s normal_force_n tangential_force_n friction_coefficient safety_margin stick_ratio contact_state "
-        "safety_margin_sigma valid"
-    )
-    return replace(trial, **{name: getattr(trial, name)[kept] for name in names.split()})
-
-
 def told(figure: Figure) -> str:
     """All words, lines that were wrapped put together again."""
     words = " ".join(found.get_text() for found in figure.findobj(Text))

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nominal import nominal_unit
 
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL
 from sliplens.simulation.geometry import Dome, FlatPad
-from sliplens.simulation.sensor import MarkerLook, draw_look
+from sliplens.simulation.sensor import MarkerLook
 
 DOME, PAD = cast("Dome", CHROMATOUCH.geometry), cast("FlatPad", FLAT_GEL.geometry)
 
@@ -51,19 +50,6 @@ def test_rings_are_where_they_were_measured():
     for ring, radius in ((1, 30.9), (2, 62.1), (3, 93.6)):
         np.testing.assert_allclose(from_apex[rings == ring], radius, atol=0.76)
     assert sum(DOME.ring_counts) == 82
-
-
-def drawn(look, *, touch=(0.0, 1.0), pressure=0.0, blur_px=0.0):
-    still = (len(touch), DOME.markers)
-    return draw_look(
-        look,
-        geometry=DOME,
-        unit=nominal_unit(DOME.markers),
-        scale=np.ones(still),
-        pressure=np.full(still, pressure),
-        touch=np.array(touch),
-        blur_px=np.full(len(touch), blur_px),
-    )
 
 
 @pytest.mark.parametrize(
