@@ -1,5 +1,6 @@
 """One figure of whatever result."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
