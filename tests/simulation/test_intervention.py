@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from nominal import nominal_unit
+from realism.scene import nominal_unit
 
 from sliplens.errors import InputError
 from sliplens.files import output_folder

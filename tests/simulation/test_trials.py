@@ -4,7 +4,7 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
-from nominal import nominal_unit
+from realism.scene import nominal_unit
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
