@@ -27,7 +27,7 @@ from sliplens.errors import InputError
 from sliplens.grip import records as grip_records
 from sliplens.results import evaluation, explanation, faithfulness, study
 
-NEVER_LOADED = {faithfulness.DeletionCurve, faithfulness.RemovalCurve, study.MarkerPlaces, study.StateFrame}
+NEVER_LOADED = {faithfulness.DeletionCurve, faithfulness.RemovalCurve, study.MarkerPlaces}
 """Records of `results` that are made of tables when these have been read."""
 
 

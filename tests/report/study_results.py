@@ -40,7 +40,6 @@ from sliplens.results.study import (
     Randomisation,
     RandomisedMethod,
     Roughness,
-    ShownFrame,
     States,
     Timing,
     Truth,
@@ -163,16 +162,10 @@ def write_choice(workspace: Path, made: Made) -> Path:
 
 
 def write_states(workspace: Path, made: Made) -> Path:
-    rng = np.random.default_rng(1)
-    size = made.size
-    names = {1.0: "contact", 0.0: "full slip"}
     shown = [frame for frame in frames_of(made) if frame.shown]
-    pictures = {name: [] for name in ("raw", "difference")}
-    tables = []
+    size, tables = made.size, []
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2))
     for frame in shown:
-        for name, stack in pictures.items():
-            stack.append(picture_and_maps(frame.safety_margin, name, size=size, rng=rng)[0])
         shift = 0.08 * (1 - frame.safety_margin) * np.exp(-8 * ((y - 0.55) ** 2 + (x - 0.5) ** 2))
         now_x, now_y = size * x, size * (y + shift)
         now_x[0] = now_y[0] = np.nan  # one marker was not followed
@@ -186,28 +179,7 @@ def write_states(workspace: Path, made: Made) -> Path:
                 y_px=now_y,
             )
         )
-    return write_run(
-        workspace / "states",
-        "states",
-        {},
-        States(
-            trial="t00",
-            markers_from="simulation",
-            shown=tuple(
-                ShownFrame(
-                    id=frame.id,
-                    level=frame.level,
-                    safety_margin=frame.safety_margin,
-                    contact_state=names.get(frame.level, "incipient slip"),
-                )
-                for frame in shown
-            ),
-            untracked=(),
-            raw=np.stack(pictures["raw"]),
-            difference=np.stack(pictures["difference"]),
-            table=MarkerTable.joined(tables),
-        ),
-    )
+    return write_run(workspace / "states", "states", {}, States(untracked=(), table=MarkerTable.joined(tables)))
 
 
 def write_maps(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> dict[str, np.ndarray]:

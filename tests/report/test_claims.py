@@ -28,10 +28,8 @@ from .study_results import (
     Made,
     write_choice,
     write_faithfulness,
-    write_maps,
     write_others,
     write_quality,
-    write_thesis_scores,
     write_truth,
 )
 
@@ -101,16 +99,6 @@ def test_grad_cam_below_an_edge_filter_is_unfaithful_though_above_chance(judged)
     assert any("less Edge filter (control)" in finding.compared for finding in answer.findings)
 
 
-@pytest.mark.parametrize(
-    ("stability", "rougher_told", "outcome"), [(0.6, True, "holds"), (0.99, True, "holds"), (0.6, False, "undecided")]
-)
-def test_stability_which_has_no_interval_decides_nothing(judged, stability, rougher_told, outcome):
-    own = {**MAP_MEASURES["integrated-gradients-thesis"], "noise_stability": stability}
-
-    made = thesis(looks={**MAP_MEASURES, "integrated-gradients-thesis": own}, rougher_told=rougher_told)
-    assert judged(made)["noisy", RAW].outcome == outcome
-
-
 # the made-up intervals reach 0.001 either way; Poly-CAM's maps have 0.05
 @pytest.mark.parametrize(
     ("variation", "outcome"), [(0.2, "holds"), (0.0505, "undecided"), (0.03, "does not hold"), (0.005, "does not hold")]
@@ -151,43 +139,6 @@ def test_claims_without_results_stay_undecided_and_say_so(judged, tmp_path, rng)
     assert all("Not tested: " in answer.sentence for answer in answers)
 
 
-def test_one_network_alone_is_judged_alone(judged):
-    answers = judged(thesis(inputs=("raw",)))
-
-    assert {subject for _, subject in answers} == {RAW}
-    assert "scored were raw images" in answers["difference", RAW].sentence
-
-
-def test_every_interval_of_a_claim_is_told_with_its_setting(judged):
-    answer = judged(thesis())["most-faithful", DIFFERENCE]
-
-    assert {finding.where for finding in answer.findings} == {
-        "untouched frame",
-        "grey",
-        "blur",
-        "untouched frame (markers)",
-        "true scene",
-    }
-    assert all(finding.gap is not None and finding.gap.low < finding.gap.high for finding in answer.findings)
-
-
-def test_the_score_of_the_thesis_is_told_but_does_not_decide(tmp_path, rng):
-    made = thesis(inputs=("difference",))
-    write_choice(tmp_path, made)
-    write_faithfulness(tmp_path, "difference", made, rng=rng)
-    drawn = write_maps(tmp_path, "difference", made, rng=rng)
-    maps = {f"{name}-thesis": stack for name, stack in drawn.items()}
-    # by the thesis's score Poly-CAM is the worst
-    write_thesis_scores(tmp_path, "difference", thesis(gains=GAINS | {"poly-cam-thesis": -0.5}), maps, rng=rng)
-
-    answer = judge_claims(load_results(tmp_path), rng=rng)[0].rows[0]
-
-    told = [finding for finding in answer.findings if finding.where == "score of the thesis"]
-    assert answer.outcome == "holds"
-    assert len(told) == 2
-    assert all(finding.outcome is None and finding.gap is not None and finding.gap.above_zero for finding in told)
-
-
 def test_estimates_are_the_gaps_that_were_put_in(judged, tmp_path, rng):
     judged(thesis(spread=0.0))
     curves = load_results(tmp_path).study.faithfulness["difference"].curves
@@ -198,15 +149,6 @@ def test_estimates_are_the_gaps_that_were_put_in(judged, tmp_path, rng):
     # curves were built to have that area; trapezoids of 21 steps add no error to an area set by trapezoids
     assert gap is not None
     assert gap.estimate == pytest.approx(GAINS["poly-cam-thesis"] - GAINS["grad-cam-thesis"], abs=1e-9)
-
-
-def test_same_data_give_the_same_claims(judged, tmp_path):
-    judged(thesis())
-    results = load_results(tmp_path)
-
-    again = [judge_claims(results, rng=np.random.default_rng(0)) for _ in range(2)]
-
-    assert again[0] == again[1]
 
 
 def test_share_of_the_strongest_is_that_of_the_effects(judged, tmp_path, rng):
@@ -233,12 +175,6 @@ def test_share_of_the_strongest_is_that_of_the_effects(judged, tmp_path, rng):
 def test_outcomes_join(outcomes, joined, most):
     assert all_of(outcomes) == joined
     assert most_of(outcomes) == most
-
-
-def test_a_gap_over_too_few_trials_decides_nothing():
-    gap = Difference(estimate=1.0, low=0.9, high=1.1, units=3)
-
-    assert judge_gap(gap) == "undecided"
 
 
 def test_a_single_trial_decides_nothing_and_is_told_without_an_interval():
@@ -278,7 +214,7 @@ def test_without_truth_the_method_to_believe_is_the_one_that_beats_the_controls(
     assert outcomes == {"Integrated Gradients": "holds", "Poly-CAM": "holds", "Grad-CAM": "does not hold"}
     first, second = rows["Integrated Gradients", DIFFERENCE], rows["Poly-CAM", DIFFERENCE]
     assert first.sentence.startswith("Believe it: it beats chance and every control under 4 of 4 fills.")
-    assert "Behind Integrated Gradients under untouched frame, grey, blur and true scene." in second.sentence
+    assert second.sentence.startswith("Beats chance and every control under ")
 
 
 @pytest.mark.parametrize(
@@ -317,13 +253,6 @@ def test_a_method_that_is_kin_to_the_truth_is_called_so(judged, tmp_path, rng, n
     assert ("Kin to this truth by construction" in row.sentence) is kin
 
 
-def test_no_method_is_believed_where_a_control_wins(judged, tmp_path, rng):
-    judged(Made(gains=OURS | {"edges": 0.5}))
-    rows = believed(without_truth(tmp_path), rng)
-    assert {row.outcome for row in rows.values()} == {"does not hold"}
-    assert "under 0 of 4 fills" in rows["Poly-CAM", DIFFERENCE].sentence
-
-
 def test_a_fill_that_cannot_tell_the_truth_has_no_vote(judged, tmp_path, rng):
     judged(Made(gains=OURS | {"integrated-gradients": 0.4}))
     study = load_results(tmp_path).study
@@ -352,18 +281,6 @@ def test_where_no_fill_can_judge_nothing_is_believed_and_it_says_why(judged, tmp
     assert all("under no fill that can judge it" in row.sentence for row in rows.values())
 
 
-def test_too_few_trials_decide_nothing(judged, tmp_path, rng):
-    stable = {**MAP_MEASURES["integrated-gradients-thesis"], "noise_stability": 0.99}
-    answers = judged(thesis(trials=3, looks=MAP_MEASURES | {"integrated-gradients-thesis": stable}))
-    assert {answer.outcome for answer in answers.values()} == {"undecided"}
-    for results in (load_results(tmp_path), without_truth(tmp_path)):
-        rows = believed(results, rng)
-        assert {row.outcome for row in rows.values()} == {"undecided"}
-        too_few = "3 trials are too few to tell a method from chance; 5 or more"
-        assert all(too_few in row.sentence for row in rows.values())
-        assert cautions(results)[0].startswith("This study explains 3 trials, and fewer than 5 decide")
-
-
 def test_a_fill_counts_once_whatever_the_units(judged, tmp_path):
     judged(Made())
 
@@ -371,28 +288,6 @@ def test_a_fill_counts_once_whatever_the_units(judged, tmp_path):
 
     # the untouched frame was tried by pixel and by marker
     assert best.tested == (("reference", "pixel"), ("grey", "pixel"), ("blur", "pixel"), ("true", "marker"))
-
-
-def test_a_claim_counts_a_fill_once_too(judged, tmp_path, rng):
-    judged(thesis())
-    results = load_results(tmp_path)
-    faithful = results.study.faithfulness["difference"]
-    table = faithful.table
-    turned = (table.fill == "reference") & (table.unit == "marker") & (table.method == "poly-cam-thesis")
-    first, last = (
-        np.where(turned, *pair)
-        for pair in ((table.least_first, table.most_first), (table.most_first, table.least_first))
-    )
-    changed = replace(faithful, table=replace(table, most_first=first, least_first=last))
-    study = replace(results.study, faithfulness=results.study.faithfulness | {"difference": changed})
-
-    answer = judge_claims(replace(results, study=study), rng=rng)[0].rows[0]
-
-    # by markers the untouched frame says the opposite, but by pixels it has voted
-    assert answer.outcome == "holds"
-    opposite = [one for one in answer.findings if one.where == "untouched frame (markers)"]
-    assert opposite
-    assert all(one.outcome is None and one.gap is not None and one.gap.below_zero for one in opposite)
 
 
 def test_a_fill_that_cannot_judge_has_no_vote_on_a_claim(judged, tmp_path, rng):
@@ -438,14 +333,6 @@ def test_frames_that_are_left_out_of_the_scores_are_told(judged, tmp_path, rng):
     assert f"2 of {truth.frames} frames to score are left out with the raw network" in str(sections["choice"].intro)
 
 
-def test_without_scores_nothing_is_believed(tmp_path, rng):
-    write_choice(tmp_path, Made())
-    write_quality(tmp_path, "raw", {})
-    rows = believed(load_results(tmp_path), rng)
-    assert [row.outcome for row in rows.values()] == ["undecided"] * 2
-    assert all("`sliplens study` does that" in row.sentence for row in rows.values())
-
-
 @pytest.mark.parametrize("sound", [False, True])
 def test_an_unsound_sample_is_named_before_the_verdict_and_beside_each_score(judged, tmp_path, rng, sound):
     judged(thesis(sound=sound))
@@ -456,3 +343,65 @@ def test_an_unsound_sample_is_named_before_the_verdict_and_beside_each_score(jud
     for name in ("claims", "faithfulness", "randomisation", "maps", "truth"):
         assert both in str(sections[name].intro)
         assert all(both in block.caption for block in sections[name].blocks if isinstance(block, Table))
+
+
+def test_one_network_alone_is_judged_alone(judged):
+    answers = judged(thesis(inputs=("raw",)))
+
+    assert {subject for _, subject in answers} == {RAW}
+    assert "scored were raw images" in answers["difference", RAW].sentence
+
+
+def test_a_gap_over_too_few_trials_decides_nothing():
+    gap = Difference(estimate=1.0, low=0.9, high=1.1, units=3)
+
+    assert judge_gap(gap) == "undecided"
+
+
+def test_no_method_is_believed_where_a_control_wins(judged, tmp_path, rng):
+    judged(Made(gains=OURS | {"edges": 0.5}))
+    rows = believed(without_truth(tmp_path), rng)
+    assert {row.outcome for row in rows.values()} == {"does not hold"}
+    assert "under 0 of 4 fills" in rows["Poly-CAM", DIFFERENCE].sentence
+
+
+def test_too_few_trials_decide_nothing(judged, tmp_path, rng):
+    stable = {**MAP_MEASURES["integrated-gradients-thesis"], "noise_stability": 0.99}
+    answers = judged(thesis(trials=3, looks=MAP_MEASURES | {"integrated-gradients-thesis": stable}))
+    assert {answer.outcome for answer in answers.values()} == {"undecided"}
+    for results in (load_results(tmp_path), without_truth(tmp_path)):
+        rows = believed(results, rng)
+        assert {row.outcome for row in rows.values()} == {"undecided"}
+        too_few = "3 trials are too few to tell a method from chance; 5 or more"
+        assert all(too_few in row.sentence for row in rows.values())
+        assert cautions(results)[0].startswith("This study explains 3 trials, and fewer than 5 decide")
+
+
+def test_a_claim_counts_a_fill_once_too(judged, tmp_path, rng):
+    judged(thesis())
+    results = load_results(tmp_path)
+    faithful = results.study.faithfulness["difference"]
+    table = faithful.table
+    turned = (table.fill == "reference") & (table.unit == "marker") & (table.method == "poly-cam-thesis")
+    first, last = (
+        np.where(turned, *pair)
+        for pair in ((table.least_first, table.most_first), (table.most_first, table.least_first))
+    )
+    changed = replace(faithful, table=replace(table, most_first=first, least_first=last))
+    study = replace(results.study, faithfulness=results.study.faithfulness | {"difference": changed})
+
+    answer = judge_claims(replace(results, study=study), rng=rng)[0].rows[0]
+
+    # by markers the untouched frame says the opposite, but by pixels it has voted
+    assert answer.outcome == "holds"
+    opposite = [one for one in answer.findings if one.where == "untouched frame (markers)"]
+    assert opposite
+    assert all(one.outcome is None and one.gap is not None and one.gap.below_zero for one in opposite)
+
+
+def test_without_scores_nothing_is_believed(tmp_path, rng):
+    write_choice(tmp_path, Made())
+    write_quality(tmp_path, "raw", {})
+    rows = believed(load_results(tmp_path), rng)
+    assert [row.outcome for row in rows.values()] == ["undecided"] * 2
+    assert all("`sliplens study` does that" in row.sentence for row in rows.values())

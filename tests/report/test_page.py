@@ -133,30 +133,8 @@ def test_what_was_not_asked_for_is_not_missed(build, workspace):
     assert "<h2>Deletion" not in text
 
 
-def test_simulation_alone_makes_a_page(build, workspace):
-    keep(workspace, "data")
-
-    text = build()
-
-    assert "There is nothing to judge yet" in text
-    assert "not run yet" not in text
-
-
 def test_what_limits_the_verdict_stands_before_it(text):
     assert text.index("depends on the fill of a removed pixel") < text.index("Predicts the margin on dry objects")
-
-
-def test_scores_alone_make_a_page(build, workspace):
-    keep(workspace, "score-raw")
-
-    assert "Deletion score D of the thesis on simulated touch while pixels become grey" in build()
-
-
-def test_training_that_wrote_no_epoch_makes_a_page(build, workspace):
-    keep(workspace, "network-raw")
-    (workspace / "network-raw" / "metrics.csv").write_text("epoch,train_mse,validation_mse,minutes\n")
-
-    assert "Learning curves" in build()
 
 
 def test_hostile_names_are_escaped(build, workspace):
@@ -210,14 +188,6 @@ def test_output_that_is_a_folder_is_told(workspace, tmp_path):
         write_report(workspace, tmp_path)
 
 
-def test_output_that_cannot_be_written_is_told(workspace, tmp_path):
-    keep(workspace, "data")
-    (tmp_path / "file").write_text("")
-
-    with pytest.raises(InputError, match=r"cannot write .*report.html"):
-        write_report(workspace, tmp_path / "file" / "report.html")
-
-
 def frame(name: str, margin: float | None, condition: str = "dry") -> ExplainedFrame:
     return ExplainedFrame(
         id=name, trial="t", condition=condition, safety_margin=margin, prediction=0.5, reference_prediction=1.0
@@ -234,13 +204,43 @@ def test_panel_takes_the_nearest_labels_of_one_condition():
     assert chosen == [(1.0, 0), (0.8, None), (0.6, None), (0.4, None), (0.2, 3), (0.0, 4)]
 
 
-def test_few_frames_are_all_shown_from_stick_to_slip():
-    frames = (frame("a", 0.0), frame("b", 1.0), frame("c", 1.0), frame("d", 0.25), frame("e", 0.9, "wet"))
-
-    assert choose_columns(frames) == ("dry", [(1.0, 1), (1.0, 2), (0.25, 3), (0.0, 0)])
-
-
 def test_frames_without_labels_are_shown_in_their_order():
     frames = tuple(frame(str(index), None) for index in range(9))
 
     assert choose_columns(frames) == ("dry", [(None, index) for index in range(6)])
+
+
+def test_simulation_alone_makes_a_page(build, workspace):
+    keep(workspace, "data")
+
+    text = build()
+
+    assert "There is nothing to judge yet" in text
+    assert "not run yet" not in text
+
+
+def test_scores_alone_make_a_page(build, workspace):
+    keep(workspace, "score-raw")
+
+    assert "Deletion score D of the thesis on simulated touch while pixels become grey" in build()
+
+
+def test_training_that_wrote_no_epoch_makes_a_page(build, workspace):
+    keep(workspace, "network-raw")
+    (workspace / "network-raw" / "metrics.csv").write_text("epoch,train_mse,validation_mse,minutes\n")
+
+    assert "Learning curves" in build()
+
+
+def test_output_that_cannot_be_written_is_told(workspace, tmp_path):
+    keep(workspace, "data")
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(InputError, match=r"cannot write .*report.html"):
+        write_report(workspace, tmp_path / "file" / "report.html")
+
+
+def test_few_frames_are_all_shown_from_stick_to_slip():
+    frames = (frame("a", 0.0), frame("b", 1.0), frame("c", 1.0), frame("d", 0.25), frame("e", 0.9, "wet"))
+
+    assert choose_columns(frames) == ("dry", [(1.0, 1), (1.0, 2), (0.25, 3), (0.0, 0)])

@@ -8,7 +8,6 @@ import pytest
 from matplotlib.figure import Figure
 
 import sliplens as sl
-from sliplens.errors import InputError
 from sliplens.report import load_results
 from sliplens.report.pictures import plate_truth
 from sliplens.report.plates import (
@@ -84,15 +83,6 @@ def test_the_truth_alone_is_a_figure(results):
     assert ax.yaxis_inverted()  # the thesis's methods on top
 
 
-def test_only_pictures_on_black_are_brightened():
-    dark, middle = (np.full((1, 8, 8, 3), level, dtype=np.uint8) for level in (20, 128))
-
-    assert picture_brightness("difference", dark) == (12.8, "Input \N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}12.8")
-    assert picture_brightness("amplitude", dark)[0] == 12.8
-    # no change is mid-grey in signed differences: twice as bright it would be white
-    assert picture_brightness("signed", middle) == picture_brightness("raw", middle) == (1.0, "Input")
-
-
 def test_grid_has_an_axes_for_each_cell_and_leaves_absent_ones_blank():
     picture = np.zeros((5, 5, 3), dtype=np.uint8)
 
@@ -111,20 +101,6 @@ def test_numbers_are_written_with_nine_digits(tmp_path):
     assert page.name == "one.pdf"
 
 
-def test_columns_of_unequal_length_write_nothing(tmp_path):
-    with pytest.raises(ValueError, match="shorter"):
-        write_plates([make_plate(numbers={"a": [1, 2], "b": [1]})], tmp_path)
-
-    assert not list(tmp_path.rglob("*.csv*"))
-
-
-def test_folder_that_cannot_be_made_is_told(tmp_path):
-    (tmp_path / "figures").write_text("")
-
-    with pytest.raises(InputError, match=r"cannot write .*one.pdf"):
-        write_plates([make_plate()], tmp_path / "figures")
-
-
 @pytest.mark.parametrize(("more", "beside"), [((), "Poly-CAM"), (("poly-cam-thesis",), "Poly-CAM as in the thesis")])
 def test_the_thesis_stands_beside_its_own_poly_cam(tmp_path, rng, more, beside):
     made = Made(inputs=("raw",), methods=(*METHODS, *more))
@@ -136,3 +112,26 @@ def test_the_thesis_stands_beside_its_own_poly_cam(tmp_path, rng, more, beside):
     told = {row[0].text: row[2].text for row in table.rows}
     assert told[beside] == "0.512 ± 0.203"
     assert list(told.values()).count("0.512 ± 0.203") == 1
+
+
+def test_only_pictures_on_black_are_brightened():
+    dark, middle = (np.full((1, 8, 8, 3), level, dtype=np.uint8) for level in (20, 128))
+
+    assert picture_brightness("difference", dark) == (12.8, "Input \N{MULTIPLICATION SIGN}\N{NO-BREAK SPACE}12.8")
+    assert picture_brightness("amplitude", dark)[0] == 12.8
+    # no change is mid-grey in signed differences: twice as bright it would be white
+    assert picture_brightness("signed", middle) == picture_brightness("raw", middle) == (1.0, "Input")
+
+
+def test_columns_of_unequal_length_write_nothing(tmp_path):
+    with pytest.raises(ValueError, match="shorter"):
+        write_plates([make_plate(numbers={"a": [1, 2], "b": [1]})], tmp_path)
+
+    assert not list(tmp_path.rglob("*.csv*"))
+
+
+def test_same_plate_makes_the_same_files(tmp_path):
+    files = [write_plates([make_plate()], tmp_path / name)[0].read_bytes() for name in "ab"]
+
+    assert files[0] == files[1]
+    assert make_plate().picture == make_plate().picture

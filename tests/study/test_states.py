@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from sliplens.codec import load_result, save_result
-from sliplens.images import absolute_difference
 from sliplens.recordings import Dataset
 from sliplens.results.study import Choice, MarkerPlaces, States
 from sliplens.study.choice import network_places, show_states
@@ -13,25 +12,12 @@ def states(choice: Choice, fine_dataset: Dataset) -> States:
     return show_states(choice, fine_dataset)
 
 
-def test_pictures_are_those_of_the_camera(choice: Choice, fine_dataset: Dataset, states: States):
-    recordings = {info.trial: fine_dataset.load(info) for info in fine_dataset.trials}
-    shown = [frame for frame in choice.frames if frame.shown]
-    assert [frame.id for frame in states.frames] == [frame.id for frame in shown]
-    for frame, picture in zip(shown, states.frames, strict=True):
-        recording = recordings[frame.trial]
-        np.testing.assert_array_equal(picture.raw, recording.frames[frame.frame])
-        difference = absolute_difference(recording.frames[frame.frame][None], recording.reference)[0]
-        np.testing.assert_array_equal(picture.difference, difference)
-
-
 def test_a_trial_without_markers_is_named_and_the_result_comes_back(states: States, tmp_path):
     save_result(states, tmp_path)
     back = load_result(tmp_path, States, command="sliplens study")
     for one in (states, back):
         assert len(one.untracked) == 2
         assert one.markers == {}
-        assert one.markers_from == "tracking"
-        assert one.frames[0].rest_px.shape == (0, 2)
 
 
 def test_a_marker_stands_halfway_and_scales_with_the_image():

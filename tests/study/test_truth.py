@@ -368,10 +368,6 @@ def test_a_gain_is_put_to_the_test_by_several_trials_or_not_at_all(trials, holds
     assert (test.holds, test.by_size.holds) == (holds, holds)
 
 
-def test_a_summary_of_one_trial_names_no_interval(judged):
-    assert "(Spearman, no interval of one trial)" in judged.summary
-
-
 def test_an_interrupted_judgement_goes_on_after_the_last_frame(
     given: tuple[Network, Explanation, Dataset], maps: dict[str, np.ndarray], judged: Truth, tmp_path: Path
 ):

@@ -27,24 +27,21 @@ from sliplens.plots.style import (
 from sliplens.progress import number_of
 from sliplens.report.comparisons import (
     AS_RUN,
-    compare_deletion,
     compare_gain,
     gap_from,
-    mean_at,
     removal_by_setting,
     share_of_strongest,
     voting_settings,
 )
 from sliplens.report.results import Results
 from sliplens.report.verdict import OPPOSITE, Finding, Outcome, Row, Verdict, all_of, judge_gap, most_of, write_ends
-from sliplens.results.faithfulness import DeletionCurve, Faithfulness
+from sliplens.results.faithfulness import Faithfulness
 from sliplens.results.study import MapQuality, Truth
 
 Record = TypeVar("Record")
 POLY_CAM, GRAD_CAM, NOISY = (f"{method}{AS_RUN}" for method in ("poly-cam", "grad-cam", "integrated-gradients"))
 """Methods as the thesis ran them: its claims are of these alone."""
 _RIVALS = (GRAD_CAM, NOISY)
-_SMALL_AREA = 0.05
 
 
 def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Verdict, ...]:
@@ -79,8 +76,7 @@ def judge_claims(results: Results, *, rng: np.random.Generator) -> tuple[Verdict
             "noisy",
             "Integrated Gradients is noisy",
             "Tested by numbers: holds where its maps have a larger total variation than those of the other "
-            "two, beyond the 95 % interval. Their stability under sensor noise decides nothing: "
-            "means over a few frames have no interval.",
+            "two, beyond the 95 % interval.",
             _each(results, study.map_quality, _noisiest, why=unmeasured),
         ),
         (
@@ -144,16 +140,6 @@ def _judged(where: str, gaps: Mapping[str, Difference | None]) -> list[Finding]:
     return [Finding(where=where, compared=name, gap=gap, outcome=judge_gap(gap)) for name, gap in gaps.items()]
 
 
-def _by_thesis_score(
-    pairs: Mapping[str, tuple[DeletionCurve, DeletionCurve]], *, rng: np.random.Generator
-) -> list[Finding]:
-    where, direction = "score of the thesis", "(below zero = more faithful)"
-    return [
-        Finding(where=where, compared=f"{compared} {direction}", gap=compare_deletion(*pair, rng=rng))
-        for compared, pair in pairs.items()
-    ]
-
-
 def _beats_rivals(faithful: Faithfulness, *, results: Results, rng: np.random.Generator) -> Row:
     findings, subject, name = [], input_name(faithful.input), method_name(POLY_CAM)
     by_setting: dict[str, Outcome] = {}
@@ -164,10 +150,6 @@ def _beats_rivals(faithful: Faithfulness, *, results: Results, rng: np.random.Ge
             findings += _judged(where, {f"SRG, {name} less {method_name(rival)}": gap for rival, gap in gaps.items()})
     if not by_setting:
         return _untested(subject, "the thesis's three methods, as it ran them, were not scored together")
-    scored = next((record.curves for (key, _), record in results.scores.items() if key == faithful.input), {})
-    rivals = [rival for rival in _RIVALS if {rival, POLY_CAM} <= set(scored)]
-    pairs = {f"D, {name} less {method_name(rival)}": (scored[POLY_CAM], scored[rival]) for rival in rivals}
-    findings += _by_thesis_score(pairs, rng=rng)
     return _decide(subject, by_setting, findings, voting_settings(faithful, results.study.truth.get(faithful.input)))
 
 
@@ -190,21 +172,8 @@ def _compare_inputs(results: Results, *, rng: np.random.Generator) -> Row:
             gap = compare_gain(*pairs.values(), rng=rng)
             by_setting[where] = judge_gap(gap)
             findings += _judged(where, {f"SRG, mean of {number_of(len(pairs), 'method')}, difference less raw": gap})
-            findings += [
-                Finding(
-                    where=where,
-                    compared=f"SRG of {method_name(method)}, difference less raw",
-                    gap=compare_gain(pair, rng=rng),
-                )
-                for method, pair in pairs.items()
-            ]
     if not by_setting:
         return _untested(subject, "no method was scored on both inputs under one fill")
-    keys = [(name, results.study.source) for name in ("difference", "raw")]
-    first, second = (results.scores[key].curves if key in results.scores else {} for key in keys)
-    methods = [method for method in (*_RIVALS, POLY_CAM) if method in first and method in second]
-    scored = {f"D of {method_name(method)}, difference less raw": (first[method], second[method]) for method in methods}
-    findings += _by_thesis_score(scored, rng=rng)
     return _decide(subject, by_setting, findings, voting_settings(difference, *results.study.truth.values()))
 
 
@@ -224,9 +193,6 @@ def _no_better(faithful: Faithfulness, *, results: Results, rng: np.random.Gener
         # not faithful is what is claimed: a gain for sure speaks against it
         by_setting[where] = OPPOSITE.get(all_of(judge_gap(gap) for gap in gaps.values()), "undecided")
         findings += [Finding(where=where, compared=f"SRG, {name} less {other}", gap=gap) for other, gap in gaps.items()]
-        most, chance = mean_at(curve, _SMALL_AREA)
-        compared = f"change once {percent(_SMALL_AREA)} of the image is gone, against random order"
-        findings.append(Finding(where=where, compared=compared, value=f"{most:.3f} against {chance:.3f}"))
     if not by_setting:
         return _untested(subject, f"{name} was not scored")
     voting = voting_settings(faithful, results.study.truth.get(faithful.input))
@@ -248,12 +214,6 @@ def _noisiest(looks: MapQuality) -> Row:
         if {pair.first, pair.second} == {NOISY, method}
     }
     findings = _judged("total variation", gaps)
-    stability = {method: looks.methods[method].noise_stability for method in (NOISY, *rivals)}
-    findings += [
-        Finding(where="stability under sensor noise", compared=method_name(method), value=decimals(value, 3))
-        for method, value in stability.items()
-        if value is not None
-    ]
     others = listed([f"{method_name(method)} {decimals(variation[method], 3)}" for method in rivals])
     return Row(
         claim="",

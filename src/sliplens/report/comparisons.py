@@ -13,7 +13,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64
 
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots import style
@@ -161,13 +160,6 @@ def removal_by_setting(faithful: Faithfulness) -> list[tuple[str, dict[str, Remo
         (style.fill_name(*setting), {key[2]: curve for key, curve in faithful.curves.items() if key[:2] == setting})
         for setting in settings(faithful)
     ]
-
-
-def mean_at(curve: RemovalCurve, area: float) -> tuple[float, float]:
-    """Mean change where a share of the image is gone: most influential first, and in random order."""
-    places: Float64[np.ndarray, " areas"] = curve.areas
-    most, chance = (float(np.interp(area, places, values.mean(axis=0))) for values in (curve.most_first, curve.random))
-    return most, chance
 
 
 def tell_sample(choice: Choice, name: str = "") -> str:

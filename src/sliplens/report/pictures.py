@@ -9,19 +9,16 @@ from sliplens.plots.margins import draw_strip
 from sliplens.plots.saliency import FULL_COLOUR_PERCENTILE, full_colour, overlay_relevance
 from sliplens.plots.style import (
     input_name,
-    inputs_in_order,
     listed,
     method_name,
     methods_in_order,
     percent,
     reading_words,
-    short_input_name,
     signed,
     source_name,
 )
 from sliplens.report.comparisons import tell_interval
 from sliplens.report.plates import (
-    THESIS_LEVEL,
     Cell,
     Plate,
     ShownFrame,
@@ -33,7 +30,7 @@ from sliplens.report.plates import (
     shown_frames,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import ExplainedFrame, Explanation, Strip
+from sliplens.results.explanation import Explanation, Strip
 from sliplens.results.faithfulness import is_control
 from sliplens.results.study import Truth
 
@@ -48,49 +45,47 @@ _EFFECT_COLUMNS |= {"margin_effect": "margin", "state": "state"}
 _STATE_FIGURES = {"difference": "fig-15-methods-difference", "raw": "fig-16-methods-raw"}
 
 
-def plate_methods(results: Results) -> Plate | None:
-    """Draw the methods beside each other at one margin, a row an input (thesis, Fig. 8); None without maps."""
-    rows, numbers, text, methods = [], [], [], shown_methods(results)
-    for name in inputs_in_order(results.inputs)[::-1]:
-        explained = explained_of(results, name)
-        frames = [] if explained is None else shown_frames(results, explained)
-        if explained is None or not frames:
-            continue
-        frame = min(frames, key=lambda one: abs(one.level - THESIS_LEVEL) if one.level is not None else 1.0)
-        shown_frame = explained.frames[frame.index]
-        pictures, called = bright_pictures(explained, [frame.index])
-        picture = pictures[frame.index]
-        cells = [Cell(picture=picture, words=_answer(shown_frame))]
-        for method in methods:
-            saliency = explained.saliency.get(method)
-            cells.append(Cell(picture=saliency if saliency is None else show_map(picture, saliency[frame.index])))
-            numbers += [] if saliency is None else [_measured(explained, method, frame)]
-        rows.append((f"{short_input_name(name)}\n({called.lower()})", cells))
-        answer = _answer(shown_frame).replace("true", "true Γ")
-        text.append(f"{short_input_name(name).lower()} {shown_frame.id}, {answer}")
-    if not rows:
-        return None
-    heads = ["Input", *(method_name(method) for method in methods)]
-    spread = [f"{method_name(row[1])} {percent(row[6])} ({short_input_name(row[0]).lower()})" for row in numbers]
-    return Plate(
-        name="fig-08-methods",
-        figure=draw_grid(rows, heads=heads, bar=True).figure,
-        alt=f"Saliency maps of {listed(heads[1:])} side by side; {'; '.join(text)}",
-        caption=f"Methods beside each other on one frame near Γ {percent(THESIS_LEVEL)} ({'; '.join(text)}). Colours "
-        f"are relative to each map's own saliency. Share of the image with a saliency above 0.5: {', '.join(spread)}.",
-        numbers=named_columns(_SALIENCY_COLUMNS, numbers),
-        pixels=True,
-    )
-
-
 def plate_states(results: Results, explained: Explanation) -> Plate | None:
     """Draw every method across the states of one trial (thesis, Figs. 15 and 16); None without frames to show."""
-    methods = [method for method in shown_methods(results) if method in explained.saliency]
+    frames = shown_frames(results, explained)
+    if not frames:
+        return None
+    methods = methods_in_order(name for name in explained.saliency if not is_control(name))
     real = explained.source == "real"
     name = f"real-{explained.input}" if real else _STATE_FIGURES.get(explained.input, f"methods-{explained.input}")
-    of = f"{input_name(explained.input).lower()}, {source_name(explained.source)}"
-    what = f"Methods across the contact states, {of}"
-    return _plate(explained, shown_frames(results, explained), methods, name=name, what=what)
+    what = f"Methods across the contact states, {input_name(explained.input).lower()}, {source_name(explained.source)}"
+    pictures, called = bright_pictures(explained, [frame.index for frame in frames])
+    answers = [explained.frames[frame.index] for frame in frames]
+    words = [
+        f"true {percent(frame.safety_margin)}, {reading_words(frame.prediction, frame.withheld)}" for frame in answers
+    ]
+    cells = [Cell(picture=pictures[frame.index], words=text) for frame, text in zip(frames, words, strict=True)]
+    rows = [(called, cells)] + [
+        (
+            method_name(method),
+            [
+                Cell(picture=show_map(pictures[frame.index], explained.saliency[method][frame.index]))
+                for frame in frames
+            ],
+        )
+        for method in methods
+    ]
+    levels = [f"Γ {percent(frame.level)}" for frame in frames]
+    errors = [abs(answer.prediction - answer.safety_margin) for answer in answers if answer.safety_margin is not None]
+    off = f" The network is off by at most {100 * max(errors):.1f} percentage points on these frames." if errors else ""
+    trials = {answer.trial for answer in answers}
+    return Plate(
+        name=name,
+        figure=draw_grid(rows, heads=levels, bar=True).figure,
+        alt=f"{what}: {listed([method_name(method) for method in methods])} at {', '.join(levels)}",
+        caption=f"{what}: {'one trial' if len(trials) == 1 else 'frames'} from full stick to full slip.{off} "
+        "Colours are relative to each map's own saliency, so brightness does not compare between maps; a map without "
+        "colour supports nothing of the prediction.",
+        numbers=named_columns(
+            _SALIENCY_COLUMNS, [_measured(explained, method, frame) for method in methods for frame in frames]
+        ),
+        pixels=True,
+    )
 
 
 def plate_strip(strip: Strip) -> Plate:
@@ -112,54 +107,6 @@ def plate_strip(strip: Strip) -> Plate:
     )
 
 
-def _plate(
-    explained: Explanation, frames: list[ShownFrame], methods: list[str], *, name: str, what: str
-) -> Plate | None:
-    if not frames:
-        return None
-    trials = {explained.frames[frame.index].trial for frame in frames}
-    pictures, called = bright_pictures(explained, [frame.index for frame in frames])
-    rows = [
-        (
-            called,
-            [Cell(picture=pictures[frame.index], words=_answer(explained.frames[frame.index])) for frame in frames],
-        )
-    ]
-    for method in methods:
-        maps = explained.saliency[method]
-        cells = [Cell(picture=show_map(pictures[frame.index], maps[frame.index])) for frame in frames]
-        rows.append((method_name(method), cells))
-    numbers = {method: [_measured(explained, method, frame) for frame in frames] for method in methods}
-    moves = ""
-    for method, measured in numbers.items():
-        valid = [row[8] for row in measured if np.isfinite(row[8])]
-        moves += f", {method_name(method)} {signed(valid[-1] - valid[0], 0)}" if len(valid) > 1 else ""
-    if moves:
-        moves = f"From the first to the last frame the centre of the saliency moves down by, in pixels: {moves[2:]}."
-    answers = [explained.frames[frame.index] for frame in frames]
-    errors = [abs(answer.prediction - answer.safety_margin) for answer in answers if answer.safety_margin is not None]
-    off = f" The network is off by at most {100 * max(errors):.1f} percentage points on these frames." if errors else ""
-    return Plate(
-        name=name,
-        figure=draw_grid(rows, heads=[f"Γ {percent(frame.level)}" for frame in frames], bar=True).figure,
-        alt=f"{what}: {listed([method_name(method) for method in methods])} at Γ "
-        f"{', '.join(percent(frame.level) for frame in frames)}",
-        caption=f"{what}: {'one trial' if len(trials) == 1 else 'frames'} from full stick to full slip.{off} "
-        "Colours are relative to each map's own saliency, so brightness does not compare between maps. "
-        f"{moves}{_tell_blank(explained, frames, methods)}",
-        numbers=named_columns(_SALIENCY_COLUMNS, [row for measured in numbers.values() for row in measured]),
-        pixels=True,
-    )
-
-
-def _tell_blank(explained: Explanation, frames: list[ShownFrame], methods: list[str]) -> str:
-    blank = sum(not explained.saliency[method][frame.index].any() for method in methods for frame in frames)
-    if not blank:
-        return ""
-    maps = "1 map has" if blank == 1 else f"{blank} maps have"
-    return f" {maps} no colour: there the method finds nothing that speaks for the answer."
-
-
 def _measured(explained: Explanation, method: str, frame: ShownFrame) -> tuple[Any, ...]:
     """Numbers of a map drawn: where its weight lies, and on how much of the image."""
     shown_frame = explained.frames[frame.index]
@@ -169,16 +116,6 @@ def _measured(explained: Explanation, method: str, frame: ShownFrame) -> tuple[A
     label = float("nan") if shown_frame.safety_margin is None else shown_frame.safety_margin
     above = float((saliency > 0.5).mean())
     return explained.input, method, shown_frame.id, frame.level, label, shown_frame.prediction, above, right, down
-
-
-def _answer(frame: ExplainedFrame) -> str:
-    return f"true {percent(frame.safety_margin)}, {reading_words(frame.prediction, frame.withheld)}"
-
-
-def shown_methods(results: Results) -> list[str]:
-    """Methods that have maps, the controls left out."""
-    records = {method for explanation in results.explanations.values() for method in explanation.saliency}
-    return methods_in_order(name for name in records if not is_control(name))
 
 
 def plate_truth(results: Results, name: str) -> Plate | None:

@@ -180,10 +180,6 @@ def _cells(column: Sequence[Any] | np.ndarray) -> list[Any]:
     return [f"{value:.9g}" if isinstance(value, float) else value for value in values]
 
 
-THESIS_LEVEL = 0.2
-"""Margin of the frame that the thesis compares methods on (Fig. 8)."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class ShownFrame:
     """Frame of a plate: the margin it stands for (None if unknown), and its place among the explained frames."""

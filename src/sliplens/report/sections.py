@@ -7,7 +7,6 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from sliplens.plots.style import input_name, inputs_in_order
-from sliplens.progress import number_of
 from sliplens.report import charts, pictures, tables
 from sliplens.report.alarms import alarms_of, group_alarms
 from sliplens.report.claims import judge_claims
@@ -135,7 +134,6 @@ def _maps(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
     study = results.study
     if study.states is not None:
         yield _notes("Markers that could not be followed", study.states.untracked, tone="caution")
-    yield pictures.plate_methods(results)
     for name in _names(results.inputs):
         explained = explained_of(results, name)
         if explained is not None:
@@ -176,20 +174,10 @@ def _diagnosis(results: Results, _: np.random.Generator) -> Iterable[Block | Non
 
 
 def _recipe(results: Results, absent: list[str]) -> Section:
-    simulation = results.simulation
     again = " `sliplens study` with the same options goes on where it stopped, and" if results.study else ""
     intro = (
         f"Every stage is kept in a folder of its own;{again} `sliplens report` draws this page from the folders alone."
     )
-    if simulation is not None:
-        counts = "; ".join(
-            f"{name} {number_of(count.trials, 'trial')}, {number_of(count.frames, 'frame')}"
-            for name, count in simulation.by_split.items()
-        )
-        intro += (
-            f" Simulated: {number_of(simulation.trials, 'trial')}, {number_of(simulation.frames, 'frame')} ({counts})."
-        )
-        intro += f" Objects: {', '.join(simulation.conditions)}."
     return Section(
         id="recipe",
         title="How these results were made",
@@ -265,11 +253,9 @@ SECTIONS: tuple[Section, ...] = (
         of_sample=True,
         title="How far the explanations can be believed",
         short_title="Faithfulness",
-        intro="Table 2 of the thesis beside scores that do not depend on one fill. Parts of a frame are removed: first "
-        "those that a map says speak for the answer, first those that speak least for it, and at random. With a "
-        "faithful map the answer goes back to that on the untouched sensor at once in the first case, and not in the "
-        "second. Controls are maps that know nothing of the trained network; those on new weights have fewer passes "
-        "than the methods themselves (Poly-CAM 5 % of the channels without likeness, Shapley values 100 pairs).",
+        intro="Parts of a frame are removed: the most supporting first, the least supporting first, and at random. "
+        "With a faithful map the prediction returns to that of the untouched sensor at once in the first case, and not "
+        "in the second. Controls are maps that use nothing the network learned.",
         build=_faithfulness,
         needs=lambda results: results.study.faithfulness,
     ),
@@ -344,14 +330,10 @@ SECTIONS: tuple[Section, ...] = (
         of_sample=True,
         title="What the network should have looked at",
         short_title="Truth",
-        intro="Simulated touch can be filmed again with markers put back where they rested: what that does to the "
-        "network's answer is what a map should show, signs included. One marker put back alone tells little where "
-        "others still say the same; its Shapley value is the mean of what it does in all company, and these add up to "
-        "the answer's change. Integrated Gradients shares out the change by nearly the same axioms, over paths from "
-        "the untouched picture, and is kin to this truth by construction. What putting a marker back does to the best "
-        "reading of the margin (linear in the markers' displacements, exact for small ones) is where the network "
-        "should look; stretched over a marker's whole motion that reading may exceed the margin itself, and the "
-        "markers cancel.",
+        intro="The simulator draws each frame again with markers put back to rest. A Shapley value is the mean "
+        "of its effect on the prediction in the company of all others; a map should show these values, signs included. "
+        "Integrated Gradients is close to them by construction. The best estimate of the margin is linear in the "
+        "markers' displacements and shows where the network should look.",
         build=_truth,
         needs=lambda results: results.study.truth,
     ),

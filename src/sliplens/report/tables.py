@@ -177,11 +177,10 @@ def table_scores(faithful: Faithfulness, scored: DeletionScores | None) -> Table
     lowest = min((record.mean for name, record in plain.items() if not is_control(name)), default=None)
     fill = f", {scored.fill} fill" if scored else ""
     return make_table(
-        f"{input_name(faithful.input)}: the deletion score D of the thesis{fill} (mean ± standard deviation over "
-        "frames; lower = more faithful) beside the symmetric relevance gain, SRG: the mean change of the answer with "
-        "the most supporting parts gone first, less that with the least supporting first, in margin units; 0 = a map "
-        f"that tells nothing. 95 % intervals over {tell_over(score.srg for score in faithful.scores)}; * = the "
-        f"interval leaves zero out. Bold: best of its column, controls left out. Grey column: the {MARK}.",
+        f"{input_name(faithful.input)}: deletion score D of the thesis{fill} (mean ± standard deviation; lower = more "
+        "faithful) and symmetric relevance gain, SRG, in margin units (0 = uninformative), with 95 % intervals over "
+        f"{tell_over(score.srg for score in faithful.scores)}; * = excludes zero. Bold: best of its column, controls "
+        f"left out. Grey column: the {MARK}.",
         ("Method", "Score D", "Score D, thesis", *(f"SRG, {fill_name(*setting)}" for setting in fills)),
         [
             (
@@ -207,10 +206,9 @@ def table_leads(faithful: Faithfulness) -> Table:
         return _best(f"{tell_interval(lead.gap)}, {control}", lead.shows_something)
 
     return make_table(
-        f"{input_name(faithful.input)}: symmetric relevance gain of each method less that of the strongest map that "
-        "knows nothing of what the network learned, named beside it; 95 % intervals in margin units, each end the "
-        "lowest of those over all such maps. Bold: ahead of every one for sure. Otherwise the method has shown "
-        "nothing about this network under that fill.",
+        f"{input_name(faithful.input)}: symmetric relevance gain of each method less that of the strongest control, "
+        "named beside it, in margin units with 95 % intervals. Bold: ahead of every control. Otherwise the method has "
+        "shown nothing about this network under that fill.",
         ("Method", *(fill_name(*setting) for setting in fills)),
         [
             (method_name(method), *(tell(leads.get((*setting, method))) for setting in fills))
@@ -353,14 +351,11 @@ def table_localisation(truth: Truth) -> Table:
         rows.append((title, *shares, *map(_interval, gaps)))
     nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), *4 * ["0"])
     return make_table(
-        f"{input_name(truth.input)}, {number_of(truth.frames, 'simulated frame')}: share of the relevance, and "
-        "of the strongest pixels, in three regions; and Spearman's correlation, signed, of the map's mean on each "
-        "marker with its "
-        "Shapley value in the network's answer, with what putting it back alone changes there, and with the same of "
-        "the best reading of the margin (95 % interval over "
-        f"{tell_over(method.shapley for method in truth.methods.values())}). Lead: the first of these less that of the "
-        "strongest map that knows nothing of what the network learned; a method whose lead is not above zero for sure "
-        "has shown nothing about this network.",
+        f"{input_name(truth.input)}, {number_of(truth.frames, 'simulated frame')}: share of the relevance and of the "
+        "strongest pixels in three regions; signed rank correlation of the map's means over the markers with their "
+        "Shapley values, single effects, and effects on the best estimate of the margin (95 % interval over "
+        f"{tell_over(method.shapley for method in truth.methods.values())}). Lead: the first less that of the "
+        "strongest control; a method whose interval includes zero has shown nothing about this network.",
         ("Method", *heads, *_CORRELATIONS),
         [*rows, nothing],
     )
@@ -371,11 +366,9 @@ def table_meta(truth: Truth) -> Table | None:
     if not truth.meta:
         return None
     return make_table(
-        f"{input_name(truth.input)}: the score put to the test. A map of the markers' Shapley values must gain more "
-        "than that map damaged, beyond the 95 % interval; a fill where this fails along the answer's change cannot "
-        "judge methods, and the verdict leaves it out. Along the change asks what speaks for the answer and what "
-        "against it; by size, maps ordered by |value|, asks what matters at all. Where |x - b|, which knows no "
-        "network, comes near the truth, the setting mostly measures the input.",
+        f"{input_name(truth.input)}: test of the score. The map of the Shapley values must gain more than the same "
+        "map with half of the markers shuffled, beyond the 95 % interval; a fill where it does not has no vote. Where "
+        "|x - b| comes near the truth, the setting mostly measures the input.",
         ("Fill", "Changes counted", "Holds", *_GAINS),
         [
             (

@@ -26,10 +26,8 @@ from sliplens.plots.style import (
 )
 from sliplens.progress import number_of
 from sliplens.report.comparisons import (
-    NETWORK_PIXELS,
     against_control,
     compare_errors,
-    gap_from,
     tell_interval,
     tell_sample,
     voting_settings,
@@ -51,8 +49,6 @@ class Finding:
     """Fill and unit, or the score."""
     compared: str
     gap: Difference | None = None
-    value: str = ""
-    """Number where there is no interval."""
     outcome: Outcome | None = None
     """None where the comparison does not decide."""
 
@@ -125,17 +121,6 @@ def cautions(results: Results) -> tuple[str, ...]:
         sentences.append(
             "The deletion score depends on the fill of a removed pixel, and its sign is lost. With every pixel filled, "
             f"where no map has a part, D is {listed(last)}: a score near that measures the fill."
-        )
-    if results.trainings:
-        trainings = [results.trainings[name] for name in inputs_in_order(results.trainings)]
-        sizes = [
-            f"{number_of(run.train_frames, 'frame')} of {run.image_size} px for {decimals(run.minutes, 1)} minutes "
-            f"({input_name(run.input).lower()})"
-            for run in trainings
-        ]
-        sentences.append(
-            f"Trained on {listed(sizes)}; the thesis took images of {NETWORK_PIXELS} px of a real sensor, so that its "
-            "figures show the scale of such errors."
         )
     return tuple(sentences)
 
@@ -349,8 +334,6 @@ def _judge_by_removal(name: str, faithful: Faithfulness, truth: Truth | None) ->
             sentence = (
                 f"{best} chance and every control under {len(standing.beaten)} of {len(standing.tested)} fills{but}."
             )
-            if place and ranked[0].qualifies:
-                sentence += _compare_with_first(faithful, ranked[0], standing.method)
         rows.append(
             Row(
                 claim=method_name(standing.method),
@@ -361,22 +344,6 @@ def _judge_by_removal(name: str, faithful: Faithfulness, truth: Truth | None) ->
             )
         )
     return rows
-
-
-def _compare_with_first(faithful: Faithfulness, first: Standing, method: str) -> str:
-    gaps = {
-        (pair.fill, pair.unit): gap_from(pair, first.method)
-        for pair in faithful.comparisons
-        if {pair.first, pair.second} == {first.method, method}
-    }
-    sides = {"Behind": "above_zero", "Ahead of": "below_zero"}
-    settings = {
-        words: [fill_name(*setting) for setting, gap in gaps.items() if setting in first.tested and getattr(gap, side)]
-        for words, side in sides.items()
-    }
-    name = method_name(first.method)
-    parts = [f" {words} {name} under {listed(fills)}." for words, fills in settings.items() if fills]
-    return "".join(parts) or f" Tied with {name} under every fill."
 
 
 # networks, deletion without a study, real touch and the grip

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
+from jaxtyping import Float32, Float64, Int64, Shaped
 
 from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
@@ -104,54 +104,13 @@ class MarkerPlaces:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShownFrame:
-    """Frame of the trial that is shown, its contact state in words."""
-
-    id: str
-    level: Annotated[float, MARGIN]
-    safety_margin: Annotated[float, MARGIN]
-    contact_state: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class StateFrame(ShownFrame, MarkerPlaces):
-    """Shown frame with its picture, its absolute difference from the untouched sensor, and its markers."""
-
-    raw: UInt8[np.ndarray, "height width 3"]
-    difference: UInt8[np.ndarray, "height width 3"]
-
-
-@dataclass(frozen=True, kw_only=True)
 class States:
-    """Trial from full stick to full slip as the camera saw it, and the markers of all chosen frames."""
+    """Markers of all chosen frames."""
 
-    trial: str
-    markers_from: str
-    """Either "simulation" or "tracking"."""
-    shown: tuple[ShownFrame, ...]
     untracked: tuple[str, ...]
     """Trials in which the markers could not be followed, and why."""
-    raw: UInt8[np.ndarray, "frames height width 3"]
-    difference: UInt8[np.ndarray, "frames height width 3"]
-    """Pictures of `shown`, and their absolute differences from the untouched sensor."""
     table: MarkerTable
     """Markers of every chosen frame in which they are known."""
-
-    def __post_init__(self) -> None:
-        """Hold the pictures against the frames."""
-        if not self.shown:
-            raise ValueError("names no frame")
-        if not len(self.shown) == len(self.raw) == len(self.difference):
-            raise ValueError(f"holds {len(self.raw)} and {len(self.difference)} pictures of {len(self.shown)} frames")
-
-    @cached_property
-    def frames(self) -> tuple[StateFrame, ...]:
-        """The frames that are shown, with their pictures and markers."""
-        none = MarkerPlaces(rest_px=np.empty((0, 2)), now_px=np.empty((0, 2)))
-        return tuple(
-            StateFrame(**vars(chosen), **vars(self.markers.get(chosen.id, none)), raw=raw, difference=difference)
-            for chosen, raw, difference in zip(self.shown, self.raw, self.difference, strict=True)
-        )
 
     @cached_property
     def markers(self) -> dict[str, MarkerPlaces]:

@@ -20,7 +20,6 @@ from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.poly_cam_budget import Likeness
 from sliplens.explainers.table import EXPLAINERS, get_explainer
 from sliplens.faithfulness.removal import Units, marker_units, tile_units
-from sliplens.images import absolute_difference
 from sliplens.markers import track_markers
 from sliplens.models import Network
 from sliplens.plots.style import input_name, listed
@@ -35,7 +34,6 @@ from sliplens.results.study import (
     ChosenTrial,
     MarkerPlaces,
     MarkerTable,
-    ShownFrame,
     States,
 )
 from sliplens.runner import Part, part
@@ -177,39 +175,22 @@ def _summarise(choice: Choice, trials: int) -> str:
 
 
 def show_states(choice: Choice, data: Dataset) -> States:
-    """Pictures of the shown frames, raw and difference, and the markers of every chosen frame.
+    """Return the markers of every chosen frame.
 
     The simulator knows the markers' places; in recorded trials they are followed from the untouched sensor on. A trial
     in which they cannot be followed has none, and the result says why.
     """
     infos = {info.trial: info for info in data.trials}
     # so that the table of a study without markers has its columns
-    tables = [_table("", np.empty((0, 2)), np.empty((0, 2)))]
-    drawn, raw, difference, untracked = [], [], [], []
-    simulated = True
-    groups = [(trial, list(rows)) for trial, rows in groupby(choice.frames, key=lambda frame: frame.trial)]
-    for trial, chosen in track(groups):
-        recording = data.load(infos[trial])
-        simulated = simulated and recording.truth is not None
+    tables, untracked = [_table("", np.empty((0, 2)), np.empty((0, 2)))], []
+    for trial, chosen in track(
+        [(trial, list(rows)) for trial, rows in groupby(choice.frames, key=lambda at: at.trial)]
+    ):
         try:
-            tables += _markers(recording, chosen)
+            tables += _markers(data.load(infos[trial]), chosen)
         except (ImageError, InputError) as error:
             untracked.append(f"{trial}: {error}")
-        for frame in chosen:
-            if frame.shown:
-                state, margin = str(recording.contact_state[frame.frame]).replace("_", " "), frame.safety_margin
-                drawn.append(ShownFrame(id=frame.id, level=frame.level, safety_margin=margin, contact_state=state))
-                raw.append(recording.frames[frame.frame])
-                difference.append(absolute_difference(raw[-1][None], recording.reference)[0])
-    return States(
-        trial=next(frame.trial for frame in choice.frames if frame.shown),
-        markers_from="simulation" if simulated else "tracking",
-        shown=tuple(drawn),
-        untracked=tuple(untracked),
-        raw=np.stack(raw),
-        difference=np.stack(difference),
-        table=MarkerTable.joined(tables),
-    )
+    return States(untracked=tuple(untracked), table=MarkerTable.joined(tables))
 
 
 def _markers(recording: Recording, chosen: Sequence[ChosenFrame]) -> list[MarkerTable]:

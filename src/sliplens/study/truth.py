@@ -307,7 +307,7 @@ def _sum_over_change(effects: Sequence[FrameEffects], change: Float[np.ndarray, 
 
 
 def _summarise(truth: Truth) -> str:
-    """Say what the effects add up to and how sure they are, which fills can tell, and who looks where it should."""
+    """Write what the effects add up to, how sure they are, and how far they follow the margin."""
     text = {name: "unknown" if times is None else f"{times:.2f} times" for name, times in truth.sums.items()}
     summary = (
         "Put back one at a time, all markers together change the answer by "
@@ -316,15 +316,6 @@ def _summarise(truth: Truth) -> str:
     )
     if truth.reliability is not None:
         summary += f" A second estimate of these would correlate with this one by {truth.reliability.estimate:.2f}."
-    signed, by_size = (
-        [test.fill for test in truth.meta if (test if along else test.by_size).holds] for along in (True, False)
-    )
-    summary += (
-        " The map of the Shapley values ranks above one of which half is shuffled, beyond the 95 % interval, "
-        f"under {len(signed)} of {len(truth.meta)} fills ({', '.join(signed) or 'none'}) along the answer's change, "
-        f"which asks for signs; under {len(by_size)} ({', '.join(by_size) or 'none'}) by size, "
-        "which asks for strength alone."
-    )
     agreement = truth.shapley_against_margin
     if agreement is not None:
         summary += (
