@@ -12,7 +12,7 @@ from sliplens.errors import InputError
 from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.files import DIFFERENCE_NETWORK, output_folder, require_folder
 from sliplens.models.checkpoint import load
-from sliplens.progress import OnProgress, stage, wrote
+from sliplens.progress import OnProgress, open_stage, report_file, reporting
 from sliplens.recordings import Dataset
 from sliplens.report import write_report
 from sliplens.results.explanation import Strip
@@ -97,7 +97,7 @@ def run_demo(
     _open_folder(folder, _Settings(train_minutes=train_minutes, image_size=image_size, real_frames=real, seed=seed))
 
     def show(*waiting: str) -> Path:
-        with stage(on_progress, "Writing the page"):
+        with reporting(on_progress), open_stage("Writing the page"):
             page = write_report(folder, waiting_for=waiting).page
         if on_page is not None:
             on_page(page)
@@ -115,7 +115,8 @@ def run_demo(
             networks[name] = str(folder / f"train-{name}")
             trained = partial(train, image_size=image_size, epochs=60, max_minutes=minutes, seed=seed)
             trained(data, networks[name], input=name, on_progress=on_progress)
-    _make_strip(folder / "strip", data, networks["difference"], on_progress=on_progress)
+    with reporting(on_progress):
+        _make_strip(folder / "strip", data, networks["difference"])
     show(*later)
     for name in INPUTS:
         evaluate(networks[name], data, folder / f"evaluate-{name}", on_progress=on_progress)
@@ -164,17 +165,17 @@ def _open_folder(folder: Path, settings: _Settings) -> None:
     save_record(settings, path)
 
 
-def _make_strip(out: Path, data: Dataset, network: str, *, on_progress: OnProgress | None) -> Strip:
+def _make_strip(out: Path, data: Dataset, network: str) -> Strip:
     """Strip of the first dry trial that tests: chosen by its place, so that no answer plays a part."""
     run = load(network)
     info = data.select(split="test", condition="dry")[0]
     config = {"data_hash": data.hash, "trial": info.trial, "weights_sha256": run.manifest.weights_sha256}
     with output_folder(out, stage="strip", config=config) as output:
         if not output.complete:
-            with stage(on_progress, "Explaining a grip from stick to slip"):
+            with open_stage("Explaining a grip from stick to slip"):
                 strip = make_strip(run, data.load(info), source=data.source, method=STRIP_METHOD)
             save_result(strip, output.folder)
-    wrote(on_progress, out, "a grip from stick to slip", kept=output.complete)
+    report_file(out, "a grip from stick to slip", kept=output.complete)
     return load_result(out, Strip, command="sliplens demo")
 
 

@@ -64,38 +64,6 @@ class Stages(Protocol):
         ...
 
 
-@contextmanager
-def stage(on_progress: OnProgress | None, title: str) -> Iterator[OnProgress]:
-    """Begin a stage of long work; gives the callback for its progress, which may be called whatever was given.
-
-    Examples
-    --------
-    >>> from sliplens.progress import stage
-    >>> with stage(lambda done, total: print(f"{done} of {total}"), "Explain") as count:
-    ...     for frame in range(2):
-    ...         count(frame + 1, 2)
-    1 of 2
-    2 of 2
-    """
-    if isinstance(on_progress, Stages):
-        with on_progress.stage(title) as count:
-            yield count
-    else:
-        yield on_progress or ignore
-
-
-def wrote(on_progress: OnProgress | None, path: Path, what: str, *, kept: bool = False) -> None:
-    """Tell what was written where, or that it was there already, to a callback that shows stages."""
-    if isinstance(on_progress, Stages):
-        on_progress.wrote(path, what, kept=kept)
-
-
-def note(on_progress: OnProgress | None, message: str) -> None:
-    """Tell a sentence to a callback that shows stages."""
-    if isinstance(on_progress, Stages):
-        on_progress.note(message)
-
-
 def fold_equal(messages: Iterable[str]) -> list[str]:
     """Tell once what is said again and again, in the order of the first: names and numbers of the others are folded.
 
@@ -260,19 +228,6 @@ class _Counter:
         self._count(done, total)
 
 
-def continued(on_progress: OnProgress | None, *, before: int, total: int) -> OnProgress | None:
-    """Callback for a part of longer work, which comes after `before` of `total`; None where nobody listens."""
-    return None if on_progress is None else lambda done, _: on_progress(before + done, total)
-
-
-def counted(items: Collection[Item], on_progress: OnProgress | None) -> Iterator[Item]:
-    """Give items one by one; each counts as done when the next is asked for."""
-    for done, item in enumerate(items, start=1):
-        yield item
-        if on_progress is not None:
-            on_progress(done, len(items))
-
-
 def ignore(_done: int, _total: int) -> None:
     """Show nothing."""
 
@@ -281,19 +236,14 @@ __all__ = [
     "OnProgress",
     "Stages",
     "add_note",
-    "continued",
-    "counted",
     "counting",
     "current_listener",
     "current_reporter",
     "fold_equal",
-    "note",
     "number_of",
     "open_stage",
     "report_file",
     "report_progress",
     "reporting",
-    "stage",
     "track",
-    "wrote",
 ]

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from sliplens.cli import console
 from sliplens.cli.console import Terminal, print_table
-from sliplens.progress import Stages, fold_equal, stage
+from sliplens.progress import Stages, fold_equal, open_stage, report_progress, reporting
 
 METHODS = ["Grad-CAM", "Integrated Gradients", "Poly-CAM (thesis)"]
 HEAD = ["Method", "Score D (lower is better)", "Standard deviation", "SRG, grey fill", "SRG, blurred fill", "Seconds"]
@@ -78,8 +78,8 @@ def test_terminal_shows_stages(screen: Console) -> None:
     terminal = Terminal()
     assert isinstance(terminal, Stages)
 
-    with stage(terminal, "Explain") as count:
-        count(2, 2)
+    with reporting(terminal), open_stage("Explain"):
+        report_progress(2, 2)
         with terminal.stage("Score") as inner:
             inner(1, 5)
             terminal(3, 5)

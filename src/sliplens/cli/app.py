@@ -163,14 +163,15 @@ def _fields_of(kind: Any, *, group: str = "") -> list[_Option]:
 
 
 def _further(run: Callable[..., object]) -> list[_Option]:
-    helps, hints = _parameter_help(run), get_type_hints(run)
-    return [
-        _Option(
-            name=name, kind=typed_kind(hints[name]), default=parameter.default, help=helps.get(name, ""), further=True
-        )
-        for name, parameter in signature(run).parameters.items()
-        if parameter.kind is Parameter.KEYWORD_ONLY
-    ]
+    """Return the options of `Command.run`."""
+    helps, hints, options = _parameter_help(run), get_type_hints(run), []
+    for name, parameter in signature(run).parameters.items():
+        if parameter.kind is Parameter.VAR_KEYWORD:
+            options += [replace(option, further=True) for option in _fields_of(get_args(hints[name])[0])]
+        elif parameter.kind is Parameter.KEYWORD_ONLY:
+            kind, text = typed_kind(hints[name]), helps.get(name, "")
+            options.append(_Option(name=name, kind=kind, default=parameter.default, help=text, further=True))
+    return options
 
 
 def _parameter_help(kind: Any) -> dict[str, str]:

@@ -6,7 +6,7 @@ from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 import msgspec
 
@@ -567,6 +567,35 @@ def run_grip(call: Any) -> None:
     output.draw_report(out)
 
 
+class HoldOptions(TypedDict, total=False):
+    """Options of `sliplens hold` beside those of `hold_grip`."""
+
+    dry_run: bool
+    """Send nothing: print what would be sent, as if it were obeyed at once."""
+    messages: str
+    """Messages of a ROS 2 gripper: gripper-command (default), numbers or controllers."""
+    joint: str
+    """Joint of a ROS 2 gripper that has width and force; the first if not given."""
+    second: str
+    """Source of a second fingertip."""
+    reference: tuple[Path, ...]
+    """Image of each untouched sensor; taken when the picture is still at first if not given."""
+    friction: str
+    """Coefficient of friction of the object, if it is known: 0.62, 0.5..0.8 or 0.58+-0.05."""
+    same_object: bool
+    """All grasps are of one object: friction measured in a slip holds for the next."""
+    sequence: bool
+    """Predict frames in order, with those before; for a network of the recipe sequence."""
+    sensor: str
+    """Profile of the sensors, a file or a name such as digit."""
+    engine: Literal["auto", "torch", "openvino"]
+    """Library that runs the network; auto (default) is the fastest."""
+    device: str
+    """Device of the network: cpu (default), cuda or cuda:1."""
+    json: bool
+    """Print a line of JSON for each command; else a line a second."""
+
+
 @command(
     "hold",
     "grip.hold:hold_grip",
@@ -575,51 +604,8 @@ def run_grip(call: Any) -> None:
     ("ceiling_n", "--ceiling"),
     ("watchdog_s", "--watchdog"),
 )
-def run_hold(
-    call: Any,
-    *,
-    dry_run: bool = False,
-    messages: str = "gripper-command",
-    joint: str | None = None,
-    second: str | None = None,
-    reference: tuple[Path, ...] = (),
-    friction: str | None = None,
-    same_object: bool = False,
-    sequence: bool = False,
-    sensor: str | None = None,
-    engine: Literal["auto", "torch", "openvino"] = "auto",
-    device: str = "cpu",
-    json: bool = False,
-) -> None:
-    """Print the commands.
-
-    Parameters
-    ----------
-    dry_run
-        Send nothing: print what would be sent, as if it were obeyed at once.
-    messages
-        Messages of a ROS 2 gripper: gripper-command, numbers or controllers.
-    joint
-        Joint of a ROS 2 gripper that has width and force; the first if not given.
-    second
-        Source of a second fingertip.
-    reference
-        Image of each untouched sensor; taken when the picture is still at first if not given.
-    friction
-        Coefficient of friction of the object, if it is known: 0.62, 0.5..0.8 or 0.58+-0.05.
-    same_object
-        All grasps are of one object: friction measured in a slip holds for the next.
-    sequence
-        Predict frames in order, with those before; for a network of the recipe sequence.
-    sensor
-        Profile of the sensors, a file or a name such as digit.
-    engine
-        Library that runs the network; auto is the fastest.
-    device
-        Device of the network: cpu, cuda or cuda:1.
-    json
-        Print a line of JSON for each command; else a line a second.
-    """
+def run_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
+    """Print the commands."""
     from sliplens.grip.controllers import make_controller
     from sliplens.grip.gripper import open_gripper
     from sliplens.grip.hold import GRIPPERS
@@ -630,20 +616,23 @@ def run_hold(
     from sliplens.recordings.sensor import load_profile
 
     arguments = call.keywords
-    gripper = "dry-run" if dry_run else arguments.get("gripper")
+    gripper = "dry-run" if options.get("dry_run") else arguments.get("gripper")
     if gripper is None:
         raise InputError("no gripper is given; name one with --gripper, or see what would be sent with --dry-run")
     make_controller(arguments.get("controller", "margin"), arguments.get("settings"))  # refused before a network loads
-    names = [source for source in (arguments["source"], second) if source is not None]
+    names = [source for source in (arguments["source"], options.get("second")) if source is not None]
+    reference, sensor = options.get("reference", ()), options.get("sensor")
     if reference and len(reference) != len(names):
         raise InputError(f"--reference takes an image for each source, {len(names)}, got {len(reference)}")
     profile = None if sensor is None else load_profile(sensor)
     sources = [open_grip(source, LiveOptions()) or source for source in names]
     networks = [arguments.get("network") or usual_network(source, profile) for source in sources]
-    loaded = {name: load(name, device=device) for name in dict.fromkeys(networks) if name is not None}
+    loaded = {
+        name: load(name, device=options.get("device", "cpu")) for name in dict.fromkeys(networks) if name is not None
+    }
     with ExitStack() as stack:
         if gripper not in GRIPPERS:
-            gripper = stack.enter_context(closing(open_gripper(gripper, messages=messages, joint=joint)))
+            gripper = stack.enter_context(closing(open_gripper(gripper, messages=messages, joint=options.get("joint"))))
         readers = [
             stack.enter_context(
                 LiveReader(
@@ -651,15 +640,17 @@ def run_hold(
                     None if network is None else loaded[network],
                     reference=image,
                     sensor=profile,
-                    friction=friction,
-                    same_object=same_object,
-                    sequence=sequence,
-                    engine=engine,
+                    friction=options.get("friction"),
+                    same_object=options.get("same_object", False),
+                    sequence=options.get("sequence", False),
+                    engine=options.get("engine", "auto"),
                 )
             )
             for source, network, image in zip(sources, networks, reference or [None] * len(sources), strict=True)
         ]
-        result = call(source=readers, gripper=gripper, network=None, on_step=_Steps(readers, json=json))
+        result = call(
+            source=readers, gripper=gripper, network=None, on_step=_Steps(readers, json=options.get("json", False))
+        )
     say(result.why, aside=True)
     for name, reader in zip(names, readers, strict=True):
         if reader.lesson is not None:
