@@ -281,7 +281,8 @@ def summarise(read: Read) -> dict[str, Any]:
     for condition, rows in (("dry", ~read.wet), ("wet", read.wet)):
         if ratios:
             found[f"ratio_r2_{condition}"] = r2(read.ratio[rows], np.concatenate([one.mean for one in ratios])[rows])
-            found[f"ratio_in_90_{condition}"] = held(read.ratio, [one.interval(0.9) for one in ratios], rows)
+            intervals = [(one.mean - 1.645 * one.sigma, one.mean + 1.645 * one.sigma) for one in ratios]
+            found[f"ratio_in_90_{condition}"] = held(read.ratio, intervals, rows)
         if is_known:
             found[f"known_below_5_{condition}"] = float(np.mean(np.concatenate(is_known)[rows] < 0.05))
         for name, estimates in read.told.items():

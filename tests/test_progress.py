@@ -1,6 +1,6 @@
 """Progress of nested loops."""
 
-from sliplens.progress import add_note, open_stage, report_file, report_progress, reporting, track
+from sliplens.progress import add_note, open_stage, report_each, report_file, report_progress, reporting
 
 
 def collect(work):
@@ -12,8 +12,8 @@ def collect(work):
 
 def test_nested_loops_fill_the_part_of_their_item_and_never_go_back():
     def work():
-        for count in track([2, 4], sizes=[10, 20]):
-            for _ in track(range(count)):
+        for count in report_each([2, 4], sizes=[10, 20]):
+            for _ in report_each(range(count)):
                 pass
 
     calls = collect(work)
@@ -25,8 +25,8 @@ def test_nested_loops_fill_the_part_of_their_item_and_never_go_back():
 
 def test_a_loop_that_is_left_early_gives_its_bar_back():
     def work():
-        for _ in track(range(2)):
-            for _ in track(range(5)):
+        for _ in report_each(range(2)):
+            for _ in report_each(range(5)):
                 break
 
     assert collect(work) == [(1, 2), (2, 2)]
@@ -37,4 +37,4 @@ def test_work_without_a_listener_runs_silently(tmp_path):
         add_note("a note")
         report_file(tmp_path, "a file")
         report_progress(1, 2)
-        assert list(track("ab")) == ["a", "b"]
+        assert list(report_each("ab")) == ["a", "b"]

@@ -165,18 +165,18 @@ def _open_folder(folder: Path, settings: _Settings) -> None:
     save_record(settings, path)
 
 
-def _make_strip(out: Path, data: Dataset, network: str) -> Strip:
+def _make_strip(folder: Path, data: Dataset, network: str) -> Strip:
     """Strip of the first dry trial that tests: chosen by its place, so that no answer plays a part."""
     run = load(network)
     info = data.select(split="test", condition="dry")[0]
     config = {"data_hash": data.hash, "trial": info.trial, "weights_sha256": run.manifest.weights_sha256}
-    with output_folder(out, stage="strip", config=config) as output:
+    with output_folder(folder, stage="strip", config=config) as output:
         if not output.complete:
             with open_stage("Explaining a grip from stick to slip"):
                 strip = make_strip(run, data.load(info), source=data.source, method=STRIP_METHOD)
             save_result(strip, output.folder)
-    report_file(out, "a grip from stick to slip", kept=output.complete)
-    return load_result(out, Strip, command="sliplens demo")
+    report_file(folder, "a grip from stick to slip", kept=output.complete)
+    return load_result(folder, Strip, command="sliplens demo")
 
 
 __all__ = ["DEMO_SEED", "find_real_frames", "run_demo"]

@@ -122,13 +122,13 @@ def reporting(listener: OnProgress | None) -> Iterator[None]:
     """Report progress, stages, files and notes of the enclosed work to a callback.
 
     Public functions enclose their work in it and pass their parameter `on_progress`; None keeps the callback of the
-    caller. Functions below them call `track`, `open_stage`, `add_note` and `report_file` and take no callback.
+    caller. Functions below them call `report_each`, `open_stage`, `add_note` and `report_file` and take no callback.
 
     Examples
     --------
-    >>> from sliplens.progress import reporting, track
+    >>> from sliplens.progress import reporting, report_each
     >>> with reporting(lambda done, total: print(f"{done} of {total}")):
-    ...     squares = [number**2 for number in track([1, 2])]
+    ...     squares = [number**2 for number in report_each([1, 2])]
     1 of 2
     2 of 2
     """
@@ -141,7 +141,7 @@ def reporting(listener: OnProgress | None) -> Iterator[None]:
         _SPAN.set(before)
 
 
-def track(items: Collection[Item], *, sizes: Sequence[int] | None = None) -> Iterator[Item]:
+def report_each(items: Collection[Item], *, sizes: Sequence[int] | None = None) -> Iterator[Item]:
     """Iterate over items and report each as done when the next one is requested.
 
     Loops nest: a loop within an item fills the item's part of the bar. `sizes` gives the length of each item's part
@@ -169,7 +169,7 @@ def track(items: Collection[Item], *, sizes: Sequence[int] | None = None) -> Ite
 
 
 def report_progress(done: int, total: int) -> None:
-    """Report how many items of the running loop are done, where `track` does not fit."""
+    """Report how many items of the running loop are done, where `report_each` does not fit."""
     if (span := _SPAN.get()) is not None:
         span.show(done, total)
 
@@ -242,8 +242,8 @@ __all__ = [
     "fold_equal",
     "number_of",
     "open_stage",
+    "report_each",
     "report_file",
     "report_progress",
     "reporting",
-    "track",
 ]

@@ -37,7 +37,7 @@ def command(name: str, function: str, example: str, *aliases: tuple[str, str]) -
 
 
 @command("demo", "demo:run_demo", "sliplens demo runs/demo")
-def run_demo(call: Any) -> None:
+def call_demo(call: Any) -> None:
     """Print where the page is as soon as it exists; its notes are on the page."""
     started = time.perf_counter()
     pages: list[Path] = []
@@ -65,7 +65,7 @@ def run_demo(call: Any) -> None:
     ("rate_hz", "--rate"),
     ("smoothing_s", "--smoothing"),
 )
-def run_live(
+def call_live(
     call: Any,
     *,
     list_sources: bool = False,
@@ -169,7 +169,7 @@ def _watch(reader: "LiveReader", *, quiet: bool, lines: bool) -> None:
 @command(
     "sensor new", "plots.figure:make_profile", "sliplens sensor new --from tip.mp4 -o tip.toml", ("source", "--from")
 )
-def run_sensor_new(call: Any) -> None:
+def call_sensor_new(call: Any) -> None:
     """Write the profile and its picture."""
     proposal, path = call(), Path(call.keywords["out"])
     for sentence in proposal.notes:
@@ -179,7 +179,7 @@ def run_sensor_new(call: Any) -> None:
 
 
 @command("sensor list", "recordings.sensor:shipped_profiles", "sliplens sensor list")
-def run_sensor_list(call: Any) -> None:
+def call_sensor_list(call: Any) -> None:
     """Print the profiles."""
     from sliplens.recordings.sensor import load_profile
 
@@ -191,7 +191,7 @@ def run_sensor_list(call: Any) -> None:
 
 
 @command("simulate", "simulation.trials:simulate", "sliplens simulate runs/mine/data --preset small")
-def run_simulate(call: Any, *, preview: Path | None = None, video: Path | None = None) -> None:
+def call_simulate(call: Any, *, preview: Path | None = None, video: Path | None = None) -> None:
     """Print the splits.
 
     Parameters
@@ -225,7 +225,7 @@ def run_simulate(call: Any, *, preview: Path | None = None, video: Path | None =
     "recordings.importing:import_recordings",
     "sliplens import cup.mp4 --forces cup.csv --sensor tip.toml -o runs/mine/data",
 )
-def run_import(call: Any, *, audit: bool = True) -> None:
+def call_import(call: Any, *, audit: bool = True) -> None:
     """Print what the labels rest on.
 
     Parameters
@@ -244,7 +244,7 @@ def run_import(call: Any, *, audit: bool = True) -> None:
 
 
 @command("label", "recordings.relabelling:label_dataset", "sliplens label runs/mine/data --draft corrections.csv")
-def run_label(call: Any, *, draft: Path | None = None, audit: bool = True, audit_only: bool = False) -> None:
+def call_label(call: Any, *, draft: Path | None = None, audit: bool = True, audit_only: bool = False) -> None:
     """Print what the labels rest on.
 
     Parameters
@@ -281,14 +281,14 @@ def run_label(call: Any, *, draft: Path | None = None, audit: bool = True, audit
 
 
 @command("recover", "recordings.dataset:recover_dataset", "sliplens recover runs/mine/data")
-def run_recover(call: Any) -> None:
+def call_recover(call: Any) -> None:
     """Print what the data set holds."""
     data = call()
     say(f"{data.folder} holds {number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}")
 
 
 @command("split", "recordings.splits:split_dataset", "sliplens split runs/mine/data --splits object --dry-run")
-def run_split(call: Any) -> None:
+def call_split(call: Any) -> None:
     """Print the splits, and the trials that move."""
     from sliplens.recordings.dataset import load_dataset
 
@@ -308,7 +308,7 @@ def run_split(call: Any) -> None:
 
 
 @command("check", "recordings.check:check_dataset", "sliplens check runs/mine/data")
-def run_check(call: Any) -> None:
+def call_check(call: Any) -> None:
     """Print the findings; exit code 2 if there are any."""
     from sliplens.recordings.dataset import load_dataset, trial_path
     from sliplens.recordings.store import read_header
@@ -332,7 +332,7 @@ def run_check(call: Any) -> None:
 
 
 @command("compare", "simulation.sharing:compare_datasets", "sliplens compare runs/mine/data runs/other/data")
-def run_compare(call: Any) -> None:
+def call_compare(call: Any) -> None:
     """Print what two data sets share, or which trials of a data set trained a network."""
     from sliplens.recordings.dataset import DATASET_FILE
 
@@ -355,7 +355,7 @@ def run_compare(call: Any) -> None:
     "live.viewer:view",
     "sliplens view runs/mine/data --trial cup --predictions margins.parquet --maps runs/mine/explain",
 )
-def run_view(call: Any) -> None:
+def call_view(call: Any) -> None:
     """Print what is shown."""
     trial = call()
     about = f"{trial.trial.trial}, {number_of(len(trial.trial), 'frame')}"
@@ -367,7 +367,7 @@ def run_view(call: Any) -> None:
 
 
 @command("track", "markers.tracking:track", "sliplens track cup.mp4 --reference untouched.png -o markers.parquet")
-def run_track(call: Any, *, video: Path | None = None) -> None:
+def call_track(call: Any, *, video: Path | None = None) -> None:
     """Print how many markers were followed.
 
     Parameters
@@ -408,7 +408,7 @@ def run_track(call: Any, *, video: Path | None = None) -> None:
     "training.fitting:train",
     "sliplens train runs/mine/data -o runs/mine/train --start-from chromatouch-pair --epochs 5",
 )
-def run_train(call: Any) -> None:
+def call_train(call: Any) -> None:
     """Draw the learning curve."""
     from sliplens.plots.errors import draw_learning_curve
 
@@ -424,7 +424,7 @@ def run_train(call: Any) -> None:
 @command(
     "evaluate", "training.evaluation:evaluate", "sliplens evaluate runs/mine/train runs/mine/data -o runs/mine/evaluate"
 )
-def run_evaluate(call: Any, *, device: str = "cpu") -> None:
+def call_evaluate(call: Any, *, device: str = "cpu") -> None:
     """Print the scores and draw them.
 
     Parameters
@@ -450,7 +450,7 @@ def run_evaluate(call: Any, *, device: str = "cpu") -> None:
     "models.predictions:predict",
     "sliplens predict cup.mp4 --sensor tip.toml --plot margin.png -o margins.csv",
 )
-def run_predict(call: Any, *, plot: Path | None = None) -> None:
+def call_predict(call: Any, *, plot: Path | None = None) -> None:
     """Print the margins.
 
     Parameters
@@ -482,7 +482,7 @@ def run_predict(call: Any, *, plot: Path | None = None) -> None:
 
 
 @command("export onnx", "models.onnx:export_onnx", "sliplens export onnx runs/mine/train -o tip.onnx")
-def run_export_onnx(call: Any) -> None:
+def call_export_onnx(call: Any) -> None:
     """Print what was written."""
     from sliplens.models.checkpoint import load
 
@@ -496,7 +496,7 @@ def run_export_onnx(call: Any) -> None:
 
 @command("export lerobot", "recordings.exporting:export_lerobot", "sliplens export lerobot runs/mine/data -o lerobot")
 @command("export mcap", "recordings.exporting:export_mcap", "sliplens export mcap runs/mine/data -o mcap")
-def run_export_dataset(call: Any) -> None:
+def call_export_dataset(call: Any) -> None:
     """Write the data set."""
     call()
 
@@ -507,7 +507,7 @@ def run_export_dataset(call: Any) -> None:
     "sliplens explain runs/mine/train runs/mine/data -o runs/mine/explain",
     ("source", "--frames"),
 )
-def run_explain(call: Any) -> None:
+def call_explain(call: Any) -> None:
     """Write the maps."""
     if "out" not in call.keywords:
         raise InputError("name the folder of the maps with -o FOLDER")
@@ -515,13 +515,13 @@ def run_explain(call: Any) -> None:
 
 
 @command("score", "study.scoring:score", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score")
-def run_score(call: Any) -> None:
+def call_score(call: Any) -> None:
     """Print the scores."""
     output.print_faithfulness(call())
 
 
 @command("diagnose", "study.diagnose:diagnose", "sliplens diagnose runs/mine/train runs/mine/data -o runs/mine/why")
-def run_diagnose(call: Any) -> None:
+def call_diagnose(call: Any) -> None:
     """Print the findings, and draw the page."""
     diagnosis = call()
     for sentence in filter(None, (*diagnosis.sentences, diagnosis.left_out)):
@@ -537,7 +537,7 @@ def run_diagnose(call: Any) -> None:
     ("networks", "--network"),
     ("methods", "--method"),
 )
-def run_study(call: Any) -> None:
+def call_study(call: Any) -> None:
     """Draw the page."""
     if "out" not in call.keywords:
         raise InputError("name the folder of the study with -o FOLDER")
@@ -546,7 +546,7 @@ def run_study(call: Any) -> None:
 
 
 @command("status", "runner:read_status", "sliplens status runs/mine/margins")
-def run_status(call: Any) -> None:
+def call_status(call: Any) -> None:
     """Print the progress."""
     output.print_status(Path(call.keywords["out"]), call())
 
@@ -558,7 +558,7 @@ def run_status(call: Any) -> None:
     ("settings", "--set"),
     ("latency_s", "--latency"),
 )
-def run_grip(call: Any) -> None:
+def call_grip(call: Any) -> None:
     """Print what became of the episodes, and draw the page."""
     if "out" not in call.keywords:
         raise InputError("name the folder to make with -o FOLDER")
@@ -604,7 +604,7 @@ class HoldOptions(TypedDict, total=False):
     ("ceiling_n", "--ceiling"),
     ("watchdog_s", "--watchdog"),
 )
-def run_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
+def call_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
     """Print the commands."""
     from sliplens.grip.controllers import make_controller
     from sliplens.grip.gripper import open_gripper
@@ -627,9 +627,8 @@ def run_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
     profile = None if sensor is None else load_profile(sensor)
     sources = [open_grip(source, LiveOptions()) or source for source in names]
     networks = [arguments.get("network") or usual_network(source, profile) for source in sources]
-    loaded = {
-        name: load(name, device=options.get("device", "cpu")) for name in dict.fromkeys(networks) if name is not None
-    }
+    device, messages = options.get("device", "cpu"), options.get("messages", "gripper-command")
+    loaded = {name: load(name, device=device) for name in dict.fromkeys(networks) if name is not None}
     with ExitStack() as stack:
         if gripper not in GRIPPERS:
             gripper = stack.enter_context(closing(open_gripper(gripper, messages=messages, joint=options.get("joint"))))
@@ -680,13 +679,13 @@ class _Steps:
 
 
 @command("report", "report.page:write_report", "sliplens report runs/mine")
-def run_report(call: Any) -> None:
+def call_report(call: Any) -> None:
     """Print what was written."""
     output.print_written(call())
 
 
 @command("doctor", "doctor:examine_installation", "sliplens doctor")
-def run_doctor(call: Any) -> None:
+def call_doctor(call: Any) -> None:
     """Print a line for each part; exit code 2 if something that is installed does not work."""
     with reporting(Terminal()), open_stage("Trying what is installed"):
         items = call()

@@ -327,11 +327,11 @@ def print_faithfulness(faithfulness: "Faithfulness") -> None:
         say(f"  alarm: {alarm}")
 
 
-def print_status(out: Path, works: "Sequence[Status]") -> None:
+def print_status(path: Path, works: "Sequence[Status]") -> None:
     """Print the progress of each work on a result."""
     if not works:
-        whole = out.is_file() or (out / RUN_FILE).is_file()
-        say(f"{out} is complete" if whole else f"nothing in {out} is divided into parts now")
+        whole = path.is_file() or (path / RUN_FILE).is_file()
+        say(f"{path} is complete" if whole else f"nothing in {path} is divided into parts now")
     for work in works:
         frames = f"{work.frames_done:,} of {work.frames:,} frames"
         say(f"{work.title}, --on {work.on}: {work.done:,} of {work.parts:,} parts, {frames}")

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from sliplens.errors import ModelError
 from sliplens.explainers.attribution import Attribution, check_slopes, scale_to, spread
 from sliplens.explainers.contract import Comparison, Method, frozen, require_at_least_one
-from sliplens.progress import track
+from sliplens.progress import report_each
 
 
 @contextmanager
@@ -266,7 +266,7 @@ class _Cam(Method):
         maps, predictions, reference_predictions = [], [], []
         empty = reference_prediction = torch.empty(0)
         parts = torch.arange(len(comparison.images)).split(self.batch_size)
-        for part in track(parts, sizes=[len(part) for part in parts]):
+        for part in report_each(parts, sizes=[len(part) for part in parts]):
             # images and references in one pass; a reference shared by all images passes once
             shared = comparison.references[: 0 if maps else 1]
             references = comparison.references[part] if len(comparison.references) > 1 else shared

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from sliplens.errors import ImageError, InputError, ModelError
 from sliplens.explainers.attribution import Attribution, check_maps, frame_of
 from sliplens.models.engines import Engine, prepare
-from sliplens.progress import track
+from sliplens.progress import report_each
 
 Batch: TypeAlias = Shaped[Tensor, "..."]
 """Images or a reference as a caller gave them, before they are checked."""
@@ -114,7 +114,7 @@ class Comparison:
         self, relevance: Callable[[int], Float[Tensor, "height width"]]
     ) -> Float[Tensor, "batch height width"]:
         """Compute the maps of all images one after another, each from its index in the batch."""
-        return torch.stack([relevance(index) for index in track(range(len(self.images)))])
+        return torch.stack([relevance(index) for index in report_each(range(len(self.images)))])
 
     def attribution(
         self,

@@ -22,7 +22,7 @@ from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, find_marke
 from sliplens.explainers.table import RECOMMENDED_METHOD, get_explainer
 from sliplens.models import Network
 from sliplens.models.engines import expecting
-from sliplens.progress import number_of, track
+from sliplens.progress import number_of, report_each
 from sliplens.results.evaluation import ANSWER
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes, require_saliency
 from sliplens.results.study import STUDY_BUDGET
@@ -147,7 +147,7 @@ def explain_frames(
 ) -> Explanation:
     """Explain frames with several explainers; `warnings` are added to those of every method."""
     jobs, maps = list(product(explainers, chosen.batches)), {}
-    for name, rows in track(jobs, sizes=[len(rows) for _, rows in jobs]):
+    for name, rows in report_each(jobs, sizes=[len(rows) for _, rows in jobs]):
         count = len(chosen.ids) * len(explainers)
         maps.setdefault(name, []).append(explain_rows(network, chosen, explainers[name], rows, maps=count))
     return join_maps(network, chosen, maps, warnings=warnings)

@@ -15,7 +15,7 @@ from sliplens.explainers.contract import Comparison, Method, black_frames, freez
 from sliplens.explainers.folding import fold_batch_norm
 from sliplens.extras import require_packages
 from sliplens.models.backbones import HistogramRegressor
-from sliplens.progress import track
+from sliplens.progress import report_each
 
 _NODES = 4  # of a piece; the slope along the path has kinks, on which more nodes to a piece are wasted
 _ROUNDING = 1e-6  # of |f|: a gap that float32 predictions cannot resolve is no gap
@@ -297,7 +297,9 @@ class Lrp(Method):
             if isinstance(module, fx.GraphModule):
                 _name_functions(module)
         parts = comparison.images.split(self.batch_size)
-        relevance = torch.cat([_propagate(copy, part) for part in track(parts, sizes=[len(part) for part in parts])])
+        relevance = torch.cat(
+            [_propagate(copy, part) for part in report_each(parts, sizes=[len(part) for part in parts])]
+        )
         shares = (relevance.sum(dim=(1, 2, 3)) / prediction).tolist()
         return comparison.attribution(
             frame_of(relevance).sum(dim=1),

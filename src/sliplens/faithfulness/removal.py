@@ -14,7 +14,7 @@ from sliplens.errors import InputError
 from sliplens.explainers.occlusion import marker_regions, tile_regions
 from sliplens.faithfulness.fills import Fill, Painter
 from sliplens.models.engines import Engine
-from sliplens.progress import report_progress, track
+from sliplens.progress import report_each, report_progress
 from sliplens.results.explanation import require_saliency
 from sliplens.results.faithfulness import RemovalCurve
 
@@ -290,7 +290,7 @@ def marker_curves(
     areas, (_, images, markers) = np.asarray(SHARES), orders.shape
     counts = np.round(areas * markers).astype(np.int64)
     answers = np.empty((len(orders), images, len(areas)))
-    for image in track(range(images)):
+    for image in report_each(range(images)):
         rank = np.argsort(orders[:, image], axis=-1)
         back = rank[:, None] < counts[:, None]
         answer = answer_scenes(predict, partial(redraw, image), batch_size=batch_size)

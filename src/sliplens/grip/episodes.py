@@ -28,7 +28,7 @@ from sliplens.mechanics import stick_ratio
 from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
 from sliplens.plots.clip import write_clip
-from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_file, reporting, track
+from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_file, reporting
 from sliplens.recordings import Recording
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
@@ -238,7 +238,7 @@ class _Job:
         done: list[_Batch] = []
         chunks = [np.arange(first, min(first + size, total)) for first in range(0, total, size)]
         with open_stage("Gripping"):
-            for number, rows in enumerate(track(chunks, sizes=list(map(len, chunks)))):
+            for number, rows in enumerate(report_each(chunks, sizes=list(map(len, chunks)))):
                 part = None if folder is None else folder / "parts" / str(number)
                 make = partial(self.run_batch, number, self.scripts.where(rows), folder)
                 done.append(keep_part(part, _Batch, make))

@@ -17,7 +17,7 @@ from sliplens.files import find_run, shipped_names
 from sliplens.grip.plant import PlantState
 from sliplens.models import Network, make_engine
 from sliplens.models.predictions import LEVEL
-from sliplens.progress import track
+from sliplens.progress import report_each
 from sliplens.results.evaluation import ANSWER, MARGIN
 from sliplens.simulation.filming import Film, batches, prepare_film, see_markers
 from sliplens.simulation.loading import load_at_margins, load_at_states
@@ -294,7 +294,7 @@ def measure_readings(run: Network, *, fingertips: int = 96, seed: int = 0, engin
     tables: list[np.ndarray] = []
     repeats: list[np.ndarray] = []
     tip = None
-    for number in track(range(fingertips)):
+    for number in report_each(range(fingertips)):
         tip = Fingertip(seed=seed + number, day=tip.day if tip is not None and number % 2 else None)
         film = tip.film(force[drawn], held_s=np.ones(int(drawn.sum())), **states)
         frames = draw_film(film)

@@ -33,7 +33,7 @@ from sliplens.plots.audit import Fact, audit_facts, end_of_ratio, force_ratio
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name, written_whole
-from sliplens.progress import OnProgress, open_stage, reporting, track, visible
+from sliplens.progress import OnProgress, open_stage, report_each, reporting, visible
 from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo, load_dataset
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import DATASET_FILE, trial_path
@@ -303,7 +303,7 @@ def play_trial(viewed: ViewedTrial, sink: RerunSink, overlays: Overlays) -> None
     if viewed.forces is not None:
         _log_samples(sink, rerun, trial, viewed.forces)
     _log_states(sink, rerun, trial)
-    for number, frame in zip(track(range(len(trial))), viewed.read_frames(), strict=True):
+    for number, frame in zip(report_each(range(len(trial))), viewed.read_frames(), strict=True):
         time_s = float(trial.time_s[number])
         if number in readings:
             sink.send(replace(readings[number], time_s=time_s), frame)

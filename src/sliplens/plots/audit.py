@@ -42,7 +42,7 @@ from sliplens.plots.style import (
     signed,
     write_over,
 )
-from sliplens.progress import OnProgress, number_of, open_stage, reporting, track
+from sliplens.progress import OnProgress, number_of, open_stage, report_each, reporting
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.dataset import trial_path
 from sliplens.recordings.labelling import Found, FrictionEstimate, Labelling, Lag
@@ -316,7 +316,7 @@ def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None 
     drawn = 0
     folder.mkdir(parents=True, exist_ok=True)
     with reporting(on_progress), open_stage("Drawing pages"):
-        for info in track(data.trials):
+        for info in report_each(data.trials):
             path, page = trial_path(data.folder, info.trial), folder / f"{info.trial}.png"
             if not page.is_file() or page.stat().st_mtime_ns < path.stat().st_mtime_ns:
                 # without pixels but those on the page: a long trial needs little memory

@@ -18,7 +18,7 @@ from sliplens.images import absolute_difference
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.style import BLACK, SKY, VERMILLION, YELLOW, percent, written_whole
-from sliplens.progress import track
+from sliplens.progress import report_each
 from sliplens.recordings import Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
 
@@ -40,7 +40,7 @@ def write_clip(recording: Recording, path: Path, *, frames_per_s: float = 30.0) 
     factor = brightening([absolute_difference(some, recording.reference)])
     size = _draw_frame(recording, 0, factor).shape[:2]
     with _open_clip(path, size, frames_per_s) as add:
-        for index in track(clip_frames(recording.time_s, frames_per_s).tolist()):
+        for index in report_each(clip_frames(recording.time_s, frames_per_s).tolist()):
             add(_draw_frame(recording, index, factor))
 
 

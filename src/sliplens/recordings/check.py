@@ -13,7 +13,7 @@ from jaxtyping import Bool
 
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file
-from sliplens.progress import OnProgress, reporting, track
+from sliplens.progress import OnProgress, report_each, reporting
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, report_flags, trial_path
 from sliplens.recordings.journal import JOURNAL_FOLDER
 from sliplens.recordings.store import forces_path, load_recording, read_header, stream_frames
@@ -61,7 +61,7 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
     # hashes and decoding release the interpreter's lock
     with ThreadPoolExecutor(os.cpu_count()) as pool, reporting(on_progress):
         checked = pool.map(lambda info: tuple(_check_trial(folder, info)), data.trials)
-        for info, errors in zip(track(data.trials), checked, strict=True):
+        for info, errors in zip(report_each(data.trials), checked, strict=True):
             violations += [Violation(where=info.trial, what=error) for error in errors]
             with suppress(SliplensError):  # an unreadable file is among the violations
                 labellings.append((info.trial, read_header(trial_path(folder, info.trial)).labelling))

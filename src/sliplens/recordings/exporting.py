@@ -83,7 +83,7 @@ def export_mcap(
 def _export(
     write: Callable[[Dataset, Sequence[TrialInfo], Path], None],
     data: Dataset | Path | str,
-    out: Path,
+    folder: Path,
     *,
     trials: Sequence[str] | None,
     overwrite: bool,
@@ -93,11 +93,11 @@ def _export(
     chosen = tuple(data.find(trial) for trial in dict.fromkeys(trials)) if trials else data.trials
     config = {"format": write.__name__, "data_hash": data.hash, "trials": [info.trial for info in chosen]}
     with output_folder(
-        out, stage="export", config=config, overwrite=overwrite, run_file=run_file, resumable=False
+        folder, stage="export", config=config, overwrite=overwrite, run_file=run_file, resumable=False
     ) as output:
         if not output.complete:
             with open_stage("Writing frames"):
                 write(data, chosen, output.folder)
     frames = sum(info.frames for info in chosen)
-    report_file(out, f"{number_of(len(chosen), 'trial')}, {number_of(frames, 'frame')}", kept=output.complete)
-    return Export(folder=out, trials=tuple(info.trial for info in chosen), frames=frames)
+    report_file(folder, f"{number_of(len(chosen), 'trial')}, {number_of(frames, 'frame')}", kept=output.complete)
+    return Export(folder=folder, trials=tuple(info.trial for info in chosen), frames=frames)

@@ -11,7 +11,7 @@ from typing import TypeAlias, TypedDict, Unpack
 
 from sliplens.errors import InputError, RecordingError, SliplensError
 from sliplens.files import output_folder, whole_file
-from sliplens.progress import OnProgress, add_note, number_of, open_stage, reporting, track
+from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, reporting
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import (
     Dataset,
@@ -224,7 +224,7 @@ class _ImportWork(TrialWork):
     def open_all(self) -> list[LeftOut]:
         """Open all recordings; return those of a manifest or a folder that cannot be opened."""
         left_out = []
-        for number, row in enumerate(track(self.rows)):
+        for number, row in enumerate(report_each(self.rows)):
             try:
                 self._open_row(number)
             except SliplensError as error:

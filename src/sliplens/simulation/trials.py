@@ -12,7 +12,7 @@ import torch
 from sliplens.errors import InputError
 from sliplens.extras import require_device
 from sliplens.files import output_folder, scratch_folder
-from sliplens.progress import OnProgress, number_of, open_stage, report_file, reporting, track
+from sliplens.progress import OnProgress, number_of, open_stage, report_each, report_file, reporting
 from sliplens.recordings import Dataset, GroundTruth, Recording
 from sliplens.recordings.dataset import load_dataset, trial_info, trial_path, write_dataset_table
 from sliplens.recordings.store import read_header, save_recording
@@ -51,7 +51,7 @@ def simulate_trial(plan: TrialPlan, *, device: str | torch.device = "cpu") -> Re
     frames = np.empty((plan.frames, *reference.shape), dtype=np.uint8)
     contact_map = np.empty(frames.shape[:3], dtype=np.uint8)
     parts = batches(plan.frames, device=device)
-    for part in track(parts, sizes=[part.stop - part.start for part in parts]):
+    for part in report_each(parts, sizes=[part.stop - part.start for part in parts]):
         frames[part] = film.draw(part, device=device).cpu().numpy()
         contact_map[part] = film.contact_map(part)
     return Recording(
@@ -82,7 +82,7 @@ def simulate_examples(recipe: SimulationRecipe, *, device: str | torch.device = 
     wet = [plan for plan in plans if plan.condition == "wet"][:1]
     count = min(4 - len(wet), len(dry))
     chosen = [dry[index * (len(dry) - 1) // max(1, count - 1)] for index in range(count)] + wet
-    return [simulate_trial(plan, device=device) for plan in track(chosen)]
+    return [simulate_trial(plan, device=device) for plan in report_each(chosen)]
 
 
 def simulate(
@@ -138,7 +138,7 @@ def simulate(
 def simulate_dataset(folder: Path, recipe: SimulationRecipe, *, device: str | torch.device = "cpu") -> Dataset:
     """Simulate `trials/*.parquet` and, last, `dataset.json` into a folder; existing trials are kept."""
     plans, table = plan_trials(recipe), []
-    for plan in track(plans, sizes=[plan.frames for plan in plans]):
+    for plan in report_each(plans, sizes=[plan.frames for plan in plans]):
         path = trial_path(folder, plan.trial)
         if not path.is_file():
             save_recording(simulate_trial(plan, device=device), path)

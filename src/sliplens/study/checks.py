@@ -30,7 +30,7 @@ from sliplens.faithfulness.controls import (
 )
 from sliplens.intervals import paired_difference
 from sliplens.models import Network
-from sliplens.progress import OnProgress, track
+from sliplens.progress import OnProgress, report_each
 from sliplens.recordings import Dataset
 from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.results.study import (
@@ -170,7 +170,7 @@ def time_explainers(material: Material, *, longest_s: float = _LONGEST_S) -> Tim
     frames = [(material.inputs[row, None], material.references[row, None]) for row in order]
     forward = float(np.median(_seconds(frames, lambda images, _: material.trained.predict(images), longest_s)))
     methods = {}
-    for name, explainer in track(as_the_thesis_ran(material.explainers).items()):
+    for name, explainer in report_each(as_the_thesis_ran(material.explainers).items()):
 
         def explain(images: Tensor, reference: Tensor, explainer: Explainer = explainer) -> Tensor:
             return explainer(model, images, reference=reference).relevance
@@ -344,7 +344,7 @@ class Untrained(MaterialStage[UntrainedMaps]):
             maps: dict[str, list[np.ndarray]] = {}
             with suppress(ModelError):  # without layers that have a map
                 maps["weights-1"] = list(even_channels(model, inputs[frames], references[frames]).cpu().numpy())
-            for name, frame in track(list(product(material.explainers, frames))):
+            for name, frame in report_each(list(product(material.explainers, frames))):
                 record, empty = inputs[frame, None], references[frame, None]
                 records = _influence(controls[name](model, record, reference=empty))
                 maps.setdefault(name, []).append(records[0].astype(np.float32))

@@ -23,7 +23,7 @@ from sliplens.faithfulness.removal import Units, marker_units, tile_units
 from sliplens.markers import track_markers
 from sliplens.models import Network
 from sliplens.plots.style import input_name, listed
-from sliplens.progress import number_of, track
+from sliplens.progress import number_of, report_each
 from sliplens.recordings import Dataset, Recording, TrialInfo
 from sliplens.results.explanation import Explanation
 from sliplens.results.study import (
@@ -69,7 +69,7 @@ def choose_frames(
     if not 0 <= tolerance <= 1:
         raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
     infos = data.select(split=split, condition=condition)
-    measured = (_look_at(info, networks, data, tolerance=tolerance) for info in track(infos))
+    measured = (_look_at(info, networks, data, tolerance=tolerance) for info in report_each(infos))
     candidates = [record for record in measured if record is not None]
     if not candidates:
         raise RecordingError(
@@ -183,7 +183,7 @@ def show_states(choice: Choice, data: Dataset) -> States:
     infos = {info.trial: info for info in data.trials}
     # so that the table of a study without markers has its columns
     tables, untracked = [_table("", np.empty((0, 2)), np.empty((0, 2)))], []
-    for trial, chosen in track(
+    for trial, chosen in report_each(
         [(trial, list(rows)) for trial, rows in groupby(choice.frames, key=lambda at: at.trial)]
     ):
         try:

@@ -25,9 +25,9 @@ from sliplens.progress import (
     current_listener,
     number_of,
     open_stage,
+    report_each,
     report_file,
     reporting,
-    track,
 )
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import load_dataset
@@ -143,7 +143,7 @@ def _diagnose(run: Network, data: Dataset, answers: ScoredFrames, *, trials: int
 def tabulate_errors(data: Dataset, answers: ScoredFrames) -> ErrorTable:
     """Put beside each answer what may have made it wrong."""
     pieces = []
-    for (trial,), rows in track(answers.groups("trial").items()):
+    for (trial,), rows in report_each(answers.groups("trial").items()):
         info, places = data.find(trial), [np.full(len(rows), np.nan)] * 2
         recording = data.load(info)
         if recording.truth is not None:
@@ -281,7 +281,7 @@ def _spread_rows(errors: ErrorTable, trials: int) -> Int64[np.ndarray, " rows"]:
 def refilm(run: Network, frames: Sequence[StagedFrame], conditions: Sequence[str]) -> FrictionTable:
     """Film frames anew with other frictions, and predict them."""
     rows, films, last = [], [], None
-    for frame, condition in track(list(zip(frames, conditions, strict=True))):
+    for frame, condition in report_each(list(zip(frames, conditions, strict=True))):
         at, scene = frame.number, frame.scene
         if scene is not last:  # frames of a trial stand together
             values, last = scene.loading.friction_coefficient, scene

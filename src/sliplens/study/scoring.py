@@ -37,7 +37,7 @@ from sliplens.faithfulness.scoring import (
 from sliplens.files import output_folder, remove
 from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
-from sliplens.progress import OnProgress, ignore, open_stage, report_file, reporting, track
+from sliplens.progress import OnProgress, ignore, open_stage, report_each, report_file, reporting
 from sliplens.results.explanation import Explanation, load_explanation
 from sliplens.results.faithfulness import (
     DeletionScores,
@@ -208,7 +208,7 @@ def compute(stage: Stage) -> Any:
     """Compute the result of a stage in memory."""
     shards = list(stage.shards())
     find = stage.prepare()
-    records = [find(shard.item, ignore) for shard in track(shards, sizes=[shard.frames for shard in shards])]
+    records = [find(shard.item, ignore) for shard in report_each(shards, sizes=[shard.frames for shard in shards])]
     return stage.join(records)
 
 
@@ -335,7 +335,7 @@ class Deletion(Stage[DeletionScores]):
             part = {name: order[rows] for name, order in orders.items()}
             answers = {
                 name: delete_pixels(predict, inputs[rows], order, fill=self.fill, steps=self.steps)
-                for name, order in track(list(part.items()), sizes=[len(rows)] * len(part))
+                for name, order in report_each(list(part.items()), sizes=[len(rows)] * len(part))
             }
             return TrialAnswers(answers=answers)
 
@@ -397,7 +397,7 @@ class RemedialDeletion(Stage[Remedies]):
             # inserting k pixels of an order is deleting all the others
             jobs = [(name, order[rows], self._background) for name, order in orders.items()]
             jobs += [(name, order[rows][:, ::-1].copy(), "grey") for name, order in orders.items()]
-            tracked = track(jobs, sizes=[len(rows)] * len(jobs))
+            tracked = report_each(jobs, sizes=[len(rows)] * len(jobs))
             answers = [(name, delete_rows(order, fill=fill)) for name, order, fill in tracked]
             return RemedyAnswers(background=dict(answers[: len(orders)]), insertion=dict(answers[len(orders) :]))
 

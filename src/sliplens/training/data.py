@@ -22,7 +22,7 @@ from sliplens.errors import RecordingError
 from sliplens.extras import pick
 from sliplens.models.backbones import last_layer
 from sliplens.models.encodings import Encoding
-from sliplens.progress import track
+from sliplens.progress import report_each
 from sliplens.recordings import Dataset, Labels, TrialInfo
 
 
@@ -145,7 +145,7 @@ class FrameSet(TorchDataset):
     def batches(self, size: int, *, report: bool = False) -> Iterator[Tensor]:
         """Iterate over the inputs of all frames, in their order; if `report`, report each batch as done."""
         batches = torch.arange(len(self)).split(size)
-        for rows in track(batches, sizes=[len(rows) for rows in batches]) if report else batches:
+        for rows in report_each(batches, sizes=[len(rows) for rows in batches]) if report else batches:
             yield self.__getitems__(rows)[0]
 
 
@@ -223,7 +223,7 @@ def load_frames(
     total = sum(count + copies_of(count) for count in counts)
     images = _allocate((total, encoding.colours, image_size, image_size), scratch)
     labels, ratios, frictions, times, rows = [], [], [], [], []
-    for info in track(trials):
+    for info in report_each(trials):
         recording = data.load(info, truth=False)
         labelled = np.flatnonzero(recording.labelled)
         compare = partial(encoding.compare_small, reference=recording.reference, image_size=image_size)

@@ -19,7 +19,7 @@ from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get
 from sliplens.models import Network
 from sliplens.models.checkpoint import Estimate, condition_each, open_run
 from sliplens.models.sequence import require_frequent
-from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting, track
+from sliplens.progress import OnProgress, add_note, open_stage, report_each, report_file, reporting
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset, trial_path
 from sliplens.recordings.store import stream_frames
@@ -88,7 +88,7 @@ def evaluate_baselines(
     trials = {info.trial: info for info in (*plan.training, *(info for info in data.trials if info.trial in tested))}
     fields: dict[str, _Followed] = {}
     failed: dict[str, str] = {}
-    for info in track(trials.values()):
+    for info in report_each(trials.values()):
         try:
             fields[info.trial] = keep_part(folder / info.trial, _Followed, partial(_follow, data, info, plan.markers))
         except RecordingError:

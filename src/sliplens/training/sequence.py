@@ -28,7 +28,7 @@ from sliplens.models.sequence import (
     SequenceManifest,
     require_frequent,
 )
-from sliplens.progress import open_stage, track
+from sliplens.progress import open_stage, report_each
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.results.evaluation import Training
 from sliplens.training.config import TrainingConfig
@@ -155,7 +155,7 @@ def _predict_trials(
     folder.mkdir(exist_ok=True)
     outputs, engine = [], None
     with open_stage(f"Reading {name} trials ({network.manifest.input})"):
-        for info in track(trials):
+        for info in report_each(trials):
             path = folder / f"{info.sha256}.safetensors"
             if not path.is_file():
                 engine = engine or make_engine("auto", network, frames=sum(trial.frames for trial in trials))
@@ -199,7 +199,7 @@ def _fit(
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, max_lr=config.learning_rate, total_steps=steps)
     labels, best, best_mse = _labels(validation), head.state_dict(), np.inf
     centres = bin_centres(head.edges)
-    for epoch in track(range(1, config.epochs + 1)):
+    for epoch in report_each(range(1, config.epochs + 1)):
         head.train()
         order, squares, frames = rng.permutation(len(train)), 0.0, 0
         for first in range(0, len(train) // batch * batch, batch):

@@ -12,7 +12,7 @@ from jaxtyping import Int64, Shaped
 
 from sliplens.errors import RecordingError
 from sliplens.files import write_json
-from sliplens.progress import report_progress, track
+from sliplens.progress import report_each, report_progress
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo
 from sliplens.recordings.formats.lerobot import CAMERA, COMPANION
@@ -47,7 +47,7 @@ def write_lerobot(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> N
     tasks: dict[str, int] = {}
     rows, stats, paths = [], [], []
     levels, first = np.zeros((3, 256), dtype=np.int64), 0
-    for episode, info in enumerate(track(trials, sizes=[info.frames for info in trials])):
+    for episode, info in enumerate(report_each(trials, sizes=[info.frames for info in trials])):
         capture = read_stored_trial(data, info)
         task = f"touch {info.object or 'an object'} ({info.condition})"
         number = tasks.setdefault(task, len(tasks))

@@ -14,7 +14,7 @@ from sliplens.errors import RecordingError
 from sliplens.extras import require_packages
 from sliplens.files import scratch_folder
 from sliplens.images import encode_png
-from sliplens.progress import report_progress, track
+from sliplens.progress import report_each, report_progress
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.formats.stored import encode_batches, fill_labels, read_stored_trial, save_without_images
@@ -63,7 +63,7 @@ def trial_types() -> "Typestore":
 
 def write_mcap(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> None:
     """Write trials into an empty folder; see `export_mcap`."""
-    for info in track(trials, sizes=[info.frames for info in trials]):
+    for info in report_each(trials, sizes=[info.frames for info in trials]):
         with (
             (folder / f"{info.trial}.mcap").open("wb") as stream,
             closing(_Bag(stream)) as bag,
