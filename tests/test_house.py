@@ -26,17 +26,17 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 53_900,
-    "modules": 204,
-    "riddles_per_1000": 23.3,
-    "vague_docstrings": 400,
-    "most_parameters": 20,
-    "functions_with_on_progress": 112,
-    "functions_with_out": 24,
+    "lines": 47_800,
+    "modules": 183,
+    "riddles_per_1000": 0.5,
+    "vague_docstrings": 15,
+    "most_parameters": 12,
+    "functions_with_on_progress": 19,
+    "functions_with_out": 23,
     "functions_with_overwrite": 23,
-    "functions_with_device": 25,
-    "names_defined_twice": 25,
-    "dicts_across_functions": 29,
+    "functions_with_device": 21,
+    "names_defined_twice": 7,
+    "dicts_across_functions": 14,
 }
 
 

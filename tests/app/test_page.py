@@ -284,7 +284,7 @@ def test_a_gripper_answers_water_a_wet_skin_and_another_controller(browser, tmp_
         context.set_default_timeout(60_000)
         window = context.new_page()
         window.goto(page.address)
-        window.wait_for_function(f"{least} > 0 && {told}.includes('margin: no margin is read')")
+        window.wait_for_function(f"{least} > 0 && {told}.includes('margin: no margin: ')")
         light = window.evaluate(least)
         slide(window, "Pour water", "PageUp", f"{least} > {2 * light}")
         window.get_by_label("held by").click()

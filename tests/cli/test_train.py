@@ -149,7 +149,7 @@ def test_a_loss_that_diverges_leaves_the_best_network_to_use(
 
     monkeypatch.setattr(module, "margin_loss", diverge)
     line = refused(capsys, small_dataset.folder, tmp_path / "run")
-    assert "the training loss is inf in epoch 2, at step 5, for a batch of frame " in line
+    assert "the training loss is inf in epoch 2, at step 5; lower the learning rate" in line
     assert "lower the learning rate" in line
     kept = load_checkpoint(tmp_path / ".run.partial")
     assert f"the best network so far, of validation MSE {kept.manifest.metrics['validation_mse']:.4g}, is in" in line

@@ -162,7 +162,7 @@ def test_all_channels_are_measured_where_nothing_less_is_asked(network, images):
     assert told.measured == told.channels
     torch.testing.assert_close(explanation.relevance, PolyCam()(model, images[:1]).relevance)
     done, totals = zip(*seen, strict=True)
-    assert list(done) == sorted(set(done))
+    assert list(done) == sorted(done)
     assert set(totals) == {done[-1]} == {72}
 
 
@@ -182,7 +182,7 @@ def test_all_rounds_use_one_engine(network, images, monkeypatch):
 @pytest.mark.parametrize("wrong", [{"pearson_r": 1.1}, {"top_overlap": -0.1}])
 def test_a_likeness_is_a_share(wrong):
     ((name, value),) = wrong.items()
-    with pytest.raises(InputError, match=f"asks for a {name} of {value}; give a number from 0 to 1"):
+    with pytest.raises(InputError, match=f"requires a {name} of {value}; give a number from 0 to 1"):
         Likeness(**wrong)
 
 

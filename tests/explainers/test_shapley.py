@@ -145,7 +145,7 @@ def test_players_without_part_get_nothing_and_twins_the_same() -> None:
 
 
 def test_too_few_pairs_are_refused() -> None:
-    with pytest.raises(InputError, match="59 pairs of coalitions cannot tell 30 players apart; ask for 60"):
+    with pytest.raises(InputError, match="59 pairs of coalitions cannot distinguish 30 players; use at least 60"):
         shapley_values(glove, 30, pairs=59, rng=np.random.default_rng(0))
 
 

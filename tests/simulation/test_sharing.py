@@ -70,9 +70,9 @@ def test_recorded_data_are_told_by_files_and_names(recording: Recording, tmp_pat
 def test_the_command_tells_what_is_shared_and_what_a_network_knows(
     data: Dataset, capsys: pytest.CaptureFixture, difference_run: Path
 ):
-    assert main(["check", str(data.folder), str(data.folder), "--split", "train", "--other-split", "test"]) == 0
-    assert "share 0 trials, 0 days, 1 sensor (told by their seeds and frames)" in " ".join(
+    assert main(["compare", str(data.folder), str(data.folder), "--splits", "train", "test"]) == 0
+    assert "share 0 trials, 0 days, 1 sensor (compared by seeds and frames)" in " ".join(
         capsys.readouterr().out.split()
     )
-    assert main(["check", str(data.folder), str(difference_run)]) == 0
+    assert main(["compare", str(data.folder), str(difference_run)]) == 0
     assert "was trained on 0 of the" in " ".join(capsys.readouterr().out.split())

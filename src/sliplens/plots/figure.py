@@ -76,7 +76,7 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     >>> touched = np.zeros((1, 224, 224, 3), dtype=np.uint8)
     >>> touched[:, 80:120, 90:150] = 90
     >>> figure = sl.plot(sl.explain("chromatouch-difference", touched, method="grad-cam"))
-    >>> figure.axes[0].get_title().splitlines()[1]
+    >>> figure.axes[0].get_title(loc="left").splitlines()[-1]
     'orange lowers, blue raises'
     """
     # by the names of the classes: some records live on higher floors, and drawing them needs no torch

@@ -42,7 +42,8 @@ class ForceAxes:
     drift_sigma_n_s: Vector = (0.0, 0.0, 0.0)  #: Standard uncertainty of that rate.
     direction: Vector | None = None
     """Unit vector along which pressing points, where the sensor is tilted; None where that is the axis."""
-    direction_sigma: float = 0.0  #: Standard uncertainty of that direction, in radians.
+    direction_sigma: float = 0.0
+    """Standard uncertainty of that direction, in radians."""
     notes: tuple[str, ...] = ()  #: Doubts, a sentence each.
 
     def __post_init__(self) -> None:
@@ -211,7 +212,8 @@ class Corrections:
     slip_s: float | None = None  #: First gross slip, in seconds on the clock of the forces.
     tare: Vector | None = None  #: Reading of the untouched force sensor, in newtons.
     normal_sign: int | None = None  #: 1 where pressing is positive as recorded, -1 where it is negative.
-    mu: float | None = None  #: Static coefficient of friction.
+    mu: float | None = None
+    """Static coefficient of friction."""
     bad_frames: tuple[tuple[int, int], ...] = ()  #: First and last frame of each span whose frames are not valid.
 
     def __post_init__(self) -> None:

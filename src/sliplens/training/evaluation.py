@@ -293,7 +293,7 @@ def evaluate_frames(
 ) -> Evaluation:
     """Predict the frames of `load_frames`, and score the predictions for each condition and trial.
 
-    `friction` and `sequence` as `evaluate` takes them.
+    `friction` (a coefficient) and `sequence` as `evaluate` takes them.
     """
     if not len(frames):
         raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")

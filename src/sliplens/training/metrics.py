@@ -63,7 +63,7 @@ def lead_times(
     *,
     threshold: float = THRESHOLD,
 ) -> LeadTimes:
-    """Measure warnings, predictions below a threshold, on the labelled frames of some trials.
+    """Measure warnings, predictions below a threshold in margin units, on the labelled frames of some trials.
 
     A slip is the first frame of a trial with margin 0; what comes after is left out.
     """
