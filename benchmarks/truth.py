@@ -24,8 +24,7 @@ from sliplens.errors import SliplensError
 from sliplens.intervals import Difference
 from sliplens.recordings import load_dataset
 from sliplens.report.verdict import recommend
-from sliplens.results import Study
-from sliplens.results.study import StudyConfig
+from sliplens.results.study import Study, StudyConfig
 from sliplens.simulation import simulate
 from sliplens.study.run import run_study
 

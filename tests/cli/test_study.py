@@ -10,7 +10,7 @@ from sliplens.recordings import Dataset
 from sliplens.results.study import StudyConfig
 from sliplens.study.run import run_study
 
-STAGES = ("evaluate", "explain", "score", "remedies", "faithfulness", "randomisation", "map-quality", "timing")
+STAGES = ("evaluate", "explain", "score", "faithfulness", "randomisation", "map-quality", "timing")
 
 
 @pytest.fixture(scope="module")

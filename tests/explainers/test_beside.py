@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from sliplens.explainers.gradients import ExpectedGradients
 from sliplens.explainers.poly_cam import PolyCam
-from sliplens.faithfulness.controls import control_maps, smooth_maps
+from sliplens.faithfulness.controls import control_maps
 
 pytestmark = pytest.mark.usefixtures("short_guess")
 CHEAP = DEFAULTS | {
@@ -77,14 +77,3 @@ def test_controls_are_those_of_the_frame(alone, images, reference):
     assert found.keys() == expected.keys()
     for name, maps in found.items():
         np.testing.assert_allclose(maps, expected[name], rtol=1e-4, atol=1e-6, err_msg=name)
-
-
-def test_noise_is_that_of_the_frame(alone, images, reference):
-    model = Beside(alone, reference.float())
-
-    def answers(network: nn.Module, noisy: Tensor) -> np.ndarray:
-        with torch.no_grad():
-            return np.broadcast_to(network(noisy).numpy()[..., None], (len(noisy), 64, 64))
-
-    found = smooth_maps(answers, model, beside(images.float(), reference.float()), samples=2)
-    assert len(np.unique(found)) == len(images)

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError, SaliencyError
-from sliplens.faithfulness.controls import relevance_mass, relevance_rank
+from sliplens.faithfulness.controls import relevance_mass
 
 
 @pytest.fixture
@@ -14,11 +14,9 @@ def truth() -> np.ndarray:
     return inside
 
 
-def test_a_map_of_the_truth_has_all_its_mass_and_rank_inside(truth: np.ndarray):
+def test_a_map_of_the_truth_has_all_its_mass_inside(truth: np.ndarray):
     assert relevance_mass(truth.astype(float), truth) == 1
-    assert relevance_rank(truth.astype(float), truth) == 1
     assert relevance_mass((~truth).astype(float), truth) == 0
-    assert relevance_rank((~truth).astype(float), truth) == 0
 
 
 @given(st.integers(0, 1000))
@@ -27,15 +25,6 @@ def test_a_map_that_knows_nothing_has_the_share_of_the_truth(seed: int):
     truth = rng.uniform(size=(30, 30)) < 0.3
     flat = np.ones((30, 30))
     assert relevance_mass(flat, truth) == pytest.approx(truth.mean())
-    assert relevance_rank(flat, truth) == pytest.approx(truth.mean())
-
-
-def test_ties_count_by_chance(truth: np.ndarray):
-    values = truth.astype(float)
-    values[2, 3:7] = 0.5  # four of the truth at the cut, with four outside
-    values[0, :4] = 0.5
-    # eight are above the cut; of eight at the cut four are wanted, half of them inside
-    assert relevance_rank(values, truth) == pytest.approx((8 + 4 * 0.5) / 12)
 
 
 def test_what_cannot_be_localised_is_refused(truth: np.ndarray):
@@ -44,5 +33,5 @@ def test_what_cannot_be_localised_is_refused(truth: np.ndarray):
     with pytest.raises(InputError, match="without negative values"):
         relevance_mass(-np.ones((8, 10)), truth)
     with pytest.raises(SaliencyError, match=r"the map has shape \(3, 3\) but its image is 8 x 10"):
-        relevance_rank(np.ones((3, 3)), truth)
+        relevance_mass(np.ones((3, 3)), truth)
     assert np.isnan(relevance_mass(np.zeros((8, 10)), truth))

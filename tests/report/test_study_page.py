@@ -31,7 +31,7 @@ OWN_FIGURES = {
     "truth-difference",
     "truth-raw",
 }
-STAGES = ("remedies", "faithfulness", "randomisation", "map-quality", "timing", "truth")
+STAGES = ("faithfulness", "randomisation", "map-quality", "timing", "truth")
 
 
 class Reader(HTMLParser):

@@ -62,15 +62,6 @@ def test_rows_may_stand_in_any_order(study):
         np.testing.assert_array_equal(curve.least_first, before[key].least_first)
 
 
-def test_curves_that_stop_early_keep_their_length(study):
-    remedies = load_results(study).study.remedies["raw"]
-
-    stopped = remedies.curves["stop-at-half", "grad-cam"]
-    assert len(stopped) == 18
-    assert all(len(curve.pixels_removed) < 24 for curve in stopped.values())
-    assert all(len(curve.pixels_removed) == 24 for curve in remedies.curves["insertion", "grad-cam"].values())
-
-
 def test_markers_keep_their_places(study):
     states = load_results(study).study.states
 
@@ -85,18 +76,16 @@ def test_markers_keep_their_places(study):
 
 def test_null_is_unknown(study):
     change(study / "map-quality-raw" / "result.json", ("methods", "poly-cam", "resolution"), None)
-    change(study / "truth-raw" / "result.json", ("network_against_margin",), None)
+    change(study / "truth-raw" / "result.json", ("shapley_against_margin",), None)
     change(study / "truth-raw" / "result.json", ("methods", "poly-cam", "margin"), None)
     change(study / "randomisation-raw" / "result.json", ("methods", "poly-cam", "similarity", 1), None)
-    change(study / "faithfulness-raw" / "result.json", ("agreement", 0, "tau"), None)
 
     found = load_results(study).study
 
     assert found.map_quality["raw"].methods["poly-cam"].resolution is None
-    assert found.truth["raw"].network_against_margin is None
+    assert found.truth["raw"].shapley_against_margin is None
     assert found.truth["raw"].methods["poly-cam"].margin is None
     assert found.randomisation["raw"].methods["poly-cam"].similarity[1] is None
-    assert found.faithfulness["raw"].agreement[0].tau is None
 
 
 @pytest.mark.parametrize(
@@ -104,7 +93,6 @@ def test_null_is_unknown(study):
     [
         ("choice", ("trials", 0, "qualified"), "yes", r"expected `bool`, got `str` at trials\[0\].qualified"),
         ("choice", ("summary",), None, r"choice/result.json .*expected `str`, got `null` at summary"),
-        ("remedies-raw", ("variants", "insertion", "mode"), "up", r"invalid enum value 'up' at variants"),
         ("faithfulness-raw", ("scores", 0, "srg"), 0.1, r"expected `object`, got `float` at scores\[0\].srg"),
         (
             "faithfulness-raw",
@@ -112,7 +100,6 @@ def test_null_is_unknown(study):
             "x",
             r"expected `float \| null`, got `str` at scores\[0\].srg.low",
         ),
-        ("faithfulness-raw", ("scores", 0, "at"), {"all": 1.0}, r"expected `float`, got `str` at .*scores\[0\].at"),
         ("faithfulness-raw", ("scores", 0, "method"), "none", r"lacks the curves of reference / pixel / none"),
         ("score-raw", ("methods", "none"), {"mean": 0, "sd": 0, "last_step_mean": 0, "frames": 1}, r"curves of none"),
         ("randomisation-raw", ("methods", "poly-cam", "layers"), [1], r"has 1 layers but 4 similarities"),
@@ -137,7 +124,6 @@ def test_malformed_fields_are_told_in_one_sentence(study, file, place, value, me
     ("file", "message"),
     [
         ("faithfulness-raw/table.parquet", r"table.parquet does not exist"),
-        ("remedies-raw/table.parquet", r"table.parquet does not exist"),
         ("truth-raw/effects.parquet", r"effects.parquet does not exist"),
         ("truth-raw/arrays.npz", r"arrays.npz does not exist"),
         ("states/table.parquet", r"table.parquet does not exist"),

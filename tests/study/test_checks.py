@@ -1,5 +1,4 @@
 from dataclasses import replace
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from sliplens.recordings import Dataset
 from sliplens.results.explanation import MethodNotes
 from sliplens.results.faithfulness import NEW_WEIGHTS
 from sliplens.results.study import Setting, StudyConfig
-from sliplens.study.checks import Measuring, Randomising, Untrained, time_explainers
+from sliplens.study.checks import Randomising, Untrained, measure_maps, time_explainers
 from sliplens.study.choice import Material
 from sliplens.study.run import Records, judge_by_truth
 from sliplens.study.scoring import Removal
@@ -55,15 +54,8 @@ def with_image(material: Material, explainer: ShowsTheImage) -> Material:
 def test_a_map_that_ignores_the_network_is_found_out(material: Material):
     found = Randomising(material=with_image(material, ShowsTheImage())).make()
     assert found.methods["image"].similarity == pytest.approx([1.0, 1.0, 1.0])
-    assert found.methods["image"].complexity_rise == pytest.approx(0)
     assert any(alarm.startswith("image still correlates by 1.00") for alarm in found.alarms)
     assert found.methods["grad-cam"].similarity[-1] != pytest.approx(1.0)
-
-
-def test_no_clock_decides_which_figures_a_method_gets(material: Material, monkeypatch):
-    monkeypatch.setattr("time.perf_counter", count(step=60.0).__next__)  # every look at the clock is a minute later
-    found = Randomising(material=with_image(material, ShowsTheImage())).make().methods
-    assert found["grad-cam"].smooth_complexity_rise is not None
 
 
 def test_a_map_that_only_turns_its_sign_with_the_answers_is_as_similar(material: Material):
@@ -163,8 +155,8 @@ def test_a_method_that_ignores_the_weights_shows_nothing_about_the_network(mater
     assert not lead.shows_something
 
 
-def test_looks_are_those_of_the_saved_maps(material: Material, fine_dataset: Dataset):
-    quality = Measuring(material=material, data=fine_dataset).make()
+def test_looks_are_those_of_the_saved_maps(material: Material):
+    quality = measure_maps(material)
     maps = material.explained.saliency["grad-cam"].astype(np.float64)
     found = quality.methods["grad-cam"]
     assert found.total_variation == pytest.approx(np.mean([total_variation(one) for one in maps]))
@@ -174,9 +166,6 @@ def test_looks_are_those_of_the_saved_maps(material: Material, fine_dataset: Dat
     other = np.mean([total_variation(one) for one in material.explained.saliency[compared.second].astype(np.float64)])
     assert compared.first == "grad-cam"
     assert compared.gap.estimate == pytest.approx(found.total_variation - other)
-    # frames that follow each other share a reference without noise: nothing shakes, so the maps stay as they are
-    assert quality.noise_sd == 0
-    assert found.noise_stability == pytest.approx(1.0, abs=1e-4)
 
 
 def test_the_time_without_the_forward_pass_is_shorter_by_that_pass(material: Material):

@@ -8,13 +8,9 @@ import torch
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError
 from sliplens.faithfulness.scoring import (
-    EQUAL_AREAS,
-    compare_fills,
     influences,
-    judge_curves,
     ranking_alarms,
 )
-from sliplens.intervals import paired_difference
 from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import Faithfulness, RemovalCurve
 from sliplens.results.study import Setting
@@ -71,8 +67,6 @@ def test_every_method_and_control_is_scored_under_every_setting(material: Materi
     assert {score.key for score in scored.scores} == set(scored.curves) == keys
     assert {score.method for score in scored.scores if not score.control} == set(material.explainers)
     assert (scored.frames, scored.trials, scored.random_orders) == (6, 2, 2)
-    assert scored.areas == STUDY_AREAS
-    assert set(scored.scores[0].at) == set(EQUAL_AREAS)
 
 
 def test_scores_are_the_areas_under_the_stored_curves(scored: Faithfulness, tmp_path: Path):
@@ -144,39 +138,6 @@ def test_curves_found_in_another_way_are_kept_over_an_interruption(material: Mat
     assert by_fill == pytest.approx({"true": 0.075, "other": 0.075})
 
 
-def test_a_method_is_better_only_when_the_interval_leaves_zero_out():
-    rng = np.random.default_rng(0)
-    level = rng.uniform(0.3, 0.5, 8)
-    nothing = np.zeros((8, 3))
-    noisy = RemovalCurve(
-        areas=AREAS, most_first=level[:, None] * np.array([0.0, 1.0, 1.0]), least_first=nothing, random=nothing
-    )
-    found = {PIXELS: {"poly-cam": noisy, "grad-cam": straight(0.1, 0.0), "occlusion": noisy, "edges": straight(0, 0)}}
-    scores, comparisons = judge_curves(found, clusters=np.stack([np.ones(8), np.arange(8)]), seed=0)
-    by_pair = {(one.first, one.second): one.gap for one in comparisons}
-    assert by_pair["poly-cam", "grad-cam"].sure
-    assert by_pair["poly-cam", "grad-cam"].estimate == pytest.approx(0.75 * (level.mean() - 0.1))
-    assert not by_pair["poly-cam", "occlusion"].sure
-    assert all("edges" not in pair for pair in by_pair)
-    leads = {score.method: score.lead_over_controls for score in scores}
-    assert leads["edges"] is None
-    assert leads["poly-cam"] is not None
-    assert leads["poly-cam"].shows_something
-    # a control without any gain is no more than chance
-    assert leads["grad-cam"] is not None
-    assert leads["grad-cam"].gap.estimate == pytest.approx(0.075)
-
-
-def test_intervals_resample_trials_not_frames():
-    values = np.array([0.1, 0.1, 0.9, 0.9])
-    rng = np.random.default_rng(1)
-    one = paired_difference(values, np.zeros(4), clusters=[np.array(["a", "a", "b", "b"])], rng=rng)
-    # t of one degree of freedom is tan: 12.7 standard errors of two means that lie 0.4 from theirs
-    half = 0.4 * np.tan(0.475 * np.pi)
-    assert (one.low, one.high, one.units) == (pytest.approx(0.5 - half), pytest.approx(0.5 + half), 2)
-    assert not one.sure
-
-
 def test_fills_that_rank_the_methods_backwards_are_named():
     methods = {"poly-cam": 0.3, "grad-cam": 0.2, "occlusion": 0.1}
     other = Setting(fill="blur", unit="pixel")
@@ -184,9 +145,6 @@ def test_fills_that_rank_the_methods_backwards_are_named():
         PIXELS: {name: straight(level, 0) for name, level in methods.items()},
         other: {name: straight(0.4 - level, 0) for name, level in methods.items()},
     }
-    (agreement,) = compare_fills(found)
-    assert (agreement.unit, agreement.first, agreement.second) == ("pixel", "grey", "blur")
-    assert agreement.tau == pytest.approx(-1)
     assert any("rank the methods differently" in alarm for alarm in ranking_alarms(found))
     same = {PIXELS: found[PIXELS], other: found[PIXELS]}
     assert not any("rank the methods differently" in alarm for alarm in ranking_alarms(same))

@@ -19,8 +19,7 @@ from sliplens.faithfulness.removal import SHARES, unit_means
 from sliplens.files import output_folder
 from sliplens.models import Manifest, Network
 from sliplens.recordings import Dataset, load_dataset
-from sliplens.results import ExplainedFrame, Explanation
-from sliplens.results.explanation import MethodNotes
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.results.study import Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
 from sliplens.simulation.intervention import draw_with_markers_back, marker_readings, visible_markers
@@ -231,10 +230,9 @@ def test_the_oracle_is_right_and_chance_knows_nothing(judged, explained):
     # exact for a linear network, but for rounding to grey levels and for what of a marker lies beyond its rim
     assert methods["attribution"].network.estimate > 0.9
     assert methods["attribution"].shapley.estimate > 0.9
-    for measure in ("mass", "rank"):
-        # of 12,544 pixels a frame: 2 % is four deviations of a share; where nothing slips, nothing is to be found
-        for area in ("markers", "edges", "slip_annulus"):
-            assert getattr(methods["random"], measure)[area] == pytest.approx(judged.areas[area], abs=0.02)
+    # of 12,544 pixels a frame: 2 % is four deviations of a share; where nothing slips, nothing is to be found
+    for area in ("markers", "edges", "slip_annulus"):
+        assert methods["random"].mass[area] == pytest.approx(judged.areas[area], abs=0.02)
     # the effects on the reading, as the oracle ranks them: what the network does against what it should
     assert methods["oracle"].margin.estimate == pytest.approx(judged.shapley_against_margin.estimate)
     assert methods["oracle"].network.units == 1
@@ -288,37 +286,6 @@ def test_supporting_evidence_alone_ties_what_opposes(rng):
     assert rank_correlation(-values, values) == pytest.approx(-1)
 
 
-def test_by_size_maps_are_ranked_by_size(two_signed, data):
-    trained, explained, truth = two_signed
-    frames = stage_frames(trained, explained, data)
-    places, redraw = [find_places(frame, image_size=SIZE) for frame in frames], redrawing(trained, frames)
-    inputs = network_inputs(trained, explained)
-    found = []
-    for index, frame in enumerate(explained.frames):
-        values = np.array([row["shapley"] for row in rows_of(truth, frame.id)])
-        # of an amplitude image the untouched one is black
-        changed = unit_means(inputs[index].mean(dim=0).double().numpy(), places[index].units)[:-1]
-        own = []
-        for ranked, along in ((explained.towards[index] * values, True), (np.abs(values), False), (changed, False)):
-            areas = []
-            for least in (False, True):
-                order = np.argsort(ranked if least else -ranked)
-                back = np.zeros((len(SHARES), len(values)), dtype=bool)
-                for step, share in enumerate(SHARES):
-                    back[step, order[: round(share * len(values))]] = True
-                answers = trained.predict(redraw(index, back)).double().numpy()
-                lost = explained.towards[index] * (answers[0] - answers)
-                areas.append(np.trapezoid(lost if along else np.abs(lost), SHARES))
-            own.append(areas[0] - areas[1])
-        found.append(own)
-    (test,) = truth.meta
-    expected = np.mean(found, axis=0)
-    assert (test.oracle, test.by_size.oracle, test.by_size.changed) == pytest.approx(expected, abs=1e-6)
-    # nothing is worth more along the answer's change than what knows the signs
-    assert test.gap.estimate > 0
-    assert test.oracle > test.changed
-
-
 def test_markers_areas_and_rims_are_where_they_are(trained, explained, data):
     frame = stage_frames(trained, explained, data)[1]
     places = find_places(frame, image_size=SIZE)
@@ -337,35 +304,30 @@ def test_the_meta_test_tells_fills_apart(judged):
     meta = {test.fill: test for test in judged.meta}
     assert set(meta) == {"reference", "grey", "true"}
     for test in meta.values():
-        for one in (test, test.by_size):
-            assert one.gap is not None
-            assert one.gap.estimate == pytest.approx(one.oracle - one.degraded)
-            # of a single trial nothing is sure
-            assert (one.gap.low, one.holds) == (None, False)
+        assert test.gap is not None
+        assert test.gap.estimate == pytest.approx(test.oracle - test.degraded)
+        # of a single trial nothing is sure
+        assert (test.gap.low, test.holds) == (None, False)
     # each marker of this network counts for itself and all one way: the oracle's order is the best there is
     assert meta["true"].gap.estimate > 0
     assert meta["true"].oracle >= meta["true"].changed
-    # and what is put back moves the answer towards the target only, so that the sign tells nothing more
-    assert meta["true"].by_size.oracle == pytest.approx(meta["true"].oracle, abs=1e-6)
 
 
 @pytest.mark.parametrize(("trials", "holds"), [(1, False), (4, False), (5, True)])
 def test_a_gain_is_put_to_the_test_by_several_trials_or_not_at_all(trials, holds, rng):
     # frames of one trial, each well ahead of the map that is half wrong
-    gains = np.array([[0.5, 0.3, 0.1], [0.4, 0.3, 0.2]])
+    gains = np.array([0.5, 0.3, 0.1])
     none = np.zeros(2)
     effects = [
         FrameEffects(shapley=none, shapley_error=none, network=none, margin=none, shuffled=none,
-                     gains={"true": gains + 0.01 * rng.normal(size=(1, 3))})
+                     gains={"true": gains + 0.01 * rng.normal(size=3)})
         for _ in range(3 * trials)
     ]  # fmt: skip
     clusters = np.stack([np.zeros(3 * trials), np.arange(3 * trials) % trials])
     (test,) = meta_test(effects, partial(mean_of_defined, clusters=clusters, seed=0))
     assert test.gap is not None
-    assert test.by_size.gap is not None
     assert test.gap.estimate == pytest.approx(0.2, abs=0.03)
-    assert test.by_size.gap.estimate == pytest.approx(0.1, abs=0.03)
-    assert (test.holds, test.by_size.holds) == (holds, holds)
+    assert test.holds == holds
 
 
 def test_an_interrupted_judgement_goes_on_after_the_last_frame(

@@ -1,9 +1,9 @@
-"""Control maps that use nothing the network learned, randomised networks, and measures of how maps look."""
+"""Control maps that use nothing the network learned, networks with new weights, and measures of how maps look."""
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -79,32 +79,13 @@ def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "
 
     Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance mass accuracy.
     """
-    _require(saliency, truth)
+    require_saliency(saliency, truth.shape, where="the map")
+    if not truth.any():
+        raise InputError("the truth is nowhere in this frame; choose a frame in contact")
     if saliency.min() < 0:
         raise InputError("relevance mass needs a map without negative values; take its positive part or its size")
     total = float(saliency.sum())
     return float(saliency[truth].sum()) / total if total > 0 else float("nan")
-
-
-def relevance_rank(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
-    """Share of the K highest pixels that lie inside the truth, which has K pixels; ties count by chance.
-
-    Arras, Osman and Samek, *CLEVR-XAI* (2022): relevance rank accuracy.
-    """
-    _require(saliency, truth)
-    size = int(truth.sum())
-    values, inside = saliency.ravel(), truth.ravel()
-    cut = np.partition(values, -size)[-size]
-    above, level = values > cut, values == cut
-    # of the pixels at the cut, as many as are still wanted: on average their share inside
-    wanted = size - int(above.sum())
-    return float((inside[above].sum() + wanted * inside[level].mean()) / size)
-
-
-def _require(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> None:
-    require_saliency(saliency, truth.shape, where="the map")
-    if not truth.any():
-        raise InputError("the truth is nowhere in this frame; choose a frame in contact")
 
 
 Images = Float[Tensor, "images colours height width"]
@@ -114,8 +95,6 @@ _QUARTER_GREY_LEVEL = 0.001
 """Added to what is divided by: where nothing changed there is nothing to compare."""
 _SEEDS_APART = 1000
 """Seeds that each network has for its layers, of which none has so many: those of no other network."""
-_NOISE_SD = 0.02
-"""Of the noise over which maps are averaged, in shares of the range of an input."""
 _BATCH_NORMS = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d, nn.SyncBatchNorm)
 
 
@@ -247,65 +226,3 @@ def _settle(model: nn.Module, changed: list[nn.Module], images: Tensor) -> None:
     for norm, momentum in zip(norms, momenta, strict=True):
         norm.momentum = momentum
         norm.eval()
-
-
-@dataclass(frozen=True, kw_only=True)
-class RandomisationScores:
-    """Change of the maps of one method as the weights of the network are drawn anew."""
-
-    layers: tuple[int, ...]
-    """Layers with new weights, by stage."""
-    similarity: Float[np.ndarray, "stages images"]
-    """Pearson's correlation with the maps of the trained network; if it does not fall towards 0, the maps do not
-    depend on the network."""
-    complexity_rise: Float[np.ndarray, " images"]
-    """Rise of the entropy of the map's histogram from the trained to the wholly random network, over that of the
-    trained one. A faithful map gets more complex."""
-
-
-def randomisation_scores(
-    explain: Callable[[nn.Module, Tensor], Maps],
-    model: nn.Module,
-    images: Images,
-    *,
-    before: Maps,
-    seed: int,
-    stages: int = 5,
-) -> RandomisationScores:
-    """Explain a network whose weights are drawn anew from the output on, and compare with the maps of the trained one.
-
-    Adebayo et al. (2018); Hedstroem et al., *Sanity Checks Revisited* (2024): eMPRT, the rise of complexity, and its
-    histogram entropy.
-    """
-    similarity, layers, after = [], [], before
-    for count, network in cascade(model, seed=seed, stages=stages, images=images):
-        after = explain(network, images)
-        similarity.append(stability(before, after))
-        layers.append(count)
-    first, last = (np.array([histogram_entropy(values) for values in maps]) for maps in (before, after))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rise = (last - first) / first
-    return RandomisationScores(layers=tuple(layers), similarity=np.stack(similarity), complexity_rise=rise)
-
-
-def histogram_entropy(values: Float[np.ndarray, "height width"]) -> float:
-    """Entropy, in nats, of a map's values in 100 bins of its range: 0 for a constant map, at most log 100."""
-    counts = np.histogram(values, bins=100)[0]
-    share = counts[counts > 0] / values.size
-    return float(-(share * np.log(share)).sum()) if np.ptp(values) > 0 else 0.0
-
-
-def smooth_maps(
-    explain: Callable[[nn.Module, Tensor], Maps], model: nn.Module, images: Images, *, samples: int = 16, seed: int = 0
-) -> Maps:
-    """Mean of the maps of several noisy copies of each image: so that randomisation compares signal with signal.
-
-    Hedstroem et al. (2024): sMPRT.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    total = np.zeros((len(images), *images.shape[-2:]))
-    for _ in range(samples):
-        noise = _NOISE_SD * torch.randn(images.shape, generator=generator).to(images)
-        noise[:, 3:] = 0  # the frame's alone
-        total += explain(model, (images + noise).clamp(0, 1))
-    return total / samples

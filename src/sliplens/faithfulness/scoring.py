@@ -1,13 +1,11 @@
 """Scores of explanations: removal under several fills, the deletion score of the thesis, and alarms."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import combinations
 
 import numpy as np
-import torch
-from jaxtyping import Float, Float64, Int, Shaped, UInt8
+from jaxtyping import Float, Float64, Int, UInt8
 from scipy.stats import kendalltau
 from torch import Tensor
 
@@ -17,21 +15,19 @@ from sliplens.explainers.explain import join_maps, network_inputs, network_refer
 from sliplens.explainers.frames import frames_from_arrays
 from sliplens.faithfulness.controls import control_maps, lead_over_controls
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import Predict, Units, answer_whole, removal_curves, score_maps
+from sliplens.faithfulness.removal import Predict, removal_curves
 from sliplens.intervals import mean_interval, paired_difference
 from sliplens.models import Network
 from sliplens.models.engines import Engine, prepare
-from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes, require_saliency
+from sliplens.results.explanation import Explanation, MethodNotes, require_saliency
 from sliplens.results.faithfulness import (
     CHANCE,
-    Agreement,
-    Comparison,
-    Deletion,
     DeletionScores,
     DeletionTable,
     Faithfulness,
     MethodScore,
     RemovalCurve,
+    RemovalGap,
     RemovalScore,
     RemovalTable,
     is_control,
@@ -108,57 +104,8 @@ class SettingCurves:
     """Predictions where all of the frame is removed; NaN where the setting has no fill."""
 
 
-def stack_curves(curves: Mapping[str, RemovalCurve]) -> dict[str, Float64[np.ndarray, "3 frames areas"]]:
-    """Stack the curves of each method: most influential first, least first, random."""
-    return {name: np.stack([curve.most_first, curve.least_first, curve.random]) for name, curve in curves.items()}
-
-
-def curves_of_frames(
-    predict: Predict,
-    network: Network,
-    explanation: Explanation,
-    maps: Mapping[str, Maps],
-    units: Sequence[Units],
-    *,
-    fill: str,
-    areas: Sequence[float],
-    random_orders: int,
-    seed: int,
-) -> SettingCurves:
-    """Remove parts of explained frames in the order of every map, and in random orders."""
-    inputs, references = network_inputs(network, explanation), network_references(network, explanation)
-    paint = get_fill(fill)(inputs, references, seed)
-    gone = torch.ones((len(inputs), *inputs.shape[-2:]), dtype=torch.bool, device=inputs.device)
-    batches = torch.arange(len(inputs), device=inputs.device).split(16)
-    blank = answer_whole(predict, torch.cat([paint(rows, gone[rows]) for rows in batches]))
-    curves = score_maps(
-        predict,
-        inputs,
-        maps,
-        units,
-        fill=get_fill(fill),
-        references=references,
-        towards=explanation.towards,
-        # the same random orders under every fill
-        rng=np.random.default_rng(seed),
-        random_orders=random_orders,
-        areas=areas,
-        seed=seed,
-    )
-    return SettingCurves(
-        areas=np.asarray(areas, dtype=np.float64),
-        curves=stack_curves(curves),
-        whole=answer_whole(predict, inputs),
-        blank=blank,
-    )
-
-
 def score_curves(
-    explanation: Explanation,
-    curves: Mapping[Setting, SettingCurves],
-    *,
-    random_orders: int,
-    seed: int,
+    explanation: Explanation, curves: Mapping[Setting, SettingCurves], *, random_orders: int, seed: int
 ) -> Faithfulness:
     """Make the scores of the curves of all frames, by setting, with intervals over days and trials."""
     by_method = {
@@ -168,22 +115,56 @@ def score_curves(
         }
         for setting, part in curves.items()
     }
+    rng, clusters, frames = np.random.default_rng(seed), explanation.clusters, explanation.frames
+    scores, comparisons, tables = [], [], []
+    for setting, of_setting in by_method.items():
+        gains = {name: curve.symmetric_gain for name, curve in of_setting.items()}
+        controls = {name: gain for name, gain in gains.items() if is_control(name)}
+        methods = [name for name in gains if name not in controls]
+        for name, gain in gains.items():
+            score = RemovalScore(
+                fill=setting.fill,
+                unit=setting.unit,
+                method=name,
+                control=name in controls,
+                srg=mean_interval(gain, clusters=clusters, rng=rng),
+                lead_over_controls=None
+                if name in controls
+                else lead_over_controls(gain, controls, clusters=clusters, rng=rng),
+            )
+            scores.append(score)
+        for first, second in combinations(methods, 2):
+            gap = paired_difference(gains[first], gains[second], clusters=clusters, rng=rng)
+            comparisons.append(RemovalGap(fill=setting.fill, unit=setting.unit, first=first, second=second, gap=gap))
+        for name, curve in of_setting.items():
+            rows, steps = curve.most_first.size, len(curve.areas)
+            labels = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
+            tables.append(
+                RemovalTable(
+                    fill=np.repeat(setting.fill, rows),
+                    unit=np.repeat(setting.unit, rows),
+                    method=np.repeat(name, rows),
+                    frame_id=np.repeat([frame.id for frame in frames], steps),
+                    day=np.repeat([frame.day for frame in frames], steps),
+                    trial=np.repeat([frame.trial for frame in frames], steps),
+                    safety_margin=np.repeat(labels, steps),
+                    area=np.tile(curve.areas, len(frames)),
+                    most_first=curve.most_first.ravel(),
+                    least_first=curve.least_first.ravel(),
+                    random=curve.random.ravel(),
+                )
+            )
     whole = next(iter(curves.values())).whole
-    scores, comparisons = judge_curves(by_method, clusters=explanation.clusters, seed=seed)
-    change = np.array([frame.prediction - frame.reference_prediction for frame in explanation.frames])
+    change = np.array([frame.prediction - frame.reference_prediction for frame in frames])
     blank = {setting.fill: part.blank for setting, part in curves.items() if np.isfinite(part.blank).all()}
     return Faithfulness(
         input=explanation.input,
         source=explanation.source,
-        frames=len(explanation.frames),
+        frames=len(frames),
         trials=len(explanation.trials),
         random_orders=random_orders,
-        fills=tuple(dict.fromkeys(setting.fill for setting in curves)),
-        units=tuple(dict.fromkeys(setting.unit for setting in curves)),
-        areas=tuple(next(iter(curves.values())).areas.tolist()),
-        scores=scores,
-        comparisons=comparisons,
-        agreement=compare_fills(by_method),
+        scores=tuple(scores),
+        comparisons=tuple(comparisons),
         alarms=(
             *little_to_explain(change),
             *saturated(whole),
@@ -191,105 +172,8 @@ def score_curves(
             *(alarm for fill, gone in blank.items() for alarm in fill_decides(whole, gone, fill=fill)),
             *ranking_alarms(by_method),
         ),
-        table=_table(by_method, explanation),
+        table=RemovalTable.joined(tables),
     )
-
-
-EQUAL_AREAS = (0.01, 0.02, 0.05, 0.1, 0.2)
-"""Shares of the image at which methods are compared."""
-
-
-def judge_curves(
-    curves: Mapping[Setting, Mapping[str, RemovalCurve]], *, clusters: Shaped[np.ndarray, "2 frames"], seed: int
-) -> tuple[tuple[RemovalScore, ...], tuple[Comparison, ...]]:
-    """Score methods and controls with intervals over days and trials, and compare the methods with each other."""
-    rng = np.random.default_rng(seed)
-    scores, comparisons = [], []
-    for setting, by_method in curves.items():
-        gains = {name: curve.symmetric_gain for name, curve in by_method.items()}
-        controls = {name: gain for name, gain in gains.items() if is_control(name)}
-        for name, curve in by_method.items():
-            mean = partial(mean_interval, clusters=clusters, rng=rng)
-            area = partial(np.trapezoid, x=curve.areas, axis=-1)
-            steps = {share: np.flatnonzero(np.isclose(curve.areas, share)) for share in EQUAL_AREAS}
-            score = RemovalScore(
-                fill=setting.fill,
-                unit=setting.unit,
-                method=name,
-                control=is_control(name),
-                srg=mean(gains[name]),
-                gain_over_random=mean(curve.gain_over_random),
-                lead_over_controls=None
-                if is_control(name)
-                else lead_over_controls(gains[name], controls, clusters=clusters, rng=rng),
-                most_first=float(area(curve.most_first).mean()),
-                least_first=float(area(curve.least_first).mean()),
-                random=float(area(curve.random).mean()),
-                at={share: float(curve.most_first[:, at[0]].mean()) for share, at in steps.items() if len(at)},
-            )
-            scores.append(score)
-        for first, second in combinations([name for name in by_method if not is_control(name)], 2):
-            gap = paired_difference(gains[first], gains[second], clusters=clusters, rng=rng)
-            comparisons.append(Comparison(fill=setting.fill, unit=setting.unit, first=first, second=second, gap=gap))
-    return tuple(scores), tuple(comparisons)
-
-
-def compare_fills(curves: Mapping[Setting, Mapping[str, RemovalCurve]]) -> tuple[Agreement, ...]:
-    """Compute how far the rankings of the methods agree between fills of the same unit."""
-    agreement = []
-    for first, second in combinations(curves, 2):
-        if first.unit != second.unit:
-            continue
-        names = [name for name in curves[first] if not is_control(name)]
-        ranks = [[float(curves[setting][name].symmetric_gain.mean()) for name in names] for setting in (first, second)]
-        tau = float(np.asarray(kendalltau(*ranks))[0]) if len(names) > 1 else float("nan")
-        defined = tau if np.isfinite(tau) else None
-        agreement.append(Agreement(unit=first.unit, first=first.fill, second=second.fill, tau=defined))
-    return tuple(agreement)
-
-
-def ranking_alarms(curves: Mapping[Setting, Mapping[str, RemovalCurve]]) -> list[str]:
-    """Warn where a control wins, and of fills that rank the methods differently."""
-    by_fill: dict[str, dict[str, float]] = {}
-    alarms = []
-    for setting, of_setting in curves.items():
-        gains = {name: float(curve.symmetric_gain.mean()) for name, curve in of_setting.items()}
-        methods = {name: gain for name, gain in gains.items() if not is_control(name)}
-        best = max(gains.keys() - methods.keys(), key=lambda name: gains[name], default=None)
-        where = f"under {setting.fill}, {setting.unit} by {setting.unit}"
-        for name, gain in methods.items():
-            if gain <= 0:
-                alarms.append(f"{where}: {name} does not beat a random order: its symmetric gain is {gain:.3f}")
-            elif best is not None and gain <= gains[best]:
-                alarms.append(f"{where}: {name} gains {gain:.3f}, no more than the control {best} ({gains[best]:.3f})")
-        if setting.unit == "pixel":
-            by_fill[setting.fill] = methods
-    return [*rankings_disagree(by_fill), *alarms]
-
-
-def _table(curves: Mapping[Setting, Mapping[str, RemovalCurve]], explanation: Explanation) -> RemovalTable:
-    frames, tables = explanation.frames, []
-    for setting, by_method in curves.items():
-        for name, curve in by_method.items():
-            count, steps = curve.most_first.shape
-            if count != len(frames):
-                raise InputError(f"{count} curves of {name} for {len(frames)} frames; make the study again")
-            labels = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
-            table = RemovalTable(
-                fill=np.repeat(setting.fill, count * steps),
-                unit=np.repeat(setting.unit, count * steps),
-                method=np.repeat(name, count * steps),
-                frame_id=np.repeat([frame.id for frame in frames], steps),
-                day=np.repeat([frame.day for frame in frames], steps),
-                trial=np.repeat([frame.trial for frame in frames], steps),
-                safety_margin=np.repeat(labels, steps),
-                area=np.tile(curve.areas, count),
-                most_first=curve.most_first.ravel(),
-                least_first=curve.least_first.ravel(),
-                random=curve.random.ravel(),
-            )
-            tables.append(table)
-    return RemovalTable.joined(tables)
 
 
 def deletion_score(
@@ -324,9 +208,13 @@ def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarra
     return np.argsort(saliency.ravel(), kind="stable")[::-1].copy()
 
 
-def random_order(shape: tuple[int, int], *, rng: np.random.Generator) -> Int[np.ndarray, " pixels"]:
-    """Return flat pixel indices in random order: the control that every explanation has to beat."""
-    return rng.permutation(shape[0] * shape[1])
+def deletion_orders(explanation: Explanation, *, seed: int) -> dict[str, Int[np.ndarray, "frames pixels"]]:
+    """Compute the order of the pixels of each frame by method, most salient first, and a random one."""
+    rng, pixels = np.random.default_rng(seed), explanation.image_size**2
+    orders = {
+        name: np.stack([deletion_order(values) for values in maps]) for name, maps in explanation.saliency.items()
+    }
+    return orders | {CHANCE: np.stack([rng.permutation(pixels) for _ in explanation.frames])}
 
 
 def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[np.ndarray, " steps"]:
@@ -348,8 +236,6 @@ def delete_pixels(
     *,
     fill: str,
     steps: int | None = None,
-    references: Float[Tensor, "images colours height width"] | None = None,
-    seed: int = 0,
     batch_size: int = 128,
 ) -> Float64[np.ndarray, "images answers"]:
     """Predict whole images, and then after each step while pixels are removed in an order (`deletion_order`).
@@ -367,117 +253,67 @@ def delete_pixels(
     array([[0.5 , 0.25, 0.  , 0.  , 0.  ]])
     """
     removed = deletion_steps((images.shape[-2], images.shape[-1]), steps=steps)
-    curves = removal_curves(
-        predict,
-        images,
-        orders[None],
-        fill=get_fill(fill),
-        references=references,
-        areas=[0.0, *removed / removed[-1]],
-        seed=seed,
-        batch_size=batch_size,
-    )
-    return curves.answers[0]
-
-
-def deletion_orders(explanation: Explanation, *, seed: int) -> dict[str, Int[np.ndarray, "frames pixels"]]:
-    """Compute the order of the pixels of each frame by method, most salient first, and a random one."""
-    rng, shape = np.random.default_rng(seed), (explanation.image_size, explanation.image_size)
-    orders = {
-        name: np.stack([deletion_order(values) for values in maps]) for name, maps in explanation.saliency.items()
-    }
-    return orders | {CHANCE: np.stack([random_order(shape, rng=rng) for _ in explanation.frames])}
+    areas = [0.0, *removed / removed[-1]]
+    fills = get_fill(fill)
+    return removal_curves(predict, images, orders[None], fill=fills, areas=areas, batch_size=batch_size).answers[0]
 
 
 def score_deletion(
     explanation: Explanation, answers: Mapping[str, Float64[np.ndarray, "frames answers"]], *, fill: str
 ) -> DeletionScores:
     """Make the thesis's deletion scores of the predictions of all frames by method (`delete_pixels`)."""
-    shape = (explanation.image_size, explanation.image_size)
-    chance = answers[CHANCE]
-    removed = deletion_steps(shape, steps=chance.shape[1] - 1)
-    tables = {name: deletion_tables(name, removed, values, explanation) for name, values in answers.items()}
+    frames, chance = explanation.frames, answers[CHANCE]
+    removed = deletion_steps((explanation.image_size, explanation.image_size), steps=chance.shape[1] - 1)
+    scores = {name: deletion_score(values[:, :1], values[:, 1:]) for name, values in answers.items()}
+    steps, rows = len(removed), len(frames) * len(removed)
+    tables = [
+        DeletionTable(
+            method=np.repeat(name, rows),
+            frame_id=np.repeat([frame.id for frame in frames], steps),
+            day=np.repeat([frame.day for frame in frames], steps),
+            trial=np.repeat([frame.trial for frame in frames], steps),
+            step=np.tile(np.arange(steps), len(frames)),
+            pixels_removed=np.tile(removed, len(frames)),
+            prediction=answers[name][:, 1:].ravel(),
+            score=values.ravel(),
+        )
+        for name, values in scores.items()
+    ]
     return DeletionScores(
         input=explanation.input,
         source=explanation.source,
         fill=fill,
-        steps=len(removed),
+        steps=steps,
         pixels_per_step=int(removed[0]),
-        methods={name: score_tables(curves) for name, curves in tables.items()},
+        methods={
+            name: MethodScore(
+                mean=float(values.mean(axis=1).mean()),
+                sd=float(values.mean(axis=1).std()),
+                last_step_mean=float(values[:, -1].mean()),
+                frames=len(frames),
+            )
+            for name, values in scores.items()
+        },
         alarms=(
             *flat_maps(explanation.saliency),
             # the fill decides where the filled image is predicted like the whole one
             *fill_decides(chance[:, 0], chance[:, -1], fill=fill),
             *saturated(chance[:, 0]),
-            *deletion_alarms(tables),
+            *deletion_alarms(scores),
         ),
-        table=DeletionTable.joined([curve for curves in tables.values() for curve in curves]),
+        table=DeletionTable.joined(tables),
     )
 
 
-def deletion_table(
-    method: str, frame: ExplainedFrame, removed: np.ndarray, answers: np.ndarray, base: float
-) -> DeletionTable:
-    """Make the rows of one frame and method."""
-    rows = len(answers)
-    return DeletionTable(
-        method=np.repeat(method, rows),
-        frame_id=np.repeat(frame.id, rows),
-        day=np.repeat(frame.day, rows),
-        trial=np.repeat(frame.trial, rows),
-        step=np.arange(rows),
-        pixels_removed=removed,
-        prediction=answers,
-        score=deletion_score(np.full(rows, base), answers),
-    )
-
-
-def deletion_tables(
-    method: str,
-    removed: Int[np.ndarray, " steps"],
-    answers: Float64[np.ndarray, "frames answers"],
-    explanation: Explanation,
-) -> list[DeletionTable]:
-    """Make the rows of a method, a table a frame."""
-    rows = zip(explanation.frames, answers, strict=True)
-    return [deletion_table(method, frame, removed, values[1:], values[0]) for frame, values in rows]
-
-
-def score_tables(curves: Sequence[DeletionTable]) -> MethodScore:
-    """Compute the score of a method from the rows of each frame."""
-    auc, last = np.array([(curve.score.mean(), curve.score[-1]) for curve in curves]).T
-    return MethodScore(
-        mean=float(auc.mean()), sd=float(auc.std()), last_step_mean=float(last.mean()), frames=len(curves)
-    )
-
-
-def deletion_alarms(curves: Mapping[str, Sequence[DeletionTable]]) -> Iterator[str]:
+def deletion_alarms(scores: Mapping[str, Float64[np.ndarray, "frames steps"]]) -> Iterator[str]:
     """Warn where the score does not measure the map: one that does not beat a random order shows nothing."""
-    chance = float(np.mean([curve.score.mean() for curve in curves[CHANCE]]))
-    for name, tables in curves.items():
-        if name == CHANCE:
-            continue
-        means, last = (
-            np.array(values) for values in zip(*((c.score.mean(), c.score[-1]) for c in tables), strict=True)
-        )
-        if len({len(curve) for curve in tables}) == 1:  # where curves stop early, the last step depends on the map
-            yield from follows_last_step(means, last, name=f"D of {name}")
-        if means.mean() >= chance:
-            yield f"{name} does not beat a random order ({means.mean():.3f} against {chance:.3f})"
-
-
-def with_deletion(faithfulness: Faithfulness, scores: DeletionScores | None = None) -> Faithfulness:
-    """Add the thesis's deletion score to the record, if it was computed."""
-    if scores is None:
-        return faithfulness
-    part = Deletion(
-        fill=scores.fill,
-        steps=scores.steps,
-        pixels_per_step=scores.pixels_per_step,
-        methods=scores.methods,
-        alarms=scores.alarms,
-    )
-    return replace(faithfulness, deletion=part, deletion_table=scores.table)
+    chance = float(scores[CHANCE].mean(axis=1).mean())
+    for name, values in scores.items():
+        if name != CHANCE:
+            means = values.mean(axis=1)
+            yield from follows_last_step(means, values[:, -1], name=f"D of {name}")
+            if means.mean() >= chance:
+                yield f"{name} does not beat a random order ({means.mean():.3f} against {chance:.3f})"
 
 
 FILL_DECIDES = 0.05
@@ -556,3 +392,22 @@ def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
                 "on what removed pixels become"
             )
     return alarms
+
+
+def ranking_alarms(curves: Mapping[Setting, Mapping[str, RemovalCurve]]) -> list[str]:
+    """Warn where a control wins, and of fills that rank the methods differently."""
+    by_fill: dict[str, dict[str, float]] = {}
+    alarms = []
+    for setting, of_setting in curves.items():
+        gains = {name: float(curve.symmetric_gain.mean()) for name, curve in of_setting.items()}
+        methods = {name: gain for name, gain in gains.items() if not is_control(name)}
+        best = max(gains.keys() - methods.keys(), key=lambda name: gains[name], default=None)
+        where = f"under {setting.fill}, {setting.unit} by {setting.unit}"
+        for name, gain in methods.items():
+            if gain <= 0:
+                alarms.append(f"{where}: {name} does not beat a random order: its symmetric gain is {gain:.3f}")
+            elif best is not None and gain <= gains[best]:
+                alarms.append(f"{where}: {name} gains {gain:.3f}, no more than the control {best} ({gains[best]:.3f})")
+        if setting.unit == "pixel":
+            by_fill[setting.fill] = methods
+    return [*rankings_disagree(by_fill), *alarms]

@@ -41,7 +41,7 @@ def group_alarms(alarms: Iterable[str]) -> dict[str, list[str]]:
 
 
 def alarms_of(results: Results, name: str, stage: str) -> tuple[str, ...]:
-    """Alarms of one network's `faithfulness`, `remedies`, `randomisation`, `score` or `explain`."""
+    """Alarms of one network's `faithfulness`, `randomisation`, `score` or `explain`."""
     if stage == "explain":
         return tuple(
             f"{method_name(method)}, {source_name(source)}: {warning}"
@@ -65,7 +65,7 @@ def count_alarms(results: Results) -> tuple[str, ...]:
     """Write a line for each kind of alarm: how often, and of which networks."""
     counts: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for name in inputs_in_order(results.inputs)[::-1]:
-        for stage in ("score", "remedies", "faithfulness", "randomisation", "explain"):
+        for stage in ("score", "faithfulness", "randomisation", "explain"):
             for kind, sentences in group_alarms(alarms_of(results, name, stage)).items():
                 counts[kind][input_name(name).lower()] += len(sentences)
     return tuple(

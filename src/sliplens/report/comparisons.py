@@ -18,8 +18,8 @@ from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots import style
 from sliplens.progress import number_of
 from sliplens.results.evaluation import ScoredFrames
-from sliplens.results.faithfulness import CHANCE, Comparison, DeletionCurve, DeletionScores, Faithfulness, RemovalCurve
-from sliplens.results.study import Choice, MarkerEffects, Roughness, Truth
+from sliplens.results.faithfulness import CHANCE, DeletionCurve, DeletionScores, Faithfulness, MethodGap, RemovalCurve
+from sliplens.results.study import Choice, MarkerEffects, Truth
 
 CITATION = (
     "Max Polak, Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning, Master's thesis, "
@@ -106,7 +106,7 @@ def compare_gain(*pairs: tuple[RemovalCurve, RemovalCurve], rng: np.random.Gener
     return paired_difference(first, second, clusters=clusters, rng=rng)
 
 
-def gap_from(compared: Comparison | Roughness, method: str) -> Difference:
+def gap_from(compared: MethodGap, method: str) -> Difference:
     """Difference of a method, one of the two that were compared, less the other."""
     gap = compared.gap
     if compared.first == method:

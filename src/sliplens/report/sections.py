@@ -114,12 +114,8 @@ def _deletion(results: Results, rng: np.random.Generator) -> Iterable[Block | No
         tables.table_deletion(scores, rng=rng) for scores in by_source.values() if not results.study.faithfulness
     )
     yield from (charts.plate_faithfulness(scores) for scores in by_source.values())
-    remedies, rows = results.study.remedies, by_source.get(results.study.source, {})
-    for name in _names({*rows, *remedies}):
+    for name in _names(by_source.get(results.study.source, {})):
         yield _alarms(results, name, "score")
-        if name in remedies:
-            yield tables.table_remedies(remedies[name], rows.get(name))
-            yield _alarms(results, name, "remedies")
 
 
 def _randomisation(results: Results, _: np.random.Generator) -> Iterable[Block | None]:
@@ -269,9 +265,7 @@ SECTIONS: tuple[Section, ...] = (
         "towards 0 if the network did rely on them. Removing pixels in random order is the control that each method "
         "has to beat. With every pixel gone no map has a part in it.",
         build=_deletion,
-        needs=lambda results: {
-            name for name, _ in results.scores if not results.study.remedies or name in results.study.remedies
-        },
+        needs=lambda results: {name for name, _ in results.scores},
     ),
     Section(
         id="randomisation",

@@ -43,7 +43,6 @@ from sliplens.results.faithfulness import (
     Faithfulness,
     Lead,
     MethodScore,
-    Remedies,
     RemovalScore,
     is_control,
 )
@@ -54,8 +53,6 @@ _LOOK_NAMES = {
     "resolution": "Resolution",
     "total_variation": "Total variation",
     "gini": "Sparsity (Gini)",
-    "noise_stability": "Stable under noise",
-    "frame_stability": "Stable between frames",
 }
 _REGION_NAMES = {"markers": "markers", "slip_annulus": "slip annulus", "edges": "marker edges"}
 _CORRELATIONS = ("With Shapley values", "Lead over controls", "With markers put back alone", "With the best reading")
@@ -217,36 +214,12 @@ def table_leads(faithful: Faithfulness) -> Table:
     )
 
 
-def table_remedies(remedies: Remedies, scored: DeletionScores | None) -> Table:
-    """Tabulate the thesis's own remedies for its score, and insertion, beside the score as it was."""
-    methods = methods_in_order({name for variant in remedies.variants.values() for name in variant.methods})
-    titles = {name: name.replace("-", " ").capitalize() for name in remedies.variants}
-    variants = [(titles[name], variant.better, variant.methods) for name, variant in remedies.variants.items()]
-    if scored is not None:
-        variants.insert(0, (f"As in the thesis ({scored.fill})", "lower", scored.methods))
-    rows = []
-    for title, better, scores in variants:
-        means = [scores[name].mean for name in methods if name in scores and not is_control(name)]
-        best = (min if better == "lower" else max)(means, default=None)
-        rows.append((title, better, *(_score_cell(scores.get(name), best) for name in methods)))
-    text = " ".join(f"{titles[name]}: {variant.summary.rstrip('.')}." for name, variant in remedies.variants.items())
-    return make_table(
-        f"{input_name(remedies.input)}: the score of the thesis with the remedies it proposes, and insertion; mean ± "
-        f"standard deviation over frames, the best method of each row bold. {text}",
-        ("Variant", "Better is", *(method_name(name) for name in methods)),
-        rows,
-        names=2,
-    )
-
-
 def table_looks(looks: Mapping[str, MapQuality]) -> Table:
     """Tabulate what the eye judges of maps."""
     return make_table(
         f"Looks of the maps, means over {number_of(max(record.frames for record in looks.values()), 'frame')}. "
         "Resolution: depth of the valley between neighbouring markers (1 = told apart). Total variation: mean step "
-        "between pixels over the "
-        "map's range (noise has 1/3). Gini: 1 = one pixel has all. Stability: correlation of the map with that of the "
-        "frame under other sensor noise, and with that of the next frame.",
+        "between pixels over the map's range (noise has 1/3). Gini: 1 = one pixel has all.",
         ("Input", "Method", *(_LOOK_NAMES[measure] for measure in MAP_MEASURES)),
         [
             (
@@ -261,22 +234,20 @@ def table_looks(looks: Mapping[str, MapQuality]) -> Table:
 
 
 def table_randomisation(randomisation: Mapping[str, Randomisation]) -> Table:
-    """Tabulate what is left of a map once every layer has new weights, and how its complexity rises."""
+    """Tabulate what is left of a map once every layer has new weights."""
     counts = {
         method.layers[0] for records in randomisation.values() for method in records.methods.values() if method.layers
     }
     first = f"{counts.pop()} layers new" if len(counts) == 1 else "First layers new"
     return make_table(
         "Weights drawn anew, layer by layer from the output: similarity of the map to the trained network's (1 = "
-        "unchanged: such a map does not depend on what was learned), and the rise of its complexity once all are new "
-        "(eMPRT), also after smoothing (sMPRT); more is better.",
-        ("Input", "Method", first, "All layers new", "eMPRT", "sMPRT"),
+        "unchanged: such a map does not depend on what was learned).",
+        ("Input", "Method", first, "All layers new"),
         [
             (
                 input_name(name),
                 method_name(method),
                 *(decimals(record.similarity[place] if record.similarity else None, 2) for place in (0, -1)),
-                *(decimals(rise, 2) for rise in (record.complexity_rise, record.smooth_complexity_rise)),
             )
             for name, method, record in _each_method(randomisation)
         ],
@@ -341,18 +312,18 @@ def table_localisation(truth: Truth) -> Table:
         *methods_in_order(set(truth.methods) - set(_TRUTHS)),
         *(record for record in _TRUTHS if record in truth.methods),
     ]
-    heads = [f"{what}, {_REGION_NAMES[region]}" for what in ("Mass", "Strongest") for region in REGIONS]
+    heads = [f"Mass, {_REGION_NAMES[region]}" for region in REGIONS]
     rows = []
     for name in names:
         records, lead = truth.methods[name], truth.methods[name].lead_over_controls
         gaps = (records.shapley, lead and lead.gap, records.network, records.margin)
-        shares = [percent(rows[region]) for rows in (records.mass, records.rank) for region in REGIONS]
+        shares = [percent(records.mass[region]) for region in REGIONS]
         title = "Random map (control)" if name == CHANCE else method_name(name)  # here it is a map, not an order
         rows.append((title, *shares, *map(_interval, gaps)))
-    nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS * 2), *4 * ["0"])
+    nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS), *4 * ["0"])
     return make_table(
-        f"{input_name(truth.input)}, {number_of(truth.frames, 'simulated frame')}: share of the relevance and of the "
-        "strongest pixels in three regions; signed rank correlation of the map's means over the markers with their "
+        f"{input_name(truth.input)}, {number_of(truth.frames, 'simulated frame')}: share of the relevance in "
+        "three regions; signed rank correlation of the map's means over the markers with their "
         "Shapley values, single effects, and effects on the best estimate of the margin (95 % interval over "
         f"{tell_over(method.shapley for method in truth.methods.values())}). Lead: the first less that of the "
         "strongest control; a method whose interval includes zero has shown nothing about this network.",
@@ -369,20 +340,18 @@ def table_meta(truth: Truth) -> Table | None:
         f"{input_name(truth.input)}: test of the score. The map of the Shapley values must gain more than the same "
         "map with half of the markers shuffled, beyond the 95 % interval; a fill where it does not has no vote. Where "
         "|x - b| comes near the truth, the setting mostly measures the input.",
-        ("Fill", "Changes counted", "Holds", *_GAINS),
+        ("Fill", "Holds", *_GAINS),
         [
             (
-                FILL_NAMES.get(record.fill, record.fill),
-                counted,
+                FILL_NAMES.get(test.fill, test.fill),
                 "yes" if test.holds else "no",
                 *(decimals(value, 3) for value in (test.oracle, test.degraded)),
                 _interval(test.gap, digits=3),
                 decimals(test.changed, 3),
             )
-            for record in truth.meta
-            for counted, test in (("along the answer's", record), ("by size", record.by_size))
+            for test in truth.meta
         ],
-        names=3,
+        names=2,
     )
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int, Int64, Shaped
 from sliplens.codec import UNKNOWN, Columns
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
-from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, SHARE, OfNetwork
+from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, SHARE, OfNetwork
 
 _Rows = TypeVar("_Rows", "DeletionTable", "RemovalTable")
 Key = tuple[str, str, str]
@@ -102,66 +102,29 @@ class DeletionScores(Deletion, OfNetwork):
     @cached_property
     def curves(self) -> dict[str, DeletionCurve]:
         """Curves by method, frames sorted by their ids."""
-        return {method: _deletion_curve(rows, method) for (method,), rows in self.table.groups("method").items()}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Variant:
-    """Variant of the thesis's score: fill, direction, and where it stops."""
-
-    summary: str
-    fill: str
-    mode: Literal["deletion", "insertion"]
-    stop: float | None
-    better: Literal["lower", "higher"]
-    methods: dict[str, MethodScore]
-
-
-@dataclass(frozen=True, kw_only=True)
-class VariantTable(DeletionTable):
-    """Deletion or insertion score of each frame, variant, method and step."""
-
-    variant: Shaped[np.ndarray, " rows"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Remedies(OfNetwork):
-    """The thesis's own remedies for its score, and insertion."""
-
-    steps: int
-    variants: dict[str, Variant]
-    alarms: tuple[str, ...]
-    table: VariantTable
-
-    @cached_property
-    def curves(self) -> dict[tuple[str, str], dict[str, DeletionCurve]]:
-        """Curves by variant and method, then by frame: one that stops at a saliency has as many steps as it needs."""
-        groups = self.table.groups("variant", "method").items()
-        return {
-            (variant, name): {
-                frame: _deletion_curve(steps, name) for (frame,), steps in rows.groups("frame_id").items()
-            }
-            for (variant, name), rows in groups
-        }
+        curves = {}
+        for (method,), group in self.table.groups("method").items():
+            ids, clusters, rows = _sort_by_frame(group, group.step, f"lacks steps of some frames under {method!r}")
+            pixels, scores, predictions = (
+                values.reshape(len(ids), -1) for values in (rows.pixels_removed, rows.score, rows.prediction)
+            )
+            curves[method] = DeletionCurve(
+                frame_ids=ids, clusters=clusters, pixels_removed=pixels[0], scores=scores, predictions=predictions
+            )
+        return curves
 
 
 @dataclass(frozen=True, kw_only=True)
 class RemovalScore:
-    """Score of one method under one fill and unit, in margin units."""
+    """Symmetric relevance gain of one method under one fill and unit, in margin units."""
 
     fill: str
     unit: str
     method: str
     control: bool
     srg: Difference
-    gain_over_random: Difference
     lead_over_controls: Lead | None
-    """Of the symmetric gain; None for a control."""
-    most_first: Annotated[float, ANSWER]
-    least_first: Annotated[float, ANSWER]
-    random: Annotated[float, ANSWER]
-    at: dict[float, Annotated[float, ANSWER]]
-    """Mean change where a share of the image is gone, most influential first."""
+    """None for a control."""
 
     @property
     def key(self) -> Key:
@@ -170,24 +133,20 @@ class RemovalScore:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Comparison:
-    """Symmetric relevance gain of the first method less that of the second."""
+class MethodGap:
+    """Measure of the first method's maps less that of the second's."""
 
-    fill: str
-    unit: str
     first: str
     second: str
     gap: Difference
 
 
 @dataclass(frozen=True, kw_only=True)
-class Agreement:
-    """Kendall's tau, a coefficient from -1 to 1, of the methods' ranking between two fills; None where undefined."""
+class RemovalGap(MethodGap):
+    """Symmetric relevance gain of the first method less that of the second, under one fill and unit."""
 
+    fill: str
     unit: str
-    first: str
-    second: str
-    tau: Annotated[float, CORRELATION] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,8 +161,8 @@ class RemovalCurve:
     >>> from sliplens.results.faithfulness import RemovalCurve
     >>> most, least, random = (np.array([[0, middle, 0.4]]) for middle in (0.4, 0.0, 0.2))
     >>> curve = RemovalCurve(areas=np.array([0, 0.5, 1.0]), most_first=most, least_first=least, random=random)
-    >>> curve.symmetric_gain, curve.gain_over_random
-    (array([0.2]), array([0.1]))
+    >>> curve.symmetric_gain
+    array([0.2])
     """
 
     frame_ids: tuple[str, ...] = ()
@@ -226,11 +185,6 @@ class RemovalCurve:
         Bluecher, Vielhaben and Strodthoff, *Decoupling Pixel Flipping and Occlusion Strategy* (2024): SRG.
         """
         return np.trapezoid(self.most_first, self.areas, axis=-1) - np.trapezoid(self.least_first, self.areas, axis=-1)
-
-    @property
-    def gain_over_random(self) -> Float64[np.ndarray, " frames"]:
-        """Area between the most influential first and random orders."""
-        return np.trapezoid(self.most_first, self.areas, axis=-1) - np.trapezoid(self.random, self.areas, axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,13 +211,9 @@ class Faithfulness(OfNetwork):
     frames: int
     trials: int
     random_orders: int
-    fills: tuple[str, ...]
-    units: tuple[str, ...]
-    areas: tuple[float, ...]
     scores: tuple[RemovalScore, ...]
     """Scores by fill, unit and method, controls included, with intervals over days and trials."""
-    comparisons: tuple[Comparison, ...]
-    agreement: tuple[Agreement, ...]
+    comparisons: tuple[RemovalGap, ...]
     alarms: tuple[str, ...]
     """Reasons why a score may not measure the maps."""
     table: RemovalTable
@@ -278,8 +228,17 @@ class Faithfulness(OfNetwork):
     @cached_property
     def curves(self) -> dict[Key, RemovalCurve]:
         """Curves by fill, unit and method, frames sorted by their ids."""
-        by_key = self.table.groups("fill", "unit", "method")
-        return {(key[0], key[1], key[2]): _removal_curve(rows, " / ".join(key)) for key, rows in by_key.items()}
+        curves = {}
+        for (fill, unit, method), group in self.table.groups("fill", "unit", "method").items():
+            complaint = f"lacks areas of some frames under {fill} / {unit} / {method}"
+            ids, clusters, rows = _sort_by_frame(group, group.area, complaint)
+            areas, most, least, random = (
+                values.reshape(len(ids), -1) for values in (rows.area, rows.most_first, rows.least_first, rows.random)
+            )
+            curves[fill, unit, method] = RemovalCurve(
+                frame_ids=ids, clusters=clusters, areas=areas[0], most_first=most, least_first=least, random=random
+            )
+        return curves
 
     @property
     def deletion_scores(self) -> DeletionScores | None:
@@ -300,40 +259,18 @@ class Faithfulness(OfNetwork):
         return self.table.table()
 
 
-def _deletion_curve(rows: DeletionTable, name: str) -> DeletionCurve:
-    ids, ordered = _sort_by_frame(rows, rows.step, f"lacks steps of some frames under {name!r}")
-    pixels, scores, predictions = (
-        values.reshape(len(ids), -1) for values in (ordered.pixels_removed, ordered.score, ordered.prediction)
-    )
-    return DeletionCurve(
-        frame_ids=ids,
-        clusters=_clusters(ordered, len(ids)),
-        pixels_removed=pixels[0],
-        scores=scores,
-        predictions=predictions,
-    )
-
-
-def _removal_curve(rows: RemovalTable, name: str) -> RemovalCurve:
-    ids, ordered = _sort_by_frame(rows, rows.area, f"lacks areas of some frames under {name}")
-    kinds = ("most_first", "least_first", "random")
-    changes = {kind: getattr(ordered, kind).reshape(len(ids), -1) for kind in kinds}
-    areas = ordered.area.reshape(len(ids), -1)[0]
-    return RemovalCurve(frame_ids=ids, clusters=_clusters(ordered, len(ids)), areas=areas, **changes)
-
-
-def _clusters(ordered: DeletionTable | RemovalTable, frames: int) -> Shaped[np.ndarray, "2 frames"]:
-    return np.stack([values.reshape(frames, -1)[:, 0].astype(str) for values in (ordered.day, ordered.trial)])
-
-
-def _sort_by_frame(rows: _Rows, step: np.ndarray, complaint: str) -> tuple[tuple[str, ...], _Rows]:
-    """Frames, and the rows sorted by frame and step, each pair of which must be there once."""
+def _sort_by_frame(
+    rows: _Rows, step: np.ndarray, complaint: str
+) -> tuple[tuple[str, ...], Shaped[np.ndarray, "2 frames"], _Rows]:
+    """Frames, their days and trials, and the rows sorted by frame and step, each pair of which must be there once."""
     ids, frame_at = np.unique(rows.frame_id, return_inverse=True)
     steps, step_at = np.unique(step, return_inverse=True)
     cells = frame_at * len(steps) + step_at
     if not np.array_equal(np.sort(cells), np.arange(len(ids) * len(steps))):
         raise ValueError(complaint)
-    return tuple(ids.tolist()), rows.where(np.argsort(cells))
+    rows = rows.where(np.argsort(cells))
+    clusters = np.stack([values.reshape(len(ids), -1)[:, 0].astype(str) for values in (rows.day, rows.trial)])
+    return tuple(ids.tolist()), clusters, rows
 
 
 def _require_curves(names: Iterable[str | Key], curves: Mapping[Any, object]) -> None:

@@ -13,11 +13,11 @@ from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
 from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, PIXEL, Evaluation, OfNetwork
 from sliplens.results.explanation import Explanation
-from sliplens.results.faithfulness import DeletionScores, Faithfulness, Lead, Remedies
+from sliplens.results.faithfulness import DeletionScores, Faithfulness, Lead, MethodGap
 
 REGIONS = ("markers", "slip_annulus", "edges")
 """Areas in which a map may lie."""
-MAP_MEASURES = ("resolution", "total_variation", "gini", "noise_stability", "frame_stability")
+MAP_MEASURES = ("resolution", "total_variation", "gini")
 """Measures of how a map looks."""
 
 
@@ -139,8 +139,6 @@ class RandomisedMethod:
 
     layers: tuple[int, ...]
     similarity: tuple[float | None, ...]
-    complexity_rise: float | None
-    smooth_complexity_rise: float | None
 
     def __post_init__(self) -> None:
         """Hold the layers against the similarities."""
@@ -164,17 +162,6 @@ class MapMeasures:
     resolution: float | None
     total_variation: float | None
     gini: float | None
-    noise_stability: float | None
-    frame_stability: float | None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Roughness:
-    """Total variation of the first method's maps less that of the second's."""
-
-    first: str
-    second: str
-    gap: Difference
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,12 +169,9 @@ class MapQuality(OfNetwork):
     """Looks of maps, by method."""
 
     frames: int
-    repeated_frames: int
-    """Frames that were explained again for the stability."""
-    noise_sd: float
-    """Camera noise that was added for it, in grey levels."""
     methods: dict[str, MapMeasures]
-    comparisons: tuple[Roughness, ...]
+    comparisons: tuple[MethodGap, ...]
+    """Of the total variation."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,8 +203,7 @@ class Localisation:
     """Where a method's relevance lies, and how well it ranks the markers as the network and the true margin do."""
 
     mass: dict[str, float | None]
-    rank: dict[str, float | None]
-    """Share of the relevance, and of its strongest pixels, by `REGIONS`."""
+    """Share of the relevance by `REGIONS`."""
     shapley: Difference | None
     network: Difference | None
     margin: Difference | None
@@ -234,9 +217,10 @@ class Localisation:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OracleTest:
-    """How much a gain tells a perfect map from a damaged one, over frames."""
+class MetaTest:
+    """How much the gain under one fill tells a perfect map from a damaged one, over frames."""
 
+    fill: str
     oracle: float
     degraded: float
     changed: float
@@ -248,17 +232,6 @@ class OracleTest:
     def holds(self) -> bool:
         """True where `gap` is above zero for sure, as few trials cannot show; else the gain cannot judge maps."""
         return self.gap is not None and self.gap.above_zero
-
-
-@dataclass(frozen=True, kw_only=True)
-class MetaTest(OracleTest):
-    """The test of a gain under one fill: along the answer's change, which asks what speaks for it and what against.
-
-    By size, maps ordered by |value|, it asks what matters at all, either way.
-    """
-
-    fill: str
-    by_size: OracleTest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -300,8 +273,7 @@ class Truth(OfNetwork):
     sums: dict[str, float | None]
     """How many times the answer's change the effects add up to, over all frames: `shapley` and `network`."""
     shapley_against_margin: Difference | None
-    network_against_margin: Difference | None
-    """Rank correlation of the effects on the answer with those on the best reading of the margin."""
+    """Rank correlation of the Shapley values with the effects on the best reading of the margin."""
     meta: tuple[MetaTest, ...]
     summary: str
     effects: MarkerEffects
@@ -323,7 +295,7 @@ class Truth(OfNetwork):
         return tuple(dict.fromkeys(self.effects.frame_id.tolist()))
 
 
-_Test = Remedies | Faithfulness | Randomisation | MapQuality | Timing | Truth
+_Test = Faithfulness | Randomisation | MapQuality | Timing | Truth
 
 
 RECORDS: dict[str, type] = {
@@ -331,7 +303,6 @@ RECORDS: dict[str, type] = {
     "states": States,
     "explain": Explanation,
     "score": DeletionScores,
-    "remedies": Remedies,
     "control": UntrainedMaps,
     "faithfulness": Faithfulness,
     "randomisation": Randomisation,
@@ -344,7 +315,6 @@ TABLES = {
     "evaluate": "evaluations",
     "explain": "explanations",
     "score": "deletion",
-    "remedies": "remedies",
     "faithfulness": "faithfulness",
     "randomisation": "randomisation",
     "map-quality": "map_quality",
@@ -354,8 +324,8 @@ TABLES = {
 """Field of `Study` with the records of each step, one a network."""
 CONFIG_FILE = "study.json"
 """File of a study's folder that holds its `StudyConfig`."""
-TESTS = ("score", "remedies", "faithfulness", "randomisation", "map-quality", "truth", "timing")
-"""Steps that a study may leave out: the thesis's score and its remedies, removal curves, new weights, ..."""
+TESTS = ("score", "faithfulness", "randomisation", "map-quality", "truth", "timing")
+"""Steps that a study may leave out: the thesis's score, removal curves, new weights, ..."""
 STUDY_METHODS = (
     "grad-cam-thesis",
     "integrated-gradients-thesis",
@@ -437,7 +407,6 @@ class Study:
     states: States | None = None
     explanations: dict[str, Explanation] = field(default_factory=dict)
     deletion: dict[str, DeletionScores] = field(default_factory=dict)
-    remedies: dict[str, Remedies] = field(default_factory=dict)
     faithfulness: dict[str, Faithfulness] = field(default_factory=dict)
     randomisation: dict[str, Randomisation] = field(default_factory=dict)
     map_quality: dict[str, MapQuality] = field(default_factory=dict)
@@ -476,4 +445,4 @@ class Study:
 
     @property
     def _tests(self) -> tuple[Mapping[str, _Test], ...]:
-        return self.remedies, self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth
+        return self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth

@@ -1,9 +1,8 @@
 """Trials, frames, markers and methods of a study."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +15,6 @@ from sliplens.explainers.explain import network_inputs, network_references, with
 from sliplens.explainers.frames import MARGIN_LEVELS as LEVELS
 from sliplens.explainers.frames import nearest_frame
 from sliplens.explainers.occlusion import RegionMethod, to_network_px
-from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.poly_cam_budget import Likeness
 from sliplens.explainers.table import EXPLAINERS, get_explainer
 from sliplens.faithfulness.removal import Units, marker_units, tile_units
@@ -24,7 +22,7 @@ from sliplens.markers import track_markers
 from sliplens.models import Network
 from sliplens.plots.style import input_name, listed
 from sliplens.progress import number_of, report_each
-from sliplens.recordings import Dataset, Recording, TrialInfo
+from sliplens.recordings import Dataset, TrialInfo
 from sliplens.results.explanation import Explanation
 from sliplens.results.study import (
     STUDY_BUDGET,
@@ -36,8 +34,6 @@ from sliplens.results.study import (
     MarkerTable,
     States,
 )
-from sliplens.runner import Part, part
-from sliplens.study.stages import Result, Stage
 
 SCORED_LEVELS = (0.4, 0.2, 0.0)
 """Margins at which the thesis scores: near slip, where there is much to explain."""
@@ -69,18 +65,20 @@ def choose_frames(
     if not 0 <= tolerance <= 1:
         raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
     infos = data.select(split=split, condition=condition)
-    measured = (_look_at(info, networks, data, tolerance=tolerance) for info in report_each(infos))
-    candidates = [record for record in measured if record is not None]
+    candidates = [
+        candidate
+        for info in report_each(infos)
+        if (candidate := _measure_trial(info, networks, data, tolerance=tolerance)) is not None
+    ]
     if not candidates:
         raise RecordingError(
             f"none of the {number_of(len(infos), f'{condition} trial')} of split {split!r} has a labelled frame "
             f"within {_REACH:.0%} of each of {', '.join(f'{level:.0%}' for level in LEVELS)}; choose another split "
-            "or condition, or trials "
-            "with more frames from full stick to full slip"
+            "or condition, or trials with more frames from full stick to full slip"
         )
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
-    taken = sorted(candidates, key=lambda one: 0.0 if one.trial.qualified else one.trial.worst)[:trials]
-    chosen = min((record.trial for record in taken), key=lambda trial: trial.worst).trial
+    taken = sorted(candidates, key=lambda each: 0.0 if each.trial.qualified else each.trial.worst)[:trials]
+    best = min((candidate.trial for candidate in taken), key=lambda trial: trial.worst).trial
     scored = [level in SCORED_LEVELS for level in LEVELS]
     choice = Choice(
         trials_wanted=trials,
@@ -90,15 +88,20 @@ def choose_frames(
         qualified_alone={
             name: sum(candidate.trial.worst_error[name] <= tolerance for candidate in candidates) for name in networks
         },
-        mean_error={name: float(np.mean([record.errors[name][scored] for record in taken])) for name in networks},
+        mean_error={name: float(np.mean([candidate.errors[name][scored] for candidate in taken])) for name in networks},
         summary="",
         source=data.source,
         condition=condition,
         inputs=tuple(networks),
         levels=LEVELS,
         scored_levels=SCORED_LEVELS,
-        trials=tuple(record.trial for record in taken),
-        frames=tuple(frame for record in taken for frame in record.frames(shown=record.trial.trial == chosen)),
+        trials=tuple(candidate.trial for candidate in taken),
+        frames=tuple(
+            replace(frame, shown=frame.trial == best)
+            for candidate in taken
+            for frame in candidate.frames
+            if frame.scored or frame.trial == best
+        ),
     )
     return replace(choice, summary=_summarise(choice, len(infos)))
 
@@ -108,32 +111,15 @@ class _Candidate:
     """A trial with a frame near every level."""
 
     trial: ChosenTrial
-    day: int
-    rows: list[int]
-    labels: Float[np.ndarray, " levels"]
-    """Frames by level, and their labels."""
+    frames: tuple[ChosenFrame, ...]
     errors: dict[str, Float[np.ndarray, " levels"]]
-    """Of each network's answers, in margin units."""
-
-    def frames(self, *, shown: bool) -> Iterator[ChosenFrame]:
-        """Frames to score, and where the panels show the trial all the others."""
-        name = self.trial.trial
-        for level, row, label in zip(LEVELS, self.rows, self.labels.tolist(), strict=True):
-            scored = level in SCORED_LEVELS
-            if shown or scored:
-                yield ChosenFrame(
-                    id=f"{name}-f{row:04d}",
-                    trial=name,
-                    day=self.day,
-                    frame=row,
-                    level=level,
-                    safety_margin=label,
-                    scored=scored,
-                    shown=shown,
-                )
+    """Errors of each network's answers, in margin units."""
 
 
-def _look_at(info: TrialInfo, networks: Mapping[str, Network], data: Dataset, *, tolerance: float) -> _Candidate | None:
+def _measure_trial(
+    info: TrialInfo, networks: Mapping[str, Network], data: Dataset, *, tolerance: float
+) -> _Candidate | None:
+    """Measure the errors at the frames nearest to the levels; None where no frame is near one of them."""
     recording = data.load(info, truth=False)
     margin = np.where(recording.labelled, recording.safety_margin, np.nan)
     if not np.isfinite(margin).any():
@@ -147,8 +133,21 @@ def _look_at(info: TrialInfo, networks: Mapping[str, Network], data: Dataset, *,
         answers = trained.predict(trained.encode(recording.frames[rows], recording.reference)).numpy()
         errors[name] = np.abs(answers - margin[rows])
     worst = {name: float(values.max()) for name, values in errors.items()}
+    frames = tuple(
+        ChosenFrame(
+            id=f"{info.trial}-f{row:04d}",
+            trial=info.trial,
+            day=info.day,
+            frame=row,
+            level=level,
+            safety_margin=label,
+            scored=level in SCORED_LEVELS,
+            shown=False,
+        )
+        for level, row, label in zip(LEVELS, rows, margin[rows].tolist(), strict=True)
+    )
     trial = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
-    return _Candidate(trial=trial, day=info.day, rows=rows, labels=margin[rows], errors=errors)
+    return _Candidate(trial=trial, frames=frames, errors=errors)
 
 
 def _summarise(choice: Choice, trials: int) -> str:
@@ -169,9 +168,7 @@ def _summarise(choice: Choice, trials: int) -> str:
         summary += f" The first {wanted} were taken."
     errors = [f"{100 * error:.0f} points ({input_name(name).lower()})" for name, error in choice.mean_error.items()]
     summary += f" The answers on the frames to score are off by {listed(errors)} on average."
-    if len(taken) < wanted:
-        summary += f" There were no more: {len(taken)} instead of {wanted}."
-    return summary
+    return summary + (f" There were no more: {len(taken)} instead of {wanted}." if len(taken) < wanted else "")
 
 
 def show_states(choice: Choice, data: Dataset) -> States:
@@ -180,33 +177,28 @@ def show_states(choice: Choice, data: Dataset) -> States:
     The simulator knows the markers' places; in recorded trials they are followed from the untouched sensor on. A trial
     in which they cannot be followed has none, and the result says why.
     """
-    infos = {info.trial: info for info in data.trials}
-    # so that the table of a study without markers has its columns
-    tables, untracked = [_table("", np.empty((0, 2)), np.empty((0, 2)))], []
-    for trial, chosen in report_each(
-        [(trial, list(rows)) for trial, rows in groupby(choice.frames, key=lambda at: at.trial)]
+    untracked, ids, rests, places = [], [], [np.empty((0, 2))], [np.empty((0, 2))]
+    for trial, group in report_each(
+        [(trial, list(rows)) for trial, rows in groupby(choice.frames, lambda at: at.trial)]
     ):
-        try:
-            tables += _markers(data.load(infos[trial]), chosen)
-        except (ImageError, InputError) as error:
-            untracked.append(f"{trial}: {error}")
-    return States(untracked=tuple(untracked), table=MarkerTable.joined(tables))
-
-
-def _markers(recording: Recording, chosen: Sequence[ChosenFrame]) -> list[MarkerTable]:
-    rows, truth = [frame.frame for frame in chosen], recording.truth
-    if truth is not None:
-        rest, places = truth.marker_rest_px.astype(np.float64), truth.marker_px.astype(np.float64)
-    else:
-        tracks = track_markers(recording.frames[: max(rows) + 1], recording.reference)
-        rest, places = tracks.rest_px, np.where(tracks.followed[..., None], tracks.position_px, np.nan)
-    return [_table(frame.id, rest, places[frame.frame]) for frame in chosen]
-
-
-def _table(frame_id: str, rest: Float[np.ndarray, "markers 2"], now: Float[np.ndarray, "markers 2"]) -> MarkerTable:
-    names, marker = np.repeat(frame_id, len(rest)), np.arange(len(rest))
-    (rest_x, rest_y), (x, y) = rest.T, now.T
-    return MarkerTable(frame_id=names, marker=marker, rest_x_px=rest_x, rest_y_px=rest_y, x_px=x, y_px=y)
+        recording, rows = data.load(data.find(trial)), [frame.frame for frame in group]
+        if recording.truth is not None:
+            rest, now = recording.truth.marker_rest_px, recording.truth.marker_px
+        else:
+            try:
+                tracks = track_markers(recording.frames[: max(rows) + 1], recording.reference)
+            except (ImageError, InputError) as error:
+                untracked.append(f"{trial}: {error}")
+                continue
+            rest, now = tracks.rest_px, np.where(tracks.followed[..., None], tracks.position_px, np.nan)
+        ids += [frame.id for frame in group for _ in rest]
+        rests += [rest.astype(np.float64)] * len(rows)
+        places += [now[row].astype(np.float64) for row in rows]
+    (rest_x, rest_y), (x, y) = np.concatenate(rests).T, np.concatenate(places).T
+    marker = np.concatenate([np.arange(len(rest)) for rest in rests])
+    names = np.array(ids, dtype=str)
+    table = MarkerTable(frame_id=names, marker=marker, rest_x_px=rest_x, rest_y_px=rest_y, x_px=x, y_px=y)
+    return States(untracked=tuple(untracked), table=table)
 
 
 def network_places(
@@ -247,33 +239,6 @@ def without_markers(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]
     """Replace explainers of markers, where these are unknown, by explainers of tiles."""
     by_tile = {name.removesuffix("-marker"): explainer for name, explainer in explainers.items()}
     return {name: get_explainer(name) if isinstance(row, RegionMethod) else row for name, row in by_tile.items()}
-
-
-def as_the_thesis_ran(explainers: Mapping[str, Explainer]) -> dict[str, Explainer]:
-    """Give the thesis's Poly-CAM all its channels, to time it as it was run there."""
-    return {
-        name: replace(explainer, budget=1.0)
-        if name == THESIS_POLY_CAM and isinstance(explainer, PolyCam)
-        else explainer
-        for name, explainer in explainers.items()
-    }
-
-
-Option: TypeAlias = bool | int | float | str | Likeness | Tensor | None
-"""Value of a field of an explainer."""
-
-
-def method_options(explainers: Mapping[str, Explainer]) -> dict[str, dict[str, Option]]:
-    """Options of each explainer by name: what a map depends on beside the network and the frame."""
-    return {
-        name: {
-            option: value
-            # a row that an installed package added may be any callable; what finds markers is code, not an option
-            for option, value in (vars(explainer) if is_dataclass(explainer) else {}).items()
-            if not callable(value)
-        }
-        for name, explainer in explainers.items()
-    }
 
 
 _TILE_PX = 16
@@ -325,33 +290,11 @@ class Material:
         return network_places(self.markers[frame], frame_size=(size[0], size[1]), image_size=self.inputs.shape[-1])
 
 
-@dataclass(frozen=True, kw_only=True)
-class MaterialStage(Stage[Result]):
-    """A stage that judges explanations."""
-
-    material: Material
-
-    @property
-    def trained(self) -> Network:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Network that was explained."""
-        return self.material.trained
-
-
-class MethodStage(MaterialStage[Result]):
-    """A stage with a part for each method."""
-
-    def shards(self) -> Iterator[Part]:
-        """All methods."""
-        for method in self.material.explainers:
-            yield part(method, trial=method, frames=1, recipe="method", content="")
-
-
 def worth_scoring(chosen: Iterable[ChosenFrame], explained: Explanation) -> tuple[ChosenFrame, ...]:
-    """The frames to score in which there is something to explain: the answer changed by `CLOSE` or more.
+    """Select the frames to score in which the answer changed by `CLOSE` or more.
 
-    That is less than the networks err by, so that the sign of a smaller change, along which maps are ranked, is chance:
-    the same constant makes every explanation say that there is next to nothing to explain. Of a network that tells no
-    frame from the untouched sensor all are scored, and each says so.
+    The sign of a smaller change, along which maps are ranked, is chance. Of a network that tells no frame from the
+    untouched sensor all are scored.
     """
     changes = {frame.id: abs(frame.prediction - frame.reference_prediction) for frame in explained.frames}
     scored = tuple(frame for frame in chosen if frame.scored)

@@ -54,7 +54,7 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.results.explanation import Explanation, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, part
 from sliplens.study.choice import study_explainers, without_markers
-from sliplens.study.stages import Find, Stage
+from sliplens.study.stages import MakeRecord, Stage
 
 
 class Running(TypedDict, total=False):
@@ -170,7 +170,7 @@ def explain(
                         output.folder / "parts",
                         on=running.get("on", "serial"),
                         retry_failed=running.get("retry_failed", False),
-                        on_piece=_draw_first(output.folder, network, chosen) if colours == "signed" else None,
+                        on_record=_draw_first(output.folder, network, chosen) if colours == "signed" else None,
                     )
                     _note_warnings(explanation)
                 draw_explanation(explanation, output.folder, colours=colours)
@@ -238,7 +238,7 @@ def _draw_first(folder: Path, network: Network, chosen: ChosenFrames) -> Callabl
 class Explaining(Stage[Explanation]):
     """Maps of chosen frames; a part is a method and the number of a batch of frames."""
 
-    piece = MethodMaps
+    record = MethodMaps
     title = "Explaining frames"
 
     trained: Network
@@ -246,11 +246,11 @@ class Explaining(Stage[Explanation]):
     explainers: Mapping[str, Explainer]
     warnings: tuple[str, ...] = ()
 
-    def prepare(self) -> Find:
+    def prepare(self) -> MakeRecord:
         """Return the function that explains a batch of frames with one method."""
         maps = len(self.chosen.ids) * len(self.explainers)
 
-        def explain_batch(item: tuple[str, int], _: OnProgress) -> MethodMaps:
+        def explain_batch(item: tuple[str, int]) -> MethodMaps:
             method, batch = item
             rows = self.chosen.batches[batch]
             with reporting(ignore):  # a whole part counts, not its passes
@@ -258,7 +258,7 @@ class Explaining(Stage[Explanation]):
 
         return explain_batch
 
-    def shards(self) -> Iterator[Part]:
+    def parts(self) -> Iterator[Part]:
         """Yield all batches with the first method, then with the next."""
         chosen = self.chosen
         for method in self.explainers:
@@ -277,10 +277,10 @@ class Explaining(Stage[Explanation]):
                     frames=len(rows),
                 )
 
-    def join(self, pieces: Sequence[MethodMaps]) -> Explanation:
+    def join(self, records: Sequence[MethodMaps]) -> Explanation:
         """Make the record of all maps."""
         count = len(self.chosen.batches)
-        maps = {method: pieces[at * count : (at + 1) * count] for at, method in enumerate(self.explainers)}
+        maps = {method: records[at * count : (at + 1) * count] for at, method in enumerate(self.explainers)}
         return join_maps(self.trained, self.chosen, maps, warnings=self.warnings)
 
 

@@ -3,14 +3,13 @@
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
-from sliplens.explainers.attribution import CLOSE
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import with_markers
 from sliplens.explainers.frames import frames_at
@@ -45,22 +44,21 @@ from sliplens.results.study import (
 )
 from sliplens.runner import MakePart, Work, require_executor
 from sliplens.simulation.intervention import rebuild_trial
-from sliplens.study.checks import CASCADE, Measuring, Randomising, Untrained, time_explainers
+from sliplens.study.checks import Randomising, Untrained, measure_maps, time_explainers
 from sliplens.study.choice import (
     Material,
     choose_frames,
     gather,
     marker_places,
-    method_options,
     show_states,
     study_explainers,
     without_markers,
     worth_scoring,
 )
 from sliplens.study.explaining import Explaining
-from sliplens.study.scoring import STEPS, STUDY_AREAS, Deletion, Influence, RemedialDeletion, Removal
+from sliplens.study.scoring import Influence, PixelDeletion, Removal
 from sliplens.study.stages import Stage
-from sliplens.study.truth import TRUE_FILL, TRUTH_PAIRS, JudgingByTruth, true_curves
+from sliplens.study.truth import TRUE_FILL, JudgingByTruth, true_curves
 from sliplens.training.evaluation import evaluate
 
 NetworkLike: TypeAlias = Network | Path | str
@@ -146,17 +144,12 @@ def run_study(
         for step in (step for step in steps if step.shared):
             _run_step(step, records, overwrite=overwrite)
         save_record(config, records.folder / CONFIG_FILE)
-        if "truth" in config.tests:
-            records = replace(records, redrawn=_can_redraw(records))
+        records = replace(records, redrawn="truth" in config.tests and _can_redraw(records))
         steps = [step for step in steps if not step.shared and (step.name != "truth" or records.redrawn)]
         for name in records.networks:
             of_network = replace(records, network=name)
-            for step in (step for step in steps if not step.alone):
+            for step in steps:
                 _run_step(step, of_network, on=on, retry_failed=retry_failed, overwrite=overwrite)
-        for name in records.networks:
-            of_network = replace(records, network=name)
-            for step in (step for step in steps if step.alone):
-                _run_step(step, of_network, overwrite=overwrite)
         tables = {
             TABLES[step.name]: {name: replace(records, network=name)[step.name] for name in records.networks}
             for step in steps
@@ -177,12 +170,13 @@ def run_study(
 def load_networks(networks: NetworkLike | Sequence[NetworkLike], *, device: str = "cpu") -> dict[str, Network]:
     """Load the networks of a study by their inputs, in one order whatever order they were named in."""
     several = [networks] if isinstance(networks, Network | Path | str) else networks
-    runs = [open_run(network, device=device) for network in several]
-    by_input = {run.encoding.name: run for run in runs}
-    if twice := [name for name in by_input if sum(run.encoding.name == name for run in runs) > 1]:
-        raise InputError(
-            f"two networks read the input {twice[0]}, and a study takes one network an input; study them one by one"
-        )
+    by_input: dict[str, Network] = {}
+    for run in (open_run(network, device=device) for network in several):
+        if by_input.setdefault(run.encoding.name, run) is not run:
+            raise InputError(
+                f"two networks read the input {run.encoding.name}, and a study takes one network an input; study them "
+                "one by one"
+            )
     return dict(sorted(by_input.items()))
 
 
@@ -198,10 +192,6 @@ class Records:
     """True where frames can be drawn anew with markers put back."""
     network: str = ""
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out what was loaded: another process loads its own."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
     def path(self, step: "Step") -> Path:
         """Return the folder of a step."""
         return self.folder / (step.name if step.shared else f"{step.name}-{self.network}")
@@ -216,18 +206,23 @@ class Records:
         return self.networks[self.network]
 
     @cached_property
+    def frames_without_markers(self) -> list[str]:
+        """Chosen frames whose markers are unknown."""
+        markers = self["states"].markers
+        return [frame.id for frame in self["choice"].frames if frame.id not in markers]
+
+    @cached_property
     def explainers(self) -> dict[str, Explainer]:
         """Explainers by name; tiles stand for markers where the markers of some frame are unknown."""
         explainers = study_explainers(self.config.methods, budget=self.config.budget)
-        return without_markers(explainers) if _frames_without_markers(self) else explainers
+        return without_markers(explainers) if self.frames_without_markers else explainers
 
     @cached_property
     def material(self) -> Material:
         """Explanations of the frames that are scored."""
         explained = self["explain"]
         scored = worth_scoring(self["choice"].frames, explained)
-        markers = self["states"].markers
-        return gather(self.run, explained, scored, markers=markers, explainers=self.explainers)
+        return gather(self.run, explained, scored, markers=self["states"].markers, explainers=self.explainers)
 
     @cached_property
     def influence(self) -> Influence:
@@ -242,11 +237,6 @@ def _warn_of_few_trials(data: Dataset, config: StudyConfig) -> None:
         wanted = config.trials == count
         cure = f"--trials is {count}" if wanted else "record more, or name another --split or --condition"
         add_note(f"{trials}: fewer than {FEWEST_UNITS} decide nothing, whatever the page then shows; {cure}")
-
-
-def _frames_without_markers(records: Records) -> list[str]:
-    markers = records["states"].markers
-    return [frame.id for frame in records["choice"].frames if frame.id not in markers]
 
 
 def _can_redraw(records: Records) -> bool:
@@ -278,7 +268,7 @@ def _choose(records: Records) -> Choice:
 
 
 def _note_markers(records: Records) -> Iterator[str]:
-    missing = _frames_without_markers(records)
+    missing = records.frames_without_markers
     if missing and list(records.explainers) != list(study_explainers(records.config.methods)):
         yield f"the markers of {number_of(len(missing), 'frame')} are not known, so that tiles are asked instead"
 
@@ -297,9 +287,11 @@ def _note_left_out(records: Records) -> Iterator[str]:
         yield say_left_out(dropped, len(scored), records.network)
 
 
-def _delete(records: Records) -> Deletion:
+def _delete(records: Records) -> PixelDeletion:
     config = records.config
-    return Deletion(trained=records.run, explained=records.material.explained, steps=config.steps, seed=config.seed)
+    return PixelDeletion(
+        trained=records.run, explained=records.material.explained, steps=config.steps, seed=config.seed
+    )
 
 
 def _remove(records: Records) -> Removal:
@@ -341,32 +333,6 @@ def judge_by_truth(records: Records) -> JudgingByTruth:
     )
 
 
-Options: TypeAlias = Mapping[str, object]
-
-
-def _choice_options(records: Records) -> Options:
-    config = records.config
-    weights = {name: run.manifest.weights_sha256 for name, run in records.networks.items()}
-    wanted = {"split": config.split, "condition": config.condition, "trials": config.trials}
-    return {"data_hash": records.data.hash, "weights_sha256": weights, **wanted, "tolerance": config.tolerance}
-
-
-def _frame_options(records: Records) -> Options:
-    return {"data_hash": records.data.hash, "choice": hash_json(records["choice"])}
-
-
-def _map_options(records: Records) -> Options:
-    weights, methods = records.run.manifest.weights_sha256, method_options(records.explainers)
-    seed = records.config.seed
-    return {**_frame_options(records), "methods": methods, "seed": seed, "weights_sha256": weights}
-
-
-def _removal_options(records: Records) -> Options:
-    config = records.config
-    options = {"random_orders": config.random_orders, "areas": STUDY_AREAS, "settings": config.settings}
-    return {**options, "redrawn": records.redrawn}
-
-
 @dataclass(frozen=True, kw_only=True)
 class Step:
     """Step of a study: from records to a record, in a folder of its name."""
@@ -375,32 +341,34 @@ class Step:
     title: str
     make: Callable[[Records], Any]
     """Makes the record, or a `Stage` whose parts workers share."""
-    needs: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ("explain",)
     """Steps whose records it takes."""
-    options: Callable[[Records], Options] = lambda _: {}
-    """Settings that its record depends on, beside the frames, methods and weights."""
+    options: tuple[str, ...] = ()
+    """Fields of `StudyConfig`, or `redrawn`, that its record depends on, beside methods, budget and seed."""
     notes: Callable[[Records], Iterator[str]] = lambda _: iter(())
     """Sentences that the user should know once it is made."""
     shared: bool = False
     """True where one record is of all networks."""
-    alone: bool = False
-    """True where nothing else may run at the same time."""
 
-    def config(self, records: Records) -> Options:
+    def config(self, records: Records) -> Mapping[str, object]:
         """Return all that the record depends on: a folder with another configuration is not reused."""
+        names = self.options if self.shared else ("methods", "budget", "seed", *self.options)
+        values = vars(records.config) | {"redrawn": records.redrawn}
+        config = {name: values[name] for name in names} | {"data_hash": records.data.hash}
+        weights = {name: run.manifest.weights_sha256 for name, run in records.networks.items()}
         if self.shared:
-            return self.options(records)
-        scored = {} if self.name == "explain" else {"least_change": CLOSE}
-        return {**_map_options(records), **scored, **self.options(records)}
+            return config | {"weights_sha256": weights}
+        return config | {"weights_sha256": weights[records.network], "choice": hash_json(records["choice"])}
 
 
-_EXPLAINED = ("explain",)
+_SAMPLE = ("split", "condition", "trials", "tolerance")
 STUDY = (
     Step(
         name="choice",
         title="Choosing trials",
         make=_choose,
-        options=_choice_options,
+        needs=(),
+        options=_SAMPLE,
         notes=lambda records: iter((records["choice"].summary,)),
         shared=True,
     ),
@@ -409,7 +377,7 @@ STUDY = (
         title="Following markers",
         make=lambda records: show_states(records["choice"], records.data),
         needs=("choice",),
-        options=_frame_options,
+        options=_SAMPLE,
         notes=_note_markers,
         shared=True,
     ),
@@ -420,62 +388,36 @@ STUDY = (
         needs=("choice", "states"),
         notes=_note_left_out,
     ),
-    Step(
-        name="score",
-        title=Deletion.title,
-        make=_delete,
-        needs=_EXPLAINED,
-        options=lambda records: {"steps": records.config.steps},
-    ),
-    Step(
-        name="remedies",
-        title=RemedialDeletion.title,
-        make=lambda records: RemedialDeletion(
-            trained=records.run, explained=records.material.explained, grey=records["score"], seed=records.config.seed
-        ),
-        needs=("explain", "score"),
-        options=lambda _: {"steps": STEPS},
-    ),
+    Step(name="score", title=PixelDeletion.title, make=_delete, options=("steps",)),
     Step(
         name="control",
         title=Untrained.title,
         make=lambda records: Untrained(material=records.material, seed=records.config.seed),
-        needs=_EXPLAINED,
     ),
     Step(
         name="faithfulness",
         title=Removal.title,
         make=_remove,
         needs=("explain", "control"),
-        options=_removal_options,
+        options=("random_orders", "settings", "redrawn"),
     ),
     Step(
         name="randomisation",
         title=Randomising.title,
         make=lambda records: Randomising(material=records.material, seed=records.config.seed),
-        needs=_EXPLAINED,
-        options=lambda _: {"stages": CASCADE},
     ),
     Step(
         name="map-quality",
-        title=Measuring.title,
-        make=lambda records: Measuring(material=records.material, data=records.data, seed=records.config.seed),
-        needs=_EXPLAINED,
+        title="Measuring how maps look",
+        make=lambda records: measure_maps(records.material, seed=records.config.seed),
     ),
     Step(
         name="truth",
         title=JudgingByTruth.title,
         make=judge_by_truth,
         needs=("explain", "control"),
-        options=lambda _: {"pairs": TRUTH_PAIRS},
     ),
-    Step(
-        name="timing",
-        title="Timing the methods",
-        make=lambda records: time_explainers(records.material),
-        needs=_EXPLAINED,
-        alone=True,
-    ),
+    Step(name="timing", title="Timing the methods", make=lambda records: time_explainers(records.material)),
 )
 """Steps of a study in their order."""
 
@@ -492,18 +434,14 @@ def _required_steps(tests: Sequence[str]) -> list[Step]:
     return [step for step in STUDY if step.name in needed]
 
 
-@dataclass(frozen=True, kw_only=True)
 class _StepWork(Work):
-    """Parts of a step, worked on in any process."""
+    """Parts of a step; another process loads the records that it needs itself."""
 
-    step: Step
-    records: Records
+    def __init__(self, name: str, records: Records) -> None:
+        self.name, self.records = name, records
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"step": self.step.name, "records": self.records}  # a step holds functions, which do not travel
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, step=_find_step(state["step"]))
+    def __reduce__(self) -> tuple[type, tuple[str, Records]]:
+        return type(self), (self.name, replace(self.records))  # without what is cached
 
     @property
     def on_gpu(self) -> bool:
@@ -512,28 +450,22 @@ class _StepWork(Work):
 
     def begin(self) -> MakePart:
         """Open the step."""
-        return self.stage.begin()
-
-    @cached_property
-    def stage(self) -> Stage:
-        """Step with all that its parts need."""
-        return self.step.make(self.records)
+        return _find_step(self.name).make(self.records).begin()
 
 
 def _run_step(
-    step: Step, records: Records, *, on: str | None = None, retry_failed: bool = False, overwrite: bool = False
+    step: Step, records: Records, *, on: str = "serial", retry_failed: bool = False, overwrite: bool = False
 ) -> None:
-    """Keep the record of a step, unless its folder is complete; it has parts where `on` says who makes them."""
+    """Keep the record of a step, unless its folder is complete."""
     folder = records.path(step)
     title = step.title if step.shared else f"{step.title} ({records.network})"
     with output_folder(folder, stage=step.name, config=step.config(records), overwrite=overwrite) as output:
         if not output.complete:
             with open_stage(title):
-                if on is None:
-                    record = step.make(records)
-                else:
-                    work = _StepWork(step=step, records=records)
-                    record = work.stage.make(output.folder / "parts", work=work, on=on, retry_failed=retry_failed)
+                record = step.make(records)
+                if isinstance(record, Stage):
+                    work = _StepWork(step.name, records)
+                    record = record.make(output.folder / "parts", work=work, on=on, retry_failed=retry_failed)
             save_result(record, output.folder)
             remove(output.folder / "parts")  # not before: what fails above goes on from them
             for alarm in getattr(record, "alarms", ()):

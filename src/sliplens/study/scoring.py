@@ -1,63 +1,48 @@
-"""Public call that scores explanations, and the study's stages: removal, the thesis's deletion score, its remedies."""
+"""Public call that scores explanations, and its two stages: removal, and the thesis's deletion."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias, Unpack
+from typing import Literal, TypeAlias, Unpack
 
 import numpy as np
+import torch
 from jaxtyping import Float, Float64, UInt8
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, SaliencyError
-from sliplens.explainers.explain import network_inputs
+from sliplens.explainers.explain import network_inputs, network_references
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Units, answer_whole, tile_units
+from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Units, answer_whole, score_maps, tile_units
 from sliplens.faithfulness.scoring import (
     SettingCurves,
-    curves_of_frames,
     delete_pixels,
-    deletion_alarms,
     deletion_orders,
     deletion_steps,
-    deletion_table,
-    deletion_tables,
     explanation_of_maps,
     influences,
     prepare_passes,
     require_same_network,
     score_curves,
     score_deletion,
-    score_tables,
-    stack_curves,
-    with_deletion,
 )
 from sliplens.files import output_folder, remove
 from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
-from sliplens.progress import OnProgress, ignore, open_stage, report_each, report_file, reporting
+from sliplens.progress import open_stage, report_each, report_file, reporting
 from sliplens.results.explanation import Explanation, load_explanation
-from sliplens.results.faithfulness import (
-    DeletionScores,
-    DeletionTable,
-    Faithfulness,
-    Remedies,
-    RemovalCurve,
-    Variant,
-    VariantTable,
-)
+from sliplens.results.faithfulness import Deletion, DeletionScores, Faithfulness, RemovalCurve
 from sliplens.results.study import SETTINGS, Setting
 from sliplens.runner import Part
 from sliplens.study.choice import trial_seed
 from sliplens.study.explaining import Running
-from sliplens.study.stages import Find, Stage, join_trials, trial_shards
+from sliplens.study.stages import MakeRecord, Stage, join_trials, trial_parts
 
 STEPS = 28
 """An eighth of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""
 STUDY_AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Fewer shares than `AREAS`, so that many settings can be scored: the equal areas, and enough for trapezoids."""
+"""Fewer shares than `AREAS`, so that many settings can be scored: enough for trapezoids."""
 _TILES_ACROSS = 14
 Influence: TypeAlias = Mapping[str, Float[np.ndarray, "images height width"]]
 """Maps that rank parts, of each method and control."""
@@ -147,16 +132,25 @@ def score(
         random_orders=random_orders,
         seed=seed,
     )
-    works: dict[str, Stage] = {"removal": removal}
+    stages: list[Stage] = [removal]
     if steps:
-        works["deletion"] = Deletion(trained=network, explained=explanation, steps=steps, seed=seed)
+        stages.append(PixelDeletion(trained=network, explained=explanation, steps=steps, seed=seed))
+
+    def compute(folder: Path | None = None, *, on: str = "serial", retry_failed: bool = False) -> Faithfulness:
+        results = []
+        for stage in stages:
+            with open_stage(stage.title):
+                parts = folder and folder / type(stage).__name__
+                results.append(stage.make(parts, on=on, retry_failed=retry_failed))
+        faithfulness, *deletions = results
+        for scores in deletions:
+            deletion = Deletion(**{field.name: getattr(scores, field.name) for field in fields(Deletion)})
+            faithfulness = replace(faithfulness, deletion=deletion, deletion_table=scores.table)
+        return faithfulness
+
     with reporting(running.get("on_progress")):
         if out is None:
-            results = []
-            for work in works.values():
-                with open_stage(work.title):
-                    results.append(compute(work))
-            return with_deletion(*results)
+            return compute()
         hashes = hashlib.sha256()
         for values in explanation.relevance.values():
             hashes.update(values.tobytes())
@@ -166,16 +160,8 @@ def score(
         overwrite = running.get("overwrite", False)
         with output_folder(Path(out), stage="faithfulness", config=config, overwrite=overwrite) as output:
             if not output.complete:
-                results = []
-                for name, work in works.items():
-                    with open_stage(work.title):
-                        result = work.make(
-                            output.folder / "parts" / name,
-                            on=running.get("on", "serial"),
-                            retry_failed=running.get("retry_failed", False),
-                        )
-                    results.append(result)
-                save_result(with_deletion(*results), output.folder)
+                retry_failed, on = running.get("retry_failed", False), running.get("on", "serial")
+                save_result(compute(output.folder / "parts", on=on, retry_failed=retry_failed), output.folder)
                 remove(output.folder / "parts")
         report_file(Path(out), "curves and scores", kept=output.complete)
     return load_result(Path(out), Faithfulness, command="sliplens score")
@@ -204,14 +190,6 @@ def _to_score(
     return maps
 
 
-def compute(stage: Stage) -> Any:
-    """Compute the result of a stage in memory."""
-    shards = list(stage.shards())
-    find = stage.prepare()
-    records = [find(shard.item, ignore) for shard in report_each(shards, sizes=[shard.frames for shard in shards])]
-    return stage.join(records)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Removal(Stage[Faithfulness]):
     """Removal of parts in the order of every map, under each setting; a part is a setting and a trial.
@@ -219,7 +197,7 @@ class Removal(Stage[Faithfulness]):
     Curves that are computed in another way, such as by drawing the scene anew (`further`), are scored with the others.
     """
 
-    piece = SettingCurves
+    record = SettingCurves
     title = "Removing parts"
 
     trained: Network
@@ -239,53 +217,65 @@ class Removal(Stage[Faithfulness]):
             get_fill(setting.fill)
 
     @property
-    def _available(self) -> list[Setting]:
-        return [setting for setting in self.settings if setting.unit in self.units]
+    def _all_settings(self) -> list[Setting]:
+        return [*(setting for setting in self.settings if setting.unit in self.units), *self.further]
 
-    def shards(self) -> Iterator[Part]:
+    def parts(self) -> Iterator[Part]:
         """Yield all trials under the first setting, then under the next."""
-        for setting in (*self._available, *self.further):
-            yield from trial_shards(self.explained, setting.fill, setting.unit)
+        for setting in self._all_settings:
+            yield from trial_parts(self.explained, setting.fill, setting.unit)
 
-    def prepare(self) -> Find:
+    def prepare(self) -> MakeRecord:
         """Return the function that computes the curves of a trial under one setting."""
         inputs, orders = network_inputs(self.trained, self.explained), 2 * len(self.maps) + self.random_orders
-        passes = len(self._available) * len(inputs) * orders * (len(self.areas) - 2)
+        references = network_references(self.trained, self.explained)
+        passes = (len(self._all_settings) - len(self.further)) * len(inputs) * orders * (len(self.areas) - 2)
         predict, trials = prepare_passes(self.trained, inputs, passes), list(self.explained.trials)
 
-        def remove_parts(item: tuple[str, str, str], _: OnProgress) -> SettingCurves:
+        def remove_parts(item: tuple[str, str, str]) -> SettingCurves:
             fill, unit, trial = item
             setting, rows = Setting(fill=fill, unit=unit), self.explained.trials[trial]
             part, maps = self.explained.take(rows), {name: values[rows] for name, values in self.maps.items()}
-            seed = trial_seed(self.seed, trials.index(trial))
-            if setting not in self.further:
-                return curves_of_frames(
+            images, empty, seed = inputs[rows], references[rows], trial_seed(self.seed, trials.index(trial))
+            if setting in self.further:
+                curves, blank = self.further[setting](part, maps, seed), np.full(len(rows), np.nan)
+            else:
+                paint = get_fill(fill)(images, empty, seed)
+                gone = torch.ones((len(images), *images.shape[-2:]), dtype=torch.bool, device=images.device)
+                batches = torch.arange(len(images), device=images.device).split(16)
+                blank = answer_whole(predict, torch.cat([paint(batch, gone[batch]) for batch in batches]))
+                curves = score_maps(
                     predict,
-                    self.trained,
-                    part,
+                    images,
                     maps,
                     [self.units[unit][row] for row in rows],
-                    fill=fill,
-                    areas=self.areas,
+                    fill=get_fill(fill),
+                    references=empty,
+                    towards=part.towards,
+                    # the same random orders under every fill
+                    rng=np.random.default_rng(seed),
                     random_orders=self.random_orders,
+                    areas=self.areas,
                     seed=seed,
                 )
-            curves = self.further[setting](part, maps, seed)
             return SettingCurves(
                 areas=next(iter(curves.values())).areas,
-                curves=stack_curves(curves),
-                whole=answer_whole(predict, network_inputs(self.trained, part)),
-                blank=np.full(len(rows), np.nan),
+                curves={
+                    name: np.stack([curve.most_first, curve.least_first, curve.random])
+                    for name, curve in curves.items()
+                },
+                whole=answer_whole(predict, images),
+                blank=blank,
             )
 
         return remove_parts
 
-    def join(self, pieces: Sequence[SettingCurves]) -> Faithfulness:
+    def join(self, records: Sequence[SettingCurves]) -> Faithfulness:
         """Score all curves."""
         count = len(self.explained.trials)
         curves = {}
-        for at, setting in enumerate((*self._available, *self.further)):
-            parts = pieces[at * count : (at + 1) * count]
+        for at, setting in enumerate(self._all_settings):
+            parts = records[at * count : (at + 1) * count]
             answers = [{"whole": part.whole, "blank": part.blank} for part in parts]
             curves[setting] = SettingCurves(
                 areas=parts[0].areas,
@@ -295,22 +285,18 @@ class Removal(Stage[Faithfulness]):
         return score_curves(self.explained, curves, random_orders=self.random_orders, seed=self.seed)
 
 
-Answers: TypeAlias = dict[str, Float64[np.ndarray, "frames answers"]]
-"""Predictions of frames while pixels are removed, by the order of removal; the first of the whole frames."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrialAnswers:
-    """Predictions of the frames of a trial while pixels are removed."""
+    """Predictions of the frames of a trial, whole and while pixels are removed, by the order of removal."""
 
     answers: dict[str, Float64[np.ndarray, "frames answers"]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deletion(Stage[DeletionScores]):
+class PixelDeletion(Stage[DeletionScores]):
     """Deletion of the most salient pixels by every method and in a random order; a part is a trial."""
 
-    piece = TrialAnswers
+    record = TrialAnswers
     title = "Deleting pixels, as the thesis did"
 
     trained: Network
@@ -320,176 +306,27 @@ class Deletion(Stage[DeletionScores]):
     """The image's height if None."""
     seed: int = 0
 
-    def shards(self) -> Iterator[Part]:
+    def parts(self) -> Iterator[Part]:
         """Yield the trials, whose maps are counted with a random one."""
-        return trial_shards(self.explained, maps=len(self.explained.relevance) + 1)
+        return trial_parts(self.explained, maps=len(self.explained.relevance) + 1)
 
-    def prepare(self) -> Find:
+    def prepare(self) -> MakeRecord:
         """Return the function that deletes the pixels of the frames of a trial."""
         inputs, orders = network_inputs(self.trained, self.explained), deletion_orders(self.explained, seed=self.seed)
         removed = deletion_steps((self.explained.image_size, self.explained.image_size), steps=self.steps)
         predict = prepare_passes(self.trained, inputs, len(orders) * len(inputs) * len(removed))
 
-        def delete(item: tuple[str], _: OnProgress) -> TrialAnswers:
+        def delete(item: tuple[str]) -> TrialAnswers:
             rows = self.explained.trials[item[-1]]
-            part = {name: order[rows] for name, order in orders.items()}
             answers = {
-                name: delete_pixels(predict, inputs[rows], order, fill=self.fill, steps=self.steps)
-                for name, order in report_each(list(part.items()), sizes=[len(rows)] * len(part))
+                name: delete_pixels(predict, inputs[rows], orders[name][rows], fill=self.fill, steps=self.steps)
+                for name in report_each(list(orders), sizes=[len(rows)] * len(orders))
             }
             return TrialAnswers(answers=answers)
 
         return delete
 
-    def join(self, pieces: Sequence[TrialAnswers]) -> DeletionScores:
+    def join(self, records: Sequence[TrialAnswers]) -> DeletionScores:
         """Score all curves."""
-        answers = join_trials(self.explained, [piece.answers for piece in pieces])
+        answers = join_trials(self.explained, [record.answers for record in records])
         return score_deletion(self.explained, answers, fill=self.fill)
-
-
-@dataclass(frozen=True, kw_only=True)
-class RemedyAnswers:
-    """Predictions of the frames of a trial while pixels become background, and while the least salient become grey."""
-
-    background: dict[str, Float64[np.ndarray, "frames answers"]]
-    insertion: dict[str, Float64[np.ndarray, "frames answers"]]
-
-
-BACKGROUND = {"difference": "black", "raw": "white"}
-"""Background that the thesis proposes for its two inputs."""
-_STOP = 0.5
-
-
-@dataclass(frozen=True, kw_only=True)
-class RemedialDeletion(Stage[Remedies]):
-    """Deletion that stops at half of the saliency, deletion to the background, and insertion; a part is a trial.
-
-    Stopping early needs no pass: it reuses `grey`, the same frames scored by deletion to grey.
-
-    Polak, discussion of the faithfulness curves: stop once all pixels with saliency above 0.5 are gone; another fill.
-    """
-
-    piece = RemedyAnswers
-    title = "Trying the thesis's remedies"
-
-    trained: Network
-    explained: Explanation
-    grey: DeletionScores
-    steps: int = STEPS
-    seed: int = 0
-
-    def shards(self) -> Iterator[Part]:
-        """Yield the trials, whose maps are counted twice, and with a random one."""
-        return trial_shards(self.explained, maps=2 * (len(self.explained.relevance) + 1))
-
-    @property
-    def _background(self) -> str:
-        return BACKGROUND.get(self.explained.input, "background")
-
-    def prepare(self) -> Find:
-        """Return the function that deletes the pixels of the frames of a trial both ways."""
-        inputs, orders = network_inputs(self.trained, self.explained), deletion_orders(self.explained, seed=self.seed)
-        predict = prepare_passes(self.trained, inputs, 2 * len(orders) * len(inputs) * self.steps)
-
-        def delete(item: tuple[str], _: OnProgress) -> RemedyAnswers:
-            rows = self.explained.trials[item[-1]]
-            delete_rows = partial(delete_pixels, predict, inputs[rows], steps=self.steps)
-            # inserting k pixels of an order is deleting all the others
-            jobs = [(name, order[rows], self._background) for name, order in orders.items()]
-            jobs += [(name, order[rows][:, ::-1].copy(), "grey") for name, order in orders.items()]
-            tracked = report_each(jobs, sizes=[len(rows)] * len(jobs))
-            answers = [(name, delete_rows(order, fill=fill)) for name, order, fill in tracked]
-            return RemedyAnswers(background=dict(answers[: len(orders)]), insertion=dict(answers[len(orders) :]))
-
-        return delete
-
-    def join(self, pieces: Sequence[RemedyAnswers]) -> Remedies:
-        """Score all remedies."""
-        explained, background = self.explained, self._background
-        removed = deletion_steps((explained.image_size, explained.image_size), steps=self.steps)
-        deleted, inserted = (
-            {name: deletion_tables(name, removed, values, explained) for name, values in joined.items()}
-            for joined in (
-                join_trials(explained, [piece.background for piece in pieces]),
-                join_trials(explained, [piece.insertion for piece in pieces]),
-            )
-        )
-        curves = {
-            "stop-at-half": _stopped(self.grey, explained),
-            "background": deleted,
-            "insertion": {name: _inserted(tables, explained) for name, tables in inserted.items()},
-        }
-        scores = {
-            name: {method: score_tables(tables) for method, tables in by_method.items()}
-            for name, by_method in curves.items()
-        }
-        variants = {
-            "stop-at-half": Variant(
-                summary="Grey fill; ends once every pixel with a saliency above 0.5 is gone, so that frames and "
-                "methods end at different areas. Random orders end at the median area of the methods.",
-                fill="grey",
-                mode="deletion",
-                stop=_STOP,
-                better="lower",
-                methods=scores["stop-at-half"],
-            ),
-            "background": Variant(
-                summary=f"Removed pixels become {background}, and all of them go.",
-                fill=background,
-                mode="deletion",
-                stop=None,
-                better="lower",
-                methods=scores["background"],
-            ),
-            "insertion": Variant(
-                summary="From an image of nothing but grey, the most salient pixels come first; D against the answer "
-                "on the whole image, so that a faithful map rises early.",
-                fill="grey",
-                mode="insertion",
-                stop=None,
-                better="higher",
-                methods=scores["insertion"],
-            ),
-        }
-        tables = [
-            VariantTable(variant=np.repeat(name, len(table)), **vars(table))
-            for name, by_method in curves.items()
-            for of_method in by_method.values()
-            for table in of_method
-        ]
-        return Remedies(
-            input=explained.input,
-            source=explained.source,
-            steps=self.steps,
-            variants=variants,
-            alarms=tuple(
-                f"{name}: {alarm}" for name in ("stop-at-half", "background") for alarm in deletion_alarms(curves[name])
-            ),
-            table=VariantTable.joined(tables),
-        )
-
-
-def _stopped(grey: DeletionScores, explained: Explanation) -> dict[str, list[DeletionTable]]:
-    """Cut each curve after the step at which all pixels above the threshold are gone, the first step at least."""
-    counts = {name: (maps > _STOP).sum(axis=(1, 2)) for name, maps in explained.saliency.items()}
-    median = np.median(np.stack(list(counts.values())), axis=0)
-    stopped = {}
-    for name, curve in grey.curves.items():
-        stopped[name] = []
-        for frame, pixels in zip(explained.frames, counts.get(name, median), strict=True):
-            answers = curve.predictions[curve.frame_ids.index(frame.id)]
-            end = int(np.searchsorted(curve.pixels_removed, int(pixels))) + 1
-            removed = curve.pixels_removed[:end]
-            stopped[name].append(deletion_table(name, frame, removed, answers[:end], frame.prediction))
-    return stopped
-
-
-def _inserted(curves: Sequence[DeletionTable], explained: Explanation) -> list[DeletionTable]:
-    """Turn deletion of the least salient pixels into insertion, the whole image last."""
-    turned = []
-    for curve, frame in zip(curves, explained.frames, strict=True):
-        removed = np.concatenate([[0], curve.pixels_removed[:-1]])[::-1]
-        answers = np.concatenate([[frame.prediction], curve.prediction[:-1]])[::-1]
-        method = str(curve.method[0])
-        turned.append(deletion_table(method, frame, removed.copy(), answers.copy(), frame.prediction))
-    return turned

@@ -1,8 +1,7 @@
-"""Stages of a study: work on shards whose parts are records, and the result that these make together."""
+"""Stages of a study: work on parts that are records, and the result that these make together."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
@@ -10,27 +9,26 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.codec import load_result, save_result
-from sliplens.files import scratch_folder
 from sliplens.models import Network
-from sliplens.progress import OnProgress, report_progress, reporting
+from sliplens.progress import OnProgress, report_each, reporting
 from sliplens.results.explanation import Explanation
 from sliplens.runner import MakePart, Part, Work, part, run_parts
 
 Result = TypeVar("Result")
-Find: TypeAlias = Callable[[Any, OnProgress], Any]
-"""From what a shard is of to its record."""
+MakeRecord: TypeAlias = Callable[[Any], Any]
+"""Function from the item of a part to its record."""
 
 
 class Stage(Work, Generic[Result]):
-    """Work on the shards of a stage; it travels, so that it holds no more than its shards need."""
+    """Work on the parts of a stage; it travels, so that it holds no more than its parts need."""
 
-    piece: ClassVar[type]
-    """Record of a shard."""
+    record: ClassVar[type]
+    """Type of the record of a part."""
     title: ClassVar[str]
     """Description of the work, shown to the user."""
 
     trained: Network
-    """Network that the stage asks."""
+    """Network that the stage runs."""
 
     @property
     def on_gpu(self) -> bool:
@@ -38,55 +36,60 @@ class Stage(Work, Generic[Result]):
         return self.trained.device.type != "cpu"
 
     @abstractmethod
-    def shards(self) -> Iterator[Part]:
-        """All shards, in the order in which `join` takes their records."""
+    def parts(self) -> Iterator[Part]:
+        """Yield all parts, in the order in which `join` takes their records."""
 
     @abstractmethod
-    def prepare(self) -> Find:
-        """Make ready what all shards need; once in each process that takes part."""
+    def prepare(self) -> MakeRecord:
+        """Prepare what all parts need, once in each process, and return the function that makes a record."""
 
     @abstractmethod
-    def join(self, pieces: Sequence[Any]) -> Result:
-        """Make the result of the records of all shards."""
+    def join(self, records: Sequence[Any]) -> Result:
+        """Make the result of the records of all parts."""
 
     def begin(self) -> MakePart:
-        """Make records, and write each as the folder of its shard."""
-        find = self.prepare()
+        """Return the function that writes the record of a part as a folder."""
+        make_record = self.prepare()
 
         def make(item: Any, path: Path) -> None:
-            piece = find(item, report_progress)
+            record = make_record(item)
             path.mkdir()
-            save_result(piece, path)
+            save_result(record, path)
 
         return make
 
     def make(
         self,
-        parts: Path | None = None,
+        folder: Path | None = None,
         *,
         work: Work | None = None,
-        on_piece: Callable[[Any, Any], None] | None = None,
+        on: str = "serial",
+        retry_failed: bool = False,
+        on_record: Callable[[Any, Any], None] | None = None,
         on_progress: OnProgress | None = None,
-        **how: Any,
     ) -> Result:
-        """Make the records that `parts` does not keep yet, and the result.
+        """Make the result, in memory or of the records in a folder, of which those that exist are not made again.
 
-        `work` opens this stage in other processes; the stage itself does if None. `on_piece` is called with the item of
-        each record and the record, as soon as it is there; `how` are other parameters of `run_parts`.
+        `work` opens this stage in other processes; the stage itself does if None. `on_record` is called with the item
+        of each part and its record as soon as it exists.
         """
-        every = list(self.shards())
-        with nullcontext(parts) if parts else scratch_folder() as folder:
-
-            def read(each: Part) -> Any:
-                return load_result(folder / each.path, self.piece, command="the interrupted command")
-
-            def show(each: Part) -> None:
-                if on_piece is not None:
-                    on_piece(each.item, read(each))
-
+        every = list(self.parts())
+        if folder is None:
+            make_record = self.prepare()
             with reporting(on_progress):
-                run_parts(work or self, every, folder, title=self.title, on_part=show, **how)
-            return self.join([read(each) for each in every])
+                sizes = [each.frames for each in every]
+                return self.join([make_record(each.item) for each in report_each(every, sizes=sizes)])
+
+        def read(each: Part) -> Any:
+            return load_result(folder / each.path, self.record, command="the interrupted command")
+
+        def show(each: Part) -> None:
+            if on_record is not None:
+                on_record(each.item, read(each))
+
+        with reporting(on_progress):
+            run_parts(work or self, every, folder, title=self.title, on=on, retry_failed=retry_failed, on_part=show)
+        return self.join([read(each) for each in every])
 
 
 def mean_of_known(values: Float[np.ndarray, " values"]) -> float | None:
@@ -95,17 +98,25 @@ def mean_of_known(values: Float[np.ndarray, " values"]) -> float | None:
     return float(finite.mean()) if len(finite) else None
 
 
-def trial_shards(explained: Explanation, *about: str, maps: int = 1) -> Iterator[Part]:
-    """A shard of (*about, trial) for each trial of explained frames, of so many maps a frame."""
+def trial_parts(explained: Explanation, *settings: str, maps: int = 1) -> Iterator[Part]:
+    """Yield a part of (*settings, trial) for each trial of explained frames, of so many maps a frame."""
     for number, (trial, rows) in enumerate(explained.trials.items()):
+        item = (*settings, trial)
         # the folder of the parts is one of these explanations and options alone (`files.output_folder`)
-        options = {"recipe": about, "content": "", "first": number, "frames": maps * len(rows)}
-        yield part((*about, trial), trial=trial, name=" ".join((*about, trial)), **options)
+        yield part(
+            item,
+            trial=trial,
+            name=" ".join(item),
+            recipe=settings,
+            content="",
+            first=number,
+            frames=maps * len(rows),
+        )
 
 
 def join_trials(
     explained: Explanation, pieces: Sequence[Mapping[str, np.ndarray]], *, axis: int = 0
 ) -> dict[str, np.ndarray]:
-    """Arrays of all frames, whose axis is named, from those of each trial (`trial_shards`)."""
+    """Arrays of all frames along an axis, from those of each trial (`trial_parts`)."""
     order = np.argsort([row for rows in explained.trials.values() for row in rows])
     return {name: np.concatenate([piece[name] for piece in pieces], axis=axis).take(order, axis) for name in pieces[0]}

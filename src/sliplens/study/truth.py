@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int, Shaped, UInt8
@@ -14,13 +13,12 @@ from sliplens.errors import InputError
 from sliplens.explainers.attribution import change_of
 from sliplens.explainers.explain import network_inputs
 from sliplens.explainers.shapley import shapley_values
-from sliplens.faithfulness.controls import lead_over_controls, relevance_mass, relevance_rank
+from sliplens.faithfulness.controls import lead_over_controls, relevance_mass
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import (
     RANDOM_ORDERS,
     SHARES,
     Redraw,
-    RemovalCurves,
     Units,
     answer_scenes,
     influence_orders,
@@ -30,16 +28,16 @@ from sliplens.faithfulness.removal import (
     unit_means,
     unit_order,
 )
-from sliplens.faithfulness.scoring import prepare_passes
+from sliplens.faithfulness.scoring import prepare_passes, require_same_network
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.models import Network
 from sliplens.plots.style import tell_ends
-from sliplens.progress import OnProgress, ignore, reporting
+from sliplens.progress import ignore, reporting
 from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
-from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, OracleTest, Truth
+from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, Truth
 from sliplens.runner import Part, part
 from sliplens.simulation.intervention import (
     FilmedTrial,
@@ -49,8 +47,7 @@ from sliplens.simulation.intervention import (
     rebuild_trial,
     visible_markers,
 )
-from sliplens.study.scoring import require_same_network
-from sliplens.study.stages import Find, Stage, mean_of_known
+from sliplens.study.stages import MakeRecord, Stage, mean_of_known
 
 _RIM_PX = 1.5
 """How far a marker's edge reaches on either side of its outline, in pixels of the network's input."""
@@ -103,13 +100,10 @@ def stage_frames(trained: Network, explained: Explanation, data: Dataset) -> tup
     if not data.simulated or explained.source != "simulated":
         raise InputError(f"{data.folder} was recorded: what each marker does is known of simulated frames alone")
     infos = {info.trial: info for info in data.trials}
-    rows: dict[str, list[int]] = {}
-    for row, frame in enumerate(explained.frames):
-        if frame.trial not in infos:
-            raise InputError(f"{data.folder} has no trial {frame.trial}; name the data set whose frames were explained")
-        rows.setdefault(frame.trial, []).append(row)
     staged: dict[int, StagedFrame] = {}
-    for trial, some in rows.items():
+    for trial, some in explained.trials.items():
+        if trial not in infos:
+            raise InputError(f"{data.folder} has no trial {trial}; name the data set whose frames were explained")
         recording = data.load(infos[trial])
         scene = rebuild_trial(data.folder, recording)
         for row in some:
@@ -122,15 +116,18 @@ def stage_frames(trained: Network, explained: Explanation, data: Dataset) -> tup
             image = trained.encoding.compare_small(frame, recording.reference, image_size=image_size)[0].numpy()
             if np.abs(image.astype(np.int16) - explained.images[row].astype(np.int16)).max() > _ROUNDING:
                 raise InputError(f"{name} is not the frame of {data.folder} that was explained; explain it again")
-            truth = recording.truth
-            assert truth is not None  # what was rebuilt has its truth
-            frames: dict[str, Any] = {"id": name, "day": infos[trial].day, "trial": trial, "number": number}
-            frames |= {
-                "safety_margin": float(recording.safety_margin[number]),
-                "contact_map": truth.contact_map[number],
-            }
-            markers = visible_markers(scene.film.sensor)
-            staged[row] = StagedFrame(**frames, scene=scene, reference=recording.reference, markers=markers)
+            assert recording.truth is not None  # a trial that was rebuilt has its truth
+            staged[row] = StagedFrame(
+                id=name,
+                day=infos[trial].day,
+                trial=trial,
+                number=number,
+                safety_margin=float(recording.safety_margin[number]),
+                contact_map=recording.truth.contact_map[number],
+                scene=scene,
+                reference=recording.reference,
+                markers=visible_markers(scene.film.sensor),
+            )
     return tuple(staged[row] for row in range(len(explained.frames)))
 
 
@@ -205,9 +202,8 @@ class FrameEffects:
     margin: Float64[np.ndarray, " markers"]
     shuffled: Float64[np.ndarray, " markers"]
     """`shapley`, the values of half of the markers shuffled: an oracle that is half wrong."""
-    gains: dict[str, Float64[np.ndarray, "2 3"]]
-    """Symmetric gain, under each fill, of the maps that have `shapley`, `shuffled` and |x - b|: a row for changes along
-    the answer's, and one for changes by their size, the maps ordered by |value|."""
+    gains: dict[str, Float64[np.ndarray, " 3"]]
+    """Symmetric gain, under each fill, of the maps that have `shapley`, `shuffled` and |x - b|."""
 
 
 def shuffle_half(values: Float[np.ndarray, " markers"], *, rng: np.random.Generator) -> Float[np.ndarray, " markers"]:
@@ -216,13 +212,6 @@ def shuffle_half(values: Float[np.ndarray, " markers"], *, rng: np.random.Genera
     shuffled = values.copy()
     shuffled[chosen] = values[rng.permutation(chosen)]
     return shuffled
-
-
-def _gains(curves: RemovalCurves, towards: float) -> Float[np.ndarray, "2 3"]:
-    """Symmetric gains along the answer's change and by size, of curves of oracle, damaged one, |x - b|, and sizes."""
-    lost = np.trapezoid(curves.lost(np.array([towards]))[:, 0], curves.areas, axis=-1)
-    along, by_size = (means[::2] - means[1::2] for means in (lost, curves.mean_changes[:, 0]))
-    return np.stack([along[:3], by_size[[3, 4, 2]]])
 
 
 def marker_means(maps: Maps, places: Sequence[Places]) -> list[Float[np.ndarray, " markers"]]:
@@ -235,18 +224,11 @@ def marker_means(maps: Maps, places: Sequence[Places]) -> list[Float[np.ndarray,
 
 def _by_region(places: Sequence[Places], measure: Callable[[int, np.ndarray], float]) -> dict[str, float | None]:
     """Means over the frames that have the region: where nothing slips there is nothing to find."""
-    return {
-        region: mean_of_known(
-            np.array(
-                [
-                    measure(at, place)
-                    for at, place in enumerate(getattr(place, region) for place in places)
-                    if place.any()
-                ]
-            )
-        )
-        for region in REGIONS
-    }
+    means = {}
+    for region in REGIONS:
+        areas = [getattr(place, region) for place in places]
+        means[region] = mean_of_known(np.array([measure(at, area) for at, area in enumerate(areas) if area.any()]))
+    return means
 
 
 def rank_correlation(first: Float[np.ndarray, " markers"], second: Float[np.ndarray, " markers"]) -> float:
@@ -276,22 +258,14 @@ _Interval = Callable[[Iterable[float]], Difference | None]
 
 
 def meta_test(effects: Sequence[FrameEffects], interval: _Interval) -> tuple[MetaTest, ...]:
-    """Test whether each fill ranks the map of all effects above the one of which half is shuffled.
-
-    A gain counts changes of the answer towards the target, as `score_maps` does when it is told, and maps rank what
-    speaks for it before what speaks against it. `by_size` counts how large changes are, and maps rank by |value|.
-    """
+    """Test whether each fill ranks the map of all effects above the one of which half is shuffled."""
     tests = []
     for fill in effects[0].gains:
         gains = np.stack([effect.gains[fill] for effect in effects])
-        along, by_size = (_test_oracle(gains[:, row], interval) for row in (0, 1))
-        tests.append(MetaTest(fill=fill, by_size=by_size, **vars(along)))
+        oracle, degraded, changed = gains.mean(axis=0).tolist()
+        gap = interval(gains[:, 0] - gains[:, 1])
+        tests.append(MetaTest(fill=fill, oracle=oracle, degraded=degraded, changed=changed, gap=gap))
     return tuple(tests)
-
-
-def _test_oracle(gains: Float[np.ndarray, "frames 3"], interval: _Interval) -> OracleTest:
-    oracle, degraded, changed = gains.mean(axis=0).tolist()
-    return OracleTest(oracle=oracle, degraded=degraded, changed=changed, gap=interval(gains[:, 0] - gains[:, 1]))
 
 
 def reliability_of(values: Float64[np.ndarray, " markers"], errors: Float64[np.ndarray, " markers"]) -> float:
@@ -327,17 +301,16 @@ def _summarise(truth: Truth) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class JudgingByTruth(Stage[Truth]):
-    """Markers of every frame, a shard, put back alone and in company, and maps held against what that does.
+    """Markers of every frame, a part, put back alone and in company, and maps compared with what that does.
 
     There are two truths: what putting a marker back alone changes, and its Shapley value, the mean of what it changes
     over all the company of markers that may be put back already. The latter add up to the change of the answer.
 
-    A map's mass and rank are those of its positive part, what works towards the answer: a share of a sum needs one
-    sign. Marker by marker the mean of the map is compared with the effect along the answer's change, both signed: a map
-    of what supports the answer alone ties the markers that oppose it.
+    A map's mass is that of its positive part, what works towards the answer: a share of a sum needs one sign. Marker by
+    marker the mean of the map is compared with the effect along the answer's change, both signed.
     """
 
-    piece = FrameEffects
+    record = FrameEffects
     title = "Putting markers back"
 
     trained: Network
@@ -346,20 +319,19 @@ class JudgingByTruth(Stage[Truth]):
     maps: Mapping[str, Maps]
     """Influences by method, controls included."""
     fills: Sequence[str] = TRUTH_FILLS
-    """Those under which a map that knows the effects is held against one that knows half of them."""
+    """Those under which a map that knows the effects is compared with one that knows half of them."""
     pairs: int = TRUTH_PAIRS
-    """How many pairs of scenes the Shapley values of a frame rest on; at least two a marker are taken."""
+    """Number of pairs of scenes behind the Shapley values of a frame; at least two a marker are taken."""
     seed: int = 0
 
     def __post_init__(self) -> None:
         for fill in self.fills:
             get_fill(fill)
 
-    def shards(self) -> Iterator[Part]:
-        """All frames."""
+    def parts(self) -> Iterator[Part]:
+        """Yield all frames."""
         for index, frame in enumerate(self.explained.frames):
-            valid = {"recipe": "truth", "content": "", "first": index, "frames": 1}
-            yield part(index, trial=frame.trial, name=frame.id, **valid)
+            yield part(index, trial=frame.trial, name=frame.id, recipe="truth", content="", first=index, frames=1)
 
     @cached_property
     def _staged(self) -> tuple[tuple[StagedFrame, ...], list[Places], int]:
@@ -368,31 +340,30 @@ class JudgingByTruth(Stage[Truth]):
         places = [find_places(frame, image_size=self.trained.manifest.image_size) for frame in frames]
         return frames, places, max([self.pairs, *(2 * len(frame.markers) for frame in frames)])
 
-    def prepare(self) -> Find:
-        """Put the markers of a frame back, and see which fills tell a map that knows their effects from half of one."""
+    def prepare(self) -> MakeRecord:
+        """Return the function that puts the markers of a frame back, and tests the fills on what that does."""
         trained, explained, fills, seed = self.trained, self.explained, self.fills, self.seed
         frames, places, pairs = self._staged
         inputs, redraw = network_inputs(trained, explained), redrawing(trained, frames)
-        # each marker alone, pairs of scenes, and under each fill five maps both ways
-        passes = len(frames) * (len(frames[0].markers) + 2 * pairs + 10 * len(SHARES) * (len(fills) + 1))
+        # each marker alone, pairs of scenes, and under each fill three maps both ways
+        passes = len(frames) * (len(frames[0].markers) + 2 * pairs + 6 * len(SHARES) * (len(fills) + 1))
         predict = prepare_passes(trained, inputs, passes)
 
-        def find(index: int, _: OnProgress) -> FrameEffects:
+        def put_back(index: int) -> FrameEffects:
             frame, place, towards = frames[index], places[index], float(explained.towards[index])
             count, answer = len(frame.markers), answer_scenes(predict, partial(redraw, index))
             # the whole image first
             answers = answer(np.eye(count + 1, count, k=-1, dtype=bool))
             # a run that goes on draws the same; a first guess would lean the truth towards the map that gave it
             rng = np.random.default_rng((seed, index))
-            records = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
-            shuffled = shuffle_half(records.values, rng=rng)
+            estimate = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
+            shuffled = shuffle_half(estimate.values, rng=rng)
             empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
-            change = change_of(inputs[index].cpu(), empty).double().numpy()
-            oracles = [towards * records.values, towards * shuffled]
-            valid = [*oracles, unit_means(change, place.units)[:count], *map(np.abs, oracles)]
+            change = unit_means(change_of(inputs[index].cpu(), empty).double().numpy(), place.units)[:count]
+            maps = [towards * estimate.values, towards * shuffled, change]
             orders = [
-                unit_order(place.paint(record), place.units, least_first=least)
-                for record in valid
+                unit_order(place.paint(values), place.units, least_first=least)
+                for values in maps
                 for least in (False, True)
             ]
             with reporting(ignore):  # a part is a frame, whatever its passes
@@ -407,25 +378,26 @@ class JudgingByTruth(Stage[Truth]):
                     )
                     for name in fills
                 }
-                curves[TRUE_FILL] = marker_curves(
-                    predict,
-                    lambda _, back: redraw(index, back),
-                    np.concatenate([influence_orders(record[None]) for record in valid]),
-                )
+                by_marker = np.concatenate([influence_orders(values[None]) for values in maps])
+                curves[TRUE_FILL] = marker_curves(predict, lambda _, back: redraw(index, back), by_marker)
+            lost = {
+                name: np.trapezoid(curve.lost(np.array([towards]))[:, 0], curve.areas, axis=-1)
+                for name, curve in curves.items()
+            }
             return FrameEffects(
-                shapley=records.values,
-                shapley_error=records.standard_errors,
+                shapley=estimate.values,
+                shapley_error=estimate.standard_errors,
                 network=answers[0] - answers[1:],
                 margin=marker_readings(frame.scene, frame.number)[1],
                 shuffled=shuffled,
-                gains={name: _gains(curve, towards) for name, curve in curves.items()},
+                gains={name: areas[::2] - areas[1::2] for name, areas in lost.items()},
             )
 
-        return find
+        return put_back
 
-    def join(self, pieces: Sequence[FrameEffects]) -> Truth:
-        """Hold the maps against what putting the markers back does."""
-        trained, explained, seed, effects = self.trained, self.explained, self.seed, pieces
+    def join(self, records: Sequence[FrameEffects]) -> Truth:
+        """Compare the maps with what putting the markers back does."""
+        trained, explained, seed, effects = self.trained, self.explained, self.seed, records
         frames, places, pairs = self._staged
         size = trained.manifest.image_size
         # along the answer's change, as the maps are
@@ -455,7 +427,6 @@ class JudgingByTruth(Stage[Truth]):
             ),
             sums={name: _sum_over_change(effects, change, name) for name in ("shapley", "network")},
             shapley_against_margin=alike(rank_correlation(effect.shapley, effect.margin) for effect in effects),
-            network_against_margin=alike(rank_correlation(effect.network, effect.margin) for effect in effects),
             meta=meta_test(effects, interval),
             summary="",
             effects=_table(frames, places, effects),
@@ -495,8 +466,7 @@ def _judge(
             relevance_mass(rows, place.edges) - place.edges.mean() for rows, place in zip(positive, places, strict=True)
         )
         records[name] = Localisation(
-            mass=_by_region(places, lambda frame, region, own=positive: relevance_mass(own[frame], region)),
-            rank=_by_region(places, lambda frame, region, own=positive: relevance_rank(own[frame], region)),
+            mass=_by_region(places, lambda frame, region, maps=positive: relevance_mass(maps[frame], region)),
             lead_over_controls=lead_over_controls(ranks[name], controls, clusters=clusters, rng=rng)
             if name in methods
             else None,
@@ -512,11 +482,22 @@ def _judge(
 def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Sequence[FrameEffects]) -> MarkerEffects:
     pieces = []
     for frame, place, effect in zip(frames, places, effects, strict=True):
-        text = {name: getattr(frame, name) for name in ("day", "trial", "safety_margin")} | {"frame_id": frame.id}
-        columns = {name: np.repeat(value, len(frame.markers)) for name, value in text.items()}
-        columns |= {name: getattr(effect, name) for name in ("shapley", "shapley_error", "network", "margin")}
-        columns |= {"x_px": place.now_px[:, 0], "y_px": place.now_px[:, 1]}
-        pieces.append(MarkerEffects(**columns, marker=frame.markers.astype(np.int64), state=place.state))
+        count = len(frame.markers)
+        rows = MarkerEffects(
+            frame_id=np.repeat(frame.id, count),
+            day=np.repeat(frame.day, count),
+            trial=np.repeat(frame.trial, count),
+            safety_margin=np.repeat(frame.safety_margin, count),
+            marker=frame.markers.astype(np.int64),
+            x_px=place.now_px[:, 0],
+            y_px=place.now_px[:, 1],
+            shapley=effect.shapley,
+            shapley_error=effect.shapley_error,
+            network=effect.network,
+            margin=effect.margin,
+            state=place.state,
+        )
+        pieces.append(rows)
     return MarkerEffects.joined(pieces)
 
 
