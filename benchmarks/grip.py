@@ -3,9 +3,7 @@
 Fingertips and seeds are others than those by which the controllers' constants were chosen (the table's first 64
 fingertips, seeds from 1000). `excess_ratio`: force excess of a controller over that of the least fixed force that drops
 as few. `drop_ratio`: its drops over those of the fixed force of the same mean. Intervals (95 %) are over episodes,
-drawn again 400 times, the same for all controllers. `--in-a-row` and `--in-order` measure something else, on the draws
-by which constants were chosen: what slips of earlier grasps teach, and frames read in order. With `--json` the last
-line is one JSON object.
+drawn again 400 times, the same for all controllers. With `--json` the last line is one JSON object.
 """
 
 import argparse
@@ -42,8 +40,6 @@ LATENCIES_S = (0.0, 0.025, 0.05, 0.075, 0.1, 0.15)
 SCALES = (0.0, 0.5, 1.0, 1.5, 2.0)
 TARGETS = (0.05, 0.15, 0.25, 0.35, 0.45)
 TOLD = ("exactly", "within 10 %", "from one slip")
-SELECTION_SEED, GRASPS = 1000, 5
-"""Seeds by which constants were chosen, and grasps of an object in a row."""
 _DRAWS = 400
 
 
@@ -218,105 +214,6 @@ def validate(count: int, conditions: Sequence[str], rng: np.random.Generator) ->
     }  # fmt: skip
 
 
-def in_a_row(objects: int, conditions: Sequence[str], rng: np.random.Generator) -> dict[str, object]:
-    """Grip objects again and again by the margin law, with and without what slips taught in the grasps before.
-
-    Fingertips and seeds are those by which constants were chosen. Intervals (95 %) are over objects, each with all its
-    grasps; the second grasp and later ones count, the first is the same in both.
-    """
-    told: dict[str, object] = {"objects": objects, "grasps": GRASPS}
-    ways: dict[str, dict[str, Any]] = {
-        "nothing": {}, "learnt": {"same_object": True}, "the object's, exactly": {"friction": "each"}
-    }  # fmt: skip
-    tables = {
-        way: EpisodeTable.joined(
-            [
-                run_episodes(
-                    "cup", "margin", condition=name, episodes=objects, network=RUN, seed=SELECTION_SEED + number,
-                    options=EpisodeOptions(readings=SELECTION, grasps=GRASPS, **options),
-                ).episodes
-                for number, name in enumerate(conditions)
-            ]
-        )
-        for way, options in ways.items()
-    }  # fmt: skip
-
-    def by_object(values: np.ndarray, table: EpisodeTable) -> np.ndarray:
-        """Mean of each object's later grasps, condition after condition."""
-        parts = [values[table.condition == name].reshape(GRASPS, objects) for name in conditions]
-        return np.concatenate([part[1:].mean(axis=0) for part in parts])
-
-    labels = np.repeat(list(conditions), objects)
-    columns = {
-        way: {
-            "drop_rate": by_object(table.dropped.astype(np.float64), table),
-            "force_excess": by_object(table.force_excess, table),
-            "known": by_object(np.isfinite(table.known_friction).astype(np.float64), table),
-        }
-        for way, table in tables.items()
-    }
-    taught = columns["learnt"]["known"] > 0
-    groups = {"all": np.ones(len(labels), dtype=bool), "of objects that taught": taught}
-    for group, rows in (groups | {name: labels == name for name in conditions}).items():
-        told[group] = {
-            way: {name: _over(values[rows], rng) for name, values in found.items()} for way, found in columns.items()
-        } | {
-            "learnt less nothing": {
-                name: _over((columns["learnt"][name] - columns["nothing"][name])[rows], rng)
-                for name in ("drop_rate", "force_excess")
-            }
-        }  # fmt: skip
-    own, exact = tables["learnt"], tables["the object's, exactly"]
-    known = (own.known_friction / exact.known_friction)[own.grasp > 1]
-    told["learnt_over_true"] = {
-        "median": _number(np.nanmedian(known)),
-        "p05": _number(np.nanquantile(known, 0.05)),
-        "p95": _number(np.nanquantile(known, 0.95)),
-    }
-    return told
-
-
-def in_order(count: int, conditions: Sequence[str], rng: np.random.Generator) -> dict[str, object]:
-    """Run episodes through pixels by the margin law, frames read one by one and in order.
-
-    Fingertips and seeds are others than those of the comparison and those of the table. `rmse` is that of the margins
-    read after the lift, of each finger. Intervals (95 %) are over episodes.
-    """
-    found: dict[str, list[tuple[float, float, float]]] = {"one by one": [], "in order": []}
-    for number in range(count):
-        scripts = draw_scripts("cup", conditions[number % len(conditions)], episodes=1, seed=SELECTION_SEED + number)
-        for way, rows in found.items():
-            ticks: list[Tick] = []
-            sensor = RenderedSensor(RUN, seed=_UNSEEN + 2 * number, sequence=way == "in order")
-            loop = GripLoop(Plant(OBJECTS["cup"]), sensor, make_controller("margin"))
-            table = run_scripts(loop, scripts, on_tick=ticks.append)
-            errors = np.concatenate(
-                [
-                    now.reading.margin[0] - before.state.margin[0]
-                    for before, now in itertools.pairwise(ticks)
-                    if before.state.time_s > 0.6 and not before.state.dropped[0]
-                ]
-            )
-            error = float((errors**2).mean())
-            rows.append((float(table.dropped[0]), float(table.force_excess[0]), error))
-        print(number, *(rows[-1] for rows in found.values()), flush=True)
-    one, several = (np.array(rows) for rows in found.values())
-    names = ("drop_rate", "force_excess", "rmse")
-    return {
-        "episodes": count,
-        **{
-            way: {
-                name: _over(values, rng, then=np.sqrt if name == "rmse" else np.asarray)
-                for name, values in zip(names, np.array(rows).T, strict=True)
-            }
-            for way, rows in found.items()
-        },
-        "in order less one by one": {
-            name: _over(values, rng) for name, values in zip(names[:2], (several - one).T[:2], strict=True)
-        },
-    }
-
-
 def _over(
     values: np.ndarray, rng: np.random.Generator, then: Callable[[np.ndarray], np.ndarray] = np.asarray
 ) -> dict[str, float | None]:
@@ -336,16 +233,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--rendered", type=int, default=0, help="episodes through pixels that the table is held against"
     )
-    parser.add_argument("--in-a-row", type=int, default=0, help="objects of each condition that are gripped again")
-    parser.add_argument("--in-order", type=int, default=0, help="episodes through pixels, frames read in order")
     parser.add_argument("--json", action="store_true", help="end with one line of JSON")
     options = parser.parse_args(arguments)
-    rng, conditions = np.random.default_rng(0), options.conditions
-    chosen = {"in_a_row": (in_a_row, options.in_a_row), "in_order": (in_order, options.in_order)}
-    if any(count for _, count in chosen.values()):
-        found = {name: ask(count, conditions, rng) for name, (ask, count) in chosen.items() if count}
-    else:
-        found = compare_all(options, rng)
+    found = compare_all(options, np.random.default_rng(0))
     for name, value in found.items():
         print(f"{name}: {json.dumps(value)}")
     if options.json:
@@ -416,8 +306,6 @@ RUN = load(DEFAULT_NETWORK)
 _TABLE = load_readings(RUN)
 assert _TABLE is not None  # it comes with the network
 READINGS = _TABLE.of(slice(CHOSEN, None))
-SELECTION = _TABLE.of(slice(0, CHOSEN))
-_UNSEEN = _TABLE.seed + 10_000
 """Seed of fingertips that no table has."""
 
 if __name__ == "__main__":

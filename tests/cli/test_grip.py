@@ -8,7 +8,6 @@ from command_line import refused, run
 import sliplens as sl
 from sliplens.codec import load_result
 from sliplens.grip.records import Grip
-from sliplens.report.grip import table_episodes
 
 
 def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -41,19 +40,9 @@ def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, cap
     assert "kept" in capsys.readouterr().out
 
 
-def test_grasps_of_the_same_objects_have_a_row_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    words = ("grip", "-o", tmp_path, "--controller", "fixed", "--episodes", 4, "--grasps", 2, "--same-object")
-    assert run(*words) == 0
-    assert "Grasp after grasp" in capsys.readouterr().out
-    table = table_episodes(load_result(tmp_path / "grip", Grip, command="sliplens grip"))
-    assert [[cell.text for cell in row[:2]] for row in table.rows] == [["1", "4"], ["2", "4"]]
-    assert "Friction learnt from a slip counts in the grasps that follow." in table.caption
-
-
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--sequence",), "add --rendered, or leave out --sequence"),
         (("--controller", "magic"), "there is no controller named 'magic'"),
         (("--condition", "oily"), "there is no condition named 'oily'"),
         (("--set", "target"), "write NAME=NUMBER"),

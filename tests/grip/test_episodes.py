@@ -12,7 +12,7 @@ import sliplens as sl
 from sliplens.codec import load_result
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK
-from sliplens.friction import GRASP_SPREAD, Friction, SlipLearner
+from sliplens.friction import Friction, SlipLearner
 from sliplens.grip import episodes as episodes_module
 from sliplens.grip.controllers import Controller, MarginLaw, make_controller
 from sliplens.grip.episodes import EpisodeOptions, run_episodes
@@ -27,7 +27,7 @@ from sliplens.grip.fingertip import (
     load_readings,
 )
 from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor
-from sliplens.grip.plant import Plant, pick_object
+from sliplens.grip.plant import OBJECTS, Plant
 from sliplens.grip.records import Grip
 from sliplens.grip.scripts import EPISODE_S, draw_scripts, hand_motion
 from sliplens.models import Network
@@ -93,7 +93,7 @@ def test_what_the_network_reads_of_a_fingertip_is_what_its_table_has(network, ta
 
 
 def test_a_network_without_errors_reads_the_truth(table):
-    plant = Plant(pick_object("cup"), episodes=20)
+    plant = Plant(OBJECTS["cup"], episodes=20)
     eyes = TableSensor(table, fingertips=np.arange(20.0), rng=np.random.default_rng(0), error_scale=0.0)
     plant.state = replace(plant.state, force_n=np.full(20, 1.0), shear_n=np.full((20, 2), 0.3))
     sight = eyes.measure(plant.state, np.full(20, np.nan))
@@ -132,7 +132,7 @@ def test_the_loop_detects_slip_as_a_real_hold_does_and_only_where_an_object_slid
         script |= {"patch_factor": factor, "patch_at_s": 2.5}
         scripts = draw_scripts("cup", "dry", episodes=6, seed=1, script=script)
         eyes = TableSensor(table, fingertips=np.arange(6.0), rng=np.random.default_rng(0))
-        loop = GripLoop(Plant(pick_object("cup"), episodes=6), eyes, make_controller("fixed", {"force_n": 1.5}))
+        loop = GripLoop(Plant(OBJECTS["cup"], episodes=6), eyes, make_controller("fixed", {"force_n": 1.5}))
         ticks = [loop.tick(scripts.world(loop.plant.state.time_s)) for _ in range(180)]
         slip, time_s = (
             np.array([tick.observation.slip for tick in ticks]),
@@ -147,7 +147,7 @@ def test_the_loop_closes_through_pixels(network):
     """A little of an episode: what is read follows what the plant does."""
     scripts = draw_scripts("cup", "dry", episodes=1, seed=0, script={"mass_kg": 0.08, "friction": 0.6})
     eyes = RenderedSensor(network, seed=11, engine="torch")
-    loop = GripLoop(Plant(pick_object("cup")), eyes, make_controller("fixed", {"force_n": 1.2}))
+    loop = GripLoop(Plant(OBJECTS["cup"]), eyes, make_controller("fixed", {"force_n": 1.2}))
     ticks = [loop.tick(scripts.world(loop.plant.state.time_s)) for _ in range(3)]
     frames = ticks[-1].reading.frames
     assert frames is not None
@@ -170,7 +170,7 @@ def test_a_reading_comes_as_late_as_is_said():
     for latency, ticks in ((0.0, 0), (0.02, 2), (0.1, 6)):
         times.clear()
         scripts = draw_scripts("cup", "dry", episodes=1, seed=0)
-        loop = GripLoop(Plant(pick_object("cup")), None, Note(), latency_s=latency)
+        loop = GripLoop(Plant(OBJECTS["cup"]), None, Note(), latency_s=latency)
         after = [loop.tick(scripts.world(loop.plant.state.time_s)).state.force_n[0] for _ in range(12)]
         forces = [0.0, *map(float, after)]
         assert [force for _, force in times][ticks:] == forces[: 12 - ticks]
@@ -213,21 +213,6 @@ def test_an_interrupted_run_goes_on_to_the_same_record(tmp_path: Path, monkeypat
     assert not (tmp_path / "grip" / "parts").exists()
 
 
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        ({"object": "anvil"}, "there is no object named 'anvil'; choose one of cup"),
-        ({"condition": "oily"}, "there is no condition named 'oily'"),
-        ({"episodes": 0}, "0 episodes cannot be run"),
-        ({"script": {"weight": 1.0}}, "an episode has no weight; choose of"),
-        ({"script": {"mass_kg": 0.0}}, "mass_kg must be above 0, got 0"),
-    ],
-)
-def test_what_cannot_be_run_is_told_in_a_sentence(options, told):
-    with pytest.raises(InputError, match=told):
-        run_episodes(**options)
-
-
 def told_table(table: ReadingTable) -> ReadingTable:
     """Readings of three quarters of F_t / F_n, as if a network told it."""
     friction, _, margins = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")
@@ -237,7 +222,7 @@ def told_table(table: ReadingTable) -> ReadingTable:
 
 def pulled(friction: float, ratio: float) -> Plant:
     """Plant of three episodes that hold with 1 N and are pulled."""
-    plant = Plant(pick_object("cup"), episodes=3)
+    plant = Plant(OBJECTS["cup"], episodes=3)
     plant.state = replace(
         plant.state, force_n=np.ones(3), shear_n=np.full((3, 2), ratio), friction=np.full((3, 2), friction)
     )
@@ -280,68 +265,20 @@ def test_a_slip_narrows_what_was_told_of_friction(table):
     assert after.margin[1:] == pytest.approx(before.margin[1:])
 
 
-def test_a_row_of_grasps_has_the_same_objects_at_a_friction_of_their_own():
-    grip = few("fixed", settings={"force_n": 3.0}, grasps=3, episodes=200)
-    first, second, third = (grip.episodes.where(grip.episodes.grasp == number) for number in (1, 2, 3))
-    for name, value in vars(
-        few("fixed", settings={"force_n": 3.0}, episodes=200).episodes.where(np.arange(200))
-    ).items():
-        np.testing.assert_array_equal(getattr(first, name), value)
-    for later in (second, third):
-        np.testing.assert_array_equal(later.mass_kg, first.mass_kg)
-        # a standard deviation of 200 normal numbers is off by 5 %
-        assert np.std(later.friction / first.friction) == pytest.approx(GRASP_SPREAD, rel=0.2)
-    assert np.isnan(grip.episodes.known_friction).all()
-
-
-def test_a_controller_of_one_s_own_begins_each_grasp_anew():
-    own, named = (few(law, "jolt", grasps=2, episodes=8).episodes for law in (MarginLaw(), "margin"))
-    np.testing.assert_array_equal(own.mean_force_n, named.mean_force_n)
-
-
-def test_what_slips_taught_counts_in_the_grasps_that_follow_only_of_the_same_object():
-    kept = few("margin", "unknown", grasps=3, same_object=True, episodes=60).episodes
-    first, *later = (kept.where(kept.grasp == number) for number in (1, 2, 3))
-    assert np.isnan(first.known_friction).all()
-    learnt = np.isfinite(later[0].known_friction)
-    assert 0 < learnt.sum() < 60
-    assert np.isfinite(later[1].known_friction[learnt]).all()  # it is not forgotten
-    forgotten = few("margin", "unknown", grasps=2, episodes=60).episodes
-    assert np.isnan(forgotten.known_friction).all()
-    np.testing.assert_array_equal(forgotten.where(forgotten.grasp == 1).mean_force_n, first.mean_force_n)
-
-
-def test_frames_of_a_grip_are_read_in_order_through_pixels(network: Network):
-    eyes = [RenderedSensor(network, seed=11, engine="torch", sequence=way) for way in (False, True)]
-    followers, differ = [network.follow() for _ in range(2)], list[float]()
-    plant = Plant(pick_object("cup"))
-    for step in range(3):
-        state = replace(plant.state, time_s=0.1 * step, force_n=np.ones(1), shear_n=np.full((1, 2), 0.1 + 0.1 * step))
-        one, several = (eye.measure(state, np.full(1, np.nan)) for eye in eyes)
-        assert one.frames is not None
-        assert several.frames is not None
-        np.testing.assert_array_equal(one.frames, several.frames)
-        inputs = [network.encode(f[None], r) for f, r in zip(one.frames, eyes[0].references, strict=True)]
-        for finger, follower in enumerate(followers):
-            estimate = follower.update(network.estimate(inputs[finger]), np.array([0.1 * step]), np.array([True]))
-            # both fingers go through the network together, which adds in another order
-            assert several.margin[0, finger] == pytest.approx(float(estimate.margin[0]), abs=1e-4)
-        differ.append(float(np.abs(one.margin - several.margin).max()))
-    assert max(differ) > 1e-3
-
-
 @pytest.mark.parametrize(
     ("options", "told"),
     [
         ({"latency_s": -1.0}, "latency and error scale must not be negative"),
         ({"method": "guess", "rendered": True}, "there is no method named 'guess'"),
-        ({"grasps": 0}, "0 grasps of an object cannot be run"),
-        ({"sequence": True}, "looked up have no order"),
-        ({"sequence": True, "rendered": True, "friction": 0.6}, "leave out one of them"),
-        ({"same_object": True}, "1 grasp of an object .* --same-object, .*; add --grasps 2"),
-        ({"same_object": True, "grasps": 2, "network": "thesis-raw"}, "--same-object learns friction .* margin alone"),
+        ({"friction": 0.6, "network": "thesis-raw"}, "F_t / F_n"),
     ],
 )
-def test_what_cannot_be_learnt_or_followed_is_refused(options: dict[str, Any], told: str):
+def test_options_that_cannot_be_are_refused(options: dict[str, Any], told: str):
     with pytest.raises(InputError, match=told):
         few("margin", **options)
+
+
+def test_each_batch_has_a_copy_of_a_controller_of_one_s_own(monkeypatch):
+    monkeypatch.setattr(episodes_module, "_BATCH", 2)
+    own, named = (few(law, "jolt", episodes=4).episodes for law in (MarginLaw(), "margin"))
+    np.testing.assert_array_equal(own.mean_force_n, named.mean_force_n)

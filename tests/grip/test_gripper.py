@@ -80,10 +80,9 @@ def test_a_wrong_answer_is_told_in_a_sentence(fake, answer, told):
     gripper.close()
 
 
-@pytest.mark.parametrize("numbered", [True, False])
-def test_a_late_answer_never_counts_as_that_of_another_line(numbered):
+def test_a_late_answer_never_counts_as_that_of_another_line(fake):
     """A gripper falls behind by some lines: each answer tells the force of its own line, or none is taken."""
-    fake, late = FakeGripper(numbered=numbered), threading.Event()
+    late = threading.Event()
     gripper = open_gripper(fake.address, timeout_s=0.05)
     assert isinstance(gripper, LineGripper)
     asked = 0
@@ -105,10 +104,9 @@ def test_a_late_answer_never_counts_as_that_of_another_line(numbered):
     for force_n in (3.0, 4.0):
         assert gripper.ask(f"F {force_n:.3f}").force_n == force_n
     gripper.close()
-    fake.close()
 
 
-def test_a_serial_gripper_without_numbers_is_left_alone_after_an_answer_that_did_not_come(clock):
+def test_a_serial_gripper_is_left_alone_after_an_answer_that_did_not_come(clock):
     gripper_end, ours = os.openpty()
     gripper = LineGripper(partial(_open_serial, Path(os.ttyname(ours))), timeout_s=0.0, silence_s=2.0)
     with pytest.raises(GripperError, match="did not answer"):
@@ -117,7 +115,7 @@ def test_a_serial_gripper_without_numbers_is_left_alone_after_an_answer_that_did
     for clock.now_s in (0.5, 1.9):
         with pytest.raises(GripperError, match="left alone"):
             gripper.read_state()
-    assert heard.strip() == b"S #1"
+    assert heard.strip() == b"S"
     gripper.close()
     os.close(gripper_end)
     os.close(ours)
@@ -145,16 +143,15 @@ def test_a_serial_line_is_spoken_as_tcp_is():
     told = []
 
     def answer() -> None:
-        for _ in range(2):  # to the first line, without its number: a plain one follows
-            told.append(os.read(gripper_end, 100))
-            os.write(gripper_end, b"OK 1.500 0.0")  # in two pieces
-            os.write(gripper_end, b"400\n")
+        told.append(os.read(gripper_end, 100))
+        os.write(gripper_end, b"OK 1.500 0.0")  # in two pieces
+        os.write(gripper_end, b"400\n")
 
     answering = threading.Thread(target=answer)
     answering.start()
     assert gripper.read_state().width_m == 0.04
     answering.join()
-    assert told == [b"S #1\n", b"S\n"]
+    assert told == [b"S\n"]
     gripper.close()
     os.close(gripper_end)
     os.close(ours)

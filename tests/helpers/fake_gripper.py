@@ -7,13 +7,9 @@ from contextlib import suppress
 
 
 class FakeGripper:
-    """A gripper on a port of this machine that speaks the line protocol, or as badly as it is told to.
+    """A gripper on a port of this machine that speaks the line protocol, or as badly as it is told to."""
 
-    The first line of a connection, which asks whether it repeats numbers, is always answered and not noted.
-    """
-
-    def __init__(self, *, numbered: bool = False) -> None:
-        self.numbered = numbered
+    def __init__(self) -> None:
         self.answer: bytes | Callable[[str], bytes | None] | None = b"OK 1.000 0.0400\n"
         self.heard: list[str] = []
         self._server = socket.create_server(("127.0.0.1", 0))
@@ -27,22 +23,13 @@ class FakeGripper:
                 self._connection, _ = self._server.accept()
                 # whoever hangs up in the middle of an answer resets the connection
                 with suppress(ConnectionError), self._connection, self._connection.makefile("rwb") as stream:
-                    for count, line in enumerate(stream):
+                    for line in stream:
                         told = self.answer  # first: another one may be set once it has heard
-                        words, _, number = line.decode().strip().partition(" #")
-                        if not count:
-                            answer = b"OK 1.000 0.0400\n"
-                        else:
-                            self.heard.append(words)
-                            answer = told(words) if callable(told) else told
+                        self.heard.append(words := line.decode().strip())
+                        answer = told(words) if callable(told) else told
                         if answer is not None:
-                            ends = f" #{number}\n".encode() if self.numbered else b"\n"
-                            stream.write(answer.replace(b"\n", ends))
+                            stream.write(answer)
                             stream.flush()
-
-    def send(self, answer: bytes) -> None:
-        """Say something unasked."""
-        self._connection.sendall(answer)
 
     def hang_up(self) -> None:
         """End the connection; another one may be made."""

@@ -357,19 +357,6 @@ def print_grip(result: "Grip", arguments: Mapping[str, Any]) -> None:
     ]
     names = [arguments.get(name, default) for name, default in (("controller", "margin"), ("object", "cup"))]
     print_table(f"{names[0]} on a {names[1]}, {arguments.get('condition', 'dry')}", ("", ""), rows)
-    if (grasps := int(table.grasp.max())) > 1:
-        by_grasp = [table.where(table.grasp == number) for number in range(1, grasps + 1)]
-        rows = [
-            (
-                f"{number}",
-                f"{int(grasp.dropped.sum())} of {len(grasp)}",
-                f"{100 * grasp.force_excess.mean():.0f} %",
-                f"{int((grasp.known_friction > 0).sum())} of {len(grasp)}",
-            )
-            for number, grasp in enumerate(by_grasp, start=1)
-        ]
-        columns = ("grasp", "dropped", "over the least force that holds", "friction known")
-        print_table("Grasp after grasp", columns, rows)
 
 
 def print_sources() -> None:

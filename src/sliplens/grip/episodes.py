@@ -9,21 +9,22 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
 from sliplens.explainers.explain import choose_explainers, explain_frames
 from sliplens.explainers.frames import frames_from_arrays
 from sliplens.explainers.table import get_explainer
+from sliplens.extras import pick
 from sliplens.files import DEFAULT_NETWORK, output_folder, remove, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import Controller, make_controller
 from sliplens.grip.fingertip import ReadingTable, load_readings, measure_readings, require_calibration
 from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor, Tick
-from sliplens.grip.plant import PERIOD_S, Episodes, GrippedObject, Plant, least_force, pick_object
+from sliplens.grip.plant import OBJECTS, PERIOD_S, Episodes, GrippedObject, Plant, least_force
 from sliplens.grip.records import EpisodeTable, Grip, GripSetup, GripTrace
-from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion, next_grasp
+from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion
 from sliplens.mechanics import stick_ratio
 from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
@@ -38,8 +39,7 @@ _BATCH = 500  # episodes stepped together: few enough for a processor's caches
 _MEASURED = 32  # fingertips by which the errors of a network without a table are measured
 _TICKS = round(EPISODE_S / PERIOD_S)
 _LIFTED_S = LIFT_S + 0.1  # time from which the least force counts: the object hangs in the hand
-MOMENTS_S = (0.4, 1.4, 2.8, 5.0)
-"""Times, in seconds, at which a rendered episode is explained."""
+_MOMENTS_S = (0.4, 1.4, 2.8, 5.0)  # times at which a rendered episode is explained
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,15 +55,7 @@ class EpisodeOptions:
     """Factor on the network's errors, where they are looked up."""
     friction: FrictionLike | Literal["each"] | None = None
     """Friction that predictions use, as in `predict`, for a network that predicts F_t / F_n; `each` uses that of each
-    episode as its first grasp begins. Slips narrow a range down."""
-    grasps: int = 1
-    """Number of grasps of each object, each with other fingertips and a friction within some percent of the object's
-    (`GRASP_SPREAD`)."""
-    same_object: bool = False
-    """Use friction learnt from a slip in the grasps that follow, as `LiveReader` does."""
-    sequence: bool = False
-    """Predict frames in order, as `predict` does; only through pixels. With a known friction they are predicted one by
-    one."""
+    episode as it begins. Slips narrow a range down."""
     latency_s: float = 0.02
     """Time from an image to the command by it."""
     method: str | None = None
@@ -72,12 +64,6 @@ class EpisodeOptions:
     def __post_init__(self) -> None:
         if self.error_scale < 0 or self.latency_s < 0:
             raise InputError("latency and error scale must not be negative; give 0 or more")
-        if self.grasps < (fewest := 1 + self.same_object):
-            learnt = " by --same-object, which learns for the grasps that follow" * self.same_object
-            count = number_of(self.grasps, "grasp")
-            raise InputError(f"{count} of an object cannot be run{learnt}; add --grasps {fewest} or more")
-        if self.sequence and not self.rendered:
-            raise InputError("predictions that are looked up have no order; add --rendered, or leave out --sequence")
         if self.method is not None:
             get_explainer(self.method)
 
@@ -118,8 +104,7 @@ def run_episodes(
     object
         Row of `OBJECTS`.
     controller
-        Row of `CONTROLLERS`, or an object with `command(observation)`, of which each batch of episodes, and each of
-        their grasps, gets a copy.
+        Row of `CONTROLLERS`, or an object with `command(observation)`, of which each batch of episodes gets a copy.
     condition
         Row of `CONDITIONS`, from which the episodes are drawn.
     episodes, seed
@@ -127,7 +112,7 @@ def run_episodes(
     network
         Network, its folder, or the name of one that comes with sliplens; it needs a calibration.
     options
-        Rendering, errors, friction, grasps and latency.
+        Rendering, errors, friction and latency.
     script
         Columns of `Scripts` to set rather than to draw, such as `{"mass_kg": 0.06, "patch_factor": 0.5}`.
     settings
@@ -142,7 +127,7 @@ def run_episodes(
     Returns
     -------
     Grip
-        A row an episode and grasp (first those of all first grasps), and the first episode tick by tick.
+        A row an episode, and the first episode tick by tick.
 
     Raises
     ------
@@ -156,20 +141,20 @@ def run_episodes(
     >>> bool(grip.episodes.dropped[0]), grip.episodes.mean_force_n.round(1)
     (False, array([3.]))
     """
-    options, gripped = options or EpisodeOptions(), pick_object(object)
+    options, gripped = options or EpisodeOptions(), pick(OBJECTS, object, noun="object")
     if isinstance(controller, str):
         make_controller(controller, settings)  # refused before anything is measured
     elif settings:
         raise InputError("settings are for the controllers of the table; set those of your own where you make it")
-    each = isinstance(options.friction, str) and options.friction == "each"
-    friction = "each" if each else None if options.friction is None else as_friction(options.friction)
     scripts = draw_scripts(gripped, condition, episodes=episodes, seed=seed, script=script)
     network = open_run(network)
     require_calibration(network)
-    if friction is not None or options.same_object:
-        network.require_ratio(learns=friction is None)
-    if options.sequence:
-        network.follow(friction=friction)
+    friction, words = None, None
+    if options.friction is not None:
+        network.require_ratio()
+        each = options.friction == "each"
+        known = [Friction(mu) if each else as_friction(options.friction) for mu in scripts.friction.tolist()]
+        friction, words = known, "that of each episode as it begins" if each else str(known[0])
     constants = dict(settings or {})
     if not isinstance(controller, str) and is_dataclass(controller):
         values = {item.name: getattr(controller, item.name) for item in fields(controller) if item.init}
@@ -180,10 +165,7 @@ def run_episodes(
         controller=controller if isinstance(controller, str) else type(controller).__name__,
         settings=constants,
         network=network.manifest.weights_sha256[:12],
-        friction="that of each episode as it begins" if each else None if friction is None else str(friction),
-        grasps=options.grasps,
-        same_object=options.same_object,
-        sequence=options.sequence,
+        friction=words,
         latency_s=options.latency_s,
         rendered=options.rendered,
         seed=seed,
@@ -229,7 +211,7 @@ class _Job:
     scripts: Scripts
     controller: str | Controller
     network: Network
-    friction: Friction | Literal["each"] | None
+    friction: list[Friction] | None
     options: EpisodeOptions
 
     def run(self, folder: Path | None) -> Grip:
@@ -240,15 +222,13 @@ class _Job:
         with open_stage("Gripping"):
             for number, rows in enumerate(report_each(chunks, sizes=list(map(len, chunks)))):
                 part = None if folder is None else folder / "parts" / str(number)
-                make = partial(self.run_batch, number, self.scripts.where(rows), folder)
-                done.append(keep_part(part, _Batch, make))
-        episodes = EpisodeTable.joined([batch.episodes for batch in done])
+                done.append(keep_part(part, _Batch, partial(self.run_batch, number, rows, folder)))
         grip = Grip(
             setup=self.setup,
             seconds=time.perf_counter() - begin,
-            episodes=episodes.where(np.argsort(episodes.grasp, kind="stable")),
+            episodes=EpisodeTable.joined([batch.episodes for batch in done]),
             trace=done[0].trace,
-            moments_s=MOMENTS_S[: len(done[0].maps)],
+            moments_s=_MOMENTS_S[: len(done[0].maps)],
             pictures=done[0].pictures,
             maps=done[0].maps,
         )
@@ -261,71 +241,48 @@ class _Job:
             remove(folder / "parts")
         return grip
 
-    def run_batch(self, number: int, scripts: Scripts, folder: Path | None) -> _Batch:
-        """Run some episodes and further grasps of their objects; save images of the first grasps in the folder."""
-        setup, learners = self.setup, list[SlipLearner]()
-        if self.friction is not None or setup.same_object:  # else it is neither given nor learnt
-            for mu in scripts.friction.tolist():
-                friction = Friction(mu) if isinstance(self.friction, str) else self.friction
-                learners.append(SlipLearner(friction, same_object=setup.same_object))
-        tables, ticks = list[EpisodeTable](), list[Tick]()
-        pictures, maps = np.zeros((0, 1, 1, 3), dtype=np.uint8), np.zeros((0, 1, 1), dtype=np.float32)
-        for grasp in range(setup.grasps):
-            seed = np.random.SeedSequence((setup.seed, number, *((grasp,) if grasp else ())))
-            scripts_now = next_grasp(scripts, rng=np.random.default_rng(seed.spawn(1)[0])) if grasp else scripts
-            known = np.full(len(scripts), np.nan)
-            for row, learner in enumerate(learners):
-                known[row] = learner.friction.mean if learner.friction else np.nan
-            parts: list[tuple[np.ndarray, EpisodeTable]] = []
-            # constants and predictions differ where the friction is known
-            for friction_known in (True, False):
-                rows = np.flatnonzero(np.isfinite(known) == friction_known)
-                if not len(rows):
-                    continue
-                chosen = scripts_now.where(rows)
-                sensor = self._make_sensor(chosen, [learners[row] for row in rows] if learners else [], seed)
-                if isinstance(self.controller, str):
-                    controller = make_controller(self.controller, setup.settings, friction_known=friction_known)
-                else:
-                    controller = deepcopy(self.controller)  # its state belongs to one grasp
-                loop = GripLoop(Plant(self.gripped, episodes=len(rows)), sensor, controller, latency_s=setup.latency_s)
-                traced = not grasp and (setup.rendered or number == 0)
-                table = run_scripts(loop, chosen, condition=setup.condition, on_tick=ticks.append if traced else None)
-                parts.append((rows, replace(table, grasp=table.grasp + grasp, known_friction=known[rows])))
-                if isinstance(sensor, RenderedSensor) and not grasp:
-                    frames = np.stack([tick.reading.frames for tick in ticks if tick.reading.frames is not None])
-                    if folder is not None:
-                        _save_trials(folder, sensor, ticks, frames, condition=setup.condition, number=number)
-                    if self.options.method is not None and number == 0:
-                        pictures = np.ascontiguousarray(frames[[round(at / PERIOD_S) for at in MOMENTS_S], 0])
-                        explained = frames_from_arrays(self.network, pictures, sensor.references[0])
-                        explainers, _ = choose_explainers(self.network, explained, self.options.method, budget=1.0)
-                        [maps] = explain_frames(self.network, explained, explainers).relevance.values()
-            order = np.argsort(np.concatenate([rows for rows, _ in parts]))
-            tables.append(EpisodeTable.joined([table for _, table in parts]).where(order))
-            for learner in learners:
-                learner.release()
-        return _Batch(episodes=EpisodeTable.joined(tables), trace=_trace(ticks), pictures=pictures, maps=maps)
-
-    def _make_sensor(
-        self, scripts: Scripts, learners: list[SlipLearner], seed: np.random.SeedSequence
-    ) -> RenderedSensor | TableSensor:
-        if self.setup.rendered:
-            return RenderedSensor(
+    def run_batch(self, number: int, rows: Int[np.ndarray, " episodes"], folder: Path | None) -> _Batch:
+        """Run some episodes; save images of a rendered one in the folder."""
+        setup, options, scripts = self.setup, self.options, self.scripts.where(rows)
+        learners = [SlipLearner(self.friction[row]) for row in rows] if self.friction else []
+        known = [np.nan if learner.friction is None else learner.friction.mean for learner in learners]
+        seed = np.random.SeedSequence((setup.seed, number))
+        if setup.rendered:
+            sensor = RenderedSensor(
                 self.network,
                 seed=int(seed.generate_state(1)[0]),
-                frames=2 * _TICKS * len(self.scripts) * self.setup.grasps,
+                frames=2 * _TICKS * len(self.scripts),
                 learner=learners[0] if learners else None,
-                sequence=self.setup.sequence,
             )
-        assert self.options.readings is not None
-        return TableSensor(
-            self.options.readings,
-            fingertips=scripts.fingertips,
-            rng=np.random.default_rng(seed),
-            error_scale=self.options.error_scale,
-            learners=learners,
-        )
+        else:
+            assert options.readings is not None
+            sensor = TableSensor(
+                options.readings,
+                fingertips=scripts.fingertips,
+                rng=np.random.default_rng(seed),
+                error_scale=options.error_scale,
+                learners=learners,
+            )
+        if isinstance(self.controller, str):
+            controller = make_controller(self.controller, setup.settings, friction_known=bool(learners))
+        else:
+            controller = deepcopy(self.controller)
+        loop = GripLoop(Plant(self.gripped, episodes=len(rows)), sensor, controller, latency_s=setup.latency_s)
+        ticks, traced = list[Tick](), setup.rendered or number == 0
+        table = run_scripts(loop, scripts, condition=setup.condition, on_tick=ticks.append if traced else None)
+        if learners:
+            table = replace(table, known_friction=np.array(known))
+        pictures, maps = np.zeros((0, 1, 1, 3), dtype=np.uint8), np.zeros((0, 1, 1), dtype=np.float32)
+        if isinstance(sensor, RenderedSensor):
+            frames = np.stack([tick.reading.frames for tick in ticks if tick.reading.frames is not None])
+            if folder is not None:
+                _save_trials(folder, sensor, ticks, frames, condition=setup.condition, number=number)
+            if options.method is not None and number == 0:
+                pictures = np.ascontiguousarray(frames[[round(at / PERIOD_S) for at in _MOMENTS_S], 0])
+                explained = frames_from_arrays(self.network, pictures, sensor.references[0])
+                explainers, _ = choose_explainers(self.network, explained, options.method, budget=1.0)
+                [maps] = explain_frames(self.network, explained, explainers).relevance.values()
+        return _Batch(episodes=table, trace=_trace(ticks), pictures=pictures, maps=maps)
 
 
 def run_scripts(
@@ -360,8 +317,7 @@ def run_scripts(
     state = loop.plant.state
     return EpisodeTable(
         condition=np.broadcast_to(np.asarray(condition, dtype=str), count).copy(),
-        grasp=np.ones(count, dtype=np.int64), known_friction=np.full(count, np.nan),
-        mass_kg=scripts.mass_kg + scripts.water_kg, friction=friction,
+        known_friction=np.full(count, np.nan), mass_kg=scripts.mass_kg + scripts.water_kg, friction=friction,
         dropped=state.dropped, crushed=state.crushed, slip_m=state.slipped_m,
         mean_force_n=force / lasted, peak_force_n=peak, least_force_n=least / lasted, peak_least_force_n=peak_least,
         force_excess=force / least - 1, peak_excess=peak / peak_least - 1, under_20_s=under,

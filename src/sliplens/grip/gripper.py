@@ -16,7 +16,7 @@ from functools import partial
 from io import FileIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from sliplens.extras import pick
 from sliplens.live.sinks import ZENOH_ADDRESS, ZenohRos, parse_zenoh
 
 _ANSWER_BYTES = 200  # longest answer; longer lines are none
-_SILENCE_S = 2.0  # time after which a serial gripper without numbers sends no more late answers
+_SILENCE_S = 2.0  # time after which a serial gripper sends no more late answers
 
 
 class GripperError(SliplensError):
@@ -68,12 +68,8 @@ class LineGripper:
 
     `F 1.250` sets the force in newtons, `W 0.0400` the width in metres, `S` asks; the answer to each is one line, `OK
     force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`, and so is a connection that
-    breaks; the next line opens it again.
-
-    The first line of a connection is `S #n`, n = 1 at first. A gripper that ends its answer with `#n` gets a number
-    with every line and repeats it: an answer with another number is late, and thrown away. Any other gripper gets plain
-    lines. Its late answers cannot be matched to a line, so the connection is closed where one does not come in time,
-    and a serial line is then left alone for `silence_s`.
+    breaks. An answer that is late cannot be matched to its line: the connection is then closed, and the next line
+    opens it again.
 
     Parameters
     ----------
@@ -82,18 +78,16 @@ class LineGripper:
     timeout_s
         Longest time until an answer, in seconds.
     silence_s
-        Time, in seconds, after which a late answer of a gripper without numbers does not come any more on a new
-        connection; 0 where the answer ends with the old connection, as in TCP.
+        Time, in seconds, after which a late answer does not come any more on a new connection; 0 where the answer ends
+        with the old connection, as in TCP.
     """
 
     def __init__(
         self, connect: Callable[[], socket.socket | FileIO], *, timeout_s: float = 0.1, silence_s: float = 0.0
     ) -> None:
         self._connect, self.timeout_s, self._silence_s = connect, timeout_s, silence_s
-        self._wire, self._broken, self._silent_until_s = connect(), False, -math.inf
-        self._numbered: bool | None = None
-        """True where the gripper repeats numbers; None before the first line."""
-        self._number, self._rest = 0, b""
+        self._wire: socket.socket | FileIO | None = connect()
+        self._rest, self._silent_until_s = b"", -math.inf
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
@@ -109,32 +103,25 @@ class LineGripper:
 
     def close(self) -> None:
         """Close the connection."""
-        self._wire.close()
+        if self._wire is not None:
+            self._wire.close()
+            self._wire = None
 
     def ask(self, line: str) -> GripperState:
         """Send a line, and return its answer."""
-        if self._broken:
+        if self._wire is None:
             if (wait_s := self._silent_until_s - time.monotonic()) > 0:
-                raise GripperError(f"the gripper answers late and without numbers; it is left alone for {wait_s:.1f} s")
-            self._wire, self._broken, self._rest, self._numbered = self._connect(), False, b"", None
+                raise GripperError(f"the gripper answered late; it is left alone for {wait_s:.1f} s")
+            self._wire, self._rest = self._connect(), b""
         try:
-            if self._numbered is None:
-                answer = self._exchange("S", numbered=True)
-                self._numbered = answer[-1:] == [f"#{self._number}"]
-            answer = self._exchange(line, numbered=self._numbered)
-        except TimeoutError as error:
-            # late answers come with their number, if they are no endless line
-            if not self._numbered or len(self._rest) >= _ANSWER_BYTES:
-                self._break(silence_s=self._silence_s)
-            sent = f", it sent {error}" if str(error) else ""
-            raise GripperError(
-                f"the gripper did not answer {line!r} in time{sent}; check its cable and power"
-            ) from None
+            answer = self._exchange(self._wire.fileno(), line)
         except (OSError, ValueError) as error:
-            self._break()
-            raise GripperError(f"the gripper cannot be reached ({error}); check its cable and power") from None
-        if self._numbered:
-            answer = answer[:-1]
+            self.close()
+            fault = f"cannot be reached ({error})"
+            if isinstance(error, TimeoutError):
+                self._silent_until_s = time.monotonic() + self._silence_s
+                fault = f"did not answer {line!r} in time" + (f", it sent {error}" if str(error) else "")
+            raise GripperError(f"the gripper {fault}; check its cable and power") from None
         if answer[0] == "ERR":
             raise GripperError(f"the gripper refused {line!r}: {' '.join(answer[1:]) or 'no reason given'}")
         try:
@@ -147,95 +134,70 @@ class LineGripper:
             )
         return GripperState(force_n=force_n, width_m=width_m)
 
-    def _exchange(self, line: str, *, numbered: bool) -> list[str]:
-        """Send a line, and return the words of its answer; lines that answer none, or an earlier one, are dropped."""
+    def _exchange(self, wire: int, line: str) -> list[str]:
+        """Send a line, and return the words of its answer; other lines are dropped."""
         ends_s, text = time.monotonic() + self.timeout_s, ""
-        if numbered:
-            self._number += 1
-            line = f"{line} #{self._number}"
-        else:
-            while self._rest or self._ready(0.0):
-                self._read_line(ends_s)
-        os.write(self._wire.fileno(), f"{line}\n".encode("ascii"))
-        while True:
+        while self._rest or select.select([wire], [], [], 0.0)[0]:
+            self._read_line(wire, ends_s)
+        os.write(wire, f"{line}\n".encode("ascii"))
+        while (words := text.split())[:1] not in (["OK"], ["ERR"]):
             try:
-                words = (text := self._read_line(ends_s)).split()
+                text = self._read_line(wire, ends_s)
             except TimeoutError:
                 raise TimeoutError(repr(text) if text else "") from None
-            # an answer with another number belongs to an earlier line
-            other = words[-1:] != [f"#{self._number}"]
-            late = other and (self._numbered or (numbered and "".join(words[-1:]).startswith("#")))
-            if words[:1] in (["OK"], ["ERR"]) and not late:
-                return words
+        return words
 
-    def _break(self, *, silence_s: float = 0.0) -> None:
-        """Close the connection, and with it drop all answers that are still to come."""
-        self._broken, self._silent_until_s = True, time.monotonic() + silence_s
-        self._wire.close()
-
-    def _read_line(self, ends_s: float) -> str:
+    def _read_line(self, wire: int, ends_s: float) -> str:
         """Read the next whole line; `TimeoutError` where none comes, or one without an end."""
         while b"\n" not in self._rest:
-            if len(self._rest) >= _ANSWER_BYTES or not self._ready(ends_s - time.monotonic()):
+            ready, _, _ = select.select([wire], [], [], max(0.0, ends_s - time.monotonic()))
+            if len(self._rest) >= _ANSWER_BYTES or not ready:
                 raise TimeoutError
-            read = os.read(self._wire.fileno(), _ANSWER_BYTES)
+            read = os.read(wire, _ANSWER_BYTES)
             if not read:
                 raise OSError("it has hung up")
             self._rest += read
         line, _, self._rest = self._rest.partition(b"\n")
         return line.decode("ascii", errors="replace").strip()
 
-    def _ready(self, wait_s: float) -> bool:
-        """Wait at most so many seconds for bytes; True where some are there."""
-        return bool(select.select([self._wire.fileno()], [], [], max(0.0, wait_s))[0])
 
-
-@dataclass(frozen=True, kw_only=True)
-class RosCommand:
+class RosCommand(NamedTuple):
     """Message by which a gripper of ROS 2 takes a force or a width."""
 
     topic: str
     """Topic, below the key of the gripper."""
     kind: str
     """Type of the message."""
-    fields: Callable[[float], dict[str, Any]]
+    fields: Callable[[float], dict[str, object]]
     """Returns the fields of the message for a force in newtons, or a width in metres."""
-    definition: str | None = None
-    """Text of the `.msg` file of a type that ROS itself does not bring."""
 
 
 _LEAST_EFFORT_N = 0.01  # effort in place of 0, which some drivers take for no limit
 _MOVING_EFFORT_N = 2.0  # effort sent with a width: it moves open fingers, and crushes little between them
+_GRIPPER, _NUMBER = "control_msgs/msg/GripperCommand", "std_msgs/msg/Float64"
+_DEFINITIONS = {_GRIPPER: "float64 position\nfloat64 max_effort"}  # of types that ROS itself does not bring
 
 
-_COMMAND = partial(
-    RosCommand,
-    topic="command",
-    kind="control_msgs/msg/GripperCommand",
-    definition="float64 position\nfloat64 max_effort",
-)
-_NUMBER = partial(RosCommand, kind="std_msgs/msg/Float64", fields=lambda value: {"data": value})
-_NUMBERS = partial(
-    RosCommand,
-    kind="std_msgs/msg/Float64MultiArray",
-    fields=lambda value: {"layout": SimpleNamespace(dim=[], data_offset=0), "data": np.array([value])},
-)
+def _as_array(value: float) -> dict[str, object]:
+    """Return the fields of `std_msgs/msg/Float64MultiArray` for one joint."""
+    return {"layout": SimpleNamespace(dim=[], data_offset=0), "data": np.array([value])}
+
+
 ROS_MESSAGES = {
     # closed as far as the effort brings it
     "gripper-command": (
-        _COMMAND(fields=lambda force_n: {"position": 0.0, "max_effort": max(force_n, _LEAST_EFFORT_N)}),
-        _COMMAND(fields=lambda width_m: {"position": width_m, "max_effort": _MOVING_EFFORT_N}),
+        RosCommand("command", _GRIPPER, lambda n: {"position": 0.0, "max_effort": max(n, _LEAST_EFFORT_N)}),
+        RosCommand("command", _GRIPPER, lambda m: {"position": m, "max_effort": _MOVING_EFFORT_N}),
     ),
-    "numbers": (_NUMBER(topic="force"), _NUMBER(topic="width")),
+    "numbers": tuple(RosCommand(topic, _NUMBER, lambda value: {"data": value}) for topic in ("force", "width")),
     # forward controllers of ros2_control take a number a joint
-    "controllers": (
-        _NUMBERS(topic="effort_controller/commands"),
-        _NUMBERS(topic="position_controller/commands"),
+    "controllers": tuple(
+        RosCommand(f"{kind}_controller/commands", "std_msgs/msg/Float64MultiArray", _as_array)
+        for kind in ("effort", "position")
     ),
 }
 """Messages of grippers of ROS 2 by name, for a force and for a width."""
 _STATE_TOPIC, _STATE_KIND = "joint_states", "sensor_msgs/msg/JointState"
-_FIRST_STATE_S = 3.0
 
 
 class RosGripper:
@@ -273,9 +235,14 @@ class RosGripper:
         self._topic, self._joint, self.timeout_s = f"{key}/{_STATE_TOPIC}", joint, timeout_s
         self._message, self._message_s, self._new = b"", -math.inf, threading.Condition()
         try:
-            self._set_force, self._set_width = (self._make_sender(key, command) for command in commands)
+            for command in commands:
+                if command.kind in _DEFINITIONS:
+                    self._ros.define(command.kind, _DEFINITIONS[command.kind])
+            self._force, self._width = (
+                (command, self._ros.publisher(f"{key}/{command.topic}", command.kind)) for command in commands
+            )
             self._ros.subscribe(self._topic, _STATE_KIND, self._receive)
-            self._await_state(_FIRST_STATE_S)
+            self._await_state(3.0)
         except SliplensError:
             self.close()
             raise
@@ -287,11 +254,11 @@ class RosGripper:
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
-        self._set_force(force_n)
+        self._send(*self._force, force_n)
 
     def set_width(self, width_m: float) -> None:
         """Open to so many metres."""
-        self._set_width(width_m)
+        self._send(*self._width, width_m)
 
     def read_state(self) -> GripperState:
         """Return force and width from the newest state."""
@@ -313,20 +280,13 @@ class RosGripper:
         """Close the connection."""
         self._ros.close()
 
-    def _make_sender(self, key: str, command: RosCommand) -> Callable[[float], None]:
-        """Return the function that sends a force or a width, and checks that the gripper still sends its state."""
-        if command.definition is not None:
-            self._ros.define(command.kind, command.definition)
-        publish = self._ros.publisher(f"{key}/{command.topic}", command.kind)
-
-        def send(value: float) -> None:
-            try:
-                publish(command.fields(value), time.time_ns())
-            except OSError as error:
-                raise GripperError(f"the gripper cannot be reached ({error}); check its bridge") from None
-            self.read_state()
-
-        return send
+    def _send(self, command: RosCommand, publish: Callable[[dict[str, object], int], None], value: float) -> None:
+        """Send a force or a width, and check that the gripper still sends its state."""
+        try:
+            publish(command.fields(value), time.time_ns())
+        except OSError as error:
+            raise GripperError(f"the gripper cannot be reached ({error}); check its bridge") from None
+        self.read_state()
 
     def _receive(self, message: bytes) -> None:
         with self._new:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from threading import Event
-from typing import Literal
 
 import numpy as np
 
@@ -17,9 +16,9 @@ from sliplens.errors import InputError
 from sliplens.files import output_folder
 from sliplens.grip.controllers import AssumedFriction, Controller, MarginGrip, Oracle, make_controller
 from sliplens.grip.gripper import DryRun, Gripper, GripperError, GripperState, GuardedGripper, open_gripper
-from sliplens.grip.holder import STALE_S, Holder
+from sliplens.grip.holder import STALE_S, GripCommand, Holder
 from sliplens.grip.plant import PERIOD_S
-from sliplens.grip.records import Hold, HoldSteps
+from sliplens.grip.records import Ending, Hold, HoldSteps
 from sliplens.grip.source import GripSource, open_grip, usual_network
 from sliplens.live.contract import LiveOptions, LiveSource, Pace
 from sliplens.live.loop import LiveReader
@@ -38,24 +37,13 @@ first."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class HoldStep:
+class HoldStep(GripCommand):
     """One command to a gripper, and the readings behind it."""
 
     time_s: float
     """Time since the hold began."""
-    command_n: float
-    """Commanded grip force."""
     force_n: float
     """Grip force that the gripper measured before; NaN without a measurement."""
-    margin: float
-    """Predicted safety margin, mean of the fingertips that have one; NaN without a margin."""
-    low: float
-    """Lower end of its interval, in margin units."""
-    slip: bool
-    """True where the markers showed a slip."""
-    why: str
-    trouble: str | None
-    """Fault of the gripper; None while it takes commands and its force follows them."""
     readings: tuple[Reading | None, ...]
     """Newest reading of each fingertip; None before the first."""
 
@@ -165,7 +153,7 @@ def hold_grip(
         loop = HoldLoop(guard, readers, controller, settings=settings, ceiling_n=ceiling_n)
         for finger, reader in enumerate(readers):
             stack.callback(reader.subscribe(partial(loop.update_reading, finger)))
-        ended, why, error = loop.run(seconds, on_step)
+        ended, why = loop.run(seconds, on_step)
         hold = Hold(
             sources=tuple(reader.source.name for reader in readers),
             gripper=address,
@@ -180,8 +168,8 @@ def hold_grip(
         )
         if output is not None:
             save_result(hold, output.folder)
-    if error is not None:
-        raise error
+    if loop.error is not None:
+        raise loop.error
     return hold
 
 
@@ -219,33 +207,33 @@ class HoldLoop:
         self._readings[finger] = reading
         self._holder.update_reading(reading, taken_s=reading.captured_s, finger=finger)
 
-    def run(
-        self, seconds: float | None, on_step: Callable[[HoldStep], None] | None
-    ) -> tuple[Literal["time", "source", "failed", "interrupted"], str, Exception | None]:
-        """Hold until the end; returns its kind, its reason, and the exception to raise."""
+    def run(self, seconds: float | None, on_step: Callable[[HoldStep], None] | None) -> tuple[Ending, str]:
+        """Hold until the end; returns its kind and reason. What a gripper or callback raises is in `error`."""
         begun_s = time.monotonic()
         pace, number = Pace(Event()), 0
+        self.error: Exception | None = None
         try:
             while pace.wait(number * PERIOD_S):
                 number += 1
                 ends = [reader.ended for reader in self._readers]
                 if None not in ends:
                     failed = any(reader.failed for reader in self._readers)
-                    return "failed" if failed else "source", ", ".join(map(str, ends)), None
+                    return "failed" if failed else "source", ", ".join(map(str, ends))
                 if seconds is not None and time.monotonic() - begun_s >= seconds:
                     break
-                try:
-                    step = self.step(begun_s)
-                except GripperError as error:
-                    return "failed", str(error), error
+                step = self.step(begun_s)
                 if on_step is not None:
                     try:
                         on_step(step)
                     except Exception as error:  # whatever a callback raises: the result is saved first
-                        return "failed", f"on_step failed ({error or type(error).__name__})", error
+                        self.error = error
+                        return "failed", f"on_step failed ({error or type(error).__name__})"
         except KeyboardInterrupt:
-            return "interrupted", "interrupted", None
-        return "time", "the time is over", None
+            return "interrupted", "interrupted"
+        except GripperError as error:
+            self.error = error
+            return "failed", str(error)
+        return "time", "the time is over"
 
     @property
     def last_force(self) -> str:
@@ -256,10 +244,13 @@ class HoldLoop:
 
     def table(self) -> HoldSteps:
         """Return all commands so far."""
-        columns = {"failed": np.array([step.trouble is not None for step in self._steps], dtype=bool)}
-        for name, kind in (("slip", bool), ("why", str), *((name, np.float64) for name in _NUMBERS)):
-            columns[name] = np.array([getattr(step, name) for step in self._steps], dtype=kind)
-        return HoldSteps(**columns)
+        numbers = dict.fromkeys(("time_s", "command_n", "force_n", "margin", "low"), np.float64)
+        columns = {
+            name: np.array([getattr(step, name) for step in self._steps], dtype=kind)
+            for name, kind in {**numbers, "slip": bool, "why": str}.items()
+        }
+        failed = np.array([step.trouble is not None for step in self._steps], dtype=bool)
+        return HoldSteps(failed=failed, **columns)
 
     def step(self, begun_s: float) -> HoldStep:
         """Measure the force, and command the next one."""
@@ -274,14 +265,9 @@ class HoldLoop:
             if trouble is not None:
                 self.troubles[trouble] = None
             step = HoldStep(
+                **vars(replace(decision, trouble=trouble)),
                 time_s=now_s - begun_s,
-                command_n=decision.command_n,
                 force_n=state.force_n,
-                margin=decision.margin,
-                low=decision.low,
-                slip=decision.slip,
-                why=decision.why,
-                trouble=trouble,
                 readings=tuple(
                     replace(reading, margin=None, low=None, high=None, withheld="the newest margin is too old")
                     if reading is not None and reading.margin is not None and now_s - reading.captured_s > STALE_S
@@ -293,7 +279,7 @@ class HoldLoop:
         return step
 
     def _first_force(self) -> float:
-        """Measure the grip force before any command."""
+        """Measure the grip force before any command; a driver may start late."""
         trouble = None
         for _ in range(_TRIES):
             state, trouble = self._measure()
@@ -331,9 +317,6 @@ class HoldLoop:
                 f"{command_n:.2f} N was commanded; without a force sensor, or with forces of the other sign, it cannot "
                 "be held by the margin: check its driver"
             )
-
-
-_NUMBERS = ("time_s", "command_n", "force_n", "margin", "low")
 
 
 def _enter_readers(

@@ -19,7 +19,7 @@ from sliplens.grip.holder import SPRINGS_BACK_S, SlipGate
 from sliplens.grip.plant import PERIOD_S, Episodes, Fingers, Plant, PlantState, World
 from sliplens.live.slip import SlipBatch
 from sliplens.markers import Tracker
-from sliplens.models import Engine, Network, make_engine
+from sliplens.models import Network, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.simulation.intervention import NOISE_PX
 
@@ -62,8 +62,6 @@ class TableSensor:
         self._rng, self._scale, self._learners = rng, error_scale, learners
         if learners and not table.ratio:
             raise InputError("friction needs F_t / F_n, but this table has margins alone; measure a ratio network")
-        if len({learner.friction is None for learner in learners}) > 1:
-            raise InputError("the friction is known in some episodes and not in others; run them separately")
 
     def still_markers(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
         """Return the markers of both untouched fingertips: at rest, then as followed in some frames."""
@@ -85,7 +83,6 @@ class TableSensor:
         friction, table, scale = state.holding_friction, self._table, self._scale
         margin, low, high, *ratio = table.read(self._tips, force, friction=friction, margins=true)
         noise = self._rng.standard_normal(true.shape)
-        by_friction = None
         if self._learners:
             traction = np.where(state.sliding, state.kinetic_ratio[:, None], 1 - true)
             traction = np.where(pressing, state.friction * traction, 0.0)
@@ -95,13 +92,11 @@ class TableSensor:
             ):
                 learner.update(state.time_s, slipping_s=None if np.isnan(since_s) else float(since_s))
                 learner.note(float(mean), sigma=float(sigma), time_s=state.time_s)
-            by_friction = _margin_of_ratio(measured, scale * ratio[1], self._learners)
-        if by_friction is None:
+            margin, low, high = _margin_of_ratio(measured, scale * ratio[1], self._learners)
+        else:
             change = (scale - 1) * (margin - true) + table.noise * scale * noise
             low, high = (end + change + (scale - 1) * (end - margin) for end in (low, high))
             margin = margin + change
-        else:
-            margin, low, high = by_friction
         places = self._field.at(
             self._gripper, state.force_n, friction=friction, margins=true, pulled_back=state.shear_n < 0
         )
@@ -113,11 +108,9 @@ class TableSensor:
         )
 
 
-def _margin_of_ratio(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLearner]) -> tuple[Fingers, ...] | None:
-    """Compute the margin and its 90 % interval from F_t / F_n and the friction; None where no friction is known."""
+def _margin_of_ratio(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLearner]) -> tuple[Fingers, ...]:
+    """Compute the margin and its 90 % interval from F_t / F_n and the friction of each episode."""
     nodes = [learner.friction.nodes for learner in learners if learner.friction is not None]
-    if not nodes:
-        return None
     most = max(len(values) for values, _ in nodes)
     values, weights = (np.stack([np.pad(pair[row], (0, most - len(pair[row]))) for pair in nodes]) for row in (0, 1))
     values, weights = np.where(values > 0, values, 1.0)[:, None], weights[:, None]
@@ -143,23 +136,18 @@ class RenderedSensor:
         network: Network,
         *,
         seed: int,
-        engine: str | Engine = "auto",
+        engine: str = "auto",
         frames: int = 4000,
         learner: SlipLearner | None = None,
-        sequence: bool = False,
     ) -> None:
         first = Fingertip(seed=seed)
         self.fingertips = (first, Fingertip(seed=seed + 1, day=first.day))
         self._network, self._threads, self._learner = network, ThreadpoolController(), learner
-        if isinstance(engine, str):
-            with self._threads.limit(limits=1):
-                engine = make_engine(engine, network, frames=frames, batch_size=1)
-        self._engine = engine
+        with self._threads.limit(limits=1):
+            self._engine = make_engine(engine, network, frames=frames, batch_size=1)
         self._trackers = [Tracker(tip.reference) for tip in self.fingertips]
         if learner is not None:
             network.require_ratio()
-        in_order = sequence and (learner is None or learner.friction is None)
-        self._followers = [network.follow() for _ in self.fingertips] if in_order else []
 
     @property
     def references(self) -> UInt8[np.ndarray, "2 height width 3"]:
@@ -197,16 +185,9 @@ class RenderedSensor:
         estimate = self._engine.estimate(self._network, inputs(), friction=friction)
         if learner is not None and (ratio := estimate.ratio) is not None:
             learner.note(float(ratio.mean.mean()), sigma=float(ratio.sigma.mean()), time_s=state.time_s)
-        estimates, touches = [estimate], np.isfinite(state.margin[0])
-        if self._followers:
-            estimates = [
-                follower.update(estimate.at(np.array([row])), np.array([state.time_s]), touches[[row]])
-                for row, follower in enumerate(self._followers)
-            ]
-        ends = [part.interval(LEVEL) or (part.margin, part.margin) for part in estimates]
-        low, high = (np.concatenate(end) for end in zip(*ends, strict=True))
+        low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)
         return FingertipReading(
-            margin=np.concatenate([part.margin for part in estimates])[None],
+            margin=estimate.margin[None],
             low=low[None],
             high=high[None],
             markers_px=(markers_px[0], markers_px[1]),

@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sliplens.errors import ContactError
-from sliplens.extras import pick
 from sliplens.mechanics import safety_margin
 
 GRAVITY_M_S2 = 9.81
@@ -46,11 +45,6 @@ OBJECTS = {
     "berries": GrippedObject(mass_kg=(0.03, 0.12), stiffness_n_m=1_500.0, crush_n=3.5, grip_length_m=0.03),
 }
 """Objects by name."""
-
-
-def pick_object(name: str) -> GrippedObject:
-    """Return the row of `OBJECTS` of a name that a user gave."""
-    return pick(OBJECTS, name, noun="object")
 
 
 @dataclass(frozen=True, kw_only=True)

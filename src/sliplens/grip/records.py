@@ -1,11 +1,11 @@
 """Records of simulated episodes and of holds with a gripper; reports load them without torch."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
+from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
 from sliplens.codec import UNKNOWN, Columns
 from sliplens.results.evaluation import AMOUNT, ANSWER, EXCESS, FORCE, FRICTION, MARGIN
@@ -16,10 +16,8 @@ class EpisodeTable(Columns):
     """Episodes, a row each; forces in newtons, lengths in metres, times in seconds."""
 
     condition: Shaped[np.ndarray, " episodes"]
-    grasp: Int64[np.ndarray, " episodes"]
-    """Number of the grasp of its object, counted from 1."""
     known_friction: Annotated[Float64[np.ndarray, " episodes"], AMOUNT, UNKNOWN]
-    """Mean of the friction that the controller's margins used, given or learnt in earlier grasps; NaN without one."""
+    """Mean of the friction that the controller's margins used; NaN without one."""
     mass_kg: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
     friction: Annotated[Float64[np.ndarray, " episodes"], FRICTION]
     """Lowest static friction of the episode, mean of both fingers."""
@@ -77,12 +75,6 @@ class GripSetup:
     """First 12 hex digits of the hash of its weights."""
     friction: str | None
     """Friction that predictions used, in words; None without one."""
-    grasps: int
-    """Number of grasps of each object."""
-    same_object: bool
-    """True where friction learnt from a slip counted in the grasps that followed."""
-    sequence: bool
-    """True where frames were predicted in order."""
     latency_s: float
     """Time from an image to the command by it."""
     rendered: bool
@@ -131,6 +123,9 @@ class HoldSteps(Columns):
     why: Shaped[np.ndarray, " steps"]
 
 
+Ending: TypeAlias = Literal["time", "source", "failed", "interrupted"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Hold:
     """Commands to a gripper while it held something, and how the hold ended."""
@@ -144,7 +139,7 @@ class Hold:
     """Changed constants of the controller."""
     ceiling_n: float
     watchdog_s: float
-    ended: Literal["time", "source", "failed", "interrupted"]
+    ended: Ending
     """`time`: the time was over; `source`: a source ended; `failed`: a source or callback failed; `interrupted`: by a
     person."""
     why: str

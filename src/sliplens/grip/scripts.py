@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -10,8 +11,7 @@ from jaxtyping import Float
 from sliplens.codec import Columns
 from sliplens.errors import InputError
 from sliplens.extras import pick
-from sliplens.friction import GRASP_SPREAD
-from sliplens.grip.plant import GRAVITY_M_S2, GrippedObject, World, pick_object
+from sliplens.grip.plant import GRAVITY_M_S2, OBJECTS, GrippedObject, World
 
 EPISODE_S = 6.0
 """Length of an episode in seconds."""
@@ -19,9 +19,7 @@ LIFT_S = 0.5
 """Time at which the hand begins to rise."""
 _RISE_S, _RISE_M = 1.5, 0.2
 _NEVER = 1e9
-_JOLT_S = 0.08
-_POUR_S = 2.0
-_FADE_S = 3.0
+_JOLT_S, _POUR_S, _FADE_S = 0.08, 2.0, 3.0
 _PULL_S, _PULL_RAMP_S = 1.5, 0.15
 _WOBBLE, _WOBBLE_HZ = 0.2, 2.0
 
@@ -93,43 +91,28 @@ def hand_motion(time_s: float) -> tuple[float, float, float]:
     return height, speed, _RISE_M / _RISE_S**2 * 60 * part * (1 - part) * (1 - 2 * part)
 
 
-Draw: TypeAlias = Callable[[Scripts, GrippedObject, np.random.Generator], Scripts]
-"""Function that changes dry episodes of an object into those of a condition."""
-
-
-def _wet(scripts: Scripts, _: GrippedObject, rng: np.random.Generator) -> Scripts:
-    count = len(scripts)
-    return replace(scripts, friction=rng.uniform(0.15, 0.7, count), drift=rng.uniform(-0.15, 0.15, count))
-
-
-def _unknown(scripts: Scripts, _: GrippedObject, rng: np.random.Generator) -> Scripts:
-    return replace(scripts, friction=np.exp(rng.uniform(np.log(0.15), np.log(1.2), len(scripts))))
-
-
-def _jolt(scripts: Scripts, _: GrippedObject, rng: np.random.Generator) -> Scripts:
-    count, weight = len(scripts), scripts.mass_kg * GRAVITY_M_S2
-    return replace(scripts, jolt_n=weight * rng.uniform(0.5, 1.5, count), jolt_at_s=rng.uniform(3, 5, count))
-
+Draw: TypeAlias = Callable[[Scripts, GrippedObject, Callable[[float, float], Values]], Mapping[str, Values | float]]
+"""Function that draws the columns in which a condition differs from dry episodes of an object."""
 
 CONDITIONS: dict[str, Draw] = {
-    "dry": lambda scripts, *_: scripts,
-    "wet": _wet,
-    "drifting": lambda scripts, _, rng: replace(scripts, drift=rng.uniform(-0.6, -0.2, len(scripts))),
-    "unknown": _unknown,
-    "patch": lambda scripts, _, rng: replace(
-        scripts, patch_factor=rng.uniform(0.4, 0.75, len(scripts)), patch_at_s=np.full(len(scripts), 2.5)
-    ),
-    "jolt": _jolt,
-    "poured": lambda scripts, gripped, rng: replace(
-        scripts,
-        mass_kg=np.full(len(scripts), gripped.mass_kg[0]),
-        water_kg=rng.uniform(0, 1, len(scripts)) * (gripped.mass_kg[1] - gripped.mass_kg[0]),
-        water_at_s=rng.uniform(2, 3, len(scripts)),
-    ),
-    "lamp": lambda scripts, _, rng: replace(scripts, lamp_at_s=rng.uniform(2, 4, len(scripts))),
-}
+    "dry": lambda *_: {},
+    "wet": lambda _, __, uniform: {"friction": uniform(0.15, 0.7), "drift": uniform(-0.15, 0.15)},
+    "drifting": lambda _, __, uniform: {"drift": uniform(-0.6, -0.2)},
+    "unknown": lambda _, __, uniform: {"friction": np.exp(uniform(np.log(0.15), np.log(1.2)))},
+    "patch": lambda _, __, uniform: {"patch_factor": uniform(0.4, 0.75), "patch_at_s": 2.5},
+    "jolt": lambda scripts, _, uniform: {
+        "jolt_n": scripts.mass_kg * GRAVITY_M_S2 * uniform(0.5, 1.5), "jolt_at_s": uniform(3, 5)
+    },
+    "poured": lambda _, gripped, uniform: {
+        "mass_kg": gripped.mass_kg[0],
+        "water_kg": uniform(0, 1) * (gripped.mass_kg[1] - gripped.mass_kg[0]),
+        "water_at_s": uniform(2, 3),
+    },
+    "lamp": lambda _, __, uniform: {"lamp_at_s": uniform(2, 4)},
+}  # fmt: skip
 """Conditions by name: dry objects of different friction; wet ones; falling friction; friction from a wide range; a wet
 patch at 2.5 s; a jolt; water poured in; a fingertip's lamp that goes out."""
+_BOUNDS = {"mass_kg": 0, "friction": 0, "kinetic_ratio": 0, "patch_factor": 0, "drift": -1, "water_kg": -1e-9}
 
 
 def draw_scripts(
@@ -154,8 +137,7 @@ def draw_scripts(
     fingertips
         Number of pairs of fingertips to choose from.
     script
-        Columns of `Scripts`, in their units (kilograms, seconds, newtons, ratios), that are the same in all episodes
-        rather than drawn, such as `mass_kg`.
+        Columns of `Scripts` to set rather than to draw, such as `mass_kg`.
 
     Examples
     --------
@@ -165,14 +147,18 @@ def draw_scripts(
     (array([0.06, 0.06]), array([2.5, 2.5]))
     """
     if isinstance(gripped, str):
-        gripped = pick_object(gripped)
+        gripped = pick(OBJECTS, gripped, noun="object")
     if episodes < 1:
         raise InputError(f"{episodes} episodes cannot be run; ask for 1 or more")
+    names, script = {field.name for field in fields(Scripts)}, script or {}
+    for name, value in script.items():
+        if name not in names:
+            raise InputError(f"an episode has no {name}; choose of {', '.join(sorted(names))}")
+        if not _BOUNDS.get(name, -np.inf) < value < np.inf:
+            bound = f"above {_BOUNDS[name]:g}" if name in _BOUNDS else "finite"
+            raise InputError(f"{name} must be {bound}, got {value:g}")
     rng, condition_rng = np.random.default_rng(seed).spawn(2)
-
-    def uniform(low: float, high: float) -> Values:
-        return rng.uniform(low, high, episodes)
-
+    uniform, condition_uniform = (partial(source.uniform, size=episodes) for source in (rng, condition_rng))
     mass = uniform(*gripped.mass_kg)
     nothing, never = np.zeros(episodes), np.full(episodes, _NEVER)
     scripts = Scripts(
@@ -182,26 +168,5 @@ def draw_scripts(
         water_kg=nothing, water_at_s=never, lamp_at_s=never,
         fingertips=rng.integers(fingertips, size=episodes).astype(np.float64),
     )  # fmt: skip
-    scripts = pick(CONDITIONS, condition, noun="condition")(scripts, gripped, condition_rng)
-    names, fixed = {field.name for field in fields(Scripts)}, script or {}
-    for name, value in fixed.items():
-        if name not in names:
-            raise InputError(f"an episode has no {name}; choose of {', '.join(sorted(names))}")
-        if not _BOUNDS.get(name, -np.inf) < value < np.inf:
-            bound = f"above {_BOUNDS[name]:g}" if name in _BOUNDS else "finite"
-            raise InputError(f"{name} must be {bound}, got {value:g}")
-    return replace(scripts, **{name: np.full(episodes, float(value)) for name, value in fixed.items()})
-
-
-def next_grasp(scripts: Scripts, *, rng: np.random.Generator) -> Scripts:
-    """Draw another grasp of the same objects with the same events.
-
-    The friction differs from the object's by a random share (`GRASP_SPREAD`), and other fingertips hold it: the errors
-    of a network differ from touch to touch.
-    """
-    share = 1 + GRASP_SPREAD * rng.standard_normal(len(scripts))
-    pairs = rng.integers(int(scripts.fingertips.max(initial=0)) + 1, size=len(scripts))
-    return replace(scripts, friction=scripts.friction * share, fingertips=pairs.astype(np.float64))
-
-
-_BOUNDS = {"mass_kg": 0, "friction": 0, "kinetic_ratio": 0, "patch_factor": 0, "drift": -1, "water_kg": -1e-9}
+    columns = {**pick(CONDITIONS, condition, noun="condition")(scripts, gripped, condition_uniform), **script}
+    return replace(scripts, **{name: np.full(episodes, value, dtype=np.float64) for name, value in columns.items()})

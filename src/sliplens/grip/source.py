@@ -9,11 +9,12 @@ from threading import Event, Lock
 import numpy as np
 
 from sliplens.errors import InputError
+from sliplens.extras import pick
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.gripper import GripperError, GripperState
 from sliplens.grip.holder import Holder
-from sliplens.grip.plant import PERIOD_S, GripperModel, Plant, PlantState, World, least_force, pick_object
+from sliplens.grip.plant import OBJECTS, PERIOD_S, GripperModel, Plant, PlantState, World, least_force
 from sliplens.grip.scripts import LIFT_S, hand_motion
 from sliplens.live.contract import LiveOptions, LiveSource, Pace
 from sliplens.live.reading import LiveFrame, Reading
@@ -79,7 +80,7 @@ class GripSource(LiveSource):
     ) -> None:
         if not 0 < friction < np.inf:
             raise InputError(f"a coefficient of friction is a positive number, got {friction:g}")
-        self._object, self._friction, self._tip = pick_object(object), friction, Fingertip(seed=seed)
+        self._object, self._friction, self._tip = pick(OBJECTS, object, noun="object"), friction, Fingertip(seed=seed)
         self.name, self.rate_hz, self.reference = f"a simulated gripper ({object})", rate_hz, self._tip.reference
         self.size = self.reference.shape[0], self.reference.shape[1]
         self._lock, self._closed = Lock(), Event()

@@ -33,7 +33,6 @@ def plate_trace(grip: Grip) -> Plate:
     force = f"{float(first.mean_force_n[0]):.2f} N, {percent(float(first.force_excess[0]))} over the least that holds"
     setup = grip.setup
     how = "those of drawn frames" if setup.rendered else "looked up in the network's measured errors"
-    how = f"{how}, predicted in order" if setup.sequence else how
     friction = "" if setup.friction is None else f" Predictions used the coefficient of friction {setup.friction}."
     return Plate(
         name="grip-episode",
@@ -70,23 +69,20 @@ def plate_moments(grip: Grip) -> Plate:
 
 
 def table_episodes(grip: Grip) -> Table:
-    """Summarise all episodes, a row a grasp."""
-    table, setup = grip.episodes, grip.setup
+    """Summarise all episodes."""
+    rows, setup = grip.episodes, grip.setup
     what = f"{setup.object}, {setup.condition}, controller {setup.controller}"
-    learnt = " Friction learnt from a slip counts in the grasps that follow." if setup.same_object else ""
     return make_table(
-        f"{number_of(len(table), 'episode')}: {what}.{learnt}",
-        ("Grasp", "Episodes", "Friction known", "Dropped", "Crushed", "Slip, median", "Mean force",
+        f"{number_of(len(rows), 'episode')}: {what}.",
+        ("Episodes", "Friction known", "Dropped", "Crushed", "Slip, median", "Mean force",
          "Over the least (quartiles)", "Under 20 %"),
         [
             (
-                f"{grasp}", f"{len(rows):,}", f"{int((rows.known_friction > 0).sum()):,}",
+                f"{len(rows):,}", f"{int((rows.known_friction > 0).sum()):,}",
                 *(percent(float(flags.mean()), digits=1) for flags in (rows.dropped, rows.crushed)),
                 f"{1e3 * float(np.median(rows.slip_m)):.1f} mm", f"{float(rows.mean_force_n.mean()):.2f} N",
                 " / ".join(percent(float(excess)) for excess in np.quantile(rows.force_excess, (0.25, 0.5, 0.75))),
                 f"{float(rows.under_20_s.mean()):.2f} s",
             )
-            for grasp in range(1, setup.grasps + 1)
-            for rows in [table.where(table.grasp == grasp)]
         ],
     )  # fmt: skip
