@@ -103,15 +103,14 @@ def follow(path: Path, labels: Path | None) -> Clip:
     assert reference is not None
     frames = list(capture.read_frames())
     tracks = track_markers(frames, frames[reference], "gelsight-mini")
-    known = tracks.from_reference
     return Clip(
         name="/".join(path.parts[-3:]),
         grasp="/".join(path.parts[-3:-1]),
         grasped=capture.object,
         slipped=known_clip.slips,
-        rest_px=tracks.rest_px[known],
-        position_px=np.where(tracks.followed[:, known, None], tracks.position_px[:, known], np.nan),
-        status=tracks.status[:, known],
+        rest_px=tracks.rest_px,
+        position_px=np.where(tracks.followed[..., None], tracks.position_px, np.nan),
+        status=tracks.status,
         picture=np.stack([shrink(frame) for frame in frames]),
         key_change=measure_key_change(path, frames, skipped=known_clip.stale_frames),
         file_bytes=path.stat().st_size,

@@ -126,7 +126,7 @@ def run_clips(folder: Path) -> dict[str, float | int]:
             detector = SlipDetector(tracker.rest.centre_px)
             rate_hz = capture.frame_rate_hz
             states = [
-                detector.update(tracker.update(frame).position_px[: len(tracker.rest)], at / rate_hz).state
+                detector.update(tracker.update(frame).position_px, at / rate_hz).state
                 for at, frame in enumerate(frames)
             ]
         except SliplensError:

@@ -139,24 +139,6 @@ def test_a_frame_in_which_nothing_was_followed_gets_the_mean_of_the_training_lab
     assert answer[30] == pytest.approx(np.nanmean(labels))
 
 
-def cut(trial, frames):
-    moved = trial.displacement_px[:frames]
-    return FieldTrial(rest_px=trial.rest_px, displacement_px=moved, hold=find_hold(trial.rest_px, moved))
-
-
-@pytest.mark.parametrize("name", ["shear-over-divergence", "ikeda-eccentricity"])
-def test_what_is_causal_says_the_same_of_a_frame_whatever_comes_after(made, name):
-    trials, margins = zip(*[(trial, margin) for split, trial, margin in made if split == "train"], strict=True)
-    (trial,) = [trial for split, trial, _ in made if split == "test"][:1]
-    kept, whole = (get_estimator(name + more).fit(trials, margins) for more in ("-causal", ""))
-    lengths = range(4, len(trial))
-    before = [[one.estimate(cut(trial, frames))[-1] for frames in lengths] for one in (kept, whole)]
-    after = [one.estimate(trial)[3:-1] for one in (kept, whole)]
-    np.testing.assert_array_almost_equal(before[0], after[0], decimal=12)
-    # where all is known that the whole trial knows, it is the same as the other but for what was fitted
-    assert np.abs(np.array(before[1]) - after[1]).max() > 0.01
-
-
 def test_what_cannot_be_fitted_is_refused(made):
     trial = made[0][1]
     with pytest.raises(InputError, match="there is no estimator named 'magic'"):

@@ -283,8 +283,8 @@ def print_baselines(evaluation: "Evaluation", baselines: "Baselines") -> None:
         f"{100 * baselines.followed:.1f} % of the markers were followed while in view"
     )
     say(
-        "  note: except for the causal ones they count motion from the last frame before the pull, found in each trial "
-        "as a whole; the network gets one frame"
+        "  note: they count motion from the last frame before the pull, found in each trial as a whole; the network "
+        "gets one frame"
     )
     if baselines.shared_trials:
         say("  note: they were fitted on trials that they are scored on, which makes their scores too good")

@@ -197,7 +197,7 @@ class RenderedSensor:
 
 def _follow_frame(tracker: Tracker, frame: UInt8[np.ndarray, "height width 3"]) -> Markers:
     """Follow a tracker's markers into its next frame."""
-    return tracker.update(frame).position_px[None, : len(tracker.rest)]
+    return tracker.update(frame).position_px[None]
 
 
 class _GripSlip:

@@ -238,7 +238,7 @@ class FrameReader:
         if self._tracker is not None and self._slip is not None:
             tracked = self._tracker.update(frame.image if self._smaller == 1 else frame.small)
             rest_px = self._tracker.rest.centre_px
-            self.markers_px = self._in_frame(rest_px), self._in_frame(tracked.position_px[: len(rest_px)])
+            self.markers_px = self._in_frame(rest_px), self._in_frame(tracked.position_px)
             markers = self._slip.update(self.markers_px[1], frame.time_s)
         health = () if self._health is None else self._health.check(frame, tracked)
         if self._shear is not None and self.network is not None and all(check.ok for check in health):

@@ -1,12 +1,12 @@
 """Estimators of the safety margin from the marker field: one interface, one row a paper."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias, final
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from sliplens.errors import InputError
 from sliplens.extras import pick
@@ -56,7 +56,7 @@ class FieldTrial:
 
     @property
     def inner(self) -> Bool[np.ndarray, " markers"]:
-        """Third of the markers nearest to the fixed point of the press: these surely touch."""
+        """Third of the markers nearest to the fixed point of the press."""
         return _ring(self.rest_px, self.displacement_px[self.hold], 0.0, INNER_SHARE)
 
     @property
@@ -129,37 +129,24 @@ def affine_parts(
 
 
 def find_hold(rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]) -> int:
-    """Find the last frame before the pull of a whole trial."""
-    return int(find_holds(rest_px, displacement_px)[-1])
-
-
-def find_holds(
-    rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np.ndarray, "frames markers 2"]
-) -> Int[np.ndarray, " frames"]:
-    """Find the last frame before the pull, for each frame from itself and those before it.
+    """Find the last frame before the pull of a whole trial.
 
     The sensor is pressed then, and the inner markers have not yet moved by 0.2 px on average. Pressing ends where the
-    divergence first reaches nine tenths of the largest so far; before any press the first frame is the hold.
+    divergence first reaches nine tenths of its largest; without a press the first frame is the hold.
     """
-    parts = affine_parts(rest_px, displacement_px)
-    spread = np.nan_to_num(parts[:, 2], nan=-np.inf)
-    largest, frames = np.maximum.accumulate(spread), np.arange(len(spread))
-    settled = np.array([int(np.argmax(spread >= _PRESSED_SHARE * level)) for level in largest])
-    holds = np.zeros(len(spread), dtype=np.int64)
-    for first in np.unique(settled[largest > 0]):
-        inner = _ring(rest_px, displacement_px[first], 0.0, INNER_SHARE)
-        moved = affine_parts(rest_px[inner], displacement_px[first:, inner] - displacement_px[first, inner])[:, :2]
-        later = np.flatnonzero(np.nan_to_num(np.linalg.norm(moved, axis=1), nan=0.0) > _PULL_PX)
-        pull = first + int(later[0]) if len(later) else len(spread)
-        here = (settled == first) & (largest > 0)
-        holds[here] = np.where(frames[here] >= pull, max(pull - 1, first), first)
-    return holds
+    spread = np.nan_to_num(affine_parts(rest_px, displacement_px)[:, 2], nan=-np.inf)
+    if spread.max() <= 0:
+        return 0
+    first = int(np.argmax(spread >= _PRESSED_SHARE * spread.max()))
+    inner = _ring(rest_px, displacement_px[first], 0.0, INNER_SHARE)
+    moved = affine_parts(rest_px[inner], displacement_px[first:, inner] - displacement_px[first, inner])[:, :2]
+    pulled = np.flatnonzero(np.linalg.norm(moved, axis=1) > _PULL_PX)
+    return max(first + int(pulled[0]) - 1, first) if len(pulled) else first
 
 
 def field_trial(tracks: Tracks, *, hold: int | None = None) -> FieldTrial:
     """Select the displacements of a tracked trial; its hold is found by `find_hold` if None."""
-    chosen = tracks.from_reference
-    rest, displacement = tracks.rest_px[chosen], tracks.displacement_px[:, chosen]
+    rest, displacement = tracks.rest_px, tracks.displacement_px
     hold = find_hold(rest, displacement) if hold is None else hold
     return FieldTrial(rest_px=rest, displacement_px=displacement, hold=hold)
 
@@ -173,32 +160,15 @@ def mean_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
     return np.linalg.norm(_mean(trial.increment_px), axis=-1)[:, None]
 
 
+def _over_divergence(shear: Float[np.ndarray, "frames 1"], trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
+    """Divide a motion by the divergence; at least a tenth of the trial's largest divergence counts."""
+    spread = trial.spread
+    return shear / np.maximum(spread, 0.1 * np.fmax(np.nanmax(spread), 1e-6))[:, None]
+
+
 def shear_over_divergence(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    """Compute the mean motion over divergence, in pixels; at least a tenth of the trial's largest divergence counts."""
-    return mean_shear(trial) / _pressed(trial, np.nanmax(trial.spread))[:, None]
-
-
-def _pressed(trial: FieldTrial, largest: np.ndarray | float) -> Float[np.ndarray, " frames"]:
-    return np.maximum(trial.spread, 0.1 * np.fmax(largest, 1e-6))
-
-
-def causal(
-    motion: Callable[[FieldTrial], Float[np.ndarray, "frames features"]],
-) -> Callable[[FieldTrial], Float[np.ndarray, "frames features"]]:
-    """Return a causal feature: a motion since the hold, over divergence, from a frame and those before it.
-
-    `motion` must depend on its frame and the hold alone; the hold is that of `find_holds`, and the divergence is at
-    least a tenth of the largest so far.
-    """
-
-    def values(trial: FieldTrial) -> Float[np.ndarray, "frames features"]:
-        holds = find_holds(trial.rest_px, trial.displacement_px)
-        moved = np.empty((len(trial), 1))
-        for hold in np.unique(holds):
-            moved[holds == hold] = motion(replace(trial, hold=int(hold)))[holds == hold]
-        return moved / _pressed(trial, np.fmax.accumulate(trial.spread))[:, None]
-
-    return values
+    """Compute the mean motion over divergence, in pixels."""
+    return _over_divergence(mean_shear(trial), trial)
 
 
 def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
@@ -380,34 +350,28 @@ def _learn_stick_area(trials: Trials, labels: Margins) -> Reader:
     return readers[int(np.argmin([np.nanmean((answer - labels) ** 2) for answer in answers]))]
 
 
-def _learn_eccentricity(
-    eccentricity: Callable[[FieldTrial], Float[np.ndarray, "frames 1"]], trials: Trials, labels: Margins
-) -> Reader:
+def _learn_eccentricity(trials: Trials, labels: Margins) -> Reader:
     """Learn from Ikeda's eccentricity e = delta_t / a: motion of the contact's middle over its indentation.
 
     Gamma = (1 - delta_t / delta_full)^1.5 for a sphere, with delta_full = mu (2 - nu) delta / (2 (1 - nu)): full slip
-    begins when the tangential displacement of the stuck middle reaches a multiple of the indentation delta, which for a
-    sphere is a^2 over its radius, a being the contact's. Both are read in pixels: delta_t is the mean motion of the
-    inner markers since the hold, delta is taken in proportion to the divergence since T_0, and the factor between them,
-    which holds the friction, is fitted on the training trials.
+    begins when the tangential displacement of the stuck middle reaches a multiple of the indentation delta. delta_t is
+    the mean motion of the inner markers since the hold, delta is in proportion to the divergence since T_0, and the
+    factor between them, which holds the friction, is fitted on the training trials.
 
     Ikeda, Kurita, Ueda, Matsumoto and Ogasawara, *Grip Force Control for an Elastic Finger using Vision-based Incipient
     Slip Feedback*, IROS 2004; Obinata et al., *Vision Based Tactile Sensor Using Transparent Elastic Fingertip for
     Dexterous Handling*, 2007. Johnson, *Contact Mechanics* (1985), section 7.2.
     """
-    ratio = np.concatenate([eccentricity(trial) for trial in trials])[:, 0]
+
+    def eccentricity(trial: FieldTrial) -> Margins:
+        shear = np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=1)
+        return _over_divergence(shear[:, None], trial)[:, 0]
+
+    ratio = np.concatenate([eccentricity(trial) for trial in trials])
     usable = _usable(labels, ratio[:, None])
     tries = np.geomspace(1e-2, 1e2, 400) * max(float(np.median(ratio[usable])), 1e-3)
     errors = [np.mean((_hertz(ratio[usable], full) - labels[usable]) ** 2) for full in tries]
-    return lambda trial: _hertz(eccentricity(trial)[:, 0], tries[int(np.argmin(errors))])
-
-
-def _inner_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    return np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=1)[:, None]
-
-
-def _eccentricity(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    return _inner_shear(trial) / _pressed(trial, np.nanmax(trial.spread))[:, None]
+    return lambda trial: _hertz(eccentricity(trial), tries[int(np.argmin(errors))])
 
 
 def _hertz(ratio: Margins, full: float) -> Margins:
@@ -418,18 +382,15 @@ ESTIMATORS: dict[str, Callable[[Trials, Margins], Reader]] = {
     "constant": _learn_mean,
     "mean-shear": partial(_learn_features, mean_shear),
     "shear-over-divergence": partial(_learn_features, shear_over_divergence),
-    "shear-over-divergence-causal": partial(_learn_features, causal(mean_shear)),
-    "ikeda-eccentricity": partial(_learn_eccentricity, _eccentricity),
-    "ikeda-eccentricity-causal": partial(_learn_eccentricity, causal(_inner_shear)),
+    "ikeda-eccentricity": _learn_eccentricity,
     "sui-stick-area": _learn_stick_area,
     "dong-rigid-residual": partial(_learn_features, rigid_residual),
     "yuan-entropy": partial(_learn_features, displacement_entropy),
     "khamis-edge-centre": partial(_learn_features, edge_over_centre),
     "helmholtz-hodge": partial(_learn_features, helmholtz_hodge),
 }
-"""Fits of each estimator to trials and their margins: the first four trivial, the others named after papers.
-
-Causal ones use a frame and those before it; the others need the hold of the whole trial."""
+"""Fits of each estimator to trials and their margins: the first three trivial, the others named after papers. All need
+the hold of the whole trial."""
 
 
 def get_estimator(name: str) -> MarginEstimator:

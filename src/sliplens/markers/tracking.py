@@ -77,8 +77,7 @@ class Tracking:
 
         Columns are `trial`, `frame`, `time_s`, `marker`, `status` (`MarkerStatus`), and in pixels, x to the right and y
         down, `x_px`, `y_px`, `rest_x_px`, `rest_y_px`, `dx_px`, `dy_px`, `radius_px` and `deviation_px`. Unknown
-        values are null: the place of a marker that was not detected, the displacement of one that was not followed, the
-        place at rest of a new one.
+        values are null: the place of a marker that was not detected, the displacement of one that was not followed.
         """
         if self.rows is not None:
             return self.rows
@@ -207,10 +206,9 @@ def _outcome(rows: pa.Table) -> TrialTracking:
     """Summarise a trial from its rows."""
     frame = rows["frame"].to_numpy()
     status = rows["status"].combine_chunks().indices.to_numpy()
-    whole = rows["rest_x_px"].is_valid().to_numpy()  # a marker of the reference frame
-    frames, markers = int(frame[-1]) + 1, int(whole[frame == 0].sum())
-    followed, in_view = (status == MarkerStatus.FOLLOWED) & whole, (status != MarkerStatus.OUTSIDE) & whole
-    lost = np.bincount(frame[(status == MarkerStatus.LOST) & whole], minlength=frames)
+    frames, markers = int(frame[-1]) + 1, int((frame == 0).sum())
+    followed, in_view = status == MarkerStatus.FOLLOWED, status != MarkerStatus.OUTSIDE
+    lost = np.bincount(frame[status == MarkerStatus.LOST], minlength=frames)
     return TrialTracking(
         trial=rows["trial"][0].as_py(),
         frames=frames,
@@ -224,13 +222,8 @@ def _frame_table(
     trial: str, frame: int, tracked: TrackedFrame, *, rest_px: Float[np.ndarray, "markers 2"], time_s: float | None
 ) -> pa.Table:
     count = len(tracked.status)
-    rest = np.full((count, 2), np.nan)
-    rest[: len(rest_px)] = rest_px
-    followed = (tracked.status == MarkerStatus.FOLLOWED)[:, None]
-    shift = np.where(followed, tracked.position_px - rest, np.nan)
-    numbers = np.concatenate(
-        [tracked.position_px, rest, shift, tracked.radius_px[:, None], tracked.deviation_px[:, None]], axis=1
-    )
+    shift = np.where((tracked.status == MarkerStatus.FOLLOWED)[:, None], tracked.motion_px, np.nan)
+    numbers = np.column_stack([tracked.position_px, rest_px, shift, tracked.radius_px, tracked.deviation_px])
     columns: dict[str, Any] = {
         "trial": pa.array([trial] * count),
         "frame": pa.array(np.full(count, frame, dtype=np.int32)),

@@ -12,30 +12,26 @@ from sliplens.errors import InputError
 class MarkerStatus(IntEnum):
     """State of a marker in a frame; only followed markers have a displacement."""
 
-    UNSEEN = 0
-    """A marker that appears later."""
-    FOLLOWED = 1
+    FOLLOWED = 0
     """Detected, and identified with a marker of the reference frame."""
-    MISSING = 2
+    MISSING = 1
     """Should be in view but was not detected."""
-    BROKEN = 3
+    BROKEN = 2
     """Detected, but changed in size or shape, or astray from its neighbours: its centre is unreliable."""
-    OUTSIDE = 4
+    OUTSIDE = 3
     """Cut by the edge of the frame, or beyond it."""
-    LOST = 5
+    LOST = 4
     """The pattern jumped so far that markers cannot be identified."""
-    NEW = 6
-    """Detected, but not in the reference frame: it has a place and no displacement."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackedFrame:
-    """Markers of one frame, in the order of the reference frame, new ones after them."""
+    """Markers of one frame, in the order of the reference frame."""
 
     position_px: Float[np.ndarray, "markers 2"]
     """x, y; NaN where a marker was not detected whole."""
     motion_px: Float[np.ndarray, "markers 2"]
-    """Displacement from the place at rest; NaN of new markers too."""
+    """Displacement from the place at rest."""
     size: tuple[int, int]
     """Height and width of the picture, in pixels."""
     radius_px: Float[np.ndarray, " markers"]
@@ -50,8 +46,7 @@ class Tracks:
     """Markers of a trial; pixel coordinates are (x, y), pixel centres at whole numbers."""
 
     rest_px: Float[np.ndarray, "markers 2"]
-    """Places in the reference frame T_0; NaN for markers that it does not show."""
-    rest_radius_px: Float[np.ndarray, " markers"]
+    """Places in the reference frame T_0."""
     position_px: Float[np.ndarray, "frames markers 2"]
     """NaN where a marker was not detected whole."""
     radius_px: Float[np.ndarray, "frames markers"]
@@ -70,31 +65,6 @@ class Tracks:
     def displacement_px(self) -> Float[np.ndarray, "frames markers 2"]:
         """T_n less T_0, x and y; NaN where a marker was not followed."""
         return np.where(self.followed[..., None], self.position_px - self.rest_px, np.nan)
-
-    @property
-    def from_reference(self) -> Bool[np.ndarray, " markers"]:
-        """Markers that the reference frame shows."""
-        return np.all(np.isfinite(self.rest_px), axis=1)
-
-
-_STACKED = ("position_px", "radius_px", "deviation_px", "status")
-
-
-def stack_tracks(
-    frames: list[TrackedFrame],
-    *,
-    rest_px: Float[np.ndarray, "markers 2"],
-    rest_radius_px: Float[np.ndarray, " markers"],
-) -> Tracks:
-    """Join the frames of a trial; markers that appear later are unseen before."""
-    count = max(len(frame.status) for frame in frames)
-
-    def padded(values: np.ndarray) -> np.ndarray:
-        missing = [(0, count - len(values)), *((0, 0) for _ in values.shape[1:])]
-        return np.pad(values, missing, constant_values=np.nan if values.dtype.kind == "f" else MarkerStatus.UNSEEN)
-
-    joined = {name: np.stack([padded(getattr(frame, name)) for frame in frames]) for name in _STACKED}
-    return Tracks(rest_px=padded(rest_px), rest_radius_px=padded(rest_radius_px), **joined)
 
 
 _FEWEST = 3

@@ -104,7 +104,7 @@ def _bytes(colour: str) -> tuple[int, ...]:
     return tuple(round(255 * level) for level in to_rgb(colour))
 
 
-_COLOURS = {MarkerStatus.FOLLOWED: YELLOW, MarkerStatus.BROKEN: VERMILLION, MarkerStatus.NEW: SKY}
+_COLOURS = {MarkerStatus.FOLLOWED: YELLOW, MarkerStatus.BROKEN: VERMILLION}
 _LEAST_SIDE = 640
 _MAGNIFIED = 3  # arrows, so that a pixel of motion shows
 
@@ -114,7 +114,7 @@ def draw_tracked(
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Draw a ring round every detected marker of an enlarged frame, and a magnified arrow along its displacement.
 
-    Followed markers are yellow, broken ones orange, new ones blue.
+    Followed markers are yellow, broken ones orange.
     """
     cv2 = import_cv2()
     picture = cv2.resize(frame, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)

@@ -114,7 +114,7 @@ def evaluate_baselines(
         answers[name] = replace(predictions, prediction=prediction)
     scores = Baselines(
         markers=plan.markers,
-        hold="found in each trial as a whole, by find_hold; by each frame for itself where causal",
+        hold="found in each trial as a whole, by find_hold",
         offered_trials=plan.offered_trials,
         training_trials=len(fitted),
         known_trials=0,
@@ -136,11 +136,10 @@ def evaluate_baselines(
 def _follow(data: Dataset, info: TrialInfo, kind: str) -> _Followed:
     reference = data.read_labels(info).reference
     tracks = track_markers(stream_frames(trial_path(data.folder, info.trial)), reference, kind)
-    rows = tracks.from_reference
     return _Followed(
         **vars(field_trial(tracks)),
-        in_view=int((tracks.status[:, rows] != MarkerStatus.OUTSIDE).sum()),
-        followed=int(tracks.followed[:, rows].sum()),
+        in_view=int((tracks.status != MarkerStatus.OUTSIDE).sum()),
+        followed=int(tracks.followed.sum()),
     )
 
 
