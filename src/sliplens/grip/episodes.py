@@ -153,8 +153,8 @@ def run_episodes(
     if options.friction is not None:
         network.require_ratio()
         each = options.friction == "each"
-        known = [Friction(mu) if each else as_friction(options.friction) for mu in scripts.friction.tolist()]
-        friction, words = known, "that of each episode as it begins" if each else str(known[0])
+        friction = [Friction(mu) if each else as_friction(options.friction) for mu in scripts.friction.tolist()]
+        words = "that of each episode as it begins" if each else str(friction[0])
     constants = dict(settings or {})
     if not isinstance(controller, str) and is_dataclass(controller):
         values = {item.name: getattr(controller, item.name) for item in fields(controller) if item.init}
@@ -245,7 +245,6 @@ class _Job:
         """Run some episodes; save images of a rendered one in the folder."""
         setup, options, scripts = self.setup, self.options, self.scripts.where(rows)
         learners = [SlipLearner(self.friction[row]) for row in rows] if self.friction else []
-        known = [np.nan if learner.friction is None else learner.friction.mean for learner in learners]
         seed = np.random.SeedSequence((setup.seed, number))
         if setup.rendered:
             sensor = RenderedSensor(
@@ -270,8 +269,8 @@ class _Job:
         loop = GripLoop(Plant(self.gripped, episodes=len(rows)), sensor, controller, latency_s=setup.latency_s)
         ticks, traced = list[Tick](), setup.rendered or number == 0
         table = run_scripts(loop, scripts, condition=setup.condition, on_tick=ticks.append if traced else None)
-        if learners:
-            table = replace(table, known_friction=np.array(known))
+        if self.friction:
+            table = replace(table, known_friction=np.array([self.friction[row].mean for row in rows]))
         pictures, maps = np.zeros((0, 1, 1, 3), dtype=np.uint8), np.zeros((0, 1, 1), dtype=np.float32)
         if isinstance(sensor, RenderedSensor):
             frames = np.stack([tick.reading.frames for tick in ticks if tick.reading.frames is not None])

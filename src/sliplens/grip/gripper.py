@@ -178,11 +178,6 @@ _GRIPPER, _NUMBER = "control_msgs/msg/GripperCommand", "std_msgs/msg/Float64"
 _DEFINITIONS = {_GRIPPER: "float64 position\nfloat64 max_effort"}  # of types that ROS itself does not bring
 
 
-def _as_array(value: float) -> dict[str, object]:
-    """Return the fields of `std_msgs/msg/Float64MultiArray` for one joint."""
-    return {"layout": SimpleNamespace(dim=[], data_offset=0), "data": np.array([value])}
-
-
 ROS_MESSAGES = {
     # closed as far as the effort brings it
     "gripper-command": (
@@ -192,7 +187,11 @@ ROS_MESSAGES = {
     "numbers": tuple(RosCommand(topic, _NUMBER, lambda value: {"data": value}) for topic in ("force", "width")),
     # forward controllers of ros2_control take a number a joint
     "controllers": tuple(
-        RosCommand(f"{kind}_controller/commands", "std_msgs/msg/Float64MultiArray", _as_array)
+        RosCommand(
+            f"{kind}_controller/commands",
+            "std_msgs/msg/Float64MultiArray",
+            lambda value: {"layout": SimpleNamespace(dim=[], data_offset=0), "data": np.array([value])},
+        )
         for kind in ("effort", "position")
     ),
 }
@@ -280,7 +279,7 @@ class RosGripper:
         """Close the connection."""
         self._ros.close()
 
-    def _send(self, command: RosCommand, publish: Callable[[dict[str, object], int], None], value: float) -> None:
+    def _send(self, command: RosCommand, publish: Callable[..., None], value: float) -> None:
         """Send a force or a width, and check that the gripper still sends its state."""
         try:
             publish(command.fields(value), time.time_ns())

@@ -1,6 +1,7 @@
 """Motion of the camera against the untouched sensor, apart from what a contact does to the skin."""
 
 from dataclasses import dataclass, replace
+from functools import reduce
 from math import hypot, radians
 
 import numpy as np
@@ -12,9 +13,7 @@ from sliplens.recordings.capture import Frame
 
 Plane = Float32[np.ndarray, "height width"]
 
-SIDE_PX = 224
-"""Height of the picture in whose pixels the camera's motions are given, so that limits suit every camera."""
-_HALF_PX = SIDE_PX / 2
+_HALF_PX = 112.0  # half the height of the picture in whose pixels motions are given: limits then suit every camera
 CAMERA_LIMIT_PX = 0.8
 """`CameraMotion.excess_px` above which the camera has moved: nearly twice what contacts of a fixed camera reach. Turns
 up to 0.3 degrees and zooms up to 0.5 %, on which networks are trained, stay below it."""
@@ -89,24 +88,26 @@ def marker_camera_motion(markers: TrackedFrame) -> CameraMotion | None:
     moved_px = float(np.sqrt(np.mean(np.abs(contact @ whole[2:]) ** 2)))
     if moved_px > _LIGHT_PX:
         return _as_motion(whole, moved_px, _MARKER_SHARES, free=False)
-    camera, _ = _fit(place, motion, contact[:, :0])
+    camera, _ = _fit(place, motion)
     return _as_motion(camera, 0.0, _MARKER_SHARES, free=True)
 
 
 def _fit(
     place: Complex[np.ndarray, " places"],
     motion: Complex[np.ndarray, " places"],
-    contact: Complex[np.ndarray, "places terms"],
+    contact: Complex[np.ndarray, "places terms"] | None = None,
 ) -> tuple[Complex[np.ndarray, " all_terms"], Float[np.ndarray, " places"]]:
-    """Fit shift and similarity, with further terms; gives the numbers and the misfit of each place, in pixels."""
-    terms = np.concatenate([np.ones_like(place)[:, None], place[:, None], contact], axis=1)
-    weight, found, misfit = np.ones(len(place)), np.zeros(terms.shape[1], dtype=complex), np.zeros(len(place))
+    """Fit shift and similarity, with further terms; returns the terms and the misfit of each place, in pixels."""
+    terms = np.stack([np.ones_like(place), place], axis=1)
+    if contact is not None:
+        terms = np.concatenate([terms, contact], axis=1)
+    weight, fitted, misfit = np.ones(len(place)), np.zeros(terms.shape[1], dtype=complex), np.zeros(len(place))
     for _ in range(_PASSES):
         weighted = terms.conj().T * weight
-        found = np.linalg.solve(weighted @ terms, weighted @ motion)
-        misfit = np.abs(motion - terms @ found)
+        fitted = np.linalg.solve(weighted @ terms, weighted @ motion)
+        misfit = np.abs(motion - terms @ fitted)
         weight = 1 / (1 + (misfit / _SCALE_PX) ** 2)
-    return found, misfit
+    return fitted, misfit
 
 
 def _as_motion(
@@ -127,14 +128,10 @@ def _as_motion(
 def block_means(plane: Plane, factor: int) -> Float32[np.ndarray, "rows columns"]:
     """Average square blocks; what fills no block at the right and below is left out."""
     height, width = (side // factor for side in plane.shape)
-    # line by line, several times as fast as a mean over two axes
-    lines = plane[: height * factor, : width * factor].reshape(height, factor, width, factor)
-    sums, means = np.zeros((height, width, factor), dtype=np.float32), np.zeros((height, width), dtype=np.float32)
-    for line in range(factor):
-        sums += lines[:, line]
-    for column in range(factor):
-        means += sums[..., column]
-    return means / np.float32(factor**2)
+    blocks = plane[: height * factor, : width * factor].reshape(height, factor, width, factor)
+    # sums of slices: several times as fast as a mean over two axes
+    lines = reduce(np.add, [blocks[:, line] for line in range(factor)])
+    return reduce(np.add, [lines[..., column] for column in range(factor)]) / np.float32(factor**2)
 
 
 _BORDER = 0.14  # share of the side: what touches seldom reaches there
@@ -164,23 +161,20 @@ class BorderMotion:
         self._levels = tuple((_Level(block_means(plane, factor)), factor) for factor in factors)
         self._half, self._level = min(plane.shape) / 2, _brightness(plane)
         coarse, _ = self._levels[0]
-        self.textured = int((coarse.texture > _TEXTURE).sum()) >= _PARTS - _STRAYS
-        """Whether the border shows enough for its motion to be seen."""
+        self._textured = int((coarse.texture > _TEXTURE).sum()) >= _PARTS - _STRAYS
 
     def measure(self, plane: Plane) -> CameraMotion | None:
         """Measure the camera's motion in a picture of the reference's size; None without texture."""
-        if not self.textured:
+        if not self._textured:
             return None
         plane = plane * np.float32(self._level / _brightness(plane))
         shift, similarity, misfit = np.zeros(_PARTS, dtype=complex), 0j, np.zeros(_PARTS)
         fitted = np.zeros(2, dtype=complex)
         for level, factor in self._levels:
-            pixels = level.padded(block_means(plane, factor))
+            pixels = np.pad(block_means(plane, factor), _REACH_PX, mode="edge").ravel()
             for _ in range(_STEPS):
                 shift = shift + factor * level.steps(pixels, shift / factor, similarity)
-                fitted, misfit = _fit(
-                    level.places, shift * (_HALF_PX / self._half), np.zeros((_PARTS, 0), dtype=complex)
-                )
+                fitted, misfit = _fit(level.places, shift * (_HALF_PX / self._half))
                 similarity = complex(fitted[1]) / _HALF_PX
         misfit_px, length_px = float(np.sort(misfit)[_PARTS - _STRAYS - 1]), float(np.linalg.norm(fitted))
         free = length_px < _LIGHT_PX or misfit_px < _STILL_PX + _ALIKE_SHARE * length_px
@@ -204,6 +198,11 @@ class BorderMotion:
 
 def _brightness(plane: Plane) -> float:
     return max(1.0, float(np.median(plane[::4, ::4])))
+
+
+def _green(frame: Frame) -> Plane:
+    """Return the green channel, which cameras resolve best."""
+    return frame[..., 1].astype(np.float32)
 
 
 class CameraWatch:
@@ -255,19 +254,14 @@ class CameraWatch:
         return motion if before is None or motion.excess_px > before.excess_px else before
 
 
-def _green(frame: Frame) -> Plane:
-    """Return the green channel, which cameras resolve best."""
-    return frame[..., 1].astype(np.float32)
-
-
 class _Level:
-    """Border of a picture at one scale."""
+    """Border of a picture at one scale, cut into eight sectors."""
 
     def __init__(self, plane: Plane) -> None:
         height, width = plane.shape
         wide = max(4, round(_BORDER * min(height, width)))
         rows, columns = np.mgrid[:height, :width]
-        # bearing from the middle, the sides of the picture made alike: eight sectors of the border
+        # bearing from the middle, the sides of the picture made alike
         bearing = np.arctan2(rows / (height - 1) - 0.5, columns / (width - 1) - 0.5)
         sector = np.floor((bearing / (2 * np.pi) + 1) * _PARTS).astype(int) % _PARTS
         sector[wide:-wide, wide:-wide] = -1
@@ -292,21 +286,17 @@ class _Level:
         self._arm = np.stack([arm.real, arm.imag]).astype(np.float32)
         self.places, self.texture = centres / (min(plane.shape) / 2), texture
 
-    def padded(self, plane: Plane) -> Float32[np.ndarray, " pixels"]:
-        """Pixels of a picture with room around it, in one row."""
-        return np.pad(plane, _REACH_PX, mode="edge").ravel()
-
     def steps(
         self, pixels: Float32[np.ndarray, " pixels"], shift: Complex[np.ndarray, " parts"], similarity: complex
     ) -> Complex[np.ndarray, " parts"]:
-        """How far each part lies from where its shift and the common similarity put it, in pixels."""
+        """Measure how far each part lies from where its shift and the common similarity put it, in pixels."""
         start = np.stack([np.real(shift), np.imag(shift)]).astype(np.float32)[:, self._part]
         zoom, turn = np.float32(similarity.real), np.float32(similarity.imag)
         right, down = self._arm
         motion = start + np.stack([zoom * right - turn * down, turn * right + zoom * down])
         whole = np.clip(np.rint(motion), -_REACH_PX, _REACH_PX)
-        seen = pixels[self._index + (whole[1] * self._stride + whole[0]).astype(int)]
+        visible = pixels[self._index + (whole[1] * self._stride + whole[0]).astype(int)]
         # what whole pixels leave of the motion changes the values along their slopes
-        unlike = self._values - seen - ((motion - whole) * self._slopes).sum(axis=0)
+        unlike = self._values - visible - ((motion - whole) * self._slopes).sum(axis=0)
         steps = [np.bincount(self._part, inverse * unlike, minlength=_PARTS) for inverse in self._inverse]
         return np.clip(steps[0], -1.5, 1.5) + 1j * np.clip(steps[1], -1.5, 1.5)

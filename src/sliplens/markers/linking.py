@@ -74,15 +74,15 @@ class Pattern:
 
     def _fit(self, usable: bytes) -> Float[np.ndarray, "markers neighbours"]:
         """Fit a plane by least squares: its value at a marker is a weighted sum over the neighbours."""
-        known = np.frombuffer(usable, dtype=bool)[self._near]
+        valid = np.frombuffer(usable, dtype=bool)[self._near]
         near = np.exp(-(self._offset**2).sum(axis=-1) / (2 * 1.5**2))
-        terms = np.concatenate([np.ones((*known.shape, 1)), self._offset], axis=-1)
-        weighted = np.swapaxes(terms * np.where(known, near, 0.0)[..., None], 1, 2)
+        terms = np.concatenate([np.ones((*valid.shape, 1)), self._offset], axis=-1)
+        weighted = np.swapaxes(terms * np.where(valid, near, 0.0)[..., None], 1, 2)
         normal = weighted @ terms
         normal[:, [1, 2], [1, 2]] += _STIFFNESS
         normal[:, 0, 0] += 1e-9  # for markers without neighbours, which are NaN below
         fit = np.linalg.solve(normal, weighted)
-        return np.where(known.sum(axis=1)[:, None] >= _FEWEST, fit[:, 0], np.nan)
+        return np.where(valid.sum(axis=1)[:, None] >= _FEWEST, fit[:, 0], np.nan)
 
     def predict(self, displacement_px: Places, usable: Chosen) -> Places:
         """Predict each displacement from the usable neighbours, in pixels; NaN where fewer than three are usable."""
@@ -119,7 +119,8 @@ class Pattern:
         shifts = [(origin, shift) for origin in origins for shift in likely_shifts(origin, spots_px, pitch_px=pitch)]
         tried = [*stands, *(self._pair_twice(origin, shift, spots_px) for origin, shift in shifts)]
         count = len(self._rest)
-        rivals = [one for one in tried if one.support >= _LEAST_SUPPORT and one.paired.sum() >= _LEAST_SHARE * count]
+        fewest = _LEAST_SHARE * count
+        rivals = [match for match in tried if match.support >= _LEAST_SUPPORT and match.paired.sum() >= fewest]
         # first a pattern that hardly moved, or stands at rest again, however many markers are hidden or dragged along
         for match in stands:
             moved = np.linalg.norm(match.step_px[match.paired], axis=1) / self._pitch[match.paired]
