@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.faithfulness.controls import gini, resolution, stability, total_variation
+from sliplens.faithfulness.controls import resolution, stability, total_variation
 
 
 def test_total_variation_has_its_closed_forms(rng: np.random.Generator):
@@ -14,16 +14,6 @@ def test_total_variation_has_its_closed_forms(rng: np.random.Generator):
     noise = total_variation(rng.uniform(size=(100, 100)))
     assert noise == pytest.approx(1 / 3, abs=8 / np.sqrt(18 * 2 * 9900) + 0.001)
     assert total_variation(7 * ramp - 3) == pytest.approx(total_variation(ramp))
-
-
-def test_gini_runs_from_even_to_one_pixel():
-    assert gini(np.ones((10, 10))) == pytest.approx(0)
-    one = np.zeros((10, 10))
-    one[3, 4] = -2.0
-    assert gini(one) == pytest.approx(0.99)
-    assert gini(np.zeros((3, 3))) == 0
-    assert gini(np.arange(1.0, 101).reshape(10, 10)) == pytest.approx(0.33)  # (n - 1) / (3 n) of 1 to n
-    assert gini(5 * one) == gini(one)
 
 
 @pytest.mark.parametrize("spread", [2.0, 5.0, 40.0])

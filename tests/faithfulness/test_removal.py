@@ -18,6 +18,7 @@ from sliplens.faithfulness.removal import (
 SIZE = 20
 IMAGES = 3
 EVERY = tuple(np.linspace(0, 1, SIZE * SIZE + 1))
+UP = np.ones(IMAGES)
 
 
 @pytest.fixture
@@ -44,17 +45,18 @@ def test_the_curve_of_a_linear_network_is_the_sum_of_what_went(images: torch.Ten
     units = tile_units((SIZE, SIZE), size=1)
     orders = np.stack([[unit_order(one, units, least_first=least) for one in values] for least in (False, True)])
     curves = removal_curves(linear(weights), images, orders, fill=get_fill("black"), areas=EVERY, batch_size=37)
+    lost = curves.lost(UP)
     for index, one in enumerate(values):
         falling = np.sort(one.ravel())[::-1]
-        np.testing.assert_allclose(curves.changes[0, index], np.append(0, np.cumsum(falling)), atol=1e-12)
-        np.testing.assert_allclose(curves.changes[1, index], np.append(0, np.cumsum(falling[::-1])), atol=1e-12)
+        np.testing.assert_allclose(lost[0, index], np.append(0, np.cumsum(falling)), atol=1e-12)
+        np.testing.assert_allclose(lost[1, index], np.append(0, np.cumsum(falling[::-1])), atol=1e-12)
 
 
 def test_what_contributes_is_the_best_map_there_is(images: torch.Tensor, weights: torch.Tensor, rng):
     values = contributions(images, weights)
     units = [tile_units((SIZE, SIZE), size=1)] * IMAGES
     maps = {"truth": values, "noisy": values + rng.normal(0, values.std(), values.shape), "opposite": -values}
-    scores = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, areas=EVERY)
+    scores = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, towards=UP, areas=EVERY)
     truth, noisy, opposite = (scores[name] for name in maps)
     assert np.all(truth.symmetric_gain > noisy.symmetric_gain)
     assert np.all(noisy.symmetric_gain > 0)
@@ -98,7 +100,7 @@ def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Ten
 def test_at_equal_areas_the_curves_can_be_read(images: torch.Tensor, weights: torch.Tensor, rng):
     maps = {"truth": contributions(images, weights)}
     units = [tile_units((SIZE, SIZE), size=2)] * IMAGES
-    score = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng)["truth"]
+    score = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, towards=UP)["truth"]
     np.testing.assert_array_equal(score.areas, AREAS)
     step = AREAS.index(0.05)
     assert np.all(score.most_first[:, step] > score.random[:, step])
@@ -125,7 +127,7 @@ def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Ten
 def test_a_network_that_answers_always_alike_moves_by_nothing(images: torch.Tensor, rng):
     orders = np.stack([[random_unit_order(tile_units((SIZE, SIZE), size=1), rng=rng)] * IMAGES])
     curves = removal_curves(lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey"))
-    assert np.all(curves.mean_changes == 0)
+    assert np.all(curves.lost(UP) == 0)
 
 
 @pytest.mark.parametrize("areas", [(0.1, 1.0), (0.0, 0.5), (0.0, 0.5, 0.5, 1.0)])

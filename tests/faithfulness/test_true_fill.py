@@ -13,6 +13,7 @@ from sliplens.faithfulness.removal import SHARES, answer_scenes, score_maps_by_m
 from sliplens.progress import reporting
 
 IMAGES, MARKERS = 3, 40
+UP = np.ones(IMAGES)
 
 
 class Toy:
@@ -42,7 +43,7 @@ def weights(rng) -> np.ndarray:
 
 def test_the_curve_is_the_sum_of_what_the_markers_did(weights, rng):
     toy = Toy(weights)
-    found = score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng)["truth"]
+    found = score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, towards=UP)["truth"]
     np.testing.assert_array_equal(found.areas, SHARES)
     for image, one in enumerate(weights):
         falling = np.append(0, np.cumsum(np.sort(one)[::-1]))
@@ -54,7 +55,9 @@ def test_the_curve_is_the_sum_of_what_the_markers_did(weights, rng):
 
 def test_in_random_orders_the_answer_falls_evenly(weights, rng):
     toy = Toy(weights)
-    found = score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, random_orders=400)["truth"]
+    found = score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, towards=UP, random_orders=400)[
+        "truth"
+    ]
     total = weights.sum(axis=1, keepdims=True)
     # the sum of some of 40 weights of deviation 0.26 / 40: at most 0.26 * sqrt(40) / 2 / 40, over 20 for 400 orders
     np.testing.assert_allclose(found.random, total * found.areas, atol=5 * 0.26 * np.sqrt(40) / 2 / 40 / 20)
@@ -64,7 +67,7 @@ def test_who_knows_more_gains_more(weights, rng):
     toy = Toy(weights)
     noisy = weights + rng.normal(0, weights.std(), weights.shape)
     maps = {"truth": weights, "noisy": noisy, "opposite": -weights, "flat": np.ones_like(weights)}
-    found = score_maps_by_marker(toy.predict, toy.redraw, maps, rng=rng)
+    found = score_maps_by_marker(toy.predict, toy.redraw, maps, rng=rng, towards=UP)
     gain = {name: one.symmetric_gain for name, one in found.items()}
     assert np.all(gain["truth"] > gain["noisy"])
     assert np.all(gain["noisy"] > 0)
@@ -75,7 +78,9 @@ def test_who_knows_more_gains_more(weights, rng):
 
 def test_what_many_orders_ask_for_is_drawn_once(weights, rng):
     toy = Toy(weights)
-    score_maps_by_marker(toy.predict, toy.redraw, {"one": weights, "same": 2 * weights}, rng=rng, random_orders=1)
+    score_maps_by_marker(
+        toy.predict, toy.redraw, {"one": weights, "same": 2 * weights}, rng=rng, towards=UP, random_orders=1
+    )
     # nothing back, all back, and each inner step of most first, least first and one random order
     assert toy.drawn == IMAGES * (2 + 3 * (len(SHARES) - 2))
 
@@ -85,7 +90,9 @@ def test_the_batch_size_bounds_what_is_drawn_at_once_and_changes_nothing(weights
     for size in (1, 7, 64):
         toy = Toy(weights)
         rng = np.random.default_rng(2)
-        found.append(score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, batch_size=size))
+        found.append(
+            score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, towards=UP, batch_size=size)
+        )
         assert toy.largest <= size
     for one in found[1:]:
         np.testing.assert_allclose(one["truth"].most_first, found[0]["truth"].most_first, atol=1e-12)
@@ -94,7 +101,7 @@ def test_the_batch_size_bounds_what_is_drawn_at_once_and_changes_nothing(weights
 def test_progress_is_told_in_images(weights, rng):
     toy, heard = Toy(weights), []
     with reporting(lambda *step: heard.append(step)):
-        score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng)
+        score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, towards=UP)
     assert heard == [(1, 3), (2, 3), (3, 3)]
 
 
@@ -102,7 +109,7 @@ def test_a_marker_without_influence_is_refused(weights, rng):
     toy = Toy(weights)
     weights[1, 2] = np.nan
     with pytest.raises(InputError, match="lime gives some marker no finite influence; leave out markers"):
-        score_maps_by_marker(toy.predict, toy.redraw, {"lime": weights}, rng=rng)
+        score_maps_by_marker(toy.predict, toy.redraw, {"lime": weights}, rng=rng, towards=UP)
 
 
 def test_a_scene_is_drawn_once_for_each_choice(weights, rng):

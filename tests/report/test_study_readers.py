@@ -104,7 +104,7 @@ def test_null_is_unknown(study):
         ("score-raw", ("methods", "none"), {"mean": 0, "sd": 0, "last_step_mean": 0, "frames": 1}, r"curves of none"),
         ("randomisation-raw", ("methods", "poly-cam", "layers"), [1], r"has 1 layers but 4 similarities"),
         ("randomisation-raw", ("methods", "poly-cam", "similarity"), 1, r"expected `array`, got `int`"),
-        ("map-quality-raw", ("methods", "poly-cam", "gini"), "much", r"expected `float \| null`, got `str`"),
+        ("map-quality-raw", ("methods", "poly-cam", "resolution"), "much", r"expected `float \| null`, got `str`"),
         ("timing-raw", ("methods", "poly-cam", "seconds"), None, r"expected `float`, got `null`"),
         ("truth-raw", ("areas",), [], r"expected `object`, got `array` at areas"),
         ("truth-raw", ("meta", 0, "fill"), 1, r"expected `str`, got `int` at meta\[0\].fill"),

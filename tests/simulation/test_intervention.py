@@ -24,12 +24,9 @@ from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.intervention import (
     FilmedTrial,
     draw_with_markers_back,
-    film_with_friction,
     marker_outlines,
-    marker_readings,
     put_markers_back,
     read_recipe,
-    reading_slope,
     rebuild_trial,
 )
 from sliplens.simulation.loading import load_at_margins
@@ -157,52 +154,3 @@ def test_what_was_not_simulated_so_is_refused(data: Dataset, recordings):
     frames[-1, 100, 100] ^= 64
     with pytest.raises(InputError, match="is drawn differently from its stored frames"):
         rebuild_trial(data.folder, replace(recordings[0], frames=frames))
-
-
-def test_filmed_with_the_friction_it_had_a_trial_has_the_stored_bytes(trials, recordings):
-    for trial, recording in zip(trials, recordings, strict=True):
-        again = film_with_friction(trial, trial.loading.friction_coefficient)
-        drawn = np.concatenate([again.film.draw(slice(at, at + 1)).numpy() for at in range(len(again.film))])
-        np.testing.assert_array_equal(drawn, recording.frames)
-        for name, values in vars(trial.loading).items():
-            np.testing.assert_array_equal(getattr(again.loading, name), values)
-
-
-@pytest.mark.parametrize("factor", [0.7, 1.5])
-def test_another_friction_keeps_the_forces_and_gives_the_margin_of_the_cone(trials, factor):
-    for trial in trials:
-        before, loading = trial.loading, film_with_friction(trial, factor * trial.loading.friction_coefficient).loading
-        np.testing.assert_array_equal(loading.normal_force_n, before.normal_force_n)
-        np.testing.assert_array_equal(loading.tangential_force_n, before.tangential_force_n)
-        # Gamma = 1 - F_t / (mu F_n), as long as the object held before and this friction holds it
-        with np.errstate(invalid="ignore"):
-            margin = 1 - before.tangential_force_n / (factor * before.friction_coefficient * before.normal_force_n)
-            known = (before.safety_margin > 0) & (margin > 0) & (before.carried_friction == 0)
-        assert 0 < known.sum() < len(known)
-        np.testing.assert_allclose(loading.safety_margin[known], margin[known], atol=1e-12)
-        assert np.isnan(loading.safety_margin[~known]).all()
-
-
-def test_the_best_reading_rises_as_the_markers_move_with_another_friction(trials):
-    for trial in trials:
-        frame, step = in_pull(trial), 1e-4
-        seen, parts = marker_readings(trial, frame)
-        friction, moved = trial.loading.friction_coefficient, trial.film.motion.centres_px[frame]
-        other = film_with_friction(trial, (1 + step) * friction)
-        # the reading is linear in each marker's motion; along the pull, down the image, most of it
-        apart = other.film.motion.centres_px[frame][seen] - moved[seen]
-        assert np.abs(apart).max() > 0
-        change = other.loading.safety_margin[frame] - trial.loading.safety_margin[frame]
-        assert change > 0
-        slope = reading_slope(trial, frame)
-        # the gain of each coordinate, from what a marker that moved a pixel more in it would add
-        gained = 0.0
-        for axis in (0, 1):
-            film = trial.film
-            nudged = film.motion.centres_px.copy()
-            nudged[frame, :, axis] += 1
-            pushed = replace(trial, film=replace(film, motion=replace(film.motion, centres_px=nudged)))
-            gained += ((marker_readings(pushed, frame)[1] - parts) * apart[:, axis]).sum()
-        # drift, creep and an earlier slip stay as they are in both: the steps differ in the second order alone
-        assert slope == pytest.approx(gained / change, rel=0.01)
-        assert 0 < slope < 1

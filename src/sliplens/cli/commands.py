@@ -524,7 +524,7 @@ def call_score(call: Any) -> None:
 def call_diagnose(call: Any) -> None:
     """Print the findings, and draw the page."""
     diagnosis = call()
-    for sentence in filter(None, (*diagnosis.sentences, diagnosis.left_out)):
+    for sentence in diagnosis.sentences:
         say(f"- {sentence}")
     if "out" in call.keywords:
         output.draw_report(Path(call.keywords["out"]))

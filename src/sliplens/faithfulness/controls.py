@@ -32,19 +32,6 @@ def total_variation(saliency: Float[np.ndarray, "height width"]) -> float:
     return float(np.concatenate(list(steps)).mean()) / span
 
 
-def gini(saliency: Float[np.ndarray, "height width"]) -> float:
-    """Gini index of the sizes of a map's values: 0 where all are alike, towards 1 where one pixel has all.
-
-    Chalasani et al., *Concise Explanations of Neural Networks using Adversarial Training* (2020), sparsity.
-    """
-    values = np.sort(np.abs(saliency).ravel())
-    total = values.sum()
-    if total == 0:
-        return 0.0
-    rank = np.arange(1, len(values) + 1)
-    return float(2 * (rank * values).sum() / (len(values) * total) - (len(values) + 1) / len(values))
-
-
 def resolution(saliency: Float[np.ndarray, "height width"], markers_px: Float[np.ndarray, "markers 2"]) -> float:
     """Depth of the valley between neighbouring markers (x, y) over the lower of their peaks, from 0 to 1.
 

@@ -21,16 +21,11 @@ from sliplens.results.faithfulness import RemovalCurve
 Units = Int[np.ndarray, "height width"]
 """Number of what is removed at once, a pixel, a tile or a marker, that each pixel belongs to, from 0."""
 Predict: TypeAlias = Callable[[Tensor], Tensor] | Engine
-"""From inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine made ready for many passes,
-which keeps all cores busy (`sliplens.models.engines.prepare`)."""
+"""Function from inputs (batch, 3, height, width) to answers (batch,), in margin units; or an engine."""
 Redraw: TypeAlias = Callable[
     [int, Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants colours height width"]
 ]
-"""From the number of an image, and the markers that are put back in each variant, to the network's inputs.
-
-It is the true fill: any other puts pixels where no marker ever was, and a network may answer to that; here every image
-is one that the sensor could have seen, and what is taken away is the marker's motion and nothing else.
-"""
+"""True fill: from the number of an image, and the markers put back in each variant, to the inputs of the network."""
 AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 """Shares of the image that are removed; dense where maps differ most."""
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
@@ -89,63 +84,43 @@ class RemovalCurves:
     answers: Float64[np.ndarray, "orders images steps"]
     """Answers in margin units; at step 0 those on the whole images."""
 
-    @property
-    def changes(self) -> Float64[np.ndarray, "orders images steps"]:
-        """How far each answer lies from that on the whole image, in margin units."""
-        return np.abs(self.answers - self.answers[..., :1])
-
     def lost(self, towards: Float[np.ndarray, " images"]) -> Float64[np.ndarray, "orders images steps"]:
         """Changes along the sign of f(x) - f(untouched sensor): how much of the supporting evidence is removed."""
         return towards[:, None] * (self.answers[..., :1] - self.answers)
 
-    @property
-    def mean_changes(self) -> Float64[np.ndarray, "orders images"]:
-        """Area under each curve of changes: the mean change over all shares of the image, by trapezoids from 0."""
-        return np.trapezoid(self.changes, self.areas, axis=-1)
-
-
-def order_curves(
-    curves: RemovalCurves, names: Iterable[str], *, towards: Float[np.ndarray, " images"] | None = None
-) -> dict[str, RemovalCurve]:
-    """Name the curves of orders: most, then least influential first for each method, then the random ones."""
-    names = list(names)
-    changes = curves.changes if towards is None else curves.lost(towards)
-    random = changes[2 * len(names) :].mean(axis=0)
-    return {
-        name: RemovalCurve(
-            areas=curves.areas, most_first=changes[2 * row], least_first=changes[2 * row + 1], random=random
-        )
-        for row, name in enumerate(names)
-    }
-
-
-def _made_ready(predict: Predict, batch_size: int) -> Engine:
-    if isinstance(predict, Engine):
-        return predict
-    return Engine(name="torch", batch_size=batch_size, answers=lambda batches: ((predict(batch),) for batch in batches))
+    def by_method(self, names: Iterable[str], *, towards: Float[np.ndarray, " images"]) -> dict[str, RemovalCurve]:
+        """Name the curves: most, then least influential first for each method, then the random orders."""
+        names, changes = list(names), self.lost(towards)
+        random = changes[2 * len(names) :].mean(axis=0)
+        return {
+            name: RemovalCurve(
+                areas=self.areas, most_first=changes[2 * row], least_first=changes[2 * row + 1], random=random
+            )
+            for row, name in enumerate(names)
+        }
 
 
 def _answer(
-    engine: Engine, batches: Iterable[Tensor], on_batch: Callable[[Tensor], None] = lambda _: None
+    predict: Predict, batches: Iterable[Tensor], on_batch: Callable[[int], None] = lambda _: None
 ) -> Float64[np.ndarray, " images"]:
+    run = predict.run if isinstance(predict, Engine) else partial(map, predict)
     answers = []
     with torch.no_grad():
-        for margins in engine.run(batches):
+        for margins in run(batches):
             answers.append(margins.double().cpu().numpy())
-            on_batch(margins)
+            on_batch(len(margins))
     return np.concatenate(answers) if answers else np.empty(0)
 
 
 def answer_whole(predict: Predict, images: Tensor, *, batch_size: int = 64) -> Float64[np.ndarray, " images"]:
     """Predict whole images."""
-    engine = _made_ready(predict, batch_size)
-    return _answer(engine, images.split(engine.batch_size))
+    return _answer(predict, images.split(predict.batch_size if isinstance(predict, Engine) else batch_size))
 
 
 def _paint(
     paint: Painter, orders: np.ndarray, jobs: Sequence[tuple[int, int, int]], *, images: Tensor, batch_size: int
 ) -> Iterator[Tensor]:
-    """Images of which parts are gone, a batch in memory at a time; jobs are image, order and pixels removed."""
+    """Yield images of which parts are gone, a batch at a time; jobs are image, order and pixels removed."""
     ranked, rank = None, torch.empty(0)
     for start in range(0, len(jobs), batch_size):
         batch = jobs[start : start + batch_size]
@@ -191,11 +166,11 @@ def removal_curves(
         jobs += [(image, order, step) for order in range(len(orders)) for step in range(1, last)]
         # what is left of the image when all is gone depends on no order: answered once
         jobs.append((image, 0, last))
-    done, engine = 0, _made_ready(predict, batch_size)
+    done = 0
 
-    def count(batch: Tensor) -> None:
+    def count(answered: int) -> None:
         nonlocal done
-        done += len(batch)
+        done += answered
         report_progress(done * len(images) // len(jobs), len(images))
 
     batches = _paint(
@@ -203,12 +178,12 @@ def removal_curves(
         orders,
         [(image, order, removed[step]) for image, order, step in jobs],
         images=images,
-        batch_size=engine.batch_size,
+        batch_size=predict.batch_size if isinstance(predict, Engine) else batch_size,
     )
     answers = np.empty((len(orders), len(images), len(shares)))
     image_of, order_of, step_of = np.transpose(jobs)
-    answers[order_of, image_of, step_of] = _answer(engine, batches, count)
-    answers[:, :, 0] = answer_whole(engine, images)
+    answers[order_of, image_of, step_of] = _answer(predict, batches, count)
+    answers[:, :, 0] = answer_whole(predict, images, batch_size=batch_size)
     answers[:, :, -1] = answers[0, :, -1]
     return RemovalCurves(areas=shares, answers=answers)
 
@@ -221,21 +196,19 @@ def score_maps(
     *,
     fill: Fill,
     rng: np.random.Generator,
+    towards: Float[np.ndarray, " images"],
     references: Float[Tensor, "images colours height width"] | None = None,
-    towards: Float[np.ndarray, " images"] | None = None,
     random_orders: int = RANDOM_ORDERS,
     areas: Sequence[float] = AREAS,
     seed: int = 0,
 ) -> dict[str, RemovalCurve]:
     """Score the maps of several methods on the same images, against the same random orders.
 
-    Of signed relevance give the part that works towards the target, and `towards`, the sign of f(x) - f(untouched
-    sensor) of each image: changes count along it, by their size if None. By size removing what speaks against the
-    target counts like removing what speaks for it: order by |influence| then, or a map of what each marker really does
-    can rank below the same map half shuffled (docs/study.md).
+    Of signed relevance give the part that works towards the target; changes count along `towards`, the sign of
+    f(x) - f(untouched sensor) of each image.
 
-    Section 3 of the notes on faithfulness; Samek et al., *Evaluating the Visualization of What a Deep Neural Network
-    Has Learned* (2017), most and least relevant first.
+    Samek et al., *Evaluating the Visualization of What a Deep Neural Network Has Learned* (2017), most and least
+    relevant first.
     """
     orders = [
         np.stack([unit_order(values, unit, least_first=least) for values, unit in zip(maps, units, strict=True)])
@@ -243,16 +216,8 @@ def score_maps(
         for least in (False, True)
     ]
     orders += [np.stack([random_unit_order(unit, rng=rng) for unit in units]) for _ in range(random_orders)]
-    curves = removal_curves(
-        predict,
-        images,
-        np.stack(orders),
-        fill=fill,
-        references=references,
-        areas=areas,
-        seed=seed,
-    )
-    return order_curves(curves, influence, towards=towards)
+    curves = removal_curves(predict, images, np.stack(orders), fill=fill, references=references, areas=areas, seed=seed)
+    return curves.by_method(influence, towards=towards)
 
 
 def answer_scenes(
@@ -304,7 +269,7 @@ def score_maps_by_marker(
     influence: Mapping[str, Float[np.ndarray, "images markers"]],
     *,
     rng: np.random.Generator,
-    towards: Float[np.ndarray, " images"] | None = None,
+    towards: Float[np.ndarray, " images"],
     random_orders: int = RANDOM_ORDERS,
     batch_size: int = 64,
 ) -> dict[str, RemovalCurve]:
@@ -316,4 +281,4 @@ def score_maps_by_marker(
     images, markers = orders[0].shape[1:]
     by_chance = [[rng.permutation(markers) for _ in range(images)] for _ in range(random_orders)]
     curves = marker_curves(predict, redraw, np.concatenate([*orders, np.array(by_chance)]), batch_size=batch_size)
-    return order_curves(curves, influence, towards=towards)
+    return curves.by_method(influence, towards=towards)

@@ -11,7 +11,7 @@ from sliplens.report import charts, pictures, tables
 from sliplens.report.alarms import alarms_of, group_alarms
 from sliplens.report.claims import judge_claims
 from sliplens.report.comparisons import tell_sample
-from sliplens.report.diagnosis import show_diagnosis
+from sliplens.report.diagnosis import table_slices
 from sliplens.report.grip import show_grip
 from sliplens.report.plates import Plate, explained_of
 from sliplens.report.results import Results
@@ -165,8 +165,7 @@ def _diagnosis(results: Results, _: np.random.Generator) -> Iterable[Block | Non
         records = results.diagnoses[name]
         groups = {sentence: [sentence] for sentence in records.sentences}
         yield Notes(title=f"What was found, {input_name(name).lower()}", groups=groups)
-        yield _notes("Left out", [records.left_out], tone="caution")
-        yield from show_diagnosis(records)
+        yield table_slices(records)
 
 
 def _recipe(results: Results, absent: list[str]) -> Section:

@@ -52,7 +52,6 @@ Kind = Literal["name", "number", "best", "thesis"]
 _LOOK_NAMES = {
     "resolution": "Resolution",
     "total_variation": "Total variation",
-    "gini": "Sparsity (Gini)",
 }
 _REGION_NAMES = {"markers": "markers", "slip_annulus": "slip annulus", "edges": "marker edges"}
 _CORRELATIONS = ("With Shapley values", "Lead over controls", "With markers put back alone", "With the best reading")
@@ -219,7 +218,7 @@ def table_looks(looks: Mapping[str, MapQuality]) -> Table:
     return make_table(
         f"Looks of the maps, means over {number_of(max(record.frames for record in looks.values()), 'frame')}. "
         "Resolution: depth of the valley between neighbouring markers (1 = told apart). Total variation: mean step "
-        "between pixels over the map's range (noise has 1/3). Gini: 1 = one pixel has all.",
+        "between pixels over the map's range (noise has 1/3).",
         ("Input", "Method", *(_LOOK_NAMES[measure] for measure in MAP_MEASURES)),
         [
             (

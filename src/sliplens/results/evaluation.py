@@ -310,8 +310,6 @@ class ErrorTable(ScoredFrames):
     """Middle of the contact, right and down, as shares of the image's width and height."""
     slice: Annotated[Int64[np.ndarray, " frames"], PLACE]
     """Place in `Diagnosis.slices`; -1 where no held-out frame is."""
-    limit: Annotated[Float64[np.ndarray, " frames"], AMOUNT, UNKNOWN]
-    """Least standard deviation of an unbiased reader of the markers of one frame, in margin units."""
 
     @property
     def error(self) -> Float64[np.ndarray, " frames"]:
@@ -340,41 +338,11 @@ class ErrorSlice:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrictionTable(Columns):
-    """Frames filmed again with other frictions, a row a frame and friction, in margin units."""
-
-    frame_id: Shaped[np.ndarray, " rows"]
-    trial: Shaped[np.ndarray, " rows"]
-    condition: Shaped[np.ndarray, " rows"]
-    day: Int64[np.ndarray, " rows"]
-    friction: Annotated[Float64[np.ndarray, " rows"], FRICTION]
-    safety_margin: Annotated[Float64[np.ndarray, " rows"], MARGIN]
-    """True margin with that friction."""
-    prediction: Annotated[Float64[np.ndarray, " rows"], ANSWER]
-    reading_slope: Annotated[Float64[np.ndarray, " rows"], ANSWER, UNKNOWN]
-    """Rise of the best reading over that of the margin there (`simulation.intervention.reading_slope`)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrictionSlope:
-    """How far answers follow the margin where friction alone changes, 1 being all the way: of both, and the gap."""
-
-    condition: str
-    network: Difference
-    reading: Difference
-    gap: Difference
-
-
-@dataclass(frozen=True, kw_only=True)
 class Diagnosis(OfNetwork):
-    """Where a network fails and why: slices of its errors, the limit of one frame, and other frictions."""
+    """Where a network fails: slices of its errors."""
 
     sentences: tuple[str, ...]
     """Findings, with figures."""
-    left_out: str
-    """Steps that were left out, and why; empty if none."""
     slices: tuple[ErrorSlice, ...]
     """Leaves of the tree, the largest error first."""
-    slopes: tuple[FrictionSlope, ...]
     errors: ErrorTable
-    frictions: FrictionTable

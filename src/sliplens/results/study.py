@@ -17,7 +17,7 @@ from sliplens.results.faithfulness import DeletionScores, Faithfulness, Lead, Me
 
 REGIONS = ("markers", "slip_annulus", "edges")
 """Areas in which a map may lie."""
-MAP_MEASURES = ("resolution", "total_variation", "gini")
+MAP_MEASURES = ("resolution", "total_variation")
 """Measures of how a map looks."""
 
 
@@ -161,7 +161,6 @@ class MapMeasures:
 
     resolution: float | None
     total_variation: float | None
-    gini: float | None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,6 @@ unknowns.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -22,7 +21,7 @@ from sliplens.errors import ContactError, InputError
 from sliplens.files import RUN_FILE, read_json
 from sliplens.recordings import Recording
 from sliplens.simulation.filming import Film, batches
-from sliplens.simulation.loading import Loading, load_at_margins, with_friction
+from sliplens.simulation.loading import Loading, load_at_margins
 from sliplens.simulation.motion import move_markers
 from sliplens.simulation.nuisances import Nuisances, Pulls, Range, Touch
 from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
@@ -274,15 +273,6 @@ def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecip
     return FilmedTrial(plan=plans[name], loading=loading, film=film)
 
 
-def film_with_friction(trial: FilmedTrial, friction: Float[np.ndarray, " frames"]) -> FilmedTrial:
-    """Film a trial as if the object had another friction in each frame: same forces, light, sensor and noise.
-
-    Frames without a margin (NaN, see `loading.with_friction`) are meaningless.
-    """
-    loading, film = prepare_trial(trial.plan, change=partial(with_friction, friction=friction))
-    return FilmedTrial(plan=trial.plan, loading=loading, film=film)
-
-
 def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants markers"]) -> Film:
     """Film one moment several times, each time with other markers put back; all else stays, the noise too.
 
@@ -349,25 +339,6 @@ def marker_readings(
     motion, visible = trial.film.motion, visible_markers(trial.plan.recipe.sensor)
     moved = (motion.centres_px[frame] - motion.rest_px)[visible]
     return visible, (gain.reshape(-1, 2) * moved).sum(axis=1)
-
-
-def reading_slope(trial: FilmedTrial, frame: int) -> float:
-    """Compute the change of the best estimate over that of the margin, where friction alone changes.
-
-    Below 1 even the best estimator ascribes part of the markers' motion to the friction. With friction mu and the same
-    forces d log(mu) = d Gamma / (1 - Gamma).
-    """
-    sensitivity, prior = _sensitivity(trial, frame)
-    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
-    moved = dict(zip(sensitivity.unknowns, sensitivity.jacobian[0].T, strict=True))
-    used = max(1 - float(trial.loading.safety_margin[frame]), _NEAREST_END)
-    return float(gain @ (moved[MARGIN] + moved["log_friction"] / used))
-
-
-def reading_limit(trial: FilmedTrial, frame: int) -> float:
-    """Compute the least standard deviation of an unbiased estimate from a frame's markers, wet or dry being known."""
-    sensitivity, prior = _sensitivity(trial, frame)
-    return least_sigma(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
 
 
 def _sensitivity(trial: FilmedTrial, frame: int) -> tuple[Sensitivity, dict[str, float]]:

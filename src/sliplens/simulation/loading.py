@@ -1,6 +1,6 @@
 """Load on the fingertip through a trial: touch, press, hold, pull until it slips, slide on, let go."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool
@@ -286,36 +286,6 @@ def _newest_margin(margin: Frames, *, let_back: Frames, retaken: Frames) -> Fram
     """Compute the margin of the slip that last began at the rim of the contact."""
     newest = np.where(retaken > 0, 1 - retaken / 2, 1 - let_back / 2)
     return np.where((let_back > 0) & ~np.isnan(margin), newest, margin)
-
-
-def with_friction(loading: Loading, friction: Frames) -> Loading:
-    """Apply the same forces to an object of another friction, one value a frame.
-
-    Frames whose friction stays do not change. The margin of the others is NaN where their friction cannot hold the
-    pull, and after the first slip, whose traces would have differed.
-    """
-    same = friction == loading.friction_coefficient
-    ratio = loading.friction_coefficient / friction
-    let_back, retaken = np.where(same, 1, ratio) * (loading.let_back, loading.retaken)
-    normal, tangential = loading.normal_force_n, loading.tangential_force_n
-    farthest = tangential + (let_back - retaken) * friction * normal
-    sticks = ((loading.safety_margin > 0) & (loading.carried_friction == 0) & (farthest < friction * normal)) | same
-    margin = np.where(same, loading.safety_margin, safety_margin(normal, tangential, friction))
-    margin = np.where(sticks, margin, np.nan)
-    newest = _newest_margin(margin, let_back=let_back, retaken=retaken)
-    stick_margin = np.where(same, loading.stick_margin, newest)
-    return replace(
-        loading,
-        friction_coefficient=friction,
-        static_friction=np.where(same, loading.static_friction, friction),
-        safety_margin=margin,
-        stick_ratio=stick_ratio(stick_margin),
-        carried_friction=np.where(same, loading.carried_friction, 0.0),
-        stick_margin=stick_margin,
-        let_back=let_back,
-        retaken=retaken,
-        contact_state=contact_states(margin, without=ContactState.NO_CONTACT),
-    )
 
 
 def _phase_ends(

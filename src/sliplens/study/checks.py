@@ -16,7 +16,7 @@ from sliplens.explainers.contract import Explainer
 from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
-from sliplens.faithfulness.controls import cascade, even_channels, gini, resolution, stability, total_variation
+from sliplens.faithfulness.controls import cascade, even_channels, resolution, stability, total_variation
 from sliplens.intervals import paired_difference
 from sliplens.models import Network
 from sliplens.progress import report_each
@@ -43,7 +43,7 @@ _FEW_CHANNELS, _FEW_PAIRS = 0.05, 100
 
 
 def measure_maps(material: Material, *, seed: int = 0) -> MapQuality:
-    """Measure resolution, smoothness and sparsity of the maps, and compare the methods' smoothness."""
+    """Measure resolution, smoothness of the maps, and compare the methods' smoothness."""
     explained, rng = material.explained, np.random.default_rng(seed)
     measures, roughness = {}, {}
     for method in report_each(list(material.explainers)):
@@ -57,7 +57,6 @@ def measure_maps(material: Material, *, seed: int = 0) -> MapQuality:
         measures[method] = MapMeasures(
             resolution=mean_of_known(np.array(resolutions, dtype=np.float64)),
             total_variation=mean_of_known(roughness[method]),
-            gini=mean_of_known(np.array([gini(saliency) for saliency in maps])),
         )
     return MapQuality(
         input=explained.input,
