@@ -5,10 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import refused, run
-from PIL import Image
 
 from sliplens import __version__
 from sliplens.recordings import Dataset
@@ -55,54 +53,6 @@ def test_the_stages_one_by_one(
     assert (work / "train" / "model.safetensors").stat().st_mtime_ns == before
     assert "refused" not in capsys.readouterr().out
     assert "other settings" in refused(capsys, *train, "--seed", 1)
-
-
-def test_a_missing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    line = refused(capsys, "train", tmp_path / "nothing", "-o", tmp_path / "out")
-    assert "the data set" in line
-    assert "does not exist; check the path" in line
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("name", "pixels", "message"),
-    [
-        (
-            "a_20.png",
-            np.zeros((50, 48, 3), np.uint8),
-            "frames such as a_20.png are 50 x 48 pixels but the network was",
-        ),
-        ("a_20.png", np.zeros((48, 48, 4), np.uint8), "a_20.png has 4 channels (alpha)"),
-        ("a_20.tiff", np.zeros((48, 48), np.uint16), "a_20.tiff has 16 bits a channel"),
-    ],
-)
-def test_bad_frames(difference_run: Path, tmp_path: Path, capsys, *, name: str, pixels: np.ndarray, message: str):
-    (tmp_path / "frames").mkdir()
-    Image.fromarray(pixels).save(tmp_path / "frames" / name)
-    line = refused(capsys, "explain", difference_run, "--frames", tmp_path / "frames", "-o", tmp_path / "out")
-    assert message in line
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["frames"]
-
-
-def test_a_truncated_frame(difference_run: Path, difference_folder: Path, tmp_path: Path, capsys):
-    victim = next(difference_folder.glob("frame6_*.png"))
-    whole = victim.read_bytes()
-    victim.write_bytes(whole[: len(whole) // 2])
-    line = refused(capsys, "explain", difference_run, "--frames", difference_folder, "-o", tmp_path / "out")
-    assert f"{victim.name} cannot be read as an image" in line
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_report_of_nothing(tmp_path: Path, capsys):
-    (tmp_path / "empty").mkdir()
-    assert "empty" in refused(capsys, "report", tmp_path / "empty")
-
-
-def test_a_demo_does_not_touch_a_folder_of_somebody_else(tmp_path: Path, capsys):
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "holiday.jpg").touch()
-    assert "photos exists and is no demo; choose another folder" in refused(capsys, "demo", tmp_path / "photos")
-    assert [path.name for path in (tmp_path / "photos").iterdir()] == ["holiday.jpg"]
 
 
 def test_an_interruption_says_how_to_go_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):

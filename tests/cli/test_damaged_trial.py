@@ -9,7 +9,6 @@ from command_line import refused, run
 
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.dataset import trial_path
-from sliplens.simulation import SimulationRecipe, simulate_dataset
 
 
 def damage_page(path: Path, column: str) -> None:
@@ -60,13 +59,3 @@ def test_a_damaged_page_leaves_all_other_trials_predicted(
     assert line.startswith(f"  {trial}: ")
     assert "is not a readable Parquet file" in line
     assert not (tmp_path / "margins.parquet").exists()
-
-
-@pytest.mark.parametrize("column", ["contact_map", "static_friction"])
-def test_a_damaged_truth_is_told_by_the_viewer(capsys: pytest.CaptureFixture[str], tmp_path: Path, column: str):
-    data = simulate_dataset(tmp_path / "data", SimulationRecipe(dry_trials=3, wet_trials=0, frames_per_trial=20))
-    trial = data.trials[0].trial
-    damage_page(trial_path(data.folder, trial), column)
-    line = refused(capsys, "view", data.folder, "--trial", trial, "-o", tmp_path / "trial.rrd")
-    assert "is not a readable Parquet file" in line
-    assert not (tmp_path / "trial.rrd").exists()

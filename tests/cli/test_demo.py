@@ -9,9 +9,8 @@ import pytest
 from command_line import refused, run
 
 import sliplens.demo
-from sliplens.demo import DEMO_STUDY, NETWORKS, find_real_frames, run_demo
-from sliplens.files import read_json, shipped_names
-from sliplens.models import load
+from sliplens.demo import DEMO_STUDY, find_real_frames, run_demo
+from sliplens.files import read_json
 from sliplens.report.page import Written
 
 SMALL = {"dry_trials": 3, "wet_trials": 1, "frames_per_trial": 24, "days": 2, "test_days": 1}
@@ -61,36 +60,6 @@ def test_the_demo_runs_every_stage_and_its_page_grows(
     assert {path: path.stat().st_mtime_ns for path in out.glob("*/run.json")} == written
 
 
-def test_the_demo_is_there_for_the_networks_of_the_package_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    named = []
-
-    def stop(run: object, *arguments: object, **options: object) -> None:
-        named.append(run)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(sliplens.demo, "evaluate", stop)
-    with pytest.raises(KeyboardInterrupt):
-        run_demo(tmp_path / "demo")
-    assert named == ["chromatouch-difference"]
-    # interrupted after the first page: it is there
-    assert (tmp_path / "demo" / "report.html").is_file()
-
-
-def test_a_folder_that_is_no_demo_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.txt").write_text("precious")
-    assert "is no demo; choose another folder" in refused(capsys, "demo", tmp_path / "mine")
-    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.txt"]
-
-
-def test_a_workspace_of_ones_own_is_no_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    words = ("--dry-trials", 3, "--wet-trials", 1, "--frames-per-trial", 24, "--days", 2)
-    assert run("simulate", tmp_path / "mine" / "data", *words) == 0
-    capsys.readouterr()
-    assert "is no demo; choose another folder" in refused(capsys, "demo", tmp_path / "mine")
-    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["data"]
-
-
 def test_a_demo_of_other_settings_is_refused_with_a_cure_that_exists(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -103,12 +72,6 @@ def test_a_demo_of_other_settings_is_refused_with_a_cure_that_exists(
     capsys.readouterr()
     sentence = refused(capsys, "demo", tmp_path / "demo", "--seed", 1)
     assert "holds a demo of other settings; choose another folder or delete it" in sentence
-
-
-def test_wrong_options_are_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert "must be above 0" in refused(capsys, "demo", tmp_path / "a", "--train-minutes", "0")
-    assert "folder of real frames" in refused(capsys, "demo", tmp_path / "a", "--real-frames", tmp_path / "none")
-    assert not (tmp_path / "a").exists()
 
 
 def test_real_frames_are_found_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -135,8 +98,3 @@ def test_the_command_says_where_the_page_is_as_soon_as_it_is_there(
     assert printed.index(f"open {tmp_path / 'demo' / 'report.html'} now") < printed.index("the demo took")
     assert "1 note" in printed
     assert "random order" not in printed  # the page tells them
-
-
-def test_the_networks_of_the_demo_come_with_the_package():
-    assert set(NETWORKS.values()) <= set(shipped_names())
-    assert all(load(name).manifest.input == seen for seen, name in NETWORKS.items())

@@ -78,31 +78,3 @@ def test_a_failure_leaves_nothing_behind(small_dataset: Dataset, tmp_path: Path,
     monkeypatch.setattr("sliplens.recordings.formats.lerobot_export.write_lerobot", fail)
     refused("the disk is full", "lerobot", small_dataset.folder, "-o", tmp_path / "out")
     assert not names(tmp_path)
-
-
-def test_what_others_made_is_never_replaced(small_dataset: Dataset, tmp_path: Path):
-    (tmp_path / "mine").write_text("")
-    refused("was not made by sliplens", "lerobot", small_dataset.folder, "-o", tmp_path, "--overwrite")
-    assert names(tmp_path) == ["mine"]
-
-
-def test_the_wrong_kind_of_source_is_told(difference_run: Path, small_dataset: Dataset, tmp_path: Path):
-    data, out = small_dataset.folder, tmp_path / "a.onnx"
-    refused("does not exist; make it with", "onnx", data, "-o", out)
-    refused("does not exist|is no data set|make a data set", "lerobot", difference_run, "-o", out)
-    refused("does not end in .onnx", "onnx", difference_run, "-o", tmp_path / "a")
-    refused("has no trial nobody; it has train-dry-0, .*, test-wet-7$", "mcap", data, "-o", out, "--trials", "nobody")
-    refused("the run .*nothing does not exist", "onnx", tmp_path / "nothing", "-o", out)
-    refused("the data set .*nothing does not exist", "mcap", tmp_path / "nothing", "-o", out)
-    assert not names(tmp_path)
-
-
-def test_without_the_extra_the_cure_is_told(difference_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sliplens.extras.find_spec", lambda name: None if name != "onnx" else name)
-    refused(
-        r'needs onnxscript and onnxruntime, which are not installed; install with `pip install "sliplens\[onnx\]"`',
-        "onnx",
-        difference_run,
-        "-o",
-        tmp_path / "a.onnx",
-    )

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from command_line import refused, run
+from command_line import run
 
 import sliplens as sl
 from sliplens.codec import load_result
@@ -38,19 +38,3 @@ def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, cap
     assert len(sl.plot(grip).axes[0].lines) >= 2
     assert run(*words) == 0
     assert "kept" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("--controller", "magic"), "there is no controller named 'magic'"),
-        (("--condition", "oily"), "there is no condition named 'oily'"),
-        (("--set", "target"), "write NAME=NUMBER"),
-        (("--set", "speed=3"), "has no constant 'speed'"),
-        (("--script", "mass_kg=-1"), "mass_kg must be above 0"),
-        (("--network", "nothing"), "the run nothing does not exist"),
-    ],
-)
-def test_mistakes_are_one_sentence_and_nothing_is_written(tmp_path: Path, capsys, words, told):
-    assert told in refused(capsys, "grip", "-o", tmp_path / "out", "--episodes", 3, *words)
-    assert not (tmp_path / "out").exists()

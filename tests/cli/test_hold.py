@@ -3,8 +3,7 @@
 import json
 from pathlib import Path
 
-import pytest
-from command_line import refused, run
+from command_line import run
 
 from sliplens.codec import load_result
 from sliplens.grip.records import Hold
@@ -24,35 +23,9 @@ def test_a_line_of_json_a_command_and_a_table_of_all(small_dataset: Dataset, tmp
     assert hold.steps.time_s.tolist() == [step["time_s"] for step in steps]
 
 
-def test_the_network_is_that_of_the_profile(tmp_path: Path, capsys):
-    profile = tmp_path / "tip.toml"
-    profile.write_text('name = "tip"\nnetwork = "trained-elsewhere"\n', encoding="utf-8")
-    told = refused(capsys, "hold", "simulated", "--dry-run", "--sensor", profile)
-    assert "the run trained-elsewhere does not exist" in told
-
-
 def test_frames_of_another_sensor_are_told_once(small_dataset: Dataset, difference_run: Path, tmp_path: Path, capsys):
     profile = tmp_path / "tip.toml"
     profile.write_text('name = "another"\n', encoding="utf-8")
     words = ("hold", small_dataset.folder, "--network", difference_run, "--engine", "torch", "--sensor", profile)
     assert run(*words, "--dry-run", "--controller", "fixed") == 0
     assert " ".join(capsys.readouterr().err.split()).count("reads frames of another") == 1
-
-
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("grip",), "name one with --gripper"),
-        (("grip", "--gripper", "tcp://nowhere"), "is no address of a gripper"),
-        (("nowhere", "--dry-run"), "nowhere is no source that is known"),
-        (("grip:anvil", "--dry-run"), "there is no object named 'anvil'"),
-        (
-            ("simulated", "--dry-run", "--reference", "one.png", "two.png"),
-            "an image for each source, 1, got 2",
-        ),
-        (("simulated", "--dry-run", "--controller", "fixed", "--set", "speed=3"), "has no constant 'speed'"),
-        (("simulated", "--dry-run", "--sequence", "--friction", "0.6"), "leave out one of them"),
-    ],
-)
-def test_mistakes_are_one_sentence(capsys, words, told):
-    assert told in refused(capsys, "hold", *words)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command_line import refused, run
+from command_line import run
 from data_sets import save_dataset
 from own_recording import TARE, write_forces, write_video
 from there import there
@@ -25,11 +25,6 @@ def table(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def video(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_video(trial, tmp_path_factory.mktemp("video") / "cup.mkv")
-
-
-@pytest.fixture(scope="module")
-def recorded(video: Path, table: Path) -> tuple[Path, Path]:
-    return video, table
 
 
 def test_labels_of_an_imported_video_are_those_of_the_simulator(
@@ -114,28 +109,3 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
     assert {path.name for path in (tmp_path / "b").iterdir()} == {path.name for path in (tmp_path / "w").iterdir()}
     for name in ("dataset.json", "trials/a.parquet", "trials/b.parquet"):
         assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "w" / name).read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ((), "has no forces, and without them there is no label; give the table of the force sensor"),
-        (("--forces", "MISSING.csv"), "MISSING.csv does not exist"),
-        (("--format", "papyrus"), "there is no format named 'papyrus'; choose one of sliplens, rosbag, lerobot"),
-        (("--image-topic", "/camera"), "is read as video, which does not take --image-topic"),
-        (("--forces", "TABLE", "--test-trials", "2"), "2 to test are more than 1; give fewer"),
-        (("--forces", "TABLE", "--test-trials", "-1"), "numbers of trials are not negative"),
-        (("--forces", "TABLE", "--reference-frame", "999"), "the reference is frame 999 of 240"),
-    ],
-)
-def test_mistakes_are_told_in_one_line_and_leave_nothing(
-    tmp_path: Path,
-    recorded: tuple[Path, Path],
-    capsys: pytest.CaptureFixture[str],
-    words: tuple[str, ...],
-    message: str,
-):
-    video, table = recorded
-    named = [str(table) if word == "TABLE" else word for word in words]
-    assert message in refused(capsys, "import", video, "-o", tmp_path / "data", "--sensor", "mine", *named)
-    assert not list(tmp_path.iterdir())

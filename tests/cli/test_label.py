@@ -249,11 +249,3 @@ def test_corrections_outside_their_data_set_are_refused_with_their_cure(
         table.write_text(f"trial,bad_frames,slip_s\n{row}\n")
         assert error in refused(capsys, "label", folder, "--no-audit", "--corrections", table)
     assert contents(folder) == before
-
-
-@pytest.mark.parametrize(
-    "words",
-    [("--draft", "a.csv", "-o", "b"), ("--draft", "a.csv", "--audit-only"), ("--audit-only", "--corrections", "a")],
-)
-def test_options_that_exclude_each_other_are_refused(words: tuple[str, ...], relabelled: Path, capsys):
-    assert "leave" in refused(capsys, "label", relabelled, *words)

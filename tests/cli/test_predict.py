@@ -11,7 +11,6 @@ from own_recording import write_video
 from pyarrow.csv import read_csv
 
 from sliplens import __version__
-from sliplens.errors import InputError, SliplensError
 from sliplens.files import hash_file, hash_json, read_json
 from sliplens.images import write_png
 from sliplens.models.checkpoint import STRANGE_REASON
@@ -21,11 +20,6 @@ from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 def run(*words: object) -> None:
     typed("predict", *words)
-
-
-def refused(message: str, *words: object) -> None:
-    with pytest.raises(SliplensError, match=message):
-        run(*words)
 
 
 def test_a_data_set_is_predicted(
@@ -75,29 +69,6 @@ def test_engines_agree_on_a_folder_of_images(difference_run: Path, difference_fo
     assert [name.split("_")[0] for name in answers["torch"]["file"]] == ["frame1", "frame6", "frame11"]
 
 
-def test_a_file_that_exists_is_kept_unless_told_otherwise(difference_run: Path, difference_folder: Path, tmp_path):
-    output = tmp_path / "a.parquet"
-    output.write_text("somebody's")
-    refused("exists; choose another file or pass --overwrite", difference_run, difference_folder, "-o", output)
-    assert output.read_text() == "somebody's"
-    run(difference_run, difference_folder, "-o", output, "--overwrite")
-    assert pq.read_table(output).num_rows == 3
-
-
-def test_mistakes_are_told_before_anything_is_written(
-    difference_run: Path, difference_folder: Path, small_dataset: Dataset, tmp_path: Path
-):
-    output = tmp_path / "a.parquet"
-    here = ("-o", output)
-    refused("does not end in .parquet or .csv or .json", difference_run, difference_folder, "-o", tmp_path / "a.txt")
-    refused("--batch-size must be at least 1, got 0", difference_run, difference_folder, *here, "--batch-size", 0)
-    refused("device 'qpu' is not known", difference_run, difference_folder, *here, "--device", "qpu")
-    refused("the run .*nothing does not exist", tmp_path / "nothing", difference_folder, *here)
-    refused("nothing does not exist", difference_run, tmp_path / "nothing", *here)
-    refused("no trial with split exam", difference_run, small_dataset.folder, *here, "--split", "exam")
-    assert not output.exists()
-
-
 def test_few_frames_are_told_one_by_one(difference_run: Path, difference_folder: Path, tmp_path: Path, capsys):
     run(difference_run, difference_folder, "-o", tmp_path / "a.json")
     rows = json.loads((tmp_path / "a.json").read_text())
@@ -121,14 +92,6 @@ def test_many_frames_are_told_by_their_lowest(difference_run: Path, small_datase
         assert len([sign for sign in line if "\u2581" <= sign <= "\u2588"]) == min(40, len(margins))
     assert {"normal_force_n", "tangential_force_n", "safety_margin"} <= rows[0].keys()
     assert (tmp_path / "a.png").stat().st_size > 10_000
-
-
-def test_a_graphics_card_that_is_not_there_is_told(difference_run: Path, difference_folder: Path, tmp_path: Path):
-    torch = pytest.importorskip("torch")
-    if torch.cuda.is_available():
-        pytest.skip("there is one")
-    with pytest.raises(InputError, match="device cuda is not on this machine; use cpu"):
-        run(difference_run, difference_folder, "-o", tmp_path / "a.parquet", "--device", "cuda")
 
 
 @pytest.mark.parametrize("shown", [slice(10, 20), slice(None)])  # a line a frame, and a line a trial

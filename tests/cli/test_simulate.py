@@ -46,33 +46,3 @@ def test_options_change_a_preset_and_drop_its_totals():
     assert make_recipe() == PRESETS["small"]
     changed = make_recipe("thesis", days=6)
     assert (changed.days, changed.dry_trials, changed.frame_totals) == (6, 191, None)
-
-
-def test_a_picture_that_cannot_be_is_refused_before_the_other_is_drawn(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    words = ("--preview", tmp_path / "sheet.png", "--video", tmp_path / "clip.avi")
-    assert "clip.avi does not end in .mp4" in refused(capsys, "simulate", *SMALL, *words)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ((), "nothing to do; name a folder to make, or a picture with --preview"),
-        (("OUT", "--days", "1"), "days is 1, at least 2 is needed"),
-        (("OUT", "--seed", "-1"), "seed is -1"),
-        (("OUT", "--sensor", "flat-gel", "--displacement", "calibrated"), "which sensor flat-gel does not have"),
-        (("OUT", "--device", "toaster"), "device 'toaster' is not known; use cpu, cuda or cuda:1"),
-        (("OUT", "--device", "cuda:99"), "device cuda:99 is not on this machine; use cpu"),
-        (("--preview", "OUT.gif"), "does not end in .png, .pdf, .svg"),
-        (("--video", "OUT.avi"), "does not end in .mp4"),
-    ],
-)
-def test_mistakes_are_told_in_one_line_and_leave_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], message: str
-):
-    named = [word.replace("OUT", str(tmp_path / "out")) for word in words]
-    small = [word for pair in zip(SMALL[::2], SMALL[1::2], strict=True) if pair[0] not in words for word in pair]
-    assert message in refused(capsys, "simulate", *named, *small)
-    assert not list(tmp_path.iterdir())

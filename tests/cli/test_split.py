@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from command_line import refused, run
+from command_line import run
 from data_sets import contents
 
 from sliplens.recordings import Dataset, load_dataset
@@ -75,13 +75,3 @@ def test_trials_are_dealt_by_a_fact_and_leaks_are_noted(folder: Path, capsys: py
     days = [{info.day for info in data.select(split=name)} for name in ("train", "validation", "test")]
     assert [len(each) for each in days] == [2, 1, 1]
     assert "note:" not in capsys.readouterr().out
-
-
-def test_a_mistake_leaves_all_as_it_was(folder: Path, table: Path, capsys: pytest.CaptureFixture[str]):
-    before = contents(folder)
-    assert "name trial, object or day" in refused(capsys, "split", folder, "--splits", "nothing.csv")
-    assert "the object of" in refused(capsys, "split", folder, "--splits", "object")
-    table.write_text("trial,split\n*-3,test\n")
-    assert "no row of the table of splits matches train-dry-0" in refused(capsys, "split", folder, "--splits", table)
-    assert "does not exist" in refused(capsys, "split", folder / "nothing", "--splits", "trial")
-    assert contents(folder) == before

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from command_line import refused, run
+from command_line import run
 
 from sliplens.recordings import Dataset
 from sliplens.results.study import StudyConfig
@@ -58,34 +58,6 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
     for name, figures in methods[0].items():
         for key, figure in figures.items():
             assert methods[1][name][key] == (pytest.approx(figure, rel=1e-5) if isinstance(figure, float) else figure)
-
-
-def test_two_networks_of_one_input_are_refused(
-    difference_run: Path, fine_dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
-    networks = ("--network", difference_run, "chromatouch-difference")
-    line = refused(capsys, "study", fine_dataset.folder, *networks, "-o", tmp_path / "study")
-    assert "two networks read the input difference" in line
-    assert not (tmp_path / "study").exists()
-
-
-@pytest.mark.parametrize(
-    ("more", "sentence"),
-    [
-        (("--method", "guess"), "no method named 'guess'"),
-        (("--random-orders", 0), "at least 1"),
-        (("--on", "cloud"), "no executor named 'cloud'"),
-    ],
-)
-def test_mistakes_are_told_before_anything_is_made(
-    fine_dataset: Dataset,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    more: tuple[object, ...],
-    sentence: str,
-):
-    assert sentence in refused(capsys, "study", fine_dataset.folder, "-o", tmp_path / "study", *more)
-    assert not (tmp_path / "study").exists()
 
 
 def test_too_few_trials_are_told_before_a_network_is_loaded(

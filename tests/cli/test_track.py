@@ -5,7 +5,7 @@ import pytest
 from command_line import command
 from data_sets import save_dataset
 
-from sliplens.errors import ImageError, InputError
+from sliplens.errors import InputError
 from sliplens.images import write_png
 from sliplens.markers import track_markers
 from sliplens.markers.tracking import track
@@ -77,44 +77,3 @@ def test_a_data_set_gives_what_the_tracker_gives(trials, tmp_path):
     np.testing.assert_allclose(np.unique(table["time_s"].to_numpy()), trial.time_s)
     with av.open(str(clip)) as container:
         assert sum(1 for _ in container.decode(video=0)) == len(trial)
-
-
-def test_what_cannot_be_followed_is_refused_and_leaves_no_file(folder, tmp_path, rng):
-    output = tmp_path / "tracks.parquet"
-    with pytest.raises(InputError, match=r"does not end in \.parquet"):
-        command("track", source=folder, out=tmp_path / "tracks.csv")
-    with pytest.raises(InputError, match="there is no kind of markers named 'digit'"):
-        command("track", source=folder, out=output, markers="digit")
-    with pytest.raises(InputError, match="named twice"):
-        command("track", source=folder, out=output, reference=tmp_path / "untouched.png", reference_frame=1)
-    with pytest.raises(InputError, match="has no frame 9"):
-        command("track", source=folder, out=output, reference_frame=9)
-    with pytest.raises(InputError, match="does not exist"):
-        command("track", source=tmp_path / "nothing", out=output)
-    with pytest.raises(InputError, match="no trial other"):
-        command("track", source=folder, out=output, trial="other")
-    with pytest.raises(InputError, match=r"does not end in \.mp4"):
-        command("track", source=folder, out=output, video=tmp_path / "clip.avi")
-    small = tmp_path / "small.png"
-    write_png(small, rng.integers(0, 255, (40, 40, 3), dtype=np.uint8))
-    with pytest.raises(ImageError):
-        command("track", source=folder, out=output, reference=small)
-    assert not output.exists()
-    assert not list(tmp_path.glob(".*"))
-
-
-def test_one_frame_alone_has_nothing_to_move_against(tmp_path, moving):
-    path = tmp_path / "one"
-    path.mkdir()
-    write_png(path / "frame.png", moving[1][0])
-    with pytest.raises(InputError, match="one frame and no reference"):
-        command("track", source=path, out=tmp_path / "tracks.parquet")
-
-
-def test_a_result_is_not_overwritten_unless_asked(folder, tmp_path):
-    output = tmp_path / "tracks.parquet"
-    output.write_text("mine")
-    with pytest.raises(InputError, match="exists"):
-        command("track", source=folder, out=output)
-    command("track", source=folder, out=output, overwrite=True)
-    assert pq.read_table(output).num_rows == 120

@@ -165,14 +165,6 @@ def test_one_condition_alone(small_dataset: Dataset, tmp_path: Path, capsys):
     assert "other settings" in capsys.readouterr().err
 
 
-def test_a_condition_that_no_trial_has(small_dataset: Dataset, tmp_path: Path, capsys):
-    line = refused(capsys, small_dataset.folder, tmp_path / "run", "--condition", "oily")
-    assert (
-        "has no trial with split train and condition oily; it has test/dry, test/wet, train/dry, validation/dry" in line
-    )
-    assert line.endswith("name another --condition, or divide it with `sliplens split`")
-
-
 def test_no_validation_split(small_dataset: Dataset, tmp_path: Path, capsys):
     data = divided(small_dataset, tmp_path / "data", validation={"split": ""})
     line = refused(capsys, data, tmp_path / "run")
@@ -206,13 +198,6 @@ def test_it_goes_on_from_a_network_at_another_size(finished: Path, small_dataset
     assert more.image_size == 48
     recipe = json.loads((tmp_path / "more" / "run.json").read_text())["config"]
     assert recipe["started_from"] == start.weights_sha256
-
-
-def test_a_network_to_start_from_must_fit(finished: Path, small_dataset: Dataset, tmp_path: Path, capsys):
-    line = refused(capsys, small_dataset.folder, tmp_path / "run", "--start-from", str(finished), "--input", "raw")
-    assert "has the input difference, and raw is to be trained" in line
-    line = refused(capsys, small_dataset.folder, tmp_path / "run", "--start-from", str(tmp_path / "none"))
-    assert "none does not exist; check the path" in line
 
 
 def test_labels_that_are_all_the_same_are_refused(

@@ -8,9 +8,8 @@ import pyarrow.parquet as pq
 import pytest
 from command_line import command
 
-from sliplens.errors import InputError, RecordingError
+from sliplens.errors import InputError
 from sliplens.recordings import Dataset
-from sliplens.recordings.dataset import write_dataset_table
 
 rerun = pytest.importorskip("rerun")
 chunk = pytest.importorskip("rerun.chunk")
@@ -50,45 +49,6 @@ def test_a_table_of_predictions_finds_its_frames(small_dataset: Dataset, tmp_pat
         ):
             command("view", source=table, out=tmp_path / "b.rrd")
     command("view", source=small_dataset.folder, trial="test-wet-7", predictions=table, out=tmp_path / "b.rrd")
-
-
-def test_an_unknown_trial_is_refused_with_those_there_are(small_dataset: Dataset, tmp_path: Path):
-    with pytest.raises(InputError, match=r"has no trial nobody; it has train-dry-0, .*, test-wet-7$"):
-        command("view", source=small_dataset.folder, trial="nobody", out=tmp_path / "a.rrd")
-    assert not list(tmp_path.iterdir())
-
-
-def test_of_many_trials_ten_are_named(small_dataset: Dataset, tmp_path: Path):
-    write_dataset_table(tmp_path, [small_dataset.trials[0]] * 12)
-    with pytest.raises(InputError, match=r"it has (train-dry-0, ){9}train-dry-0 and 2 more$"):
-        command("view", source=tmp_path, trial="nobody")
-
-
-def test_a_file_that_exists_is_kept_unless_told_otherwise(small_dataset: Dataset, tmp_path: Path):
-    output = tmp_path / "a.rrd"
-    output.write_text("somebody's")
-    with pytest.raises(InputError, match=r"a\.rrd exists; choose another file or pass --overwrite"):
-        command("view", source=small_dataset.folder, out=output)
-    assert output.read_text() == "somebody's"
-    command("view", source=small_dataset.folder, out=output, overwrite=True)
-    assert name_of(output) == small_dataset.trials[0].trial
-
-
-def test_another_suffix_is_refused(small_dataset: Dataset, tmp_path: Path):
-    with pytest.raises(InputError, match=r"a\.html does not end in \.rrd"):
-        command("view", source=small_dataset.folder, out=tmp_path / "a.html")
-
-
-def test_a_folder_that_is_no_data_set_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="does not exist"):
-        command("view", source=tmp_path / "nothing")
-
-
-def test_a_lost_trial_is_told(small_dataset: Dataset, tmp_path: Path):
-    write_dataset_table(tmp_path, small_dataset.trials[:1])
-    with pytest.raises(RecordingError, match="does not exist; make the data set again"):
-        command("view", source=tmp_path, out=tmp_path / "a.rrd")
-    assert [path.name for path in tmp_path.iterdir()] == ["dataset.json"]
 
 
 def test_without_an_output_the_viewer_opens(small_dataset: Dataset, monkeypatch: pytest.MonkeyPatch, tmp_path, capsys):

@@ -1,0 +1,174 @@
+"""Mistakes on the command line: one sentence with its cure, exit code 2, and nothing written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import refused, run
+from own_recording import write_forces, write_video
+from PIL import Image
+
+from sliplens.recordings import Dataset, Recording
+
+SMALL = "--dry-trials 3 --wet-trials 1 --days 2 --frames-per-trial 20"
+MISTAKES = {
+    "train NOTHING -o OUT": "the data set NOTHING does not exist; check the path",
+    "train DATA -o OUT --start-from RUN --input raw --image-size 32": "has the input difference, and raw is to be",
+    "train DATA -o OUT --start-from NOTHING": "NOTHING does not exist; check the path",
+    "train DATA -o OUT --condition oily": "and condition oily; it has test/dry, test/wet, train/dry, validation/dry",
+    "train DATA -o OUT --accelerator cpu --devices 11 --batch-size 12": "does not divide among 11 processes",
+    "explain RUN --frames FRAMES/tall -o OUT": "a_20.png are 50 x 48 pixels but the network was",
+    "explain RUN --frames FRAMES/clear -o OUT": "a_20.png has 4 channels (alpha)",
+    "explain RUN --frames FRAMES/deep -o OUT": "a_20.tiff has 16 bits a channel",
+    "explain RUN --frames FRAMES/cut -o OUT": "a_20.png cannot be read as an image",
+    "explain RUN -o OUT": "requires an argument",
+    "explain RUN DATA": "name the folder of the maps with -o",
+    "explain RUN DATA -o OUT --trials 0": "--trials must be at least 1, got 0",
+    "explain RUN DATA -o OUT --method lime": "no method named 'lime'; choose",
+    "explain RUN DATA -o OUT --budget 2": "budget is 2.0; give a share",
+    "explain RUN --frames FRAMES/good -o OUT --method occlusion-marker": "markers do not show in difference images",
+    "predict RUN DATA -o OUT.txt": "does not end in .parquet or .csv or .json",
+    "predict RUN DATA -o OUT.csv --batch-size 0": "--batch-size must be at least 1, got 0",
+    "predict RUN DATA -o OUT.csv --device qpu": "device 'qpu' is not known",
+    "predict NOTHING DATA -o OUT.csv": "the run NOTHING does not exist",
+    "predict RUN NOTHING -o OUT.csv": "NOTHING does not exist",
+    "predict RUN DATA -o OUT.csv --split exam": "no trial with split exam",
+    "study DATA -o OUT --network RUN chromatouch-difference": "two networks read the input difference",
+    "study DATA -o OUT --method guess": "no method named 'guess'",
+    "study DATA -o OUT --random-orders 0": "at least 1",
+    "study DATA -o OUT --on cloud": "no executor named 'cloud'",
+    "report EMPTY": "EMPTY",
+    "demo EMPTY/..": "is no demo; choose another folder",
+    "demo OUT --train-minutes 0": "must be above 0",
+    "demo OUT --real-frames NOTHING": "folder of real frames",
+    f"simulate {SMALL}": "nothing to do; name a folder to make, or a picture with --preview",
+    "simulate OUT --days 1": "days is 1, at least 2 is needed",
+    f"simulate OUT --seed -1 {SMALL}": "seed is -1",
+    f"simulate OUT --sensor flat-gel --displacement calibrated {SMALL}": "which sensor flat-gel does not have",
+    f"simulate OUT --device toaster {SMALL}": "device 'toaster' is not known; use cpu, cuda or cuda:1",
+    f"simulate OUT --device cuda:99 {SMALL}": "device cuda:99 is not on this machine; use cpu",
+    f"simulate --preview OUT.gif {SMALL}": "does not end in .png, .pdf, .svg",
+    f"simulate --preview OUT.png --video OUT.avi {SMALL}": "does not end in .mp4",
+    "import VIDEO -o OUT --sensor mine": "there is no label; give the table of the force sensor",
+    "import VIDEO -o OUT --sensor mine --forces NOTHING": "NOTHING does not exist",
+    "import VIDEO -o OUT --sensor mine --format papyrus": "no format named 'papyrus'; choose one of sliplens",
+    "import VIDEO -o OUT --sensor mine --image-topic /camera": "is read as video, which does not take --image-topic",
+    "import VIDEO -o OUT --sensor mine --forces FORCES --test-trials 2": "2 to test are more than 1; give fewer",
+    "import VIDEO -o OUT --sensor mine --forces FORCES --test-trials -1": "numbers of trials are not negative",
+    "import VIDEO -o OUT --sensor mine --forces FORCES --reference-frame 999": "the reference is frame 999 of 240",
+    "split DATA --splits NOTHING": "name trial, object or day",
+    "split DATA --splits object": "the object of",
+    "split NOTHING --splits trial": "does not exist",
+    "label DATA --draft OUT -o EMPTY": "leave",
+    "label DATA --audit-only --corrections OUT": "leave",
+    "export onnx DATA -o OUT.onnx": "does not exist; make it with",
+    "export onnx RUN -o OUT": "does not end in .onnx",
+    "export lerobot RUN -o OUT": "RUN",
+    "export lerobot DATA -o EMPTY/.. --overwrite": "was not made by sliplens",
+    "export mcap DATA -o OUT --trials nobody": "has no trial nobody; it has train-dry-0, ",
+    "track DATA -o OUT.csv": "does not end in .parquet",
+    "track DATA -o OUT.parquet --markers digit": "there is no kind of markers named 'digit'",
+    "track DATA -o OUT.parquet --trial other": "no trial other",
+    "track DATA -o OUT.parquet --video OUT.avi --trial train-dry-0": "does not end in .mp4",
+    "track DATA -o OUT.parquet --video OUT.mp4 --trial train-dry-0 --on processes": "leave out --on, or --video",
+    "track FRAMES/good -o OUT.parquet --reference-frame 9": "has no frame 9",
+    "track FRAMES/good -o OUT.parquet": "one frame and no reference",
+    "view DATA --trial nobody -o OUT.rrd": "has no trial nobody; it has train-dry-0, ",
+    "view DATA -o OUT.html": "does not end in .rrd",
+    "view NOTHING": "does not exist",
+    "live 99": "the camera /dev/video99 is not there; plug it in",
+    "live 0 --size 640": "--size requires 2",
+    "live simulated --sink paper": "there is no sink named 'paper'; choose one of json",
+    "live simulated --speed 2": "the simulated fingertip takes no --speed; leave it out",
+    "live nowhere": "nowhere is no source that is known",
+    "live DATA --sensor PROFILE --no-page": "the run trained-elsewhere does not exist",
+    "hold grip": "name one with --gripper",
+    "hold grip --gripper tcp://nowhere": "is no address of a gripper",
+    "hold nowhere --dry-run": "nowhere is no source that is known",
+    "hold grip:anvil --dry-run": "there is no object named 'anvil'",
+    "hold simulated --dry-run --reference one.png two.png": "an image for each source, 1, got 2",
+    "hold simulated --dry-run --controller fixed --set speed=3": "has no constant 'speed'",
+    "hold simulated --dry-run --sequence --friction 0.6": "leave out one of them",
+    "hold simulated --dry-run --sensor PROFILE": "the run trained-elsewhere does not exist",
+    "grip -o OUT --controller magic": "there is no controller named 'magic'",
+    "grip -o OUT --condition oily": "there is no condition named 'oily'",
+    "grip -o OUT --set target": "write NAME=NUMBER",
+    "grip -o OUT --script mass_kg=-1": "mass_kg must be above 0",
+    "grip -o OUT --network NOTHING": "the run NOTHING does not exist",
+}
+"""Message of each mistake."""
+
+
+@pytest.fixture(scope="module")
+def places(
+    tmp_path_factory: pytest.TempPathFactory, small_dataset: Dataset, difference_run: Path, trial: Recording
+) -> dict[str, str]:
+    """Paths that the mistakes name in capitals."""
+    folder = tmp_path_factory.mktemp("mistakes")
+    (folder / "empty").mkdir()
+    for name, pixels in {
+        "good/a_20.png": np.zeros((48, 48, 3), np.uint8),
+        "tall/a_20.png": np.zeros((50, 48, 3), np.uint8),
+        "clear/a_20.png": np.zeros((48, 48, 4), np.uint8),
+        "deep/a_20.tiff": np.zeros((48, 48), np.uint16),
+        "cut/a_20.png": np.zeros((48, 48, 3), np.uint8),
+    }.items():
+        path = folder / "frames" / name
+        path.parent.mkdir(parents=True)
+        Image.fromarray(pixels).save(path)
+    path = folder / "frames" / "cut" / "a_20.png"
+    path.write_bytes(path.read_bytes()[:60])
+    (folder / "tip.toml").write_text('name = "tip"\nnetwork = "trained-elsewhere"\n', encoding="utf-8")
+    return {
+        "NOTHING": str(folder / "nothing"),
+        "EMPTY": str(folder / "empty"),
+        "OUT": str(folder / "out"),
+        "FRAMES": str(folder / "frames"),
+        "PROFILE": str(folder / "tip.toml"),
+        "VIDEO": str(write_video(trial, folder / "cup.mkv")),
+        "FORCES": str(write_forces(trial, folder / "cup.csv")),
+        "DATA": str(small_dataset.folder),
+        "RUN": str(difference_run),
+    }
+
+
+def fill(text: str, places: dict[str, str]) -> str:
+    for name, path in places.items():
+        text = text.replace(name, path)
+    return text
+
+
+@pytest.mark.parametrize(("words", "message"), MISTAKES.items(), ids=MISTAKES)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(
+    words: str, message: str, places: dict[str, str], capsys: pytest.CaptureFixture[str]
+):
+    folder = Path(places["OUT"]).parent
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    assert fill(message, places) in refused(capsys, *(fill(word, places) for word in words.split()))
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "predict RUN DATA -o FILE.csv",
+        "track DATA -o FILE.parquet",
+        "view DATA -o FILE.rrd",
+        "export onnx RUN -o FILE.onnx",
+    ],
+)
+def test_a_file_is_replaced_only_by_overwrite(
+    words: str, places: dict[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    if words.startswith("view"):
+        pytest.importorskip("rerun")
+    if words.startswith("export"):
+        pytest.importorskip("onnxscript")
+    asked = fill(words.replace("FILE", str(tmp_path / "a")), places).split()
+    file = Path(asked[-1])
+    file.write_text("somebody's")
+    assert "exists; choose another file or pass --overwrite" in refused(capsys, *asked)
+    assert file.read_text() == "somebody's"
+    if not words.startswith("track"):  # frames of noise show no markers
+        assert run(*asked, "--overwrite") == 0
+        assert file.read_bytes() != b"somebody's"
