@@ -135,12 +135,6 @@ def test_what_is_recorded_is_a_data_set_that_passes(seen, page: Served):
     assert check_dataset(page.record_into) == ()
 
 
-def test_a_new_object_is_announced_by_key(seen):
-    seen.locator("body").click(position={"x": 2, "y": 2})
-    seen.keyboard.press("n")
-    seen.get_by_text("nothing is known of the friction of the new object").wait_for()
-
-
 def test_a_narrow_window_needs_no_scrolling_sideways(seen):
     assert seen.evaluate("document.documentElement.scrollWidth") <= 320
 
@@ -173,25 +167,6 @@ def test_a_page_of_another_site_is_refused(page: Served):
     assert get(page.address, Host="evil.example")[0] == 403
     assert get(page.address, Origin="http://evil.example")[0] == 403
     assert get(page.address)[0] == 200
-
-
-def test_a_viewer_that_never_answers_is_sent_two_messages(page: Served):
-    client = pytest.importorskip("websockets.sync.client")
-    [name] = set(re.findall(r"/frames/([\w-]+)", get(page.address)[1]))
-    address = page.address.replace("http", "ws") + f"frames/{name}"
-    with client.connect(address, open_timeout=60) as socket:
-        serials = []
-        for _ in range(2):
-            message = socket.recv(timeout=60)
-            length = int.from_bytes(message[:4], "little")
-            serials.append(json.loads(message[4 : 4 + length])["serial"])
-        with pytest.raises(TimeoutError):
-            socket.recv(timeout=1.5)  # longer than what is sent for want of news
-        assert serials == [1, 2]
-        socket.send(json.dumps({"serial": 1, "drawn": False}))
-        assert socket.recv(timeout=60)
-    with pytest.raises(Exception, match=r"403|rejected"), client.connect(address, origin="http://evil.example"):
-        pass
 
 
 def send_all(socket: Any, messages: list[str]) -> None:

@@ -63,12 +63,6 @@ def test_what_changes_slowly_takes_turns_and_is_told_within_a_tenth_of_a_second(
     assert times_s[-1] - times_s[0] < 0.1
 
 
-def test_a_healthy_frame_passes_every_check(monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator):
-    checks = monitor.check(shot(untouched, rng))
-    assert failed(checks) == set()
-    assert max(map(severity, checks)) < 1
-
-
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.3])
 def test_exposure_tells_the_factor(
     monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator, factor: float
@@ -197,10 +191,6 @@ def test_a_frame_is_strange_where_predict_withholds_it(known: float, ok: bool):
     assert (severity(check) <= 1) == ok
 
 
-def test_a_network_without_novelty_has_no_such_check():
-    assert check_novelty(Estimate(margin=np.array([0.5]), calibration=None)) is None
-
-
 @pytest.mark.parametrize(("name", "limit"), [("focus", -1.0), ("haze", 1.0)])
 def test_a_limit_that_cannot_be_is_refused_with_those_that_can(untouched: np.ndarray, name: str, limit: float):
     with pytest.raises(InputError, match=f"the health limit {name} is {limit:g}; give a positive limit of one of"):
@@ -220,13 +210,3 @@ def test_risk_is_that_of_causes_which_each_suffice():
     assert margin_risk((camera,), 0.0, harm=harm, spread=sure) == pytest.approx(0.6, abs=0.01)
     both = margin_risk((camera, light), 0.3, harm=harm, spread=sure)
     assert both == pytest.approx(1 - 0.7 * 0.4 * 0.5, abs=0.01)
-
-
-def test_risk_grows_with_every_fault_and_with_the_spread(
-    untouched: np.ndarray, monitor: HealthMonitor, rng: np.random.Generator
-):
-    risks = [
-        margin_risk(monitor.check(shot(np.clip(factor * untouched, 0, 255), rng)), beyond)
-        for factor, beyond in ((1.0, 0.05), (0.5, 0.05), (0.5, 0.5))
-    ]
-    assert 0 < risks[0] < risks[1] < risks[2] < 1

@@ -3,7 +3,7 @@
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -130,36 +130,12 @@ def test_every_frame_is_read_or_counted_as_dropped(recording: Recording, wait_s:
     assert len(heard) + heard[-1].dropped + numbers[0] == len(recording.frames)
 
 
-def test_frames_that_the_camera_lost_count_as_dropped(recording: Recording):
-    source = Patient(recording.frames[:3], [0, 4, 5])
-    readings = source.all_readings(plain_reader(source, reference=recording.reference))
-    assert [reading.dropped for reading in readings] == [0, 3, 3]
-
-
-def test_a_slow_reader_gets_the_newest(recording: Recording):
-    source = Patient(recording.frames, list(range(12)))
-    with plain_reader(source, reference=recording.reference) as reader:
-        readings = reader.readings()
-        next(readings)
-        source.read.release(11)
-        assert reader._over.wait(timeout=10)
-        assert [reading.number for reading in readings] == [11]
-
-
 def test_who_asks_late_gets_the_newest_and_is_not_left_waiting(recording: Recording):
     with plain_reader(Burst(recording.frames[:2], [0, 1]), reference=recording.reference) as reader:
         early = reader.readings()
         assert reader._over.wait(timeout=10)
         for readings in early, reader.readings():
             assert [reading.number for reading in readings] == [1]
-
-
-def test_who_stops_asking_is_told_no_more(recording: Recording):
-    with plain_reader(Burst(recording.frames[:2], [0, 1]), reference=recording.reference) as reader:
-        reader.readings()
-        next(reader.readings())
-    # its threads have ended: while they tell somebody they hold on to them
-    assert not list(reader._mailboxes)
 
 
 def test_without_a_reference_the_first_still_picture_is_taken(recording: Recording, rng: np.random.Generator):
@@ -171,24 +147,6 @@ def test_without_a_reference_the_first_still_picture_is_taken(recording: Recordi
     assert "no reference frame yet" in str(readings[0].withheld)
     assert readings[-1].withheld is None
     np.testing.assert_array_equal(reader.reference, still[0])
-
-
-def test_a_grey_camera_puts_a_network_that_learned_from_colours_in_doubt(recording: Recording, raw_run: Path):
-    trained = sl.load(raw_run)
-    trained = replace(trained, manifest=replace(trained.manifest, colour=True))
-    grey = np.repeat(recording.reference[..., :1], 3, axis=-1)
-    for untouched, doubts in ((grey, 1), (recording.reference, 0)):
-        reader = plain_reader(recording.frames[:1], trained, reference=untouched, engine="torch")
-        assert not reader.doubts
-        with reader:
-            assert len(reader.doubts) == doubts
-
-
-def test_a_black_picture_is_no_reference(recording: Recording):
-    source = Patient(np.zeros_like(recording.frames), list(range(12)))
-    reader = plain_reader(source)
-    assert len(source.all_readings(reader)) == 12
-    assert reader.reference is None
 
 
 def test_a_new_reference_is_taken_on_request(recording: Recording):
@@ -384,17 +342,6 @@ def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another
     assert kept[5:9] == [sequence and not same_object] * 4
 
 
-def test_a_new_object_may_be_told_its_friction(ratio_run: Path, difference_run: Path):
-    with closing(plain_reader("simulated", ratio_run, friction="0.5..0.8")) as reader:
-        reader.new_object("0.58+-0.05")
-        reader.new_object()
-        with pytest.raises(InputError, match="'wood' is no friction"):
-            reader.new_object("wood")
-    alone = pytest.raises(InputError, match="answers with the margin alone")
-    with closing(plain_reader("simulated", difference_run)) as reader, alone:
-        reader.new_object(0.5)
-
-
 def test_only_a_network_that_tells_f_t_over_f_n_can_learn_friction(difference_run: Path):
     with pytest.raises(InputError, match="--same-object needs a network; name one with --network"):
         plain_reader("simulated", same_object=True)
@@ -402,23 +349,9 @@ def test_only_a_network_that_tells_f_t_over_f_n_can_learn_friction(difference_ru
         plain_reader("simulated", difference_run, same_object=True)
 
 
-def test_friction_needs_a_network_that_tells_f_t_over_f_n(difference_run: Path):
-    with pytest.raises(InputError, match="--friction needs a network; name one with --network"):
-        plain_reader("simulated", friction=0.6)
-    with pytest.raises(InputError, match="answers with the margin alone and cannot use it"):
-        plain_reader("simulated", difference_run, friction=0.6)
-
-
 def test_a_network_of_another_sensor_is_refused_before_anything_runs(difference_run: Path):
     with pytest.raises(ImageError, match=r"224 x 224 pixels but the network was trained on 48 x 48"):
         plain_reader("simulated", difference_run).__enter__()
-
-
-def test_options_that_cannot_be_are_told():
-    with pytest.raises(InputError, match="--smoothing must be 0 or more seconds, got -1"):
-        plain_reader("simulated", smoothing_s=-1.0)
-    with pytest.raises(InputError, match="--seconds must be positive, got 0"):
-        plain_reader("simulated", seconds=0.0)
 
 
 def test_a_low_pass_delays_a_ramp_by_its_time_constant(rng: np.random.Generator):
@@ -426,11 +359,6 @@ def test_a_low_pass_delays_a_ramp_by_its_time_constant(rng: np.random.Generator)
     values = [smooth.update(np.array([3.0 * now]), now)[0] for now in time_s.tolist()]
     # a sampled filter lags up to a sample less than a continuous one
     assert values[-1] == pytest.approx(3.0 * (time_s[-1] - 0.2), abs=3.0 * 0.0015)
-
-
-def test_a_low_pass_of_no_time_constant_changes_nothing():
-    smooth = LowPass(time_constant_s=0.0)
-    assert [smooth.update(np.array([value]), 0.1)[0] for value in (0.3, 0.9)] == [0.3, 0.9]
 
 
 def test_by_default_health_and_slip_are_watched_and_no_touch_has_no_margin(trials: dict[str, Recording]):

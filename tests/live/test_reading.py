@@ -75,18 +75,6 @@ def test_a_slip_that_the_markers_show_is_never_called_safe():
             assert words.contact in expected
 
 
-def test_incipient_slip_needs_an_interval_without_full_stick_and_full_slip():
-    for one in READINGS:
-        if describe_reading(one).contact == ContactState.INCIPIENT_SLIP:
-            assert one.low is not None
-            assert one.high is not None
-            assert 0 < one.low <= one.high < 1
-
-
-def test_no_two_states_of_contact_and_markers_contradict_each_other():
-    assert "stick" not in str(SlipState.STICKING)  # beside incipient slip, of which a part slips
-
-
 @pytest.mark.parametrize("margin", [None, 0.6])
 @pytest.mark.parametrize("slip", [None, *SlipState])
 def test_what_is_withheld_gives_its_reason_and_no_other_words(margin: float | None, slip: SlipState | None):
@@ -103,11 +91,6 @@ def test_without_a_network_the_markers_are_described(contact: bool | None):
     words = describe_reading(reading(markers=markers, slip=markers.state, contact_state=state))
     assert words.contact == {None: "unknown", False: "no contact", True: "contact"}[contact]
     assert not words.margin
-
-
-def test_a_network_without_intervals_is_never_trusted():
-    for margin in SHARES:
-        assert describe_reading(reading(margin)).zone is Zone.UNCERTAIN
 
 
 def test_a_line_says_what_its_parts_say():

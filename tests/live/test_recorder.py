@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -23,9 +22,8 @@ from sliplens.errors import RecordingError, SliplensError
 from sliplens.live import ForceStream, LiveFrame, LiveOptions, Recorder, SimulatedSource, open_live
 from sliplens.recordings import Dataset, Recording, TrialFacts, load_dataset
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.dataset import begin_recording, finish_recording, recover_dataset, save_profile
+from sliplens.recordings.dataset import begin_recording, finish_recording, recover_dataset
 from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, Journal, JournalHeader
-from sliplens.recordings.sensor import SENSORS_FOLDER, load_profile
 from sliplens.recordings.store import forces_path, load_forces
 
 FACTS = TrialFacts(trial="cup", sensor="tip", object="a cup", condition="wet", day=3)
@@ -79,29 +77,6 @@ def test_a_recording_is_what_was_seen(recording: Recording, tmp_path: Path):
     np.testing.assert_array_equal(forces.force_n[:, 0], np.repeat(np.arange(1, 12), 2))
     np.testing.assert_allclose(forces.time_s, 0.05 * np.arange(1, 23), atol=1e-9)
     assert not (data.folder / JOURNAL_FOLDER).exists()
-
-
-def test_a_recording_is_imported_again(recording: Recording, tmp_path: Path):
-    record(tmp_path / "data", frames_of(recording), recording)
-    data = sl.import_recordings(tmp_path / "data", out=tmp_path / "again")
-    np.testing.assert_array_equal(data.load(data.trials[0]).frames, recording.frames)
-
-
-def test_a_recording_is_studied(fine_dataset: Dataset, difference_run: Path, tmp_path: Path):
-    whole = fine_dataset.load(fine_dataset.trials[0])
-    recorder = Recorder(tmp_path / "data", facts=TrialFacts(trial="grip"))
-    recorder.set_reference(whole.reference)
-    for frame in frames_of(whole):
-        recorder.add(frame)
-    data = recorder.close()
-    assert data is not None
-    study = sl.run_study(
-        data,
-        difference_run,
-        sl.StudyConfig(methods=("grad-cam",), trials=1, tests=("score",), steps=4, random_orders=1),
-        out=tmp_path / "study",
-    )
-    assert set(study.deletion) == {"difference"}
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.77, 0.999])
@@ -279,32 +254,7 @@ def test_a_new_reference_a_clock_that_jumps_and_another_size_begin_a_trial(recor
     assert sl.check_dataset(data) == ()
 
 
-def test_trials_are_added_to_a_data_set_that_is_there(recording: Recording, tmp_path: Path):
-    before = record(tmp_path / "data", frames_of(recording), recording)
-    after = record(tmp_path / "data", frames_of(recording), recording)
-    assert before is not None
-    assert after is not None
-    assert [info.trial for info in after.trials] == ["cup-1", "cup-2"]
-    assert after.trials[0] == before.trials[0]
-
-
 def test_nothing_recorded_leaves_nothing_behind(tmp_path: Path):
-    assert Recorder(tmp_path / "data").close() is None
-    assert not (tmp_path / "data").exists()
-
-
-def test_nothing_recorded_by_a_profile_leaves_its_folder_free_whenever_it_was_killed(tmp_path: Path, monkeypatch):
-    def killed(folder: Path, **options: Any) -> None:
-        if folder.name == SENSORS_FOLDER:
-            raise KeyboardInterrupt
-        remove(folder, **options)
-
-    recorder, remove = Recorder(tmp_path / "data"), shutil.rmtree
-    save_profile(tmp_path / "data", load_profile("digit"))
-    with monkeypatch.context() as patch:
-        patch.setattr(shutil, "rmtree", killed)
-        with pytest.raises(KeyboardInterrupt):
-            recorder.close()
     assert Recorder(tmp_path / "data").close() is None
     assert not (tmp_path / "data").exists()
 
@@ -446,8 +396,3 @@ def test_lines_that_are_no_forces_are_told(tmp_path: Path, lines: str, words: st
             time.sleep(0.01)
     assert words in str(stream.trouble)
     assert "the forces of" in str(stream.trouble)
-
-
-def test_a_stream_of_forces_that_is_not_there_is_told(tmp_path: Path):
-    with pytest.raises(RecordingError, match="does not exist; begin to write the forces, then record"):
-        ForceStream(tmp_path / "none.csv").__enter__()

@@ -1,7 +1,6 @@
 """What the Rerun viewer is given of a trial, read back with Rerun's own reader."""
 
 import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -15,10 +14,10 @@ import pytest
 from data_sets import save_dataset
 from there import there
 
-from sliplens.errors import InputError, RecordingError
+from sliplens.errors import InputError
 from sliplens.images import decode_png
 from sliplens.live import viewer as viewer_process
-from sliplens.live.viewer import Overlays, open_viewer, view_capture, view_explained, view_stored, write_rrd
+from sliplens.live.viewer import Overlays, view_capture, view_explained, view_stored, write_rrd
 from sliplens.progress import reporting
 from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
 from sliplens.recordings.capture import Capture, Forces
@@ -26,7 +25,6 @@ from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_ta
 from sliplens.recordings.labels import LabelSettings
 from sliplens.recordings.source import open_source
 from sliplens.recordings.store import forces_path, read_header
-from sliplens.recordings.trial import SIGNALS
 from sliplens.recordings.trial_writer import import_trial
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
@@ -124,22 +122,6 @@ def test_differences_are_those_of_signed_numbers_times_one_factor(
     assert np.abs(shown - np.minimum(factor * difference, 255)).max() <= 0.5 + 0.025 * 255 / factor
 
 
-def test_every_frame_has_its_time_and_its_number(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
-    parts = {
-        "frame": "EncodedImage:blob",
-        "difference": "EncodedImage:blob",
-        "frame/zones": "SegmentationImage:buffer",
-        "frame/markers": "Points2D:positions",
-        "frame/displacements": "Arrows2D:vectors",
-        "label/margin": "Scalars:scalars",
-    }
-    for entity, component in parts.items():
-        found = rows(simulated, entity, component)
-        # Rerun counts whole nanoseconds
-        np.testing.assert_allclose(there(found.time_ns) / 1e9, trial.time_s, rtol=0, atol=0.6e-9)
-        np.testing.assert_array_equal(found.frame, np.arange(FRAMES))
-
-
 def test_labels_and_forces_are_those_of_the_recording(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
     expected = {
         "force/normal": trial.normal_force_n,
@@ -185,26 +167,6 @@ def test_truth_lies_over_the_pixels_it_belongs_to(trial: Recording, simulated: d
     np.testing.assert_allclose(begin + way, markers, atol=1e-4)
 
 
-def test_a_trial_and_its_layout_are_told(trial: Recording, written: Path, simulated: dict[str, list[pa.RecordBatch]]):
-    (text,) = rows(simulated, "about", "TextDocument:text").values[0]
-    assert text.startswith(f"# {trial.trial}\n")
-    assert f"- frames: {FRAMES} of 224" in text
-    assert "Simulated" in text
-    assert rows(simulated, "__properties", "RecordingInfo:name").values[-1] == [trial.trial]
-    reader = chunk.RrdReader(written)
-    (blueprint,) = reader.blueprints()
-    origins = {
-        value
-        for one in reader.stream(store=blueprint)
-        for batch in [one.to_record_batch()]
-        if "ViewBlueprint:space_origin" in batch.schema.names
-        for (value,) in batch.column("ViewBlueprint:space_origin").to_pylist()
-    }
-    # the margins of labels and predictions share the chart at the root
-    shown = {"frame", "difference", "reference", "state", "force", "ratio", "", "about"}
-    assert {origin.strip("/") for origin in origins} == shown
-
-
 def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
     margin, normal = trial.safety_margin.copy(), trial.normal_force_n.copy()
     margin[8:11], normal[12] = np.nan, np.nan
@@ -234,22 +196,6 @@ def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
     last = np.searchsorted(there(label.frame), np.arange(FRAMES), side="right") - 1
     np.testing.assert_array_equal([label.values[at] == ["valid"] for at in last], valid & np.isfinite(margin))
     np.testing.assert_array_equal(pictures(found, "frame"), trial.frames)
-
-
-def test_a_trial_where_nothing_is_known_can_be_looked_at(trial: Recording, tmp_path: Path):
-    nothing = np.full(FRAMES, np.nan)
-    bare = replace(
-        trial,
-        truth=None,
-        frames=np.repeat(trial.reference[None], FRAMES, axis=0),
-        contact_state=(ContactState.UNKNOWN,) * FRAMES,
-        **dict.fromkeys(SIGNALS[1:], nothing),
-    )
-    data = save_dataset(tmp_path / "data", bare)
-    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
-    found = read_rrd(tmp_path / "a.rrd")
-    assert np.isnan(numbers(found, "label/margin")).all()
-    assert not pictures(found, "difference").any()
 
 
 def test_what_networks_and_trackers_say_stands_on_the_clock_of_the_frames(trial: Recording, tmp_path: Path):
@@ -394,15 +340,6 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
     assert "table of forces" in text
 
 
-def test_a_damaged_trial_leaves_no_file(trial: Recording, tmp_path: Path):
-    data = save_dataset(tmp_path / "data", trial)
-    path = trial_path(data.folder, trial.trial)
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(RecordingError, match="is not a readable Parquet file"):
-        write_rrd(view_stored(data, data.trials[0]), tmp_path / "out" / "a.rrd")
-    assert not (tmp_path / "out").exists()
-
-
 def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
     def interrupt(done: int, total: int) -> None:
         raise KeyboardInterrupt
@@ -412,21 +349,6 @@ def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
-def test_without_rerun_its_installation_is_told(
-    monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path
-):
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    wanted = r'the viewer needs Rerun, which is not installed; install with `pip install "sliplens\[view\]"'
-    with pytest.raises(InputError, match=wanted):
-        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
-
-
-def test_rerun_that_is_too_old_is_told(monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path):
-    monkeypatch.delattr(rerun, "StateChange")
-    with pytest.raises(InputError, match=r"too old .*; upgrade it with `pip install"):
-        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
-
-
 def test_rerun_switched_off_writes_no_empty_file(
     monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path
 ):
@@ -434,32 +356,6 @@ def test_rerun_switched_off_writes_no_empty_file(
     with pytest.raises(InputError, match="the environment variable RERUN switches Rerun off; unset it"):
         write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
     assert not list(tmp_path.iterdir())
-
-
-def test_an_open_viewer_is_given_what_a_file_is(
-    monkeypatch: pytest.MonkeyPatch, trial: Recording, simulated: dict[str, list[pa.RecordBatch]], tmp_path: Path
-):
-    def connect(stream: Any, url: str) -> None:
-        assert url == "rerun+http://127.0.0.1:1/proxy"
-        stream.save(tmp_path / "sent.rrd")
-
-    monkeypatch.setattr(rerun.RecordingStream, "connect_grpc", connect)
-    monkeypatch.setattr("sliplens.live.viewer.start_viewer", lambda: "rerun+http://127.0.0.1:1/proxy")
-    data = save_dataset(tmp_path / "data", trial)
-    open_viewer(view_stored(data, data.trials[0]))
-    sent = read_rrd(tmp_path / "sent.rrd")
-    assert set(sent) == set(simulated)
-    np.testing.assert_array_equal(pictures(sent, "frame"), trial.frames)
-
-
-def test_no_viewer_opens_for_a_trial_that_is_not_there(
-    monkeypatch: pytest.MonkeyPatch, trial: Recording, tmp_path: Path
-):
-    monkeypatch.setattr("sliplens.live.viewer.start_viewer", lambda: pytest.fail("a viewer was started"))
-    data = save_dataset(tmp_path / "data", trial)
-    trial_path(data.folder, trial.trial).unlink()
-    with pytest.raises(RecordingError, match="does not exist; make the data set again"):
-        open_viewer(view_stored(data, data.trials[0]))
 
 
 class Begun(NamedTuple):
@@ -514,11 +410,3 @@ def test_a_viewer_that_finds_no_screen_is_told_with_its_reason(stand_in: StandIn
     stand_in(STAND_IN.replace("time.sleep(60)", "time.sleep(0.3); sys.exit('Error: no DISPLAY is set')"))
     with pytest.raises(InputError, match=r"did not start \(Error: no DISPLAY is set\); write a file with --output"):
         viewer_process.start_viewer()
-
-
-def test_a_viewer_that_never_answers_is_ended(monkeypatch: pytest.MonkeyPatch, stand_in: StandIn):
-    monkeypatch.setattr(viewer_process, "_PATIENCE_S", 0.5)
-    begun = stand_in("import time; time.sleep(60)")
-    with pytest.raises(InputError, match=r"did not start \(it gave no reason\)"):
-        viewer_process.start_viewer()
-    assert begun[0].process.returncode is not None

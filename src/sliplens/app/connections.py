@@ -39,10 +39,9 @@ class HttpConnection(H11Protocol):
         super().connection_made(transport)
         self._set_deadline()
         if len(self.connections) > MOST_CONNECTIONS:
-            waiting = [
-                other for other in self.connections if isinstance(other, HttpConnection) and other.waiting_since_s
-            ]
-            min(waiting, key=lambda other: other.waiting_since_s or 0.0).cut_off()
+            others = (other for other in self.connections if isinstance(other, HttpConnection))
+            waiting = {other: other.waiting_since_s for other in others if other.waiting_since_s}
+            min(waiting, key=lambda other: waiting[other]).transport.abort()
 
     def data_received(self, data: bytes) -> None:
         """Take a part of a request."""
@@ -72,18 +71,11 @@ class HttpConnection(H11Protocol):
     def _waits(self) -> bool:
         return self.conn.their_state in {h11.IDLE, h11.SEND_BODY}
 
-    def cut_off(self) -> None:
-        """End the connection, whatever is under way."""
-        self._end_deadline()
-        self.transport.abort()
-
     def _set_deadline(self) -> None:
         self._end_deadline()
-        if self.transport.get_protocol() is not self:
-            return  # it has become a socket
-        if self._waits:
-            self.waiting_since_s = self.loop.time()
-        self._deadline = self.loop.call_later(REQUEST_S if self._waits else ANSWER_S, self.cut_off)
+        if self.transport.get_protocol() is self:  # else it has become a socket
+            self.waiting_since_s = self.loop.time() if self._waits else None
+            self._deadline = self.loop.call_later(REQUEST_S if self._waits else ANSWER_S, self.transport.abort)
 
     def _end_deadline(self) -> None:
         self.waiting_since_s = None

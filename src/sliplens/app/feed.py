@@ -74,7 +74,7 @@ class Arrow:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Picture:
+class PageFrame:
     """Frame as the page shows it."""
 
     reading: Reading
@@ -200,7 +200,7 @@ class Feed:
         """Newest reading."""
         self.grip: GripStatus | None = None
         """State of a simulated gripper at that reading."""
-        self.picture: Picture | None = None
+        self.picture: PageFrame | None = None
         """Newest picture."""
         self.map: Map | None = None
         """Newest map of the running picture."""
@@ -261,7 +261,7 @@ class Feed:
         self._before = self.reader.reference
         self.reader.take_reference()
 
-    async def explain(self, picture: Picture, method: str) -> Map:
+    async def explain(self, picture: PageFrame, method: str) -> Map:
         """Explain a picture by any method; one explanation runs at a time.
 
         Raises
@@ -320,11 +320,11 @@ class Feed:
         with suppress(RuntimeError):  # the server has gone
             loop.call_soon_threadsafe(lambda: [client.wake() for client in tuple(self.clients)])
 
-    def _draw(self, reading: Reading, frame: LiveFrame) -> Picture:
+    def _draw(self, reading: Reading, frame: LiveFrame) -> PageFrame:
         thumbnail, markers_px = Image.fromarray(frame.image), self.reader.markers_px
         thumbnail.thumbnail((_LONGEST_PX, _LONGEST_PX), reducing_gap=1.0)
         ways = [] if markers_px is None else np.column_stack(markers_px).round(1).tolist()
-        return Picture(
+        return PageFrame(
             reading=reading,
             frame=frame,
             reference=self.reader.reference,
@@ -350,7 +350,7 @@ class Feed:
                 self.map = None
             self._wake()
 
-    def _explain(self, picture: Picture, method: str) -> Map:
+    def _explain(self, picture: PageFrame, method: str) -> Map:
         assert self._network is not None
         chosen = frames_from_arrays(self._network, picture.frame.image[None], picture.reference)
         methods = None if method == RECOMMENDED_METHOD else method
@@ -379,7 +379,7 @@ class Feed:
         )
 
 
-def _sum_by_marker(values: np.ndarray, picture: Picture) -> tuple[MarkerRelevance, ...]:
+def _sum_by_marker(values: np.ndarray, picture: PageFrame) -> tuple[MarkerRelevance, ...]:
     """Sum the relevance around each marker."""
     if len(picture.arrows) < 2:
         return ()
@@ -399,7 +399,7 @@ class Client:
 
     def __init__(self, feed: Feed) -> None:
         self.feed = feed
-        self.frozen: Picture | None = None
+        self.frozen: PageFrame | None = None
         """Picture that stays until `thaw`; number and chart go on."""
         self.explained: Map | None = None
         """Map of the frozen picture."""
@@ -417,7 +417,7 @@ class Client:
 
     def _reset(self) -> None:
         self._sent_until_s, self._drawn_ms = -np.inf, None
-        self._picture: Picture | None = None
+        self._picture: PageFrame | None = None
         self._map: Map | None = None
         self._unanswered.clear()
 
@@ -436,7 +436,7 @@ class Client:
         """True where a newer picture would be sent; one that waits for a slow client is not drawn again."""
         return self.ready or self._picture is self.feed.picture
 
-    def freeze(self) -> Picture | None:
+    def freeze(self) -> PageFrame | None:
         """Stop at the picture on the screen; None before the first."""
         self.frozen = self.frozen or self._picture or self.feed.picture
         self.wake()

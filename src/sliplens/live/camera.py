@@ -25,22 +25,28 @@ from sliplens.recordings.capture import Frame
 if TYPE_CHECKING:
     from linuxpy.video.device import Device
 
-# formats of V4L2 by their four letters: the decoder of FFmpeg, its pixel format, and bytes a pixel where rows may be
-# padded
-_DECODERS: dict[str, tuple[str, str | None, int]] = {
-    "MJPG": ("mjpeg", None, 0),
-    "JPEG": ("mjpeg", None, 0),
+_DECODERS = {
+    "MJPG": ("mjpeg", "", 0),
+    "JPEG": ("mjpeg", "", 0),
     "YUYV": ("rawvideo", "yuyv422", 2),
     "UYVY": ("rawvideo", "uyvy422", 2),
     "RGB3": ("rawvideo", "rgb24", 3),
     "BGR3": ("rawvideo", "bgr24", 3),
     "GREY": ("rawvideo", "gray", 1),
 }
-_MOST_HALVINGS = 3  # of what a JPEG decoder can leave out of its blocks of 8
+"""Formats of V4L2 by their four letters: the decoder of FFmpeg, its pixel format, and bytes a pixel."""
 _BUFFERS = 4  # two are not enough where a process is now and then late
-_POLL_S = 0.1
-_STALL_S = 2.0
+_POLL_S, _STALL_S = 0.1, 2.0
 _MOST_BAD = 30  # frames in a row that cannot be decoded
+_CURES = {
+    errno.EBUSY: "is taken by another program; close that one",
+    errno.EACCES: "may not be opened; add yourself to the group video and log in again",
+    errno.ENOENT: "is not there; plug it in, and see `sliplens live --list`",
+    errno.ENODEV: "was unplugged; plug it in again",
+    errno.ENXIO: "was unplugged; plug it in again",
+    errno.ENOTTY: "is no camera; see `sliplens live --list`",
+    errno.EINVAL: "does not take these settings; see `sliplens live --list`",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,40 +79,28 @@ class Camera:
 
 
 class FrameDecoder:
-    """Decoder of a camera's frames; it scales them down while it decodes, where the format allows.
-
-    Parameters
-    ----------
-    pixel_format
-        Four letters of V4L2.
-    size, wanted
-        Height and width of the camera's frames and of the decoded ones, in pixels.
-    """
+    """Decoder of a camera's frames, of a size (height, width) in pixels; scales them down to `wanted`."""
 
     def __init__(self, pixel_format: str, *, size: tuple[int, int], wanted: tuple[int, int] | None = None) -> None:
-        codec, pixels, self._pixel_bytes = _DECODERS[pixel_format]
-        self._size, self._wanted = size, wanted or size
+        codec, pixels, pixel_bytes = _DECODERS[pixel_format]
+        self._height, self._row_bytes, self._wanted = size[0], size[1] * pixel_bytes, wanted or size
         context = av.CodecContext.create(codec, "r")
         assert isinstance(context, VideoCodecContext)
-        self._context = context
-        self._context.thread_count = 1  # frame by frame: more threads would each keep one back
-        if pixels is None:
+        context.thread_count = 1  # frame by frame: more threads would each keep one back
+        if pixels:
+            context.height, context.width = size
+            context.pix_fmt = pixels
+        else:  # a JPEG decoder halves the picture up to three times for nothing
             ratio = min(have / want for have, want in zip(size, self._wanted, strict=True))
-            halvings = min(max(int(np.floor(np.log2(ratio))), 0), _MOST_HALVINGS)
-            self._context.options = {"lowres": str(halvings), "err_detect": "explode"}
-        else:
-            self._context.height, self._context.width = size
-            self._context.pix_fmt = pixels
-        self._to_rgb = VideoReformatter()
+            context.options = {"lowres": str(min(max(int(np.log2(ratio)), 0), 3)), "err_detect": "explode"}
+        self._context, self._to_rgb = context, VideoReformatter()
 
     def decode(self, data: bytes, *, row_bytes: int = 0) -> Frame | None:
         """Decode one frame as RGB; None where the bytes are no whole frame. `row_bytes`: length of a padded row."""
-        height, width = self._size
-        full = width * self._pixel_bytes
-        if row_bytes > full > 0 and len(data) >= height * row_bytes:
-            rows = np.frombuffer(data, dtype=np.uint8, count=height * row_bytes).reshape(height, row_bytes)
-            data = rows[:, :full].tobytes()
-        if len(data) < max(1, height * full):
+        if row_bytes > self._row_bytes > 0 and len(data) >= self._height * row_bytes:
+            rows = np.frombuffer(data, dtype=np.uint8, count=self._height * row_bytes).reshape(self._height, row_bytes)
+            data = rows[:, : self._row_bytes].tobytes()
+        if len(data) < max(1, self._height * self._row_bytes):
             return None
         try:
             frames = self._context.decode(av.Packet(data))
@@ -115,9 +109,8 @@ class FrameDecoder:
         if len(frames) != 1 or frames[0].is_corrupt:
             return None
         height, width = self._wanted
-        return self._to_rgb.reformat(
-            frames[0], width=width, height=height, format="rgb24", interpolation="AREA"
-        ).to_ndarray()
+        rgb = self._to_rgb.reformat(frames[0], width=width, height=height, format="rgb24", interpolation="AREA")
+        return rgb.to_ndarray()
 
 
 class CameraSource(LiveSource):
@@ -143,24 +136,32 @@ class CameraSource(LiveSource):
         from linuxpy.video.device import Device, VideoCapture  # noqa: PLC0415 (an extra)
 
         self.closed.clear()
+        options = self._options
         with ExitStack() as stack:
             try:
                 self._device = stack.enter_context(Device(self._path))
                 mode = self._choose(read_modes(self._device))
                 self._capture = VideoCapture(self._device, size=_BUFFERS)
                 if mode is not None:
-                    height, width = mode.size
-                    self._capture.set_format(width, height, mode.pixel_format)
-                if self._options.rate_hz is not None:
-                    self._capture.set_fps(self._options.rate_hz)
+                    self._capture.set_format(mode.size[1], mode.size[0], mode.pixel_format)
+                if options.rate_hz is not None:
+                    self._capture.set_fps(options.rate_hz)
                 chosen = self._capture.get_format()
-                self._decoder = self._make_decoder(chosen.pixel_format.human_str(), (chosen.height, chosen.width))
+                pixel_format, size = chosen.pixel_format.human_str(), (chosen.height, chosen.width)
+                if pixel_format not in _DECODERS:
+                    raise SourceError(
+                        f"{self.name} gives {pixel_format}, which is not read; choose one of {', '.join(_DECODERS)} "
+                        "with --pixel-format"
+                    )
+                fit = options.fit_size
+                fits = fit is not None and _is_alike(size, fit) and size[0] >= fit[0]
+                self.size = options.size or (fit if fit is not None and fits else size)
+                self._decoder = FrameDecoder(pixel_format, size=size, wanted=self.size)
                 self._row_bytes = chosen.bytes_per_line
-                rate_hz = float(self._capture.get_fps())
+                self.rate_hz = float(self._capture.get_fps())
                 stack.enter_context(self._capture)
             except (OSError, ZeroDivisionError) as error:
                 raise self._explained(error) from None
-            self.rate_hz = rate_hz
             self._stack = stack.pop_all()
         return self
 
@@ -191,18 +192,18 @@ class CameraSource(LiveSource):
                         "or plug it into a port of its own"
                     )
                 continue
-            last_s = now_s
-            image = None
+            last_s, image = now_s, None
             if BufferFlag.ERROR not in sent.flags:
                 image = self._decoder.decode(bytes(sent.data), row_bytes=self._row_bytes)
-            bad = 0 if image is not None else bad + 1
             if image is None:
+                bad += 1
                 if bad >= _MOST_BAD:
                     raise SourceError(
                         f"{self.name} sends frames that cannot be decoded; check its cable, choose another "
                         "--pixel-format, or a smaller --size"
                     )
                 continue
+            bad = 0
             monotonic = (sent.flags & BufferFlag.TIMESTAMP_MASK) == BufferFlag.TIMESTAMP_MONOTONIC
             yield LiveFrame(
                 image=image,
@@ -225,10 +226,9 @@ class CameraSource(LiveSource):
             return None if pixel_format is None or not usable else usable[0]
         rate_hz = self._options.rate_hz or 0.0
         for mode in sorted(usable, key=lambda mode: mode.size):
-            larger = all(have >= want for have, want in zip(mode.size, wanted, strict=True))
-            alike = mode.size[0] * wanted[1] == mode.size[1] * wanted[0]
-            fast = not mode.rates_hz or max(mode.rates_hz) >= rate_hz
-            if larger and alike and fast and mode.pixel_format == usable[0].pixel_format:
+            fast = max(mode.rates_hz, default=np.inf) >= rate_hz
+            fits = _is_alike(mode.size, wanted) and mode.size[0] >= wanted[0]
+            if fits and fast and mode.pixel_format == usable[0].pixel_format:
                 return mode
         if self._options.size is None:
             return None  # no size was set: the network refuses frames of another size
@@ -238,29 +238,14 @@ class CameraSource(LiveSource):
             f"choose a --size of the same shape as one of {sizes}, or a lower --rate"
         )
 
-    def _make_decoder(self, pixel_format: str, size: tuple[int, int]) -> FrameDecoder:
-        if pixel_format not in _DECODERS:
-            raise SourceError(
-                f"{self.name} gives {pixel_format}, which is not read; choose one of {', '.join(_DECODERS)} "
-                "with --pixel-format"
-            )
-        fit = self._options.fit_size
-        alike = fit is not None and size[0] * fit[1] == size[1] * fit[0] and size[0] >= fit[0]
-        self.size = self._options.size or (fit if fit is not None and alike else size)
-        return FrameDecoder(pixel_format, size=size, wanted=self.size)
-
     def _explained(self, error: Exception) -> SourceError:
-        number = getattr(error, "errno", None)
-        cures = {
-            errno.EBUSY: "is taken by another program; close that one",
-            errno.EACCES: "may not be opened; add yourself to the group video and log in again",
-            errno.ENOENT: "is not there; plug it in, and see `sliplens live --list`",
-            errno.ENODEV: "was unplugged; plug it in again",
-            errno.ENXIO: "was unplugged; plug it in again",
-            errno.ENOTTY: "is no camera; see `sliplens live --list`",
-            errno.EINVAL: "does not take these settings; see `sliplens live --list`",
-        }
-        return SourceError(f"{self.name} {cures.get(number or 0, f'cannot be read ({error}); plug it in again')}")
+        number = getattr(error, "errno", None) or 0
+        return SourceError(f"{self.name} {_CURES.get(number, f'cannot be read ({error}); plug it in again')}")
+
+
+def _is_alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return True where two sizes have the same shape."""
+    return size[0] * other[1] == size[1] * other[0]
 
 
 def read_modes(device: "Device") -> tuple[CameraMode, ...]:

@@ -26,7 +26,6 @@ class LiveOptions:
     """Height and width of the frames, in pixels; larger ones are scaled down. The source's own if None."""
     pixel_format: str | None = None
     """Format of a camera, four letters such as MJPG or YUYV; MJPG where the camera has it if None."""
-
     fit_size: tuple[int, int] | None = None
     """Height and width that a network was trained on, in pixels: used where the source can give it, else ignored."""
 
@@ -103,10 +102,7 @@ class Pace:
         self._closed, self._start_s = closed, time.monotonic()
 
     def wait(self, due_s: float) -> bool:
-        """Wait until so many seconds after the start; False if the source was closed.
-
-        A late frame moves the start: a slow source falls behind once, and does not hurry afterwards.
-        """
+        """Wait until so many seconds after the start; False if the source was closed. A late frame moves the start."""
         wait_s = self._start_s + due_s - time.monotonic()
         if wait_s > 0:
             return not self._closed.wait(wait_s)

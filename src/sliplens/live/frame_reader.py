@@ -168,9 +168,9 @@ class FrameReader:
         # a new one, not emptied: the reading thread may still teach the one before
         self.learner = SlipLearner(None if friction is None else as_friction(friction), same_object=same_object)
 
-    def begin(self, engine: Engine | None, reference: Frame | None) -> None:
-        """Prepare for frames of the open source, with an image of the untouched sensor if there is one."""
-        self.engine, self._size = engine, self.source.size
+    def begin(self, engine: Engine | None, reference: Frame | None, *, size: tuple[int, int] | None = None) -> None:
+        """Prepare for frames of the open source, of its size if None, with an image of the untouched sensor if any."""
+        self.engine, self._size = engine, size or self.source.size
         if self._follower is not None and self.source.rate_hz:
             require_frequent(np.arange(2) * self.source.speed / self.source.rate_hz, what=self.source.name)
         if reference is None:

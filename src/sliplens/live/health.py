@@ -144,35 +144,30 @@ class HealthMonitor:
         self._before: np.ndarray | None = None
         self._changed_s = 0.0
         self._numbers: deque[tuple[float, int]] = deque()
-        self._slow_checks: dict[str, tuple[float, Check]] = {}
+        self._last: dict[str, tuple[float, Check]] = {}
 
     def check(self, frame: LiveFrame, markers: TrackedFrame | None = None, /) -> tuple[Check, ...]:
         """Check a frame of the reference's size, and its markers where they are tracked.
 
         The first check that fails names the cause: faults of the camera come before what they change in the picture.
         """
-        view = self._compare(frame, markers)
+        view, checks = self._compare(frame, markers), []
         self._stillness.update(block_means(_green(frame.small), _BLOCK_PX), frame.forces)
-        every_frame: dict[str, Callable[[_FrameView], Measured]] = {
-            "repeated": self._repeated,
-            "halves": self._halves,
-            "frozen": self._frozen,
-            "late": _late,
-            "drops": self._drops,
-            "saturation": self._saturation,
-            "exposure": _exposure,
-        }
-        slow = {"focus": self._focus, "light": _light, "camera": self._camera_motion}
-        last: dict[str, Callable[[_FrameView], Measured]] = {"touch": _touch}
-        if self._stillness.force_change_n is None:
-            del every_frame["frozen"]
-        if markers is not None:  # markers show the camera's motion at once, the border takes as long as the other two
-            last = {"camera": slow.pop("camera"), "markers": _absent_markers, **last}
-        return (
-            *(self._judge(name, measure(view)) for name, measure in every_frame.items()),
-            *self._take_turns(slow, view),
-            *(self._judge(name, measure(view)) for name, measure in last.items()),
-        )
+        slow = _SLOW if markers is None else _SLOW[:2]  # markers show the camera's motion at once, the border slowly
+        due = self._due(slow, frame.time_s)
+        for name, measure in _MEASURES.items():
+            if name in slow and name not in due:
+                checks.append(self._last[name][1])
+            elif (measured := measure(self, view)) is not None:
+                checks.append(make_check(name, *measured, limit=self._limits.get(name)))
+                self._last[name] = frame.time_s, checks[-1]
+        return tuple(checks)
+
+    def _due(self, names: tuple[str, ...], time_s: float) -> list[str]:
+        """Name the slow checks that are too old, or the oldest of them."""
+        age_s = {name: time_s - self._last[name][0] if name in self._last else np.inf for name in names}
+        # at the same time it may be another frame, of a source without a clock
+        return [name for name in names if not 0 < age_s[name] < _OLDEST_S] or [max(names, key=lambda name: age_s[name])]
 
     def _compare(self, frame: LiveFrame, markers: TrackedFrame | None) -> _FrameView:
         soft = soften(frame.small)
@@ -181,19 +176,6 @@ class HealthMonitor:
         gain = float(np.median(ratio[both])) if both.any() else 0.0
         change = picture_change(soft * 2**-gain, self._soft)
         return _FrameView(frame=frame, markers=markers, change=change, gain=gain, ratio=ratio, comparable=both)
-
-    def _judge(self, name: str, measured: Measured) -> Check:
-        return judge(name, *measured, limit=self._limits.get(name))
-
-    def _take_turns(self, checks: Mapping[str, Callable[[_FrameView], Measured]], view: _FrameView) -> Iterable[Check]:
-        """Renew the oldest check, and all that would be too old."""
-        time_s, made = view.frame.time_s, self._slow_checks
-        age_s = {name: time_s - made[name][0] if name in made else np.inf for name in checks}
-        # at the same time it may be another frame, of a source without a clock
-        due = [name for name in checks if not 0 < age_s[name] < _OLDEST_S]
-        for name in due or [max(checks, key=lambda name: age_s[name])]:
-            made[name] = time_s, self._judge(name, checks[name](view))
-        return [made[name][1] for name in checks]
 
     def _repeated(self, view: _FrameView) -> Measured:
         frame = view.frame
@@ -206,8 +188,9 @@ class HealthMonitor:
         ratio = self._stillness.ratio
         return ratio, f"one half of the picture changes {ratio:.2g} times as much as the other"
 
-    def _frozen(self, _: _FrameView) -> Measured:
-        change_n = self._stillness.force_change_n or 0.0
+    def _frozen(self, _: _FrameView) -> Measured | None:
+        if (change_n := self._stillness.force_change_n) is None:
+            return None
         return change_n, f"the force changed by {change_n:.2g} N while the picture showed nothing but noise"
 
     def _drops(self, view: _FrameView) -> Measured:
@@ -238,7 +221,7 @@ class HealthMonitor:
         )
 
 
-def judge(name: str, value: float, sentence: str, *, cure: str | None = None, limit: float | None = None) -> Check:
+def make_check(name: str, value: float, sentence: str, *, cure: str | None = None, limit: float | None = None) -> Check:
     """Compare a value with its limit: that of `CHECKS`, if None. A check that fails states its cure."""
     kind = CHECKS[name]
     limit = kind.limit if limit is None else limit
@@ -247,17 +230,17 @@ def judge(name: str, value: float, sentence: str, *, cure: str | None = None, li
     return Check(name=name, value=value, limit=limit, ok=ok, sentence=sentence if ok else f"{sentence}; {cure}")
 
 
-def _late(view: _FrameView) -> Measured:
+def _late(_: HealthMonitor, view: _FrameView) -> Measured:
     captured_s = view.frame.captured_s
     value = max(0.0, time.monotonic() - captured_s) if captured_s > 0 else 0.0
     return value, f"the frame is {value:.2g} s old"
 
 
-def _exposure(view: _FrameView) -> Measured:
+def _exposure(_: HealthMonitor, view: _FrameView) -> Measured:
     return abs(view.gain), f"the picture is {2**view.gain:.2g} times as bright as the reference"
 
 
-def _light(view: _FrameView) -> Measured:
+def _light(_: HealthMonitor, view: _FrameView) -> Measured:
     """Measure how much brighter or darker than the rest one side of the border is, in powers of 2."""
     height, width = (side // _TILES for side in view.ratio.shape[:2])
     # pixels that cannot be compared sort behind all others
@@ -275,9 +258,10 @@ def _light(view: _FrameView) -> Measured:
     return worst, f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference"
 
 
-def _absent_markers(view: _FrameView) -> Measured:
+def _absent_markers(_: HealthMonitor, view: _FrameView) -> Measured | None:
     """Measure the share of the reference's markers that are not where they should be."""
-    assert view.markers is not None
+    if view.markers is None:
+        return None
     status = view.markers.status
     if (status == MarkerStatus.LOST).any():
         return 1.0, "the pattern of the markers has jumped, and none can be told from the next"
@@ -286,10 +270,28 @@ def _absent_markers(view: _FrameView) -> Measured:
     return value, f"{value:.0%} of the markers are not seen where they should be"
 
 
-def _touch(view: _FrameView) -> Measured:
+def _touch(_: HealthMonitor, view: _FrameView) -> Measured:
     if view.change < LEAST_TOUCH:
         return view.change, "nothing touches the sensor"
     return view.change, f"the picture differs by {view.change:.2g} grey levels from the untouched sensor"
+
+
+_MEASURES: dict[str, Callable[[HealthMonitor, _FrameView], Measured | None]] = {
+    "repeated": HealthMonitor._repeated,
+    "halves": HealthMonitor._halves,
+    "frozen": HealthMonitor._frozen,
+    "late": _late,
+    "drops": HealthMonitor._drops,
+    "saturation": HealthMonitor._saturation,
+    "exposure": _exposure,
+    "focus": HealthMonitor._focus,
+    "light": _light,
+    "camera": HealthMonitor._camera_motion,
+    "markers": _absent_markers,
+    "touch": _touch,
+}
+"""Functions that measure the checks of `CHECKS`, in the order of causes; None where there is nothing to measure."""
+_SLOW = "focus", "light", "camera"
 
 
 class _Stillness:
@@ -346,14 +348,14 @@ def check_novelty(estimate: Estimate) -> Check | None:
         return None
     share = float(estimate.known[0])
     sentence = f"{share:.0%} of the frames that the network was tested on are as strange as this picture"
-    return judge("novelty", -float(np.log10(max(share, 1e-30))), sentence)
+    return make_check("novelty", -float(np.log10(max(share, 1e-30))), sentence)
 
 
 def check_direction(network: Network, shear: Shear) -> Check:
     """Check the direction of the shear against the directions of the training, in standard deviations (`excess`)."""
     trained = network.manifest.pull_direction_deg or FULL_CIRCLE
     sentence = f"the skin is sheared towards {shear.direction_deg:.0f} degrees (90 is down the image)"
-    return judge("direction", shear.excess(trained), sentence, cure=network.doubt_shear(shear) or "")
+    return make_check("direction", shear.excess(trained), sentence, cure=network.doubt_shear(shear) or "")
 
 
 def severity(check: Check) -> float:

@@ -28,7 +28,7 @@ from sliplens.live.reading import LiveFrame, Reading
 from sliplens.live.recorder import ForceStream, Recorder, RecordingState
 from sliplens.live.sinks import Sender, SinkState
 from sliplens.live.slip import SlipDetector
-from sliplens.live.sources import Images, ProfiledSource, open_live
+from sliplens.live.sources import Images, open_live
 from sliplens.models.checkpoint import Network, open_run
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import number_of
@@ -46,32 +46,28 @@ _PATIENCE_S = 3.0
 _SWITCH_S = 5e-4
 
 
-class _SharedCores:
-    """Thread limits of the whole process, from when the first reader is entered until the last one is left.
+_cores_lock = Lock()
+_cores: list[ExitStack] = []
+"""An entry for each reader that is entered; the first, which leaves last, undoes the thread limits."""
+
+
+@contextmanager
+def _share_cores() -> Iterator[None]:
+    """Limit the threads of the whole process from when the first reader is entered until the last one is left.
 
     A frame is checked in one thread while the network runs in another, and the page draws beside them. Threads that
-    share one step of that wait for each other, and some spin meanwhile: on cores that are all in use a matrix of
-    markers takes ten times as long by two threads as by one.
+    share one step of that wait for each other: a matrix of markers takes ten times as long by two as by one.
     """
-
-    def __init__(self) -> None:
-        self._lock, self._readers, self._restore = Lock(), 0, ExitStack()
-
-    @contextmanager
-    def __call__(self) -> Iterator[None]:
-        with self._lock:
-            if not self._readers:
-                with ExitStack() as stack:
-                    _limit_threads(stack.callback)
-                    self._restore = stack.pop_all()
-            self._readers += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._readers -= 1
-                if not self._readers:
-                    self._restore.close()
+    with _cores_lock:
+        stack = ExitStack()
+        if not _cores:
+            _limit_threads(stack.callback)
+        _cores.append(stack)
+    try:
+        yield
+    finally:
+        with _cores_lock:
+            _cores.pop().close()
 
 
 def _limit_threads(restore: Callable[..., object]) -> None:
@@ -92,7 +88,6 @@ def _limit_threads(restore: Callable[..., object]) -> None:
         cv2.setNumThreads(1)
 
 
-_share_cores = _SharedCores()
 LiveInput: TypeAlias = "str | Path | Images | Capture | LiveSource"
 
 
@@ -193,9 +188,6 @@ class LiveReader:
             options = replace(options, fit_size=self.network.manifest.frame_size)
         self.source = open_live(source, options=options)
         untouched = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
-        if profile is not None:
-            self.source = ProfiledSource(self.source, profile)
-            untouched = None if untouched is None else profile.apply(untouched)
         self.recorder: Recorder | None = None
         """Recorder, while it records."""
         self.senders: list[Sender] = []
@@ -296,10 +288,14 @@ class LiveReader:
             if self._forces is not None:
                 stack.enter_context(self._forces)
             engine = None
+            profile, size = self._profile, self.source.size
+            untouched = self.source.reference if self._untouched is None else self._untouched
+            if profile is not None:
+                size, untouched = profile.output_size(size), None if untouched is None else profile.apply(untouched)
             if self.network is not None:
-                self.network.require_frame_size(self.source.size, what=f"the frames of {self.source.name}")
+                self.network.require_frame_size(size, what=f"the frames of {self.source.name}")
                 engine = self._make_engine(self.network)
-            self._reader.begin(engine, self.source.reference if self._untouched is None else self._untouched)
+            self._reader.begin(engine, untouched, size=size)
             self._stack = stack.pop_all()
         jobs = (self._capture, self._frames.close), (self._infer, self._finish)
         self._threads = [Thread(target=self._run, args=job, daemon=True) for job in jobs]
@@ -487,6 +483,10 @@ class LiveReader:
                 return
 
     def _take(self, frame: LiveFrame) -> None:
+        if self._profile is not None and frame.size == self.source.size:  # one of another size is withheld
+            begun_s = time.perf_counter()
+            image = self._profile.apply(frame.image)
+            frame = replace(frame, image=image, decode_ms=frame.decode_ms + 1e3 * (time.perf_counter() - begun_s))
         if self._forces is not None:
             frame = self._forces.attach(frame)
         # other threads may end the recording, or take a new reference, at any time

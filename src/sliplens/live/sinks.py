@@ -11,8 +11,9 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -27,25 +28,13 @@ from sliplens.progress import number_of
 from sliplens.recordings.capture import Frame
 
 
-@runtime_checkable
-class Sink(Protocol):
+class Sink(NamedTuple):
     """Takes readings, one after another."""
 
-    def send(self, reading: Reading, image: Frame | None, /) -> None:
-        """Send a reading, and its frame where there is one."""
-        ...
-
-    def close(self) -> None:
-        """Send what waits, and end."""
-        ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class OpenSink:
-    """Sink of two functions."""
-
-    send: Callable[[Reading, Frame | None], None]
-    close: Callable[[], None]
+    send: Callable[[Reading, Frame | None], object]
+    """Sends a reading, and its frame where there is one."""
+    close: Callable[[], object] = lambda: None
+    """Sends what waits, and ends."""
 
 
 def encode_reading(reading: Reading) -> bytes:
@@ -53,7 +42,7 @@ def encode_reading(reading: Reading) -> bytes:
     return msgspec.json.encode({**to_builtins(reading), "words": to_builtins(describe_reading(reading))})
 
 
-def reading_schema() -> dict[str, Any]:
+def reading_schema() -> dict[str, object]:
     """Return the JSON schema of an encoded reading, an object at its root as Foxglove wants it."""
     (_, words), parts = msgspec.json.schema_components([Reading, ReadingWords], ref_template="#/$defs/{name}")
     schema = parts.pop("Reading")
@@ -78,7 +67,7 @@ def _open_json(address: str) -> Sink:
         sys.stdout.buffer.write(encode_reading(reading) + b"\n")
         sys.stdout.buffer.flush()
 
-    return OpenSink(send=send, close=lambda: None)
+    return Sink(send)
 
 
 _TRANSIENT = (
@@ -115,7 +104,7 @@ def _open_udp(address: str) -> Sink:
             if error.errno not in _TRANSIENT:
                 raise
 
-    return OpenSink(send=send, close=outgoing.close)
+    return Sink(send, outgoing.close)
 
 
 READING_TOPIC, IMAGE_TOPIC = "/sliplens/reading", "/sliplens/image"
@@ -125,25 +114,11 @@ _QUALITY = 90
 _FRAME_ID = "fingertip"
 
 
-def _open_foxglove(address: str) -> Sink:
-    host, port = _parse_address(address, kind="foxglove", port=8765)
-
-    def serve(foxglove: Any, context: object) -> Callable[[], None]:
-        options = {"name": "sliplens", "context": context, "message_backlog_size": _BACKLOG}
-        return foxglove.start_server(host=host, port=port, **options).stop
-
-    return _foxglove_topics(serve, kind="foxglove", where=f"{host}:{port}")
-
-
-def _open_mcap(address: str) -> Sink:
-    path = _new_file(address, kind="mcap")
-    return _foxglove_topics(
-        lambda foxglove, context: foxglove.open_mcap(str(path), context=context).close, kind="mcap", where=str(path)
-    )
-
-
-def _foxglove_topics(open_in: Callable[[Any, object], Callable[[], None]], *, kind: str, where: str) -> Sink:
+def _open_foxglove(address: str, *, file: bool = False) -> Sink:
     """Send readings and frames on two topics of Foxglove, of a server or in an MCAP file."""
+    kind = "mcap" if file else "foxglove"
+    path = _new_file(address, kind=kind) if file else None
+    host, port = ("", 0) if file else _parse_address(address, kind=kind, port=8765)
     require_packages("foxglove", extra="sinks", purpose=f"--sink {kind}")
     import foxglove  # noqa: PLC0415 (an extra)
     from foxglove.channels import CompressedImageChannel  # noqa: PLC0415
@@ -153,9 +128,14 @@ def _foxglove_topics(open_in: Callable[[Any, object], Callable[[], None]], *, ki
     readings = foxglove.Channel(READING_TOPIC, schema=reading_schema(), context=context)
     frames = CompressedImageChannel(IMAGE_TOPIC, context=context)
     try:
-        close = open_in(foxglove, context)
+        if path is not None:
+            close = foxglove.open_mcap(str(path), context=context).close
+        else:
+            close = foxglove.start_server(
+                name="sliplens", host=host, port=port, context=context, message_backlog_size=_BACKLOG
+            ).stop
     except (OSError, RuntimeError) as error:
-        raise InputError(f"{where} cannot be opened ({error}); name another with --sink") from None
+        raise InputError(f"{path or f'{host}:{port}'} cannot be opened ({error}); name another with --sink") from None
 
     def send(reading: Reading, image: Frame | None) -> None:
         at_ns = _stamp_ns(reading)
@@ -166,7 +146,7 @@ def _foxglove_topics(open_in: Callable[[Any, object], Callable[[], None]], *, ki
             frames.log(CompressedImage(timestamp=stamp, frame_id=_FRAME_ID, data=data, format="jpeg"), log_time=at_ns)
 
     # a context that is collected closes its channels
-    return OpenSink(send=send, close=lambda _=context: close())
+    return Sink(send, lambda _=context: close())
 
 
 def _new_file(address: str, *, kind: str) -> Path:
@@ -243,40 +223,31 @@ class RerunSink:
 
 def _open_rerun(address: str) -> Sink:
     path = _new_file(address, kind="rerun")
-    return RerunSink(lambda stream: stream.save(str(path)))
+    sink = RerunSink(lambda stream: stream.save(str(path)))
+    return Sink(sink.send, sink.close)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RosTopic:
+class RosTopic(NamedTuple):
     """Topic of ROS 2, and how its messages are made."""
 
     name: str
     """Below the key of the sink."""
     kind: str
     """Type of its messages."""
-    fields: Callable[[Reading, Frame | None, Any], Mapping[str, Any] | None]
+    fields: Callable[[Reading, Frame | None, object], Mapping[str, object] | None]
     """Fields of the message of a reading, its frame and a header; None to send nothing."""
 
 
-def _image_fields(_: Reading, image: Frame | None, header: Any) -> Mapping[str, Any] | None:
+def _image_fields(_: Reading, image: Frame | None, header: object) -> Mapping[str, object] | None:
     if image is None:
         return None
-    data = np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8)
-    return {"header": header, "format": "jpeg", "data": data}
+    return {"header": header, "format": "jpeg", "data": np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8)}
 
 
 ROS_TOPICS = (
-    RosTopic(
-        name="margin",
-        kind="std_msgs/msg/Float32",
-        fields=lambda reading, *_: None if reading.margin is None else {"data": reading.margin},
-    ),
-    RosTopic(
-        name="reading",
-        kind="std_msgs/msg/String",
-        fields=lambda reading, *_: {"data": encode_reading(reading).decode()},
-    ),
-    RosTopic(name="image/compressed", kind="sensor_msgs/msg/CompressedImage", fields=_image_fields),
+    RosTopic("margin", "std_msgs/msg/Float32", lambda read, *_: None if read.margin is None else {"data": read.margin}),
+    RosTopic("reading", "std_msgs/msg/String", lambda read, *_: {"data": encode_reading(read).decode()}),
+    RosTopic("image/compressed", "sensor_msgs/msg/CompressedImage", _image_fields),
 )
 """Topics of ROS 2 that the sink `zenoh` sends; a margin that is withheld is not sent at all."""
 ZENOH_ADDRESS = "tcp/127.0.0.1:7447"
@@ -337,12 +308,12 @@ class ZenohRos:
         if kind not in self._types.types:
             self._types.register(get_types_from_msg(definition, kind))
 
-    def header(self, at_ns: int) -> Any:
+    def header(self, at_ns: int) -> object:
         """Make the header of a message, at nanoseconds since 1970."""
         stamp = self._types.types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
         return self._types.types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME_ID)
 
-    def publisher(self, topic: str, kind: str) -> Callable[[Mapping[str, Any], int], None]:
+    def publisher(self, topic: str, kind: str) -> Callable[[Mapping[str, object], int], None]:
         """Declare a topic; returns a function that sends a message of some fields, at nanoseconds since 1970.
 
         It raises `OSError` where the connection is closed.
@@ -350,7 +321,7 @@ class ZenohRos:
         publishers = [self._session.declare_publisher(name) for name in self._names(topic, kind)]
         ext, sender_id, count = self._ext, secrets.token_bytes(16), itertools.count(1)
 
-        def send(fields: Mapping[str, Any], at_ns: int) -> None:
+        def send(fields: Mapping[str, object], at_ns: int) -> None:
             message = bytes(self._types.serialize_cdr(self._types.types[kind](**fields), kind))
             attachment = ext.z_serialize((ext.Int64(next(count)), ext.Int64(at_ns), sender_id))
             by_name, by_type = publishers
@@ -405,7 +376,7 @@ def _open_zenoh(address: str) -> Sink:
             if fields is not None:
                 publish(fields, at_ns)
 
-    return OpenSink(send=send, close=ros.close)
+    return Sink(send, ros.close)
 
 
 SINKS = Table[Callable[[str], Sink]](
@@ -414,7 +385,7 @@ SINKS = Table[Callable[[str], Sink]](
     {
         "json": _open_json,
         "udp": _open_udp,
-        "mcap": _open_mcap,
+        "mcap": partial(_open_foxglove, file=True),
         "foxglove": _open_foxglove,
         "rerun": _open_rerun,
         "zenoh": _open_zenoh,
@@ -500,6 +471,6 @@ class Sender:
 
 
 __all__ = [
-    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "OpenSink", "RerunSink", "RosTopic", "Sender", "Sink",
+    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "RerunSink", "RosTopic", "Sender", "Sink",
     "SinkState", "ZenohRos", "encode_reading", "open_sink", "parse_zenoh", "reading_schema",
 ]  # fmt: skip

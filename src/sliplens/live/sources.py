@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from threading import Lock
 from typing import TypeAlias
 
 import av
@@ -15,20 +14,19 @@ from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, SourceError
-from sliplens.extras import Table
+from sliplens.extras import Table, pick
 from sliplens.files import require_folder
 from sliplens.images import is_image, list_images, natural_key
 from sliplens.live.camera import CameraSource
 from sliplens.live.contract import LiveOptions, LiveSource, Pace, SourceKind
-from sliplens.live.reading import LiveFrame, Reading
+from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.video import display_turn
 from sliplens.recordings.options import ReadOptions
-from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
-from sliplens.simulation.filming import Film, prepare_film
+from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp, Nuisances, draw_unit
 from sliplens.simulation.sensor import SENSORS
@@ -54,60 +52,50 @@ class ReplaySource(LiveSource):
     ) -> None:
         self._capture, self._repeat = capture, repeat
         self.name, self.simulated = f"{capture.name} of {capture.opened}", capture.simulated
-        self.size = capture.frame_size
-        self.count = None if repeat else len(capture)
+        self.size, self.count = capture.frame_size, None if repeat else len(capture)
+        self._step_s = 1 / (rate_hz or capture.frame_rate_hz)
         recorded_s = capture.time_s if rate_hz is None else None
-        step_s = 1 / (rate_hz or capture.frame_rate_hz)
-        self._time_s = np.arange(len(capture)) * step_s if recorded_s is None else recorded_s - recorded_s[0]
-        self._length_s = float(self._time_s[-1]) + step_s
-        self.speed = speed
-        self.rate_hz = speed / step_s
-        read_reference = capture.read_reference
-        self.reference = None if read_reference is None else read_reference()
+        self._time_s = np.arange(len(capture)) * self._step_s if recorded_s is None else recorded_s - recorded_s[0]
+        self.speed, self.rate_hz = speed, speed / self._step_s
+        self.reference = None if capture.read_reference is None else capture.read_reference()
 
     def frames(self) -> Iterator[LiveFrame]:
         """Iterate over frames at their times, of the first pass and of those after it."""
-        pace, number, begun_s = Pace(self.closed), 0, 0.0
-        capture = self._capture
+        pace, number, begun_s, capture = Pace(self.closed), 0, 0.0, self._capture
         first_s = 0.0 if capture.time_s is None else float(capture.time_s[0])
+        margins = np.full(len(capture), np.nan) if capture.safety_margin is None else capture.safety_margin
         while True:
-            images = capture.read_frames()
-            forces_s = -np.inf
-            for at, offset_s in enumerate(self._time_s.tolist()):
+            images, forces_s = capture.read_frames(), -np.inf
+            for offset_s, margin in zip(self._time_s.tolist(), margins.tolist(), strict=True):
                 before = time.perf_counter()
                 image = next(images, None)
                 if image is None:  # a video whose header promised more
                     break
                 decode_ms = 1e3 * (time.perf_counter() - before)
-                time_s = begun_s + offset_s
-                if not pace.wait(time_s / self.speed):
+                if not pace.wait((begun_s + offset_s) / self.speed):
                     return
-                margins = capture.safety_margin
-                label = None if margins is None or np.isnan(margins[at]) else float(margins[at])
                 yield LiveFrame(
                     image=image,
                     number=number,
-                    time_s=time_s,
+                    time_s=begun_s + offset_s,
                     captured_s=time.monotonic(),
                     decode_ms=decode_ms,
-                    forces=self._forces_until(forces_s, offset_s + first_s, shift_s=begun_s - first_s),
-                    safety_margin=label,
+                    forces=self._forces_between(forces_s, offset_s + first_s, shift_s=begun_s - first_s),
+                    safety_margin=None if np.isnan(margin) else margin,
                 )
                 number, forces_s = number + 1, offset_s + first_s
             if not self._repeat:
                 return
-            begun_s += self._length_s
+            begun_s += float(self._time_s[-1]) + self._step_s
 
-    def _forces_until(self, after_s: float, until_s: float, *, shift_s: float) -> Forces | None:
+    def _forces_between(self, after_s: float, until_s: float, *, shift_s: float) -> Forces | None:
+        """Return the samples of the force sensor between two times, shifted."""
         forces = self._capture.forces
         if forces is None:
             return None
         first, last = np.searchsorted(forces.time_s, (after_s, until_s), side="right")
-        if first == last:
-            return None
-        return Forces(
-            time_s=forces.time_s[first:last] + shift_s, force_n=forces.force_n[first:last], source=forces.source
-        )
+        time_s, force_n = forces.time_s[first:last] + shift_s, forces.force_n[first:last]
+        return Forces(time_s=time_s, force_n=force_n, source=forces.source) if first < last else None
 
 
 _POLL_S = 0.02
@@ -131,52 +119,41 @@ class FolderSource(LiveSource):
         if not any(map(is_image, require_folder(self._folder, what="the folder").iterdir())):
             raise InputError(f"{self.name} holds no image yet; begin when the first has been saved there")
         *before, newest = list_images(self._folder)
-        self.size = frame_size(newest)
-        self._taken = {path.name for path in before}
+        self.size, self._taken = frame_size(newest), {path.name for path in before}
         return self
 
     def frames(self) -> Iterator[LiveFrame]:
         """Iterate over images in the natural order of their names; a damaged one is missing in the numbers."""
-        listed, number, last_s, broken_s = -1, 0, -np.inf, np.inf
+        number, last_s, broken_s = 0, -np.inf, np.inf
         while not self.closed.is_set():
             try:
-                changed = self._folder.stat().st_mtime_ns
-                new = self._new_images() if changed != listed else []
+                new = [path for path in self._folder.iterdir() if path.name not in self._taken and is_image(path)]
             except OSError as error:
                 raise SourceError(
                     f"{self.name} cannot be read ({error.strerror}); make it again, and begin anew"
                 ) from None
-            listed = changed
-            for path in new:
+            for path in sorted(new, key=lambda path: natural_key(path.name)):
                 before = time.monotonic()
                 try:
                     written_s, image = path.stat().st_mtime, read_frame(path, size=frame_size(path))
                 except (ImageError, OSError):
                     broken_s = min(broken_s, before)
                     if path.exists() and before - broken_s < _WRITTEN_S:
-                        listed = -1  # it may be half written; the next ones wait too, so that they come in order
-                        break
+                        break  # it may be half written; the next ones wait too, so that they come in order
                     written_s, image = 0.0, None
                 broken_s = np.inf
                 self._taken.add(path.name)
                 number += 1
-                if image is None:
-                    continue
-                last_s = max(written_s, last_s + 1e-6)
-                now_s = time.monotonic()
-                yield LiveFrame(
-                    image=image,
-                    number=number - 1,
-                    time_s=last_s,
-                    captured_s=now_s - max(0.0, time.time() - written_s),
-                    decode_ms=1e3 * (now_s - before),
-                )
+                if image is not None:
+                    last_s, now_s = max(written_s, last_s + 1e-6), time.monotonic()
+                    yield LiveFrame(
+                        image=image,
+                        number=number - 1,
+                        time_s=last_s,
+                        captured_s=now_s - max(0.0, time.time() - written_s),
+                        decode_ms=1e3 * (now_s - before),
+                    )
             self.closed.wait(_POLL_S)
-
-    def _new_images(self) -> list[Path]:
-        """List the images that are new, in the natural order of their names."""
-        paths = (path for path in self._folder.iterdir() if path.name not in self._taken)
-        return sorted(filter(is_image, paths), key=lambda path: natural_key(path.name))
 
 
 _NETWORK = ("rtsp", "rtp", "udp", "tcp", "http", "https", "rtmp", "srt")
@@ -189,49 +166,6 @@ _QUICK = {
     "flags": "low_delay",
     "analyzeduration": "500000",
 }
-
-
-class ProfiledSource(LiveSource):
-    """Source whose frames, and whose image of the untouched sensor, go through a sensor's profile.
-
-    Parameters
-    ----------
-    source
-        Source of the camera's frames.
-    profile
-        Profile of the sensor.
-    """
-
-    def __init__(self, source: LiveSource, profile: SensorProfile) -> None:
-        self._source, self._profile, self.name = source, profile, source.name
-        self.cure, self.reconnects, self.simulated = source.cure, source.reconnects, source.simulated
-
-    def __enter__(self) -> "ProfiledSource":
-        source = self._source.__enter__()
-        self.size = self._profile.output_size(source.size)
-        self.rate_hz, self.count, self.speed = source.rate_hz, source.count, source.speed
-        self.reference = None if source.reference is None else self._profile.apply(source.reference)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._source.__exit__(*error)
-
-    def update_reading(self, reading: Reading) -> None:
-        """Hand on a reading."""
-        self._source.update_reading(reading)
-
-    def close(self) -> None:
-        """Stop giving frames, soon."""
-        self._source.close()
-
-    def frames(self) -> Iterator[LiveFrame]:
-        """Iterate over frames as the profile makes them; a frame of an unexpected size stays as it is."""
-        for frame in self._source.frames():
-            begun_s = time.perf_counter()
-            fits = frame.size == self._source.size
-            image = self._profile.apply(frame.image) if fits else frame.image
-            spent_ms = 1e3 * (time.perf_counter() - begun_s)
-            yield replace(frame, image=image, decode_ms=frame.decode_ms + spent_ms)
 
 
 class StreamSource(LiveSource):
@@ -272,11 +206,10 @@ class StreamSource(LiveSource):
             try:
                 packet = next(packets)
                 arrived_s = time.monotonic()
-                try:
-                    frames = packet.decode()
-                except InvalidDataError:
-                    number += 1
-                    continue
+                frames = packet.decode()
+            except InvalidDataError:
+                number += 1
+                continue
             except (FFmpegError, OSError) as error:
                 if self.closed.is_set():
                     return
@@ -301,11 +234,11 @@ class StreamSource(LiveSource):
         return SourceError(f"{self.name} cannot be read ({reason}); check its address and that the camera runs")
 
 
-_GRIP_S = 10.0
-"""Length of the grip that the simulated fingertip repeats until `load` is called."""
-_GRIP_TIMES_S = (0.0, 1.0, 2.0, 2.5, 7.5, 8.5, 9.0, _GRIP_S)
+_GRIP_N = 1.5
+_GRIP_TIMES_S = (0.0, 1.0, 2.0, 2.5, 7.5, 8.5, 9.0, 10.0)
 _GRIP_PRESS = (0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
 _GRIP_PULL = (0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
+"""Grip that the simulated fingertip repeats until `load` is called."""
 
 
 class SimulatedSource(LiveSource):
@@ -339,15 +272,12 @@ class SimulatedSource(LiveSource):
     def __init__(
         self, sensor: str = "chromatouch", *, friction: float = 0.775, rate_hz: float = 30.0, seed: int = 0
     ) -> None:
-        if sensor not in SENSORS:
-            raise InputError(f"there is no simulated sensor named {sensor!r}; choose one of {', '.join(SENSORS)}")
-        self.name, self.rate_hz = f"a simulated {sensor}", rate_hz
-        self._rng = np.random.default_rng(seed)
-        self._grasp, self._lock = Grasp(friction=friction), Lock()
-        self._forces_n: tuple[float, float] | None = None
-        chosen = SENSORS[sensor]
+        chosen = pick(SENSORS, sensor, noun="simulated sensor")
+        self.name, self.rate_hz, self._step_s = f"a simulated {sensor}", rate_hz, 1 / rate_hz
         self.size = chosen.image_size_px, chosen.image_size_px
-        self._film: Film = prepare_film(
+        self._rng, self._grasp = np.random.default_rng(seed), Grasp(friction=friction)
+        self._forces_n: tuple[float, float] | None = None
+        self._film = prepare_film(
             chosen,
             loading=load_at_margins(np.array([np.nan]), grasp=self._grasp),
             grasp=self._grasp,
@@ -368,48 +298,42 @@ class SimulatedSource(LiveSource):
                 f"a fingertip cannot be pressed by {normal_force_n:g} N and pulled by {tangential_force_n:g} N; "
                 "give forces of 0 or more"
             )
-        with self._lock:
-            self._forces_n = normal_force_n, tangential_force_n
+        self._forces_n = normal_force_n, tangential_force_n
 
     def let_go(self) -> None:
         """Repeat the grip again."""
-        with self._lock:
-            self._forces_n = None
+        self._forces_n = None
 
     def frames(self) -> Iterator[LiveFrame]:
         """Iterate over frames, each of the load at its time."""
-        pace, number = Pace(self.closed), 0
-        rate_hz = self.rate_hz or 30.0
-        while pace.wait(number / rate_hz):
-            captured_s, time_s = time.monotonic(), number / rate_hz
-            normal_n, pull_n = self._forces_at(time_s)
-            friction, touches = self._grasp.friction, normal_n > 0
+        pace, number, friction = Pace(self.closed), 0, self._grasp.friction
+        while pace.wait(time_s := number * self._step_s):
+            captured_s = time.monotonic()
+            normal_n, pull_n = self.forces_n(time_s)
             tangential_n = min(pull_n, friction * normal_n)
-            margin = 1 - tangential_n / (friction * normal_n) if touches else np.nan
-            grasp = replace(self._grasp, normal_force_n=normal_n)
-            film = self._film.under(load_at_margins(np.array([margin]), grasp=grasp), rng=self._rng)
+            margin = 1 - tangential_n / (friction * normal_n) if normal_n > 0 else np.nan
+            loading = load_at_margins(np.array([margin]), grasp=replace(self._grasp, normal_force_n=normal_n))
+            image = self._film.under(loading, rng=self._rng).draw(slice(0, 1)).numpy()[0]
+            force_n = np.array([[tangential_n, 0.0, normal_n]])
             yield LiveFrame(
-                image=film.draw(slice(0, 1)).numpy()[0],
+                image=image,
                 number=number,
                 time_s=time_s,
                 captured_s=captured_s,
                 decode_ms=1e3 * (time.monotonic() - captured_s),
-                forces=Forces(
-                    time_s=np.array([time_s]),
-                    force_n=np.array([[tangential_n, 0.0, normal_n]]),
-                    source="the simulated fingertip",
-                ),
-                safety_margin=float(margin) if touches else None,
+                forces=Forces(time_s=np.array([time_s]), force_n=force_n, source="the simulated fingertip"),
+                safety_margin=float(margin) if normal_n > 0 else None,
             )
             number += 1
 
-    def _forces_at(self, time_s: float) -> tuple[float, float]:
-        with self._lock:
-            forces_n = self._forces_n
-        if forces_n is not None:
+    def forces_n(self, time_s: float) -> tuple[float, float]:
+        """Return the force that presses and the one that pulls at a time, before friction limits the latter."""
+        if (forces_n := self._forces_n) is not None:
             return forces_n
-        normal_n = 1.5 * float(np.interp(time_s % _GRIP_S, _GRIP_TIMES_S, _GRIP_PRESS))
-        return normal_n, float(np.interp(time_s % _GRIP_S, _GRIP_TIMES_S, _GRIP_PULL)) * self._grasp.friction * 1.5
+        press, pull = (
+            float(np.interp(time_s % _GRIP_TIMES_S[-1], _GRIP_TIMES_S, course)) for course in (_GRIP_PRESS, _GRIP_PULL)
+        )
+        return _GRIP_N * press, pull * self._grasp.friction * _GRIP_N
 
 
 def _open_simulated(name: str, options: LiveOptions) -> LiveSource:
@@ -417,11 +341,8 @@ def _open_simulated(name: str, options: LiveOptions) -> LiveSource:
     return SimulatedSource(name.partition(":")[2] or "chromatouch", rate_hz=options.rate_hz or 30.0)
 
 
-def _camera_path(name: str) -> Path | None:
-    """Return the device file of a camera's number or path; None for other names."""
-    if name.isdecimal():
-        return Path(f"/dev/video{int(name)}")
-    return Path(name) if name.startswith("/dev/") else None
+def _open_camera(name: str, options: LiveOptions) -> LiveSource:
+    return CameraSource(Path(f"/dev/video{int(name)}" if name.isdecimal() else name), options)
 
 
 def _open_stream(name: str, options: LiveOptions) -> LiveSource:
@@ -448,8 +369,8 @@ _ROWS = {
     ),
     "camera": SourceKind(
         words="camera by its number or device file (0, or /dev/video0)",
-        recognises=lambda name: _camera_path(name) is not None,
-        open=lambda name, options: CameraSource(_camera_path(name) or Path(name), options),
+        recognises=lambda name: name.isdecimal() or name.startswith("/dev/"),
+        open=_open_camera,
     ),
     "stream": SourceKind(
         words="network stream by its address (rtsp://, http://, udp://)",
@@ -514,4 +435,4 @@ def open_live(
     raise InputError(f"{name} is no source that is known, nor a path that exists; name a {kinds}")
 
 
-__all__ = ["SOURCES", "FolderSource", "ProfiledSource", "ReplaySource", "SimulatedSource", "StreamSource", "open_live"]
+__all__ = ["SOURCES", "FolderSource", "ReplaySource", "SimulatedSource", "StreamSource", "open_live"]
