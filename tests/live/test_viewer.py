@@ -191,7 +191,7 @@ def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
     np.testing.assert_allclose((high + low) / 2, margin, rtol=1e-12)
     np.testing.assert_allclose((high - low) / 2, sigma, rtol=1e-9)
     np.testing.assert_array_equal(numbers(found, "ratio/friction"), trial.friction_coefficient)
-    assert not {"frame/zones", "sensor/force"} & set(found)
+    assert "frame/zones" not in found
     label = rows(found, "state/label", "StateChange:state")
     last = np.searchsorted(there(label.frame), np.arange(FRAMES), side="right") - 1
     np.testing.assert_array_equal([label.values[at] == ["valid"] for at in last], valid & np.isfinite(margin))
@@ -291,11 +291,7 @@ def explained_of(trial: Recording, frames: list[int]) -> Explanation:
     )
 
 
-@pytest.mark.parametrize("applied", [True, False])
-def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
-    trial: Recording, tmp_path: Path, *, applied: bool
-):
-    """As import keeps them, and late by the camera's lag where the labels were shifted by it."""
+def test_an_imported_trial_says_what_its_labels_rest_on(tmp_path: Path):
     long = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=120))
     rng = np.random.default_rng(1)
     time = np.arange(0, long.time_s[-1] + 0.1, 1 / 500)
@@ -315,7 +311,7 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
     import_trial(
         capture,
         path,
-        settings=LabelSettings(apply_lag=applied),
+        settings=LabelSettings(),
         rng=rng,
         forces_file=forces_path(tmp_path, "cup_1"),
     )
@@ -325,13 +321,6 @@ def test_samples_of_the_force_sensor_stand_on_the_clock_of_the_camera(
     labelling, found = read_header(path).labelling, read_rrd(tmp_path / "a.rrd")
     assert labelling is not None
     assert labelling.basis is not None
-    late = rows(found, "sensor/force", "Scalars:scalars")
-    assert late.frame is None
-    shift = there(labelling.basis.lag).lag_s if applied else 0.0
-    np.testing.assert_allclose(there(late.time_ns) / 1e9, time + shift, rtol=0, atol=0.6e-9)
-    np.testing.assert_array_equal(np.array(late.values), force)
-    if applied:  # half a frame at 15 a second
-        assert shift == pytest.approx(LAG_S, abs=1 / 30)
     np.testing.assert_array_equal(numbers(found, "ratio/friction"), labelling.basis.friction.mu)
     (text,) = rows(found, "about", "TextDocument:text").values[0]
     # as it was typed, not as Markdown reads it

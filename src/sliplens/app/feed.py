@@ -10,6 +10,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from threading import Event, Lock, Thread
+from typing import TypeAlias
 
 import msgspec
 import numpy as np
@@ -65,12 +66,8 @@ class Point:
     """Least grip force that holds, of the same."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Arrow:
-    """Displacement of a marker from where it rests, x and y in pixels of the frame."""
-
-    start_px: tuple[float, float]
-    end_px: tuple[float, float]
+Arrow: TypeAlias = tuple[float, float, float, float]
+"""Displacement of a marker: x and y at rest, then now, in pixels of the frame."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,14 +82,8 @@ class PageFrame:
     arrows: tuple[Arrow, ...]
 
 
-@dataclass(frozen=True, kw_only=True)
-class MarkerRelevance:
-    """Relevance around a marker."""
-
-    place_px: tuple[float, float]
-    """x and y in pixels of the frame."""
-    relevance: float
-    """Sum over the pixels that are nearest to it, in margin units."""
+MarkerRelevance: TypeAlias = tuple[float, float, float]
+"""x and y of a marker in pixels of the frame, and the relevance of the pixels nearest to it, in margin units."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,7 +320,7 @@ class Feed:
             frame=frame,
             reference=self.reader.reference,
             jpeg=encode_jpeg(np.asarray(thumbnail), _QUALITY),
-            arrows=tuple(Arrow(start_px=(x, y), end_px=(to_x, to_y)) for x, y, to_x, to_y in ways if np.isfinite(to_x)),
+            arrows=tuple((x, y, to_x, to_y) for x, y, to_x, to_y in ways if np.isfinite(to_x)),
         )
 
     def _make_maps(self) -> None:
@@ -383,15 +374,12 @@ def _sum_by_marker(values: np.ndarray, picture: PageFrame) -> tuple[MarkerReleva
     """Sum the relevance around each marker."""
     if len(picture.arrows) < 2:
         return ()
-    places = np.array([arrow.end_px for arrow in picture.arrows])
+    places = np.array(picture.arrows)[:, 2:]
     relevance = torch.from_numpy(values).double()
     centres = to_network_px(places, picture.frame.size, image_size=len(relevance))
     regions = marker_regions((relevance.shape[0], relevance.shape[1]), centres)
     sums = torch.bincount(regions.flatten(), weights=relevance.flatten(), minlength=len(places) + 1)
-    return tuple(
-        MarkerRelevance(place_px=(x, y), relevance=value)
-        for (x, y), value in zip(places.tolist(), sums[: len(places)].tolist(), strict=True)
-    )
+    return tuple((*place, value) for place, value in zip(places.tolist(), sums[: len(places)].tolist(), strict=True))
 
 
 class Client:

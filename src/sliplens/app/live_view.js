@@ -201,8 +201,8 @@ export default {
       this.drawArrows(context, arrows, devicePixelRatio / scale);
     },
     drawMarkers(context, px) {
-      const most = Math.max(1e-6, ...this.mapFacts.markers.map(({ relevance }) => Math.abs(relevance)));
-      for (const { place_px: [x, y], relevance } of this.mapFacts.markers) {
+      const most = Math.max(1e-6, ...this.mapFacts.markers.map(([, , relevance]) => Math.abs(relevance)));
+      for (const [x, y, relevance] of this.mapFacts.markers) {
         const share = Math.sqrt(Math.abs(relevance) / most);
         context.beginPath();
         context.arc(x, y, 7 * devicePixelRatio * px * share, 0, 2 * Math.PI);
@@ -218,7 +218,7 @@ export default {
         context.lineWidth = width * px;
         context.lineCap = "round";
         context.beginPath();
-        for (const { start_px: [x, y], end_px: [toX, toY] } of arrows) {
+        for (const [x, y, toX, toY] of arrows) {
           const length = Math.hypot(toX - x, toY - y);
           if (length < 0.5) continue;
           const head = Math.min(5 * px, length / 2), way = Math.atan2(toY - y, toX - x);

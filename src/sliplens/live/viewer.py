@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import islice, pairwise
@@ -35,10 +36,10 @@ from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name, written_whole
 from sliplens.progress import OnProgress, open_stage, report_each, reporting, visible
 from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo, load_dataset
-from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, trial_path
 from sliplens.recordings.source import SourceOptions
-from sliplens.recordings.store import forces_path, load_forces, load_recording, read_header, stream_frames
+from sliplens.recordings.store import load_recording, read_header, stream_frames
 from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS, GroundTruth, Labels, labels_of_margins
 from sliplens.results.explanation import Explanation, is_explanation, load_explanation
 
@@ -54,7 +55,6 @@ class ViewedTrial:
     """Times, labels and the truth of a simulated trial."""
     read_frames: Callable[[], Iterator[Frame]]
     split: str = ""
-    forces: Forces | None = None
     files: tuple[str, ...] = ()
     """Names of the images of a folder."""
 
@@ -110,7 +110,6 @@ def view(
     require_rerun()
     path = None if out is None else Path(out)
     if path is not None:
-        require_rrd_path(path)
         require_new_file(path, overwrite=overwrite)
     table = None if predictions is None else Path(predictions)
     if isinstance(source, Path | str):
@@ -127,7 +126,8 @@ def view(
     overlays = Overlays(predictions=table, maps=explained, tracks=None if tracks is None else Path(tracks))
     with reporting(on_progress), open_stage(f"Reading {viewed.trial.trial}"):
         if path is None:
-            open_viewer(viewed, overlays=overlays)
+            address, failure = start_viewer(), "the Rerun viewer was closed too early; leave it open"
+            _play_into(viewed, lambda stream: stream.connect_grpc(address), overlays, failure=failure)
         else:
             write_rrd(viewed, path, overlays=overlays)
     return viewed
@@ -165,7 +165,6 @@ def view_stored(data: Dataset, info: TrialInfo) -> ViewedTrial:
         trial=trial,
         read_frames=partial(stream_frames, path) if trial.truth is None else lambda: iter(trial.frames),
         split=info.split,
-        forces=load_forces(forces_path(data.folder, info.trial)) if info.forces_sha256 else None,
     )
 
 
@@ -182,7 +181,6 @@ def view_capture(capture: Capture) -> ViewedTrial:
             frames=np.broadcast_to(reference, (count, *reference.shape)),
         ),
         read_frames=capture.read_frames,
-        forces=capture.forces,
         files=capture.files or (),
     )
 
@@ -204,12 +202,6 @@ def view_explained(explained: Explanation) -> ViewedTrial:
     return replace(view_capture(capture), files=tuple(f"{frame.id}.png" for frame in explained.frames))
 
 
-def require_rrd_path(path: Path) -> None:
-    """Check that a file is named as one of the Rerun viewer."""
-    if path.suffix.lower() != ".rrd":
-        raise InputError(f"{path} does not end in .rrd; name a file of the Rerun viewer, such as trial.rrd")
-
-
 def require_rerun() -> ModuleType:
     """Import Rerun, which only the viewer needs."""
     require_packages("rerun", extra="view", purpose="the viewer")
@@ -227,20 +219,13 @@ def require_rerun() -> ModuleType:
 
 def write_rrd(viewed: ViewedTrial, path: Path, *, overlays: Overlays = Overlays()) -> None:
     """Write a trial as a file of the Rerun viewer; it appears when complete."""
-    require_rrd_path(path)
+    if path.suffix.lower() != ".rrd":
+        raise InputError(f"{path} does not end in .rrd; name a file of the Rerun viewer, such as trial.rrd")
     require_rerun()
     with written_whole(path) as part:
         part.touch()  # Rerun reports a file that cannot be written in its own way
         failure = f"{path} could not be written; see what space is left"
         _play_into(viewed, lambda stream: stream.save(part), overlays, failure=failure)
-
-
-def open_viewer(viewed: ViewedTrial, *, overlays: Overlays = Overlays()) -> None:
-    """Open a trial in a Rerun viewer of its own, which stays when this process ends."""
-    require_rerun()
-    address = start_viewer()
-    failure = "the Rerun viewer was closed too early; leave it open"
-    _play_into(viewed, lambda stream: stream.connect_grpc(address), overlays, failure=failure)
 
 
 def _play_into(viewed: ViewedTrial, connect: Callable[[Any], None], overlays: Overlays, *, failure: str) -> None:
@@ -270,13 +255,11 @@ _LINES = {
     "interval/low": ("lower end of its 90 % interval", VERMILLION),
 }
 """Name and colour of the numbers of a frame, by entity."""
-_SENSOR_LINES = {"x (N), as recorded": VERMILLION, "y (N), as recorded": GREEN, "z (N), as recorded": BLUE}
 _LABEL_COLOURS = {"valid": GREEN, "not valid": GREY}
 _STATE_COLOURS = {str(state): GREY if colour == "white" else colour for state, colour in STATE_COLOURS.items()}
 _ZONE_OPACITY = 0.3
 _SAMPLED_FRAMES = 32  # from which the brightness of all differences is chosen
 _HALF_PX = 0.5  # a pixel's centre is a whole number here, and a half more in Rerun
-_SAMPLES_TOGETHER = 10_000
 
 
 def _rgba(colour: str) -> list[int]:
@@ -300,8 +283,6 @@ def play_trial(viewed: ViewedTrial, sink: RerunSink, overlays: Overlays) -> None
     sink.log("about", rerun.TextDocument(about, media_type=rerun.MediaType.MARKDOWN), static=True)
     sink.log_image("reference", trial.reference, static=True)
     _set_styles(sink, rerun, trial, [*numbers, *(["margin", "interval/high", "interval/low"] if readings else [])])
-    if viewed.forces is not None:
-        _log_samples(sink, rerun, trial, viewed.forces)
     _log_states(sink, rerun, trial)
     for number, frame in zip(report_each(range(len(trial))), viewed.read_frames(), strict=True):
         time_s = float(trial.time_s[number])
@@ -361,21 +342,6 @@ def _log_truth(sink: RerunSink, rerun: ModuleType, truth: GroundTruth, number: i
     sink.log("frame/markers", rerun.Points2D(places + _HALF_PX))
     rest = truth.marker_rest_px
     sink.log("frame/displacements", rerun.Arrows2D(vectors=places - rest, origins=rest + _HALF_PX))
-
-
-def _log_samples(sink: RerunSink, rerun: ModuleType, trial: Recording, forces: Forces) -> None:
-    """Log the samples of the force sensor, on the clock of the camera if its lag was applied to the labels."""
-    basis = trial.labelling.basis if trial.labelling else None
-    lag_s = basis.lag.lag_s if basis and basis.lag and basis.lag_applied else 0.0
-    colours = [_rgba(colour) for colour in _SENSOR_LINES.values()]
-    style = rerun.SeriesLines(names=list(_SENSOR_LINES), colors=colours, widths=[1.0] * len(colours))
-    sink.log("sensor/force", style, static=True)
-    for begin in range(0, len(forces.time_s), _SAMPLES_TOGETHER):
-        part = slice(begin, begin + _SAMPLES_TOGETHER)
-        # rounded here: Rerun cuts off, and a third of a second could come back a nanosecond short
-        time_ns = np.round(1e9 * (forces.time_s[part] + lag_s)).astype("timedelta64[ns]")
-        columns = rerun.Scalars.columns(scalars=forces.force_n[part])
-        sink.stream.send_columns("sensor/force", [rerun.TimeColumn("time", duration=time_ns)], columns)
 
 
 def _frame_numbers(trial: Recording) -> dict[str, Float[np.ndarray, " frames"]]:
@@ -489,8 +455,6 @@ def _lay_out(
         highest = float(np.max(friction, where=np.isfinite(friction), initial=0))
         span = rrb.ScalarAxis(range=(0.0, end_of_ratio(force_ratio(trial), highest)))
         charts += [chart("force", "forces (N)"), chart("ratio", "F_t / F_n in contact, beside friction", axis_y=span)]
-    if viewed.forces is not None:
-        charts.append(chart("sensor", "force sensor, as recorded (N)"))
     # a map is as large as the network's image, whatever the camera's
     maps = [
         rrb.Spatial2DView(origin=f"map/{method}", name=f"map by {method_name(method)}, at its frame")
@@ -551,7 +515,7 @@ def _escape(text: str) -> str:
 
 _LOOPBACK = "127.0.0.1"
 _PATIENCE_S = 30.0  # a graphics driver may take its time
-_GRACE_S = 1.0
+_GRACE_S = 1.0  # a viewer listens first, and only then looks for a screen
 
 
 def start_viewer() -> str:
@@ -565,7 +529,10 @@ def start_viewer() -> str:
         process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True)
         give_up = time.monotonic() + _PATIENCE_S
         while time.monotonic() < give_up and process.poll() is None:
-            if _listens(port) and _stays(process):
+            with suppress(OSError), socket.create_connection((_LOOPBACK, port), timeout=0.2):
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(_GRACE_S)
+                    break
                 return f"rerun+http://{_LOOPBACK}:{port}/proxy"
             time.sleep(0.05)
         if process.poll() is None:
@@ -577,20 +544,3 @@ def start_viewer() -> str:
         words = log.read().decode(errors="replace").strip().splitlines()
     why = words[-1].strip() if words else "it gave no reason"
     raise InputError(f"the Rerun viewer did not start ({why}); write a file with --output and open it elsewhere")
-
-
-def _listens(port: int) -> bool:
-    try:
-        socket.create_connection((_LOOPBACK, port), timeout=0.2).close()
-    except OSError:
-        return False
-    return True
-
-
-def _stays(process: subprocess.Popen[bytes]) -> bool:
-    """Check that a viewer that listens also finds a screen: it looks for one only then."""
-    try:
-        process.wait(_GRACE_S)
-    except subprocess.TimeoutExpired:
-        return True
-    return False
