@@ -204,19 +204,19 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_is_there(tmp_path: Path,
         for number, image in enumerate(images):
             recorder.add(LiveFrame(image=image, number=number, time_s=float(number), captured_s=0.0))
         end_s = time.monotonic() + 10
-        while recorder.state.frames + recorder.state.lost < 12 and time.monotonic() < end_s:
+        while recorder.state.sent + recorder.state.lost < 12 and time.monotonic() < end_s:
             time.sleep(0.01)
     state = recorder.state
-    assert 0 < state.frames < 8
-    assert state.lost == 12 - state.frames
-    assert f"stopped after {state.frames} frames" in str(state.trouble)
+    assert 0 < state.sent < 8
+    assert state.lost == 12 - state.sent
+    assert f"stopped after {state.sent} frames" in str(state.trouble)
     assert "make room, and record again: what is there stays" in str(state.trouble)
     data = recorder.close()
     assert data is not None
     assert sl.check_dataset(data) == ()
     kept = data.load(data.trials[0]).frames
     # the frame that did not fit may do so once there is room
-    assert state.frames <= len(kept) <= state.frames + 1
+    assert state.sent <= len(kept) <= state.sent + 1
     np.testing.assert_array_equal(kept, images[: len(kept)])
 
 
@@ -225,7 +225,7 @@ def test_a_disk_that_is_full_at_the_end_keeps_the_journal(recording: Recording, 
     for frame in frames_of(recording):
         recorder.add(frame)
     end_s = time.monotonic() + 10
-    while recorder.state.frames < 12 and time.monotonic() < end_s:
+    while recorder.state.sent < 12 and time.monotonic() < end_s:
         time.sleep(0.01)
     with room_for(5_000), pytest.raises(OSError, match="large"):
         recorder.close()
@@ -293,7 +293,7 @@ def test_a_simulated_fingertip_is_recorded_with_its_forces_and_margins(tmp_path:
         reader.record(tmp_path / "data")
         readings, recorder = reader.readings(), reader.recorder
         assert recorder is not None
-        while recorder.state.frames < 3:
+        while recorder.state.sent < 3:
             next(readings)
     data = load_dataset(tmp_path / "data")
     assert data.simulated

@@ -28,9 +28,8 @@ from sliplens.files import to_builtins
 from sliplens.grip.source import GripSource, GripStatus
 from sliplens.images import encode_jpeg
 from sliplens.live.loop import LiveReader
+from sliplens.live.mailbox import OutputState
 from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
-from sliplens.live.recorder import RecordingState
-from sliplens.live.sinks import SinkState
 from sliplens.models.checkpoint import Network
 from sliplens.plots.saliency import full_colour
 from sliplens.recordings.capture import Frame
@@ -146,8 +145,8 @@ class Update:
     """Work in progress, in words; empty for none."""
     ended: str | None
     """Why no more readings come; None while they may."""
-    recording: RecordingState | None
-    sinks: tuple[SinkState, ...]
+    recording: OutputState | None
+    sinks: tuple[OutputState, ...]
     troubles: tuple[str, ...]
     """Doubts about the network, and outputs that failed, with the cure."""
     frozen: str | None

@@ -449,7 +449,7 @@ export default {
       line.hidden = !recording;
       if (recording) {
         const lost = recording.lost ? `, ${recording.lost} lost` : "";
-        const told = `● recording ${recording.seconds.toFixed(1)} s, ${recording.frames} frames${lost}: ${recording.folder}`;
+        const told = `● recording ${recording.seconds.toFixed(1)} s, ${recording.sent} frames${lost}: ${recording.name}`;
         set(line, told);
       }
       set(this.$refs.troubles, troubles.map((trouble) => `▲ ${trouble}`).join("\n"));

@@ -4,14 +4,15 @@ from sliplens.live.camera import Camera, CameraMode, CameraSource, list_cameras
 from sliplens.live.contract import LiveOptions, LiveSource, SourceKind
 from sliplens.live.health import HealthMonitor
 from sliplens.live.loop import LiveReader, read_live
+from sliplens.live.mailbox import OutputState
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, SlipState
-from sliplens.live.recorder import ForceStream, Recorder, RecordingState
+from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.slip import SlipDetector, SlipLimits
 from sliplens.live.sources import SOURCES, FolderSource, ReplaySource, SimulatedSource, StreamSource, open_live
 
 __all__ = [
     "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthMonitor",
-    "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "Reading", "Recorder",
-    "RecordingState", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipLimits", "SlipState", "SourceKind",
+    "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "OutputState", "Reading",
+    "Recorder", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipLimits", "SlipState", "SourceKind",
     "StreamSource", "list_cameras", "open_live", "read_live",
 ]  # fmt: skip

@@ -23,10 +23,10 @@ from sliplens.images import read_image
 from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.frame_reader import FrameReader, HealthWatch, SlipWatch
 from sliplens.live.health import HealthMonitor
-from sliplens.live.mailbox import Mailbox
+from sliplens.live.mailbox import Mailbox, OutputState
 from sliplens.live.reading import LiveFrame, Reading
-from sliplens.live.recorder import ForceStream, Recorder, RecordingState
-from sliplens.live.sinks import Sender, SinkState
+from sliplens.live.recorder import ForceStream, Recorder
+from sliplens.live.sinks import Sender
 from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import Images, open_live
 from sliplens.models.checkpoint import Network, open_run
@@ -236,7 +236,7 @@ class LiveReader:
         return self._reader.markers_px
 
     @property
-    def outputs(self) -> tuple[RecordingState | SinkState, ...]:
+    def outputs(self) -> tuple[OutputState, ...]:
         """Progress of the newest recording and of each sink."""
         recorder = self._last_recorder
         return (*(() if recorder is None else (recorder.state,)), *(sender.state for sender in self.senders))

@@ -2,8 +2,11 @@
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from threading import Condition, Thread
 from typing import Generic, TypeVar
+
+from sliplens.progress import number_of
 
 Item = TypeVar("Item")
 
@@ -48,6 +51,29 @@ class Mailbox(Generic[Item]):
         with self._changed:
             self._changed.wait_for(lambda: self._items or self.closed, timeout_s)
             return self._items.popleft() if self._items else None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputState:
+    """Progress of a recording or a sink."""
+
+    name: str
+    """Folder of the recording, or name of the sink."""
+    sent: int
+    """Frames that are on disk, or readings that the sink took."""
+    lost: int
+    """Frames or readings for which it was too slow, or that came after it failed."""
+    seconds: float | None = None
+    """Time that recorded frames span, in seconds; None of a sink."""
+    trouble: str | None
+    """Why it failed, with the cure; None while it works."""
+
+    def __str__(self) -> str:
+        what = "reading" if self.seconds is None else "frame"
+        span = " sent" if self.seconds is None else f" in {self.seconds:.1f} s"
+        lost = f", {self.lost:,} lost" if self.lost else ""
+        trouble = f"; {self.trouble}" if self.trouble else ""
+        return f"{self.name}: {number_of(self.sent, what)}{span}{lost}{trouble}"
 
 
 class Outlet(Generic[Item]):

@@ -1,7 +1,8 @@
 """Recording a running source into a data set, frame by frame, and force samples that come as lines of text."""
 
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from threading import Event, Lock, Thread
 from typing import TextIO
@@ -9,7 +10,7 @@ from typing import TextIO
 import numpy as np
 
 from sliplens.errors import RecordingError
-from sliplens.live.mailbox import Outlet
+from sliplens.live.mailbox import Outlet, OutputState
 from sliplens.live.reading import LiveFrame
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Forces, Frame
@@ -27,26 +28,6 @@ from sliplens.recordings.trial import TrialFacts
 
 _MOST_WAITING_BYTES = 256 * 2**20
 _STUCK_S = 30.0  # in which not a single frame could be written
-
-
-@dataclass(frozen=True, kw_only=True)
-class RecordingState:
-    """Progress of a recording."""
-
-    folder: Path
-    frames: int
-    """Frames that are on disk."""
-    seconds: float
-    """Time that they span, in seconds."""
-    lost: int
-    """Frames that were not recorded, the disk being too slow or full."""
-    trouble: str | None
-    """Why it stopped, with the cure; None while it goes on."""
-
-    def __str__(self) -> str:
-        lost = f", {self.lost:,} lost" if self.lost else ""
-        trouble = f"; {self.trouble}" if self.trouble else ""
-        return f"{self.folder}: {number_of(self.frames, 'frame')} in {self.seconds:.1f} s{lost}{trouble}"
 
 
 class Recorder:
@@ -97,7 +78,7 @@ class Recorder:
         self._outlet = Outlet(self._append, self._end_trial, most_bytes=_MOST_WAITING_BYTES)
 
     @property
-    def state(self) -> RecordingState:
+    def state(self) -> OutputState:
         """Current progress."""
         outlet, trouble = self._outlet, None
         if outlet.error is not None:
@@ -105,8 +86,8 @@ class Recorder:
                 f"recording into {self.folder} stopped after {number_of(outlet.sent, 'frame')} "
                 f"({outlet.reason}); make room, and record again: what is there stays"
             )
-        return RecordingState(
-            folder=self.folder, frames=outlet.sent, seconds=self._seconds, lost=outlet.lost, trouble=trouble
+        return OutputState(
+            name=str(self.folder), sent=outlet.sent, lost=outlet.lost, seconds=self._seconds, trouble=trouble
         )
 
     def set_reference(self, image: Frame) -> None:
@@ -133,7 +114,7 @@ class Recorder:
                 outlet.discard()
                 raise RecordingError(
                     f"{self.folder} takes no more frames, {outlet.sent} were written; end this program and look after "
-                    "the disk, then run `sliplens recover {self.folder}`"
+                    f"the disk, then run `sliplens recover {self.folder}`"
                 )
             written = outlet.sent
         closed, self._closed = self._closed, True
@@ -238,7 +219,7 @@ class ForceStream:
     def _follow(self, begin: int) -> None:
         try:
             with self.path.open(encoding="utf-8") as file:
-                parse = _LineParser(self.path, self._next_line(file))
+                parse = _line_parser(self.path, self._next_line(file))
                 if file.seekable():
                     file.seek(max(begin, file.tell()))  # past the names, if those came later
                 while not self._closed.is_set():
@@ -269,35 +250,31 @@ class ForceStream:
                 self._delay_s = min(self._delay_s, arrived_s - stamp_s)
 
 
-class _LineParser:
-    """Reads a line of a table of forces, by the names of its columns."""
+def _line_parser(path: Path, header: str) -> Callable[[str], tuple[float, tuple[float, float, float]]]:
+    """Return the function that reads a line of a table of forces, by the names of its columns."""
+    separator = next((mark for mark in ("\t", ";", ",") if mark in header), ",")
+    names = tuple(name.strip() for name in header.split(separator))
+    table = TextTable(path=path, encoding="utf-8", separator=separator, header=names, first_line=2)
 
-    def __init__(self, path: Path, header: str) -> None:
-        separator = next((mark for mark in ("\t", ";", ",") if mark in header), ",")
-        names = tuple(name.strip() for name in header.split(separator))
-        table = TextTable(path=path, encoding="utf-8", separator=separator, header=names, first_line=2)
-        forces = guess_force_columns(table)
-        self._path, self._separator, self._names = path, separator, names
-        self._places = [names.index(name) for name in forces]
-        units = [unit_of(name, quantity="force", path=str(path)) or "N" for name in forces]
-        self._scales = [UNITS["force"][unit][0] for unit in units]
-        try:
-            stamp = guess_time_column(table)
-        except RecordingError:
-            self._stamp, self._stamp_scale = None, 1.0
-        else:
-            self._stamp = names.index(stamp)
-            self._stamp_scale = UNITS["time"][unit_of(stamp, quantity="time", path=str(path)) or "s"][0]
+    def column(name: str, quantity: str, unit: str) -> tuple[int, float]:
+        return names.index(name), UNITS[quantity][unit_of(name, quantity=quantity, path=str(path)) or unit][0]
 
-    def __call__(self, line: str) -> tuple[float, tuple[float, float, float]]:
-        fields = line.split(self._separator)
-        if len(fields) < len(self._names):
-            raise RecordingError(f"{self._path} has a line of {len(fields)} columns, {len(self._names)} are named")
-        force = [float(fields[place]) * scale for place, scale in zip(self._places, self._scales, strict=True)]
+    forces = [column(name, "force", "N") for name in guess_force_columns(table)]
+    try:
+        stamp = column(guess_time_column(table), "time", "s")
+    except RecordingError:
+        stamp = None
+
+    def parse(line: str) -> tuple[float, tuple[float, float, float]]:
+        fields = line.split(separator)
+        if len(fields) < len(names):
+            raise RecordingError(f"{path} has a line of {len(fields)} columns, {len(names)} are named")
+        force = [float(fields[at]) * scale for at, scale in forces]
         if len(force) == 2:  # normal and tangential, as `import` lays them along z and x
             force = [force[1], 0.0, force[0]]
-        stamp_s = np.nan if self._stamp is None else float(fields[self._stamp]) * self._stamp_scale
-        return stamp_s, (force[0], force[1], force[2])
+        return float(fields[stamp[0]]) * stamp[1] if stamp else np.nan, (force[0], force[1], force[2])
+
+    return parse
 
 
-__all__ = ["ForceStream", "Recorder", "RecordingState"]
+__all__ = ["ForceStream", "Recorder"]

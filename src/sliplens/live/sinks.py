@@ -10,7 +10,6 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,7 +21,7 @@ from sliplens.errors import InputError
 from sliplens.extras import Table, require_packages
 from sliplens.files import to_builtins
 from sliplens.images import encode_jpeg, encode_png
-from sliplens.live.mailbox import Outlet
+from sliplens.live.mailbox import Outlet, OutputState
 from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Frame
@@ -411,24 +410,6 @@ _READING_BYTES = 4096
 _FLUSH_S = 5.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class SinkState:
-    """Progress of a sink."""
-
-    name: str
-    sent: int
-    """Readings that it took."""
-    lost: int
-    """Readings that it was too slow for, or that came after it failed."""
-    trouble: str | None
-    """Why it failed, with the cure; None while it works."""
-
-    def __str__(self) -> str:
-        lost = f", {self.lost:,} lost" if self.lost else ""
-        trouble = f"; {self.trouble}" if self.trouble else ""
-        return f"{self.name}: {number_of(self.sent, 'reading')} sent{lost}{trouble}"
-
-
 class Sender:
     """Sends readings to a sink in a thread of its own: a slow sink loses readings, and delays none.
 
@@ -445,13 +426,13 @@ class Sender:
         )
 
     @property
-    def state(self) -> SinkState:
+    def state(self) -> OutputState:
         """Current progress."""
         outlet, trouble = self._outlet, None
         if outlet.error is not None:
             sent = number_of(outlet.sent, "reading")
             trouble = f"--sink {self._name} broke off after {sent} ({outlet.reason}); begin it anew"
-        return SinkState(name=self._name, sent=outlet.sent, lost=outlet.lost, trouble=trouble)
+        return OutputState(name=self._name, sent=outlet.sent, lost=outlet.lost, trouble=trouble)
 
     @property
     def error(self) -> Exception | None:
@@ -472,5 +453,5 @@ class Sender:
 
 __all__ = [
     "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "RerunSink", "RosTopic", "Sender", "Sink",
-    "SinkState", "ZenohRos", "encode_reading", "open_sink", "parse_zenoh", "reading_schema",
+    "ZenohRos", "encode_reading", "open_sink", "parse_zenoh", "reading_schema",
 ]  # fmt: skip
