@@ -30,9 +30,9 @@ from sliplens.recordings.capture import Frame
 class Sink(NamedTuple):
     """Takes readings, one after another."""
 
-    send: Callable[[Reading, Frame | None], object]
+    send: Callable[[Reading, Frame | None], None]
     """Sends a reading, and its frame where there is one."""
-    close: Callable[[], object] = lambda: None
+    close: Callable[[], None] = lambda: None
     """Sends what waits, and ends."""
 
 
@@ -312,7 +312,7 @@ class ZenohRos:
         stamp = self._types.types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
         return self._types.types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME_ID)
 
-    def publisher(self, topic: str, kind: str) -> Callable[[Mapping[str, object], int], None]:
+    def publisher(self, topic: str, kind: str) -> Callable[[Mapping[str, Any], int], None]:
         """Declare a topic; returns a function that sends a message of some fields, at nanoseconds since 1970.
 
         It raises `OSError` where the connection is closed.
@@ -320,7 +320,7 @@ class ZenohRos:
         publishers = [self._session.declare_publisher(name) for name in self._names(topic, kind)]
         ext, sender_id, count = self._ext, secrets.token_bytes(16), itertools.count(1)
 
-        def send(fields: Mapping[str, object], at_ns: int) -> None:
+        def send(fields: Mapping[str, Any], at_ns: int) -> None:
             message = bytes(self._types.serialize_cdr(self._types.types[kind](**fields), kind))
             attachment = ext.z_serialize((ext.Int64(next(count)), ext.Int64(at_ns), sender_id))
             by_name, by_type = publishers
