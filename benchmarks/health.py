@@ -52,7 +52,7 @@ from sliplens.simulation import TrialPlan, make_recipe, plan_trials
 from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import Loading, load_at_margins
 from sliplens.simulation.trials import prepare_trial
-from sliplens.training.metrics import auroc, risk_coverage
+from sliplens.training.evaluation import auroc, risk_coverage
 
 Fault = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
 

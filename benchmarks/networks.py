@@ -51,7 +51,7 @@ from sliplens.simulation.loading import Loading
 from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import PULLS, TrialPlan, plan_trials
 from sliplens.simulation.trials import prepare_trial
-from sliplens.training.metrics import auroc
+from sliplens.training.evaluation import auroc
 
 TRIALS, FRAMES, DRAWN = 3, 40, 10
 """Trials of a day and condition; frames of a trial, and how many of them with contact are drawn."""

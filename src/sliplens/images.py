@@ -7,43 +7,22 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from types import ModuleType
 from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float32, UInt8
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageOps
 
 from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2, missing_packages
 from sliplens.files import require_file, require_folder
 
-__all__ = ["absolute_difference", "list_images", "read_image", "signed_difference", "write_png"]
+__all__ = ["absolute_difference", "list_images", "read_image", "write_png"]
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 
-_OTHER_MODES = {
-    "L": "1 channel (grey)",
-    "1": "1 channel (black and white)",
-    "P": "a colour palette",
-    "LA": "2 channels (grey and alpha)",
-    "RGBA": "4 channels (alpha)",
-    "CMYK": "4 channels (CMYK)",
-    "I": "more than 8 bits a pixel",
-    "F": "floating-point pixels",
-}
 _BITS_PER_SAMPLE = 258  # TIFF tag
 _REDUCE = "divide its levels by 256, or by 16 or 4 where the camera gives 12 or 10 bits"
-_UPRIGHT = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
-"""Turns and mirror images that undo an orientation tag (EXIF 2.3, tag 274)."""
 _TAGGED = frozenset({"exif", "Raw profile type exif", "XML:com.adobe.xmp", "xmp"})
 """Entries of a header in which Pillow finds the tag; without any it would decode a PNG to search behind its pixels."""
 MOST_PIXELS = 100_000_000
@@ -108,8 +87,7 @@ def upright_size(image: Image.Image) -> tuple[int, int]:
 
 def upright_pixels(image: Image.Image) -> UInt8[np.ndarray, "height width *channels"]:
     """Decode an image, turned and mirrored by its orientation tag."""
-    turn = _UPRIGHT.get(_orientation(image))
-    return np.array(image if turn is None else image.transpose(turn))
+    return np.array(image if _orientation(image) == 1 else ImageOps.exif_transpose(image))
 
 
 def require_eight_bits(image: Image.Image, *, where: object) -> None:
@@ -155,9 +133,8 @@ def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.n
             )
         require_eight_bits(image, where=path)
         if image.mode != "RGB":
-            what = _OTHER_MODES.get(image.mode, f"mode {image.mode}")
             cure = "drop the alpha channel" if image.mode == "RGBA" else "convert it to 8-bit RGB"
-            raise ImageError(f"{path} has {what}; {cure}")
+            raise ImageError(f"{path} has the colours {image.mode}, not RGB; {cure}")
         return upright_pixels(image)
 
 
@@ -185,7 +162,7 @@ def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"
     damage = telling_damage(f"{where} cannot be read as PNG", "make the data set again")
     with damage, open_image(io.BytesIO(data), formats=("PNG",)) as image:
         if image.mode != "RGB":
-            raise ImageError(f"{where} has {_OTHER_MODES.get(image.mode, image.mode)}; make the data set again")
+            raise ImageError(f"{where} has the colours {image.mode}, not RGB; make the data set again")
         return np.array(image)
 
 
@@ -217,10 +194,7 @@ def natural_key(text: str) -> list[tuple[int, int | str]]:
     return [(0, int(part)) if part.isdecimal() else (1, part.lower()) for part in re.split(r"(\d+)", text)]
 
 
-@cache
-def _opencv() -> ModuleType | None:
-    """Return OpenCV; None if it is not installed."""
-    return None if missing_packages("cv2", extra="markers") else import_cv2()
+_opencv = cache(lambda: None if missing_packages("cv2", extra="markers") else import_cv2())
 
 
 def shrink(image: UInt8[np.ndarray, "height width 3"], factor: int) -> UInt8[np.ndarray, "rows columns 3"]:
@@ -289,32 +263,6 @@ def absolute_difference(
     require_same_size(frames, reference)
     # max - min instead of a subtraction: it stays in uint8 and cannot wrap
     return np.maximum(frames, reference) - np.minimum(frames, reference)
-
-
-def signed_difference(
-    frames: UInt8[np.ndarray, "*batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
-) -> UInt8[np.ndarray, "*batch height width 3"]:
-    """Compute the signed difference T_n - T_0 of frames and the reference frame, halved, plus 128, in 8 bits.
-
-    Values above 128 are brighter, values below darker; a step is two grey levels, less than the noise of a camera.
-
-    Raises
-    ------
-    ImageError
-        If a frame's size differs from the reference's.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sliplens.images import signed_difference
-    >>> untouched = np.full((1, 3, 3), 100, dtype=np.uint8)
-    >>> frame = np.array([[[100] * 3, [140] * 3, [60] * 3]], dtype=np.uint8)
-    >>> signed_difference(frame, untouched)[..., 0]
-    array([[128, 148, 108]], dtype=uint8)
-    """
-    require_same_size(frames, reference)
-    # T_n / 2 - T_0 / 2 + 128 without leaving uint8: halves of both, rounded alike, so that equal pixels give 128
-    return (frames >> 1) + (np.uint8(128) - (reference >> 1))
 
 
 _CURES = {

@@ -5,11 +5,13 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from data_sets import save_dataset
 from PIL import Image
@@ -48,6 +50,15 @@ def divided(data: Dataset, folder: Path, **changes: dict[str, object]) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Sums of several threads have other last digits, and another test may have set their number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory, small_dataset: Dataset) -> Path:
     """A training that nothing disturbed."""
@@ -80,15 +91,13 @@ def test_the_logger_tells_what_the_table_tells(finished: Path):
 
 
 def test_hardware_and_logger_are_no_part_of_the_recipe(finished: Path, small_dataset: Dataset, capsys):
-    assert train(small_dataset.folder, finished, "--accelerator", "cpu", "--devices", "11", "--batch-size", "11") == 2
-    assert "does not divide among 11 processes" in capsys.readouterr().err
     assert train(small_dataset.folder, finished, "--accelerator", "cpu") == 0
     assert "made before with the same settings" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_training_killed_in_an_epoch_goes_on_to_the_same_end(finished: Path, small_dataset: Dataset, tmp_path: Path):
     script = """
-import os, signal, sys
+import os, signal, sys, torch
 from sliplens.cli import main
 from sliplens.training.module import Regressor
 
@@ -100,6 +109,7 @@ def killed(self, batch, batch_idx):
     return step(self, batch, batch_idx)
 
 Regressor.training_step = killed
+torch.set_num_threads(1)
 main(sys.argv[1:])
 """
     words = ["train", str(small_dataset.folder), "-o", str(tmp_path / "run"), *SMALL]

@@ -14,7 +14,7 @@ from sliplens.recordings.dataset import write_dataset_table
 from sliplens.results.evaluation import Evaluation, LearningCurve, Reliability, ScoredFrames, Training
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore
-from sliplens.training.metrics import find_lead_times, risk_coverage, score_predictions
+from sliplens.training.evaluation import find_lead_times, risk_coverage, score_predictions
 
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
@@ -80,7 +80,6 @@ def write_training(workspace: Path, name: str, *, size: int, rng: np.random.Gene
         seed=0,
         best_validation_mse=float(validation.min()),
         parameters=1254629,
-        processes=1,
         stopped_by="time limit",
         curve=LearningCurve(epoch=epochs, train_mse=0.8 * validation, validation_mse=validation, minutes=epochs / 6),
     )

@@ -11,7 +11,6 @@ import torch
 from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.files import hash_file
 from sliplens.models import load_checkpoint, save_checkpoint
-from sliplens.models.checkpoint import open_run
 
 
 @pytest.fixture
@@ -72,13 +71,6 @@ def test_an_incomplete_manifest_is_refused(run: Path):
         load_checkpoint(run)
 
 
-def test_frames_of_another_sensor_are_refused(run: Path):
-    trained = load_checkpoint(run)
-    frames = np.zeros((1, 64, 64, 3), np.uint8)
-    with pytest.raises(ImageError, match="frames are 64 x 64 pixels but the network was trained on 48 x 48"):
-        trained.encode(frames, frames[0])
-
-
 def test_images_of_the_other_kind_are_noticed(run: Path, raw_run: Path):
     size = load_checkpoint(run).manifest.frame_size
     difference, frame = np.zeros((*size, 3), dtype=np.uint8), np.full((*size, 3), 120, dtype=np.uint8)
@@ -92,8 +84,3 @@ def test_images_of_the_other_kind_are_noticed(run: Path, raw_run: Path):
         network = replace(raw, manifest=replace(raw.manifest, input=seen))
         with pytest.raises(ImageError, match="as dark as a difference image"):
             network.require_kind(difference, what="a.png")
-
-
-def test_what_is_no_network_is_refused():
-    with pytest.raises(InputError, match="int is no network; give a network, its folder or its name"):
-        open_run(7)

@@ -21,7 +21,7 @@ TURNS = {
     "mirrored": lambda images: images[..., ::-1, :],
     "upside down": lambda images: images[..., ::-1, :, :],
 }
-ASTRAY = [(0.0, "as it is"), (180.0, "as it is"), (270.0, "as it is"), (90.0, "turned"), (90.0, "upside down")]
+ASTRAY = [(0.0, "as it is"), (270.0, "as it is"), (90.0, "upside down")]
 IN_RANGE = [(90.0, "as it is"), (90.0, "mirrored"), (270.0, "turned")]
 
 

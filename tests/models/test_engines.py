@@ -14,7 +14,6 @@ from sliplens.errors import InputError, ModelError
 from sliplens.models import Network, load
 from sliplens.models.backbones import answer_names
 from sliplens.models.engines import ENGINES, Engine, expecting, make_engine, prepare
-from sliplens.models.novelty import read_features
 
 ATOL = 1e-4  # float32 sums in another order, through some 60 layers
 
@@ -67,7 +66,7 @@ def test_features_come_with_the_predictions(name: str):
     network = load("chromatouch-pair")
     assert network.novelty is not None
     images = torch.rand(5, 6, 112, 112, generator=torch.Generator().manual_seed(0))
-    features = read_features(network.model, network.novelty.layer, images)
+    features = network.answers([images])[-1].double().numpy()
     [answers] = make_engine(name, network, batch_size=8).answers([images])
     assert len(answers) == len(answer_names(network.model, network.feature_layer)) == 4
     np.testing.assert_allclose(answers[-1], features, atol=ATOL)

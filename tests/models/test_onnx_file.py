@@ -48,25 +48,6 @@ def run(path: Path, images: Tensor) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("head", HEADS)
-@pytest.mark.parametrize("batch", [1, 2, 5])
-def test_the_file_answers_as_the_network(
-    head: str, batch: int, onnx_files: dict[str, Path], networks: dict[str, Network], images: Tensor
-):
-    # other images and batches than the export itself looks at
-    images = images[:batch]
-    expected = networks[head].estimate(images)
-    margin, *probabilities = run(onnx_files[head], images)
-    # float32 sums in another order, through some 60 layers
-    np.testing.assert_allclose(margin, expected.margin, atol=1e-4)
-    assert margin.shape == (batch,)
-    if head == "histogram":
-        assert expected.probabilities is not None
-        np.testing.assert_allclose(probabilities[0], expected.probabilities, atol=1e-4)
-    else:
-        assert not probabilities
-
-
-@pytest.mark.parametrize("head", HEADS)
 def test_the_file_is_valid_and_tells_how_to_feed_it(
     head: str, onnx_files: dict[str, Path], networks: dict[str, Network]
 ):
@@ -95,15 +76,6 @@ def test_the_file_is_valid_and_tells_how_to_feed_it(
         assert edges is None
 
 
-def test_an_export_is_quiet_and_leaves_only_the_file(least: Network, tmp_path: Path, capfd: pytest.CaptureFixture[str]):
-    export_onnx(least, tmp_path / "a.onnx")
-    captured = capfd.readouterr()
-    assert captured.out + captured.err == ""
-    assert [path.name for path in tmp_path.iterdir()] == ["a.onnx"]
-    # closed form: the mean of an image that is 0.25 everywhere
-    np.testing.assert_allclose(run(tmp_path / "a.onnx", torch.full((3, 3, 8, 8), 0.25))[0], [0.25] * 3, rtol=1e-6)
-
-
 def test_a_network_that_answers_otherwise_is_refused(least: Network, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = tmp_path / "a.onnx"
     path.write_text("the last good one")
@@ -123,9 +95,3 @@ def test_a_network_that_torch_cannot_export_is_refused(least: Network, tmp_path:
     with pytest.raises(ModelError, match=r"cannot export the network \(.+\); train another backbone$"):
         export_onnx(strange, tmp_path / "a.onnx")
     assert not list(tmp_path.iterdir())
-
-
-def test_differences_are_relative_only_above_one():
-    assert difference(np.array([0.5]), np.array([0.25])) == 0.25
-    assert difference(np.array([9.0]), np.array([10.0])) == pytest.approx(0.1)
-    assert np.isnan(difference(np.zeros(2), np.zeros(3)))

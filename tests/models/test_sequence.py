@@ -154,18 +154,6 @@ def test_the_rows_of_a_long_trial_are_written_as_they_come(
     assert [pq.ParquetFile(part).num_row_groups for part in parts] == [3, 3]
 
 
-def test_evaluation_reads_labelled_frames_in_order(run: Network, small_dataset: Dataset):
-    evaluation = sl.evaluate(run, small_dataset, sequence=True)
-    assert evaluation.sequence
-    found = evaluation.predictions
-    for name in np.unique(found.trial):
-        trial = small_dataset.load(next(one for one in small_dataset.trials if one.trial == name))
-        rows = trial.labelled
-        estimate = run.estimate(run.encode(trial.frames[rows], trial.reference))
-        expected = run.follow().update(estimate, trial.time_s[rows], np.ones(rows.sum(), dtype=bool))
-        np.testing.assert_allclose(found.prediction[found.trial == name], expected.margin, atol=1e-5)
-
-
 def test_what_cannot_be_followed_is_refused(run: Network, small_dataset: Dataset):
     with pytest.raises(InputError, match="--recipe sequence"):
         sl.predict("thesis-raw", small_dataset, sequence=True)

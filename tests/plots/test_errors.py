@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ from sliplens.plots.errors import (
 )
 from sliplens.plots.style import ORANGE
 from sliplens.report import Results, load_results
-from sliplens.results.evaluation import Baselines, BaselineScores, Evaluation, ScoredFrames
+from sliplens.results.evaluation import Evaluation, ScoredFrames
 
 
 @pytest.fixture(scope="module")
@@ -130,40 +129,3 @@ def test_the_picture_of_an_evaluation_is_drawn_with_and_without_uncertainty(tmp_
     # 12 inches at 150 dots, and something is drawn in every third of it
     assert pixels.shape[1] == 1800
     assert all(part.std() > 10 for part in np.array_split(pixels, 3, axis=1))
-
-
-def with_estimators(found: Evaluation, *, r2: float) -> Evaluation:
-    """Two estimators beside the network."""
-    scores = {name: replace(one, r2=r2, mae=0.2) for name, one in found.conditions.items()}
-    lost = {name: replace(one, r2=None) for name, one in scores.items()}
-    baselines = Baselines(
-        markers="chromatouch",
-        hold="found",
-        offered_trials=3,
-        training_trials=3,
-        known_trials=0,
-        shared_trials=0,
-        training_frames=60,
-        followed=1.0,
-        failed={},
-        estimators={
-            name: BaselineScores(conditions=one, lead_times=found.lead_times)
-            for name, one in (("a", scores), ("b", lost))
-        },
-    )
-    return replace(found, baselines=baselines)
-
-
-def test_estimators_stand_below_the_charts(tmp_path: Path):
-    pictures = []
-    for r2 in (0.5, -7.0):
-        draw_evaluation(with_estimators(evaluation(), r2=r2), tmp_path / "page.png", title="same")
-        with Image.open(tmp_path / "page.png") as image:
-            pictures.append(np.array(image.convert("RGB")).astype(int))
-    half, bad = pictures
-    below = half[int(7.5 * 150) :]
-    assert len(below) > 150
-    for colour in ((230, 159, 0), (0, 114, 178)):
-        assert (np.abs(below - colour).max(axis=-1) < 20).sum() > 1000
-    assert not np.array_equal(half, bad)
-    assert bad.shape == half.shape

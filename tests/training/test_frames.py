@@ -20,7 +20,7 @@ def test_a_batch_is_what_encoding_the_frames_one_by_one_gives(small_dataset: Dat
     expected = encoding.encode(recording.frames[[1, 5]], recording.reference, image_size=24)
     assert torch.equal(images, expected)
     np.testing.assert_allclose(labels.numpy(), recording.safety_margin[[1, 5]], rtol=1e-6)
-    assert torch.equal(frames[11][0], images[0])
+    assert torch.equal(frames.__getitems__([11])[0][0], images[0])
 
 
 def test_the_untouched_sensor_is_added_as_full_stick_only_when_asked_for(small_dataset: Dataset):

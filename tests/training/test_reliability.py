@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sliplens.training.metrics import lead_times, risk_coverage
+from sliplens.training.evaluation import lead_times, risk_coverage
 
 
 def trial(seconds: float = 10.0) -> tuple[list[str], np.ndarray, np.ndarray]:

@@ -116,8 +116,6 @@ def test_what_cannot_be_taught_is_refused(small_dataset: Dataset, start: Path, d
         teach(small_dataset, difference_run)
     with pytest.raises(InputError, match="--max-minutes"):
         teach(small_dataset, start, max_minutes=1.0)
-    with pytest.raises(InputError, match="--devices"):
-        teach(replace(small_dataset), start, devices=2)
     with pytest.raises(InputError, match="whose image_size is 32; leave out --image-size"):
         teach(small_dataset, start, image_size=96)
     with pytest.raises(InputError, match="takes no such option; leave out --untouched-share"):

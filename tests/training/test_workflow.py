@@ -78,9 +78,3 @@ def test_a_network_that_is_adapted_stays_of_its_kind(small_dataset: Dataset):
     assert any("6 labelled trials" in sentence for sentence in notes.sentences)
     with pytest.raises(InputError, match="teaches an existing network; name it with --start-from"):
         sl.train(small_dataset, recipe="adapt")
-
-
-def test_several_processes_need_a_folder(small_dataset: Dataset):
-    options: dict[str, Any] = SMALL | {"batch_size": 12}
-    with pytest.raises(InputError, match="several processes need a folder that all can see; name one with out"):
-        sl.train(small_dataset, **options, accelerator="cpu", devices=2)

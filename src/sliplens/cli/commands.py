@@ -441,8 +441,6 @@ def call_evaluate(call: Any, *, device: str = "cpu") -> None:
         title = f"{Path(run).name}, {evaluation.split} trials of {Path(call.keywords['data']).name}"
         draw_evaluation(evaluation, picture, title=title)
     output.print_scores(evaluation)
-    if evaluation.baselines is not None:
-        output.print_baselines(evaluation, evaluation.baselines)
 
 
 @command(

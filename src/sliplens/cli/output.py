@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sliplens.recordings import Dataset, TrialInfo
     from sliplens.recordings.labelling import Labelling
     from sliplens.report.page import Written
-    from sliplens.results.evaluation import Baselines, Evaluation, RegressionScores
+    from sliplens.results.evaluation import Evaluation, RegressionScores
     from sliplens.results.faithfulness import Faithfulness
     from sliplens.runner import Status
 
@@ -264,36 +264,6 @@ def _score_row(condition: str, evaluation: "Evaluation") -> tuple[str, ...]:
         "-" if lead.median_ms is None else f"{lead.median_ms:.0f} ms {lead.warned}/{lead.trials}",
         f"{lead.false_per_minute:.1f}",
     )
-
-
-def print_baselines(evaluation: "Evaluation", baselines: "Baselines") -> None:
-    """Print the estimators beside the network, what they were fitted on, and what failed."""
-    conditions = list(evaluation.conditions)
-    rows = {"the network": evaluation.conditions}
-    rows |= {name: scores.conditions for name, scores in baselines.estimators.items()}
-    print_table(
-        f"estimators from {baselines.markers} markers",
-        # two lines a head: the table fits into 80 columns
-        ("estimator", *(f"{name}\n{error}" for name in conditions for error in ("MSE", "R2", "MAE"))),
-        [(name, *(error for each in conditions for error in _errors(scores[each]))) for name, scores in rows.items()],
-    )
-    say(
-        f"estimators were fitted on {baselines.training_frames:,} frames of {baselines.training_trials} of the "
-        f"{baselines.offered_trials} training trials, {baselines.known_trials} of which trained the network; "
-        f"{100 * baselines.followed:.1f} % of the markers were followed while in view"
-    )
-    say(
-        "  note: they count motion from the last frame before the pull, found in each trial as a whole; the network "
-        "gets one frame"
-    )
-    if baselines.shared_trials:
-        say("  note: they were fitted on trials that they are scored on, which makes their scores too good")
-    if baselines.failed:
-        name, why = next(iter(baselines.failed.items()))
-        say(
-            f"  note: markers could not be followed in {number_of(len(baselines.failed), 'trial')}, for which the "
-            f"training mean stands, or which was left out of the fit; {name}: {why}"
-        )
 
 
 def _errors(scores: "RegressionScores") -> tuple[str, str, str]:

@@ -2,8 +2,7 @@
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
 from threading import get_ident
 from types import ModuleType
@@ -20,27 +19,16 @@ from sliplens.extras import pick
 
 
 def _import_torchvision() -> ModuleType:
-    """Import TorchVision without torch's compiler, which it needs only when it compiles.
-
-    `torchvision.ops.roi_align` imports `is_compile_supported` from there, which no network here calls; the compiler
-    takes as long to import as torch.
-    """
+    """Import TorchVision without torch's compiler, which takes as long as torch and serves a function not used here."""
     compiler = "torch._dynamo.utils"
-    hide = "torchvision" not in sys.modules and compiler not in sys.modules
-    if hide:
-        stand_in = ModuleType(compiler)
-        stand_in.is_compile_supported = _is_compile_supported  # pyright: ignore[reportAttributeAccessIssue]
-        sys.modules[compiler] = stand_in
+    if "torchvision" in sys.modules or compiler in sys.modules:
+        return import_module("torchvision")
+    sys.modules[compiler] = stand_in = ModuleType(compiler)
+    stand_in.is_compile_supported = lambda device: import_module(compiler).is_compile_supported(device)  # pyright: ignore[reportAttributeAccessIssue]
     try:
-        import torchvision  # noqa: PLC0415 (as late as the stand-in)
+        return import_module("torchvision")
     finally:
-        if hide:
-            del sys.modules[compiler]
-    return torchvision
-
-
-def _is_compile_supported(device_type: str) -> bool:
-    return import_module("torch._dynamo.utils").is_compile_supported(device_type)
+        del sys.modules[compiler]
 
 
 _classifiers = _import_torchvision().models
@@ -125,27 +113,10 @@ class HistogramRegressor(nn.Module):
         return loss, torch.softmax(logits / self.temperature, dim=-1) @ self.centres
 
 
-@contextmanager
-def watch_features(model: nn.Module, layer: str) -> Iterator[list[Float[Tensor, "batch features"]]]:
-    """Record the mean over the image of each channel of a layer, batch by batch, while this thread runs the model."""
-    features: list[Tensor] = []
-    thread = get_ident()
-
-    def record(_: nn.Module, __: object, output: Any) -> None:  # no tensor while torch traces it
-        if get_ident() == thread:  # another thread may explain the network of a running sensor meanwhile
-            features.append(output.mean(dim=(2, 3)))
-
-    handle = model.get_submodule(layer).register_forward_hook(record)
-    try:
-        yield features
-    finally:
-        handle.remove()
-
-
 class Answers(nn.Module):
     """Network that returns all outputs: margins, and probabilities of its histograms.
 
-    With `layer`, a module of the network, the features of that layer come last, in the same pass, for `Novelty`.
+    With `layer`, a module of the network, the mean over the image of each of its channels comes last, for `Novelty`.
     """
 
     def __init__(self, model: nn.Module, layer: str | None = None) -> None:
@@ -157,9 +128,19 @@ class Answers(nn.Module):
 
         Then features (batch, channels of `layer`), if there is a layer.
         """
-        backbone = self.model.backbone if isinstance(self.model, HistogramRegressor) else self.model
-        with watch_features(self.model, self.layer) if self.layer else nullcontext([]) as features:
-            answer = backbone(image)
+        features, thread, handle = [], get_ident(), None
+
+        def record(_: nn.Module, __: object, output: Any) -> None:  # no tensor while torch traces it
+            if get_ident() == thread:  # another thread may explain the network of a running sensor meanwhile
+                features.append(output.mean(dim=(2, 3)))
+
+        if self.layer:
+            handle = self.model.get_submodule(self.layer).register_forward_hook(record)
+        try:
+            answer = (self.model.backbone if isinstance(self.model, HistogramRegressor) else self.model)(image)
+        finally:
+            if handle is not None:
+                handle.remove()
         if not isinstance(self.model, HistogramRegressor):
             return answer.flatten(), *features
         logits, ratio_logits = self.model.split(answer)
@@ -168,6 +149,15 @@ class Answers(nn.Module):
         if self.model.ratio_temperature is None:
             return margins, probabilities, *features
         return margins, probabilities, torch.softmax(ratio_logits / self.model.ratio_temperature, dim=-1), *features
+
+    def run(self, batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, ...]]:
+        """Compute the outputs of batches of images, each as it comes, on the network's device."""
+        device = next(self.model.parameters(), torch.empty(0)).device
+        for batch in batches:
+            with torch.no_grad():
+                # convolutions on a processor then need no reordering
+                answers = self(batch.to(device).contiguous(memory_format=torch.channels_last))
+            yield answers
 
 
 def answer_names(model: nn.Module, layer: str | None = None) -> tuple[str, ...]:
@@ -252,18 +242,7 @@ def with_reference(weights: Mapping[str, Tensor], *, sign: float) -> dict[str, T
     return {**weights, first: torch.cat([weights[first], sign * weights[first]], dim=1)}
 
 
-def _set_channels(model: nn.Module, colours: int) -> None:
-    """Replace the first convolution by an untrained one with this number of input channels."""
-    name, first = next((name, module) for name, module in model.named_modules() if isinstance(module, nn.Conv2d))
-    names = ("out_channels", "kernel_size", "stride", "padding", "dilation", "groups", "padding_mode")
-    options: dict[str, Any] = {option: getattr(first, option) for option in names}
-    parent, _, attribute = name.rpartition(".")
-    setattr(model.get_submodule(parent), attribute, nn.Conv2d(colours, **options, bias=first.bias is not None))
-
-
 DEFAULT_BACKBONE = "shufflenet_v2_x1_0"
-
-
 BACKBONES: dict[str, Callable[..., nn.Module]] = {
     name: _classifiers.get_model_builder(name) for name in _classifiers.list_models(_classifiers)
 }
@@ -292,6 +271,9 @@ def build_model(backbone: str = DEFAULT_BACKBONE, *, head: str = "point", colour
     if backbone not in BACKBONES:
         raise ModelError(f"there is no backbone named {backbone!r}; choose a TorchVision classifier such as resnet18")
     model = BACKBONES[backbone](num_classes=pick(HEADS, head, noun="head"))
-    if colours != 3:
-        _set_channels(model, colours)
+    if colours != 3:  # an untrained first layer
+        first = next(module for module in model.modules() if isinstance(module, nn.Conv2d))
+        first.in_channels = colours
+        first.weight = nn.Parameter(first.weight.new_empty(len(first.weight), colours, *first.kernel_size))
+        first.reset_parameters()
     return model if head == "point" else HistogramRegressor(model, ratio=head == "margin-and-ratio")

@@ -14,7 +14,7 @@ from sliplens.models.backbones import bin_centres, histogram_targets
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 """Shares of the frames for which an interval is to hold."""
-_COLDEST, _HOTTEST = -3.0, 3.0  # natural logarithms of the temperature
+_TEMPERATURES = -3.0, 3.0  # natural logarithms
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,12 +42,6 @@ class Calibration:
         if not self.temperature > 0:
             raise ModelError(f"the temperature of a calibration must be positive, got {self.temperature:g}")
 
-    def offset(self, level: float) -> float:
-        """Offset of a level."""
-        if str(level) not in self.offsets:
-            raise ModelError(f"there is no interval of level {level:g}; choose {', '.join(self.offsets)}")
-        return self.offsets[str(level)]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Traction:
@@ -66,7 +60,7 @@ class Traction:
             raise ValueError("quantiles of friction are positive and rise")
 
 
-def spread(
+def standard_deviation(
     values: Float[np.ndarray, " frames"],
     probabilities: Float[np.ndarray, "frames bins"],
     edges: Float[np.ndarray, " edges"],
@@ -82,12 +76,10 @@ def fit_temperature(logits: Float[Tensor, "frames bins"], targets: Float[Tensor,
     def loss(log_temperature: float) -> float:
         return float(torch.nn.functional.cross_entropy(logits / float(np.exp(log_temperature)), targets))
 
-    # golden-section search
-    ratio, low, high = (np.sqrt(5) - 1) / 2, _COLDEST, _HOTTEST
-    while high - low > 1e-4:
-        lower, upper = high - ratio * (high - low), low + ratio * (high - low)
-        low, high = (low, upper) if loss(lower) < loss(upper) else (lower, high)
-    return float(np.exp((low + high) / 2))
+    from scipy.optimize import minimize_scalar  # noqa: PLC0415 (it takes long to import)
+
+    fitted = minimize_scalar(loss, bounds=_TEMPERATURES, method="bounded", options={"xatol": 1e-4})
+    return float(np.exp(fitted.x))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def quantiles(

@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from sliplens.codec import load_record, load_result, save_record
-from sliplens.errors import CheckpointError, ImageError, InputError
+from sliplens.errors import CheckpointError, ImageError, InputError, ModelError
 from sliplens.extras import pick, require_device
 from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import LEARNT, Friction, FrictionLike, as_friction
@@ -29,7 +29,7 @@ from sliplens.models.backbones import (
     build_model,
     ratio_edges,
 )
-from sliplens.models.calibration import Calibration, Traction, condition_on_friction, raw_interval, spread
+from sliplens.models.calibration import Calibration, Traction, condition_on_friction, raw_interval, standard_deviation
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import Novelty
 from sliplens.models.sequence import Follower, SequenceHead, SequenceManifest
@@ -114,16 +114,14 @@ class Network:
         """Describe the network in a few lines; the layers are in `model`."""
         manifest = self.manifest
         weights = sum(values.numel() for values in self.model.parameters())
-        intervals = "calibrated intervals" if manifest.calibration else "no intervals"
-        lines = (
-            f"Network: {manifest.backbone} with a {manifest.head} head, {weights:,} weights, on {self.device}",
+        return (
+            f"Network: {manifest.backbone} with a {manifest.head} head, {weights:,} weights, on {self.device}\n"
             f"  input: {manifest.input} images of {manifest.sensor}, frames of "
-            f"{' x '.join(map(str, manifest.frame_size))} px at {manifest.image_size} px",
-            f"  output: {manifest.target.replace('_', ' ')}, {intervals}",
-            f"  trained on {number_of(len(manifest.trained_on), 'trial')}, recipe {manifest.recipe or 'unknown'}",
-            "  " + ", ".join(f"{name} {value:.3g}" for name, value in manifest.metrics.items()),
+            f"{' x '.join(map(str, manifest.frame_size))} px at {manifest.image_size} px\n"
+            f"  output: {manifest.target.replace('_', ' ')}, "
+            f"{'calibrated' if manifest.calibration else 'no'} intervals\n"
+            f"  trained on {number_of(len(manifest.trained_on), 'trial')}, recipe {manifest.recipe or 'unknown'}"
         )
-        return "\n".join(filter(str.strip, lines))
 
     @property
     def device(self) -> torch.device:
@@ -160,13 +158,13 @@ class Network:
 
         A difference image is black but where something moved, a camera's is not.
         """
-        level = float(np.median(frame))
-        if not self.encoding.empty_is_black and level < _DARKEST_FRAME and frame.any():
+        level, difference = float(np.median(frame)), self.encoding.empty_is_black
+        if not difference and level < _DARKEST_FRAME and frame.any():
             raise ImageError(
                 f"{what} is as dark as a difference image (median {level:.0f} of 255 grey levels), and this network "
                 f"reads camera frames; give those, or a network on difference images such as {DIFFERENCE_NETWORK}"
             )
-        if self.encoding.empty_is_black and level > _BRIGHTEST_DIFFERENCE:
+        if difference and level > _BRIGHTEST_DIFFERENCE:
             raise ImageError(
                 f"{what} is as bright as a camera frame (median {level:.0f} of 255 grey levels), and without the "
                 "untouched sensor this network takes it for a difference image; name it with --reference IMAGE or "
@@ -180,8 +178,7 @@ class Network:
             return None
         return (
             f"the network was trained on {trained} and reads frames of {sensor}: its intervals were not measured on "
-            "that sensor, so take the margins for a trend until trials with forces say how far they can be trusted "
-            "(`sliplens import`, then `sliplens evaluate`)"
+            "that sensor, so take the margins for a trend until `sliplens evaluate` on trials with forces measures them"
         )
 
     def doubt_colour(self, frame: UInt8[np.ndarray, "height width 3"]) -> str | None:
@@ -201,11 +198,10 @@ class Network:
         values, weights = friction.nodes
         if weights[(low <= values) & (values <= high)].sum() >= 0.5:
             return None
-        learnt = friction.note == LEARNT
-        origin, cure = ("learnt from slips", "begin a new object") if learnt else ("told", "check --friction")
+        cure = "begin a new object" if friction.note == LEARNT else "check --friction"
         return (
-            f"the friction {origin} ({friction.mean:.3g}) lies outside that of the network's training, {low:.2g} to "
-            f"{high:.2g}: its intervals were not measured there, so {cure}, or take the margins for a trend"
+            f"the friction {friction.mean:.3g} lies outside that of the network's training, {low:.2g} to {high:.2g}: "
+            f"its intervals were not measured there, so {cure}, or take the margins for a trend"
         )
 
     def doubt_direction(self, profile: SensorProfile) -> str | None:
@@ -235,11 +231,9 @@ class Network:
             return None
         return f"pulled outside the trained {range_words(trained)} (90 is down); {_TURN_CURE}"
 
-    @torch.no_grad()
     def answers(self, batches: Iterable[Tensor]) -> tuple[Tensor, ...]:
         """Compute the outputs (`Answers`) for batches of encoded frames, on the network's device."""
-        network = Answers(self.model, self.feature_layer)
-        parts = [network(batch.to(self.device)) for batch in batches]
+        parts = Answers(self.model, self.feature_layer).run(batches)
         return tuple(torch.cat(answers) for answers in zip(*parts, strict=True))
 
     def predict(
@@ -250,16 +244,16 @@ class Network:
 
     def estimate(
         self,
-        inputs: Float[Tensor, "batch colours size size"],
+        inputs: Float[Tensor, "batch colours size size"] | Iterable[Tensor],
         *,
         friction: FrictionLike | None = None,
         batch_size: int = 64,
     ) -> "Estimate":
-        """Predict the safety margin of encoded frames, with its uncertainty; `friction` as `predict` takes it."""
-        return self.estimate_batches(inputs.split(batch_size), friction=friction)
+        """Predict the safety margin of encoded frames, or batches of them, with its uncertainty.
 
-    def estimate_batches(self, batches: Iterable[Tensor], *, friction: FrictionLike | None = None) -> "Estimate":
-        """Predict the safety margins of batches of encoded frames, with their uncertainty."""
+        `friction` as `predict` takes it.
+        """
+        batches = inputs.split(batch_size) if isinstance(inputs, Tensor) else inputs
         return self.to_estimate(*self.answers(batches), friction=friction)
 
     @property
@@ -333,7 +327,7 @@ class Ratio:
     @property
     def sigma(self) -> Float[np.ndarray, " frames"]:
         """Standard deviation of each distribution."""
-        return spread(self.mean, self.probabilities, self.edges)
+        return standard_deviation(self.mean, self.probabilities, self.edges)
 
 
 STRANGE = 0.01
@@ -360,11 +354,8 @@ class Estimate:
     """Friction that the margins are conditioned on; None if unknown."""
     known: Float[np.ndarray, " frames"] | None = None
     """Share of the network's validation frames that were as strange or stranger, in its features or in the spread of
-    its prediction, from 0 to 1 (`Novelty.known`). None for a network without a `Novelty`.
-
-    It does not warn of an unknown friction: a network that was trained on frictions from 0.15 to 1.2 takes wet for one
-    of them."""
-
+    its prediction, from 0 to 1 (`Novelty.known`). None for a network without a `Novelty`. It does not warn of an
+    unknown friction."""
     alone: tuple[Bool[np.ndarray, " frames"], Calibration | None] | None = None
     """Frames, of those predicted in order, that keep the prediction of a single frame, and their calibration; None
     where all have the same calibration."""
@@ -382,7 +373,7 @@ class Estimate:
         """Standard deviation of each distribution; None without a distribution."""
         if self.probabilities is None or self.edges is None:
             return None
-        return spread(self.margin, self.probabilities, self.edges)
+        return standard_deviation(self.margin, self.probabilities, self.edges)
 
     def withheld(self, touches: Bool[np.ndarray, " frames"]) -> list[str | None]:
         """Return why the margin of each frame is not reliable, with the cure; None where it is.
@@ -409,7 +400,10 @@ class Estimate:
         """Return an interval for each margin at a level of confidence, within [0, 1]; None if not calibrated."""
         if self.calibration is None:
             return None
-        offset: Any = self.calibration.offset(level)
+        if str(level) not in self.calibration.offsets:
+            levels = ", ".join(self.calibration.offsets)
+            raise ModelError(f"there is no interval of level {level:g}; choose {levels}")
+        offset: Any = self.calibration.offsets[str(level)]
         if self.alone is not None and self.alone[1] is not None:
             single = self.alone[1].offsets.get(str(level), offset)  # calibrations may have other levels
             offset = np.where(self.alone[0], single, offset)
@@ -510,7 +504,7 @@ def load_checkpoint(folder: Path, *, device: str = "cpu") -> Network:
 
 
 def _load_weights(path: Path, model: nn.Module, *, what: str, sha256: str) -> None:
-    """Fill a network with the weights of a file, which must be the one of its manifest and hold finite numbers."""
+    """Fill a network with finite weights of the file that its manifest describes."""
     if not path.is_file():
         raise CheckpointError(f"{path} is missing; train the network again or copy the whole folder")
     if hash_file(path) != sha256:

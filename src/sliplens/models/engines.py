@@ -125,7 +125,7 @@ def prepare(
             raise ModelError(f"the engine openvino cannot run {type(model).__name__} ({reason}); choose torch")
     # a graphics card wants to be filled; on a processor a batch should fit the caches
     batch_size = batch_size or (16 if images.device.type == "cpu" else 256)
-    return Engine(name="torch", batch_size=batch_size, answers=_run_by_torch(Answers(model, layer), images.device))
+    return Engine(name="torch", batch_size=batch_size, answers=Answers(model, layer).run)
 
 
 def make_engine(
@@ -169,17 +169,6 @@ def find_obstacle(model: nn.Module, images: Tensor) -> str | None:
         return f"it runs on the processor, not on {images.device.type}; leave out the device, or choose torch"
     missing = missing_packages("openvino", extra="openvino")
     return f"it needs {missing}" if missing else None
-
-
-def _run_by_torch(network: nn.Module, device: torch.device) -> RunBatches:
-    def run(batches: Iterable[Tensor]) -> Iterator[tuple[Tensor, ...]]:
-        for batch in batches:
-            with torch.no_grad():
-                # convolutions on a processor then need no reordering
-                answers = network(batch.to(device).contiguous(memory_format=torch.channels_last))
-            yield answers
-
-    return run
 
 
 _CONVERTED: WeakKeyDictionary[nn.Module, tuple[tuple[object, ...], Engine]] = WeakKeyDictionary()

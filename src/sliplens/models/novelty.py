@@ -1,6 +1,6 @@
 """Novelty: strangeness of an input, by its features' distance from the training's and the spread of the prediction."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from sliplens.errors import ModelError
 from sliplens.models.backbones import Answers, bin_edges
-from sliplens.models.calibration import spread
+from sliplens.models.calibration import standard_deviation
 
 _STRIDE = 8
 """Stride of the features: early enough to cost a third of a pass, and to respond to light, focus and print."""
@@ -95,14 +95,6 @@ class Novelty:
 
 
 @torch.no_grad()
-def read_features(
-    model: nn.Module, layer: str, images: Float[Tensor, "batch colours height width"]
-) -> Float[np.ndarray, "batch features"]:
-    """Compute the mean over the image of each channel of a layer."""
-    return Answers(model, layer)(images.to(next(model.parameters()).device))[-1].double().cpu().numpy()
-
-
-@torch.no_grad()
 def find_layer(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> str | None:
     """Find the last module whose output has an eighth of the image's side; None if there is none."""
     layers: list[str] = []
@@ -132,10 +124,12 @@ def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[
     layer = find_layer(model, batches[0][:1]) if batches else None
     if layer is None or min(sum(map(len, batches)), sum(map(len, others))) < _LEAST_FRAMES:
         return None
-    features = np.concatenate([read_features(model, layer, batch) for batch in batches])
-    margins, *probabilities, validation_features = _outputs(model, layer, others)
+    (*_, features), (margins, *probabilities, validation_features) = (
+        [torch.cat(part).double().cpu().numpy() for part in zip(*Answers(model, layer).run(some), strict=True)]
+        for some in (batches, others)
+    )
     edges = bin_edges(model)
-    sigma = None if edges is None else spread(margins, probabilities[0], edges)
+    sigma = None if edges is None else standard_deviation(margins, probabilities[0], edges)
     if not np.isfinite(features).all():
         raise ModelError(f"the layer {layer} of {type(model).__name__} returns NaN or infinity; train it again")
     mean, scale = features.mean(axis=0), features.std(axis=0)
@@ -162,14 +156,6 @@ def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[
     )
     reached = np.quantile(limited.measure_strangeness(validation_features, sigma), 1 - np.array(_SHARES))
     return replace(limited, strangeness=_rounded(reached))
-
-
-@torch.no_grad()
-def _outputs(model: nn.Module, layer: str, batches: Sequence[Tensor]) -> list[np.ndarray]:
-    """Compute the outputs of `Answers` for batches of encoded frames."""
-    answers, device = Answers(model, layer), next(model.parameters()).device
-    parts = zip(*(answers(batch.to(device)) for batch in batches), strict=True)
-    return [torch.cat(part).double().cpu().numpy() for part in parts]
 
 
 def _rounded(values: np.ndarray) -> tuple[float, ...]:

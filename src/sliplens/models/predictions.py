@@ -1,4 +1,4 @@
-"""Prediction of the safety margin of any number of frames from any source, in the memory of some thousand frames."""
+"""Prediction of the safety margin of any number of frames from any source."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Unpack
+from typing import TypeAlias, Unpack
 
 import numpy as np
 import pyarrow as pa
@@ -24,7 +24,7 @@ from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
 from sliplens.models.checkpoint import Estimate, Network, open_run
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
-from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_progress, reporting
+from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_progress, reporting
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE
@@ -58,6 +58,7 @@ _COLUMNS = {
 }
 
 
+_Read: TypeAlias = Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]
 _FORCES = ("normal_force_n", "tangential_force_n")
 
 
@@ -138,35 +139,32 @@ class Predictions:
     def trials(self) -> list[TrialMargins]:
         """Course and lowest margin of every trial."""
         table = self.frame().combine_chunks()
-        names = table["trial"].to_numpy(zero_copy_only=False)
-        numbers = {
-            name: table[name].to_numpy(zero_copy_only=False).astype(np.float64)
-            for name in ("prediction", "time_s", "low_90", "high_90")
-        }
         has_contact = "touches" in table.column_names
-        touches = np.ones(len(table), bool)
-        if has_contact:
-            touches = table["touches"].to_numpy(zero_copy_only=False).astype(bool)
-        believed = table["withheld"].is_null().to_numpy(zero_copy_only=False)
+        columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
+        names, believed = columns["trial"], table["withheld"].is_null().to_numpy(zero_copy_only=False)
+        touches = columns["touches"].astype(bool) if has_contact else np.ones(len(table), bool)
         # the rows of a trial stand together
         bounds = dict.fromkeys([0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)])
         trials = []
         for first, end in pairwise(bounds):
-            columns = {name: values[first:end] for name, values in numbers.items()}
+            margin, time_s, low, high = (
+                columns[name][first:end].astype(np.float64) for name in ("prediction", "time_s", "low_90", "high_90")
+            )
             touching = touches[first:end]
             # of an untouched sensor a difference image shows noise alone, brightened
-            counted = np.where(touching | ~touching.any(), columns["prediction"], np.nan)
+            counted = np.where(touching | ~touching.any(), margin, np.nan)
             lowest = int(np.nanargmin(counted)) if np.isfinite(counted).any() else None
-            at = {name: np.nan if lowest is None else float(values[lowest]) for name, values in columns.items()}
+            known_time = lowest is not None and np.isfinite(time_s[lowest])
+            has_interval = lowest is not None and np.isfinite(low[lowest])
             trials.append(
                 TrialMargins(
                     trial=names[first],
-                    margin=columns["prediction"],
+                    margin=margin,
                     lowest=lowest,
-                    withheld=end - first - int(believed[first:end].sum()),
+                    withheld=int((~believed[first:end]).sum()),
                     touching=int(touching.sum()) if has_contact else None,
-                    time_s=at["time_s"] if np.isfinite(at["time_s"]) else None,
-                    interval=(at["low_90"], at["high_90"]) if np.isfinite(at["low_90"]) else None,
+                    time_s=float(time_s[lowest]) if known_time else None,
+                    interval=(float(low[lowest]), float(high[lowest])) if has_interval else None,
                 )
             )
         return trials
@@ -272,46 +270,69 @@ def predict(
             name, origin = _choose_network(trials, profile)
             add_note(f"no network was named, so {name} reads it, {origin}")
             network = open_run(name, device=device)
-        if prior is not None:
-            network.require_ratio()
         kinds = [_assume_reference(network, capture) for capture in trials.kinds]
-        if sequence:
-            _require_order(network, kinds, friction=prior)
-        notes = [words for capture in kinds for words in (*capture.notes, *_require_comparable(network, capture))]
+        notes = _list_notes(network, kinds, profile, friction=prior, sequence=sequence)
+        for sentence in notes:
+            add_note(sentence)
         metadata = {
             "sliplens.source": kinds[0].opened,
             "sliplens.manifest_hash": hash_json(network.manifest),
             "sliplens.weights_sha256": network.manifest.weights_sha256,
         }
-        notes.append("" if profile is None else network.doubt_direction(profile) or "")
         if prior is not None:
-            notes += [f"The coefficient of friction is taken for {prior}.", network.doubt_friction(prior) or ""]
             metadata["sliplens.friction"] = str(prior)
-        if sequence:
-            assert network.manifest.sequence is not None  # `_require_order`
-            notes.append("Frames were read in order: each answer counts those of its contact before it.")
+        if sequence and network.manifest.sequence is not None:
             metadata["sliplens.sequence"] = network.manifest.sequence.weights_sha256
-        notes = tuple(dict.fromkeys(filter(None, notes)))
-        for sentence in notes:
-            add_note(sentence)
         schema = _schema(network, kinds, metadata)
         make = partial(make_engine, engine, network, frames=trials.frames, batch_size=batch_size)
+        work = _Prediction(network=network, trials=trials, schema=schema, friction=prior, sequence=sequence, make=make)
         recipe = {"frames": trials.frames, "batch_size": batch_size, "engine": engine, **metadata}
         recipe |= {"columns": schema.names, "device": str(network.device), "source": trials.recipe}
         recipe["friction"] = prior and prior.digest
-        written, rows = run_table(
-            _Prediction(network=network, trials=trials, schema=schema, friction=prior, sequence=sequence, make=make),
-            trials.parts(recipe, longest=None if sequence else LONGEST),
-            path,
-            title=f"Predicting frames ({network.manifest.input})",
-            recipe=recipe,
-            resumable=trials.travels,
-            on=on,
-            retry_failed=retry_failed,
-            overwrite=overwrite,
-        )
+        parts = trials.parts(recipe, longest=None if sequence else LONGEST)
+        title = f"Predicting frames ({network.manifest.input})"
+        if path is None and on == "serial":
+            with open_stage(title):
+                written, tables = work.start()
+                made = report_each(parts, sizes=[part.frames for part in parts])
+                rows = write_tables((table for part in made for table in tables(part.item)), None, written)
+        else:
+            written, rows = run_table(
+                work,
+                parts,
+                path,
+                title=title,
+                recipe=recipe,
+                resumable=trials.travels,
+                on=on,
+                retry_failed=retry_failed,
+                overwrite=overwrite,
+            )
     name = (written.metadata or {})[b"sliplens.engine"].decode()
     return Predictions(frames=trials.frames, engine=name, path=path, rows=rows, schema=path and written, notes=notes)
+
+
+def _list_notes(
+    network: Network,
+    captures: Sequence[Capture],
+    profile: SensorProfile | None,
+    *,
+    friction: Friction | None,
+    sequence: bool,
+) -> tuple[str, ...]:
+    """Refuse recordings and options that do not fit the network; return the assumptions about those that do."""
+    if friction is not None:
+        network.require_ratio()
+    if sequence:
+        _require_order(network, captures, friction=friction)
+    notes = [words for capture in captures for words in (*capture.notes, *_require_comparable(network, capture))]
+    if profile is not None:
+        notes.append(network.doubt_direction(profile) or "")
+    if friction is not None:
+        notes += [f"The coefficient of friction is taken for {friction}.", network.doubt_friction(friction) or ""]
+    if sequence:
+        notes.append("Frames were read in order: each answer counts those of its contact before it.")
+    return tuple(dict.fromkeys(filter(None, notes)))
 
 
 def _find_profile(trials: Trials, sensor: SensorProfile | Path | str | None) -> SensorProfile | None:
@@ -363,31 +384,31 @@ def _is_recorded(trial: Capture) -> bool:
 def _require_comparable(network: Network, trial: Capture) -> Iterator[str]:
     """Refuse a trial that does not fit the network; yield the assumptions about a trial that does."""
     network.require_frame_size(trial.frame_size)
-    encoding = network.encoding
-    doubt = network.doubt(trial.sensor)
-    if doubt is not None:
-        yield doubt
-    untouched = trial.read_reference
+    yield network.doubt(trial.sensor) or ""
+    untouched, encoding = trial.read_reference, network.encoding
     if untouched is not None or encoding.name == "raw":  # difference images are black where nothing moved
-        grey = network.doubt_colour(next(trial.read_frames()) if untouched is None else untouched())
-        if grey is not None:
-            yield grey
-    if untouched is None and not _is_recorded(trial):
+        yield network.doubt_colour(next(trial.read_frames()) if untouched is None else untouched()) or ""
+    if untouched is not None:
+        return
+    if not _is_recorded(trial):
         network.require_kind(next(trial.read_frames()), what=trial.files[0] if trial.files else "the first frame")
     directions = network.manifest.pull_direction_deg or FULL_CIRCLE
-    if untouched is None and encoding.name == "raw" and directions != FULL_CIRCLE:
+    if encoding.name == "raw":
+        if directions != FULL_CIRCLE:
+            yield (
+                f"{trial.name}: no reference was given, so neither the direction of the pull nor a motion of the "
+                f"camera is checked; the network was trained on {range_words(directions)} (90 is down)."
+            )
+    elif encoding.empty_is_black:
         yield (
-            f"{trial.name}: no reference was given, so neither the direction of the pull nor a motion of the camera is "
-            f"checked; the network was trained on {range_words(directions)} (90 is down)."
+            f"{trial.name}: no reference was given, so its images were taken for difference images, which hide the "
+            "pull."
         )
-    if untouched is not None or encoding.name == "raw":
-        return
-    if not encoding.empty_is_black:
+    else:
         raise InputError(
             f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
             "name its image with --reference IMAGE, or a frame of it with --reference-frame N"
         )
-    yield f"{trial.name}: no reference was given, so its images were taken for difference images, which hide the pull."
 
 
 def _schema(network: Network, trials: Sequence[Capture], metadata: dict[str, str]) -> pa.Schema:
@@ -411,7 +432,7 @@ def _contact_states(trial: Capture) -> tuple[ContactState, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Prediction(Work):
-    """Prediction of parts, (trial, first frame, number of frames), into a Parquet file each."""
+    """Prediction of parts, (trial, first frame, number of frames), each to tables of at most `LONGEST` frames."""
 
     network: Network
     trials: Trials
@@ -425,114 +446,96 @@ class _Prediction(Work):
         return self.network.device.type != "cpu"
 
     def begin(self) -> MakePart:
+        schema, tables = self.start()
+        return lambda part, path: write_tables(tables(part), path, schema)
+
+    def start(self) -> tuple[pa.Schema, Callable[[tuple[str, int, int]], Iterator[pa.Table]]]:
+        """Return the columns, and the function that predicts a part."""
         engine, read = self.make(), self.trials.reader()
         schema = self.schema.with_metadata({"sliplens.engine": engine.name, **(self.schema.metadata or {})})
 
-        def make(item: tuple[str, int, int], path: Path) -> None:
-            capture, frames = read(*item)
-            capture = _assume_reference(self.network, capture)
-            if self.sequence and capture.time_s is not None:
-                require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
-            tables = self._tables(engine, capture, frames, count=item[-1])
-            write_tables((table.cast(schema) for table in tables), path, schema)
+        return schema, partial(self._tables, engine, read, schema)
 
-        return make
+    def _tables(self, engine: Engine, read: _Read, schema: pa.Schema, part: tuple[str, int, int]) -> Iterator[pa.Table]:
+        _, first, count = part
+        capture, frames = read(*part)
+        capture = _assume_reference(self.network, capture)
+        network, follower = self.network, self.network.follow() if self.sequence else None
+        if self.sequence and capture.time_s is not None:
+            require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
+        reference = None if capture.read_reference is None else capture.read_reference()
+        check, size = _make_check(network, capture, reference), tuple(network.manifest.frame_size)
+        encode = partial(network.encoding.encode, reference=reference, image_size=network.manifest.image_size)
+        for begin in range(first, first + count, LONGEST):
+            checks: list[tuple[bool, str | None]] = []
 
-    def _tables(
-        self, engine: Engine, capture: Capture, frames: Iterator[tuple[int, Frame]], *, count: int
-    ) -> Iterator[pa.Table]:
-        """Predict the frames of a part; yield a table for each `LONGEST` frames."""
-        follower = self.network.follow() if self.sequence else None
-        checks = _Checks(self.network, capture)
-        while True:
-            batches = checks.encode(islice(frames, LONGEST), engine.batch_size)
+            def batches(checks: list[tuple[bool, str | None]] = checks) -> Iterator[Tensor]:
+                some = islice(frames, LONGEST)
+                while batch := list(islice(some, engine.batch_size)):
+                    checks.extend(check(number, frame) for number, frame in batch)
+                    images = np.stack([frame for _, frame in batch])
+                    if images.shape[1:3] != size:
+                        network.require_frame_size(images.shape[1:3])
+                    yield encode(images)
+
             answers = []
-            for answer in engine.answers(batches):
+            for answer in engine.answers(batches()):
                 answers.append([part.cpu() for part in answer])
-                report_progress(min(count, checks.done), count)
-            if not answers:
-                return
-            estimate = self.network.to_estimate(*map(torch.cat, zip(*answers, strict=True)), friction=self.friction)
-            first, touches, doubts = checks.take()
+                report_progress(begin - first + len(checks), count)
+            estimate = network.to_estimate(*map(torch.cat, zip(*answers, strict=True)), friction=self.friction)
+            touches = np.array([touch for touch, _ in checks])
             # of a strange picture the direction of the shear says nothing
             withheld = [
                 doubt if doubt == CAMERA_REASON else strange or doubt
-                for strange, doubt in zip(estimate.withheld(touches), doubts, strict=True)
+                for strange, (_, doubt) in zip(estimate.withheld(touches), checks, strict=True)
             ]
             believed = np.array([reason is None for reason in withheld])
+            here = slice(begin, begin + len(checks))
             if follower is not None:
                 assert capture.time_s is not None  # `_require_order`
-                times = capture.time_s[first : first + len(touches)]
-                estimate = follower.update(estimate, times, touches, believed=believed)
-            columns = _columns(estimate, capture, first, believed=believed) | {
+                estimate = follower.update(estimate, capture.time_s[here], touches, believed=believed)
+            columns = _columns(estimate, capture, here, believed=believed) | {
                 "touches": pa.array(touches),
                 "withheld": pa.array(withheld, type=pa.string()),
             }
-            yield pa.table({name: columns[name] for name in self.schema.names})
+            yield pa.table({name: columns[name] for name in schema.names}).cast(schema)
 
 
-class _Checks:
-    """Frames of a trial on their way to the network: encoded in batches, with contact and doubts of each frame."""
+def _make_check(
+    network: Network, capture: Capture, reference: Frame | None
+) -> Callable[[int, Frame], tuple[bool, str | None]]:
+    """Make the check of the frames of a trial in order: contact, and why the margin may be wrong."""
+    states = _contact_states(capture)
+    if reference is None:
+        return lambda number, _: (not states or states[number] != ContactState.NO_CONTACT, None)
+    untouched, shear, camera = soften(reference), network.shear_estimator(reference), CameraWatch(reference)
+    directions, moved = network.manifest.pull_direction_deg or FULL_CIRCLE, False
 
-    def __init__(self, network: Network, capture: Capture) -> None:
-        self._reference = None if capture.read_reference is None else capture.read_reference()
-        self._untouched = None if self._reference is None else soften(self._reference)
-        self._shear = None if self._reference is None else network.shear_estimator(self._reference)
-        self._camera, self._moved = None if self._reference is None else CameraWatch(self._reference), False
-        self._directions = network.manifest.pull_direction_deg or FULL_CIRCLE
-        self._states, self._capture, self._network = _contact_states(capture), capture, network
-        self._first: int | None = None
-        self._touches: list[bool] = []
-        self._doubts: list[str | None] = []
-        self.done = 0
-        """Number of frames encoded so far."""
-
-    def take(self) -> tuple[int, Bool[np.ndarray, " frames"], list[str | None]]:
-        """Return number of the first frame, contacts and doubts of the frames since the last call."""
-        assert self._first is not None  # there was a frame
-        taken = self._first, np.array(self._touches), self._doubts
-        self._first, self._touches, self._doubts = None, [], []
-        return taken
-
-    def encode(self, frames: Iterator[tuple[int, Frame]], batch_size: int) -> Iterator[Tensor]:
-        """Encode frames in batches, and check each frame."""
-        encode = partial(self._network.encoding.encode, image_size=self._network.manifest.image_size)
-        size = tuple(self._network.manifest.frame_size)
-        while batch := list(islice(frames, batch_size)):
-            self._first = batch[0][0] if self._first is None else self._first
-            for number, frame in batch:
-                self._check(number, frame)
-            images = np.stack([frame for _, frame in batch])
-            if images.shape[1:3] != size:
-                self._network.require_frame_size(images.shape[1:3])
-            self.done += len(batch)
-            yield encode(images, self._reference)
-
-    def _check(self, number: int, frame: Frame) -> None:
-        """Note whether a frame touches, and why its margin may be wrong."""
-        if self._states:
-            touches = self._states[number] != ContactState.NO_CONTACT
+    def check(number: int, frame: Frame) -> tuple[bool, str | None]:
+        nonlocal moved
+        if states:
+            touches = states[number] != ContactState.NO_CONTACT
         else:
-            touches = self._untouched is None or picture_change(soften(frame), self._untouched) >= LEAST_TOUCH
+            touches = picture_change(soften(frame), untouched) >= LEAST_TOUCH
         # a camera that has moved stays so; images of a folder are of any time
-        if self._camera is not None and (number % _CAMERA_EVERY == 0 or self._capture.files is not None):
-            motion = self._camera.update(frame, touches=touches)
-            self._moved = motion is not None and motion.excess_px > CAMERA_LIMIT_PX
-        doubt = None
-        if self._shear is not None and touches:
-            shear = self._shear.estimate(frame)
-            if shear.excess(self._directions) > DIRECTION_LIMIT:
-                doubt = self._network.doubt_shear(shear)
-        self._touches.append(touches)
-        self._doubts.append(CAMERA_REASON if self._moved else doubt)
+        if number % _CAMERA_EVERY == 0 or capture.files is not None:
+            motion = camera.update(frame, touches=touches)
+            moved = motion is not None and motion.excess_px > CAMERA_LIMIT_PX
+        if moved:
+            return touches, CAMERA_REASON
+        pull = shear.estimate(frame) if shear is not None and touches else None
+        if pull is None or pull.excess(directions) <= DIRECTION_LIMIT:
+            return touches, None
+        return touches, network.doubt_shear(pull)
+
+    return check
 
 
 def _columns(
-    estimate: Estimate, trial: Capture, first: int, *, believed: Bool[np.ndarray, " frames"]
+    estimate: Estimate, trial: Capture, here: slice, *, believed: Bool[np.ndarray, " frames"]
 ) -> dict[str, pa.Array]:
     """Make the columns of consecutive frames; NaN becomes null."""
     count, labels, ratio = len(estimate.margin), trial.labels, estimate.ratio
-    here = slice(first, first + count)
     low, high = estimate.interval(LEVEL) or (None, None)
     predicted = {
         "prediction": estimate.margin,
@@ -549,7 +552,7 @@ def _columns(
     numbers["known"] = estimate.known
     return {
         "trial": pa.array([trial.name] * count),
-        "frame": pa.array(range(first, first + count)),
+        "frame": pa.array(range(here.start, here.stop)),
         "file": pa.array(trial.files[here]) if trial.files else pa.nulls(count, pa.string()),
         **{
             name: pa.nulls(count, pa.float64()) if v is None else pa.array(v.astype(np.float64), from_pandas=True)

@@ -32,7 +32,6 @@ from sliplens.plots.style import (
     write_over,
 )
 from sliplens.results.evaluation import (
-    BaselineScores,
     BinScore,
     Evaluation,
     Reliability,
@@ -126,26 +125,21 @@ def _limits(prediction: np.ndarray) -> tuple[float, float]:
 
 
 _MOST_DOTS = 4000
-_LOWEST_R2 = -0.3  # of the axis; numbers are written beside the bars
 
 
 def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
-    """Save a page of six charts as .png, .pdf or .svg, or of eight where there are baselines.
+    """Save a page of six charts as .png, .pdf or .svg.
 
     Predictions against labels; mean squared error in ten bins of the margin (thesis, Fig. 7); bias of each trial;
-    coverage of intervals; the error as frames are withheld; the trial of median error over time. Below, R2 and mean
-    absolute error of the network beside those of model-based estimators, where there are any.
+    coverage of intervals; the error as frames are withheld; the trial of median error over time.
     """
     require_picture_path(path, example="evaluation.png")
     conditions = conditions_in_order(evaluation.conditions)
     predictions, trials = evaluation.predictions, evaluation.trials
-    estimators = {} if evaluation.baselines is None else evaluation.baselines.estimators
     with drawing_style():
-        heights = [7.5, 0.9 + 0.36 * (len(estimators) + 1)] if estimators else [7.5]
-        figure = Figure(figsize=(12, sum(heights)), layout="constrained")
+        figure = Figure(figsize=(12, 7.5), layout="constrained")
         figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", parse_math=False)
-        above, *below = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).ravel()
-        answers, errors, biases, coverage, risk, typical = above.subplots(2, 3).ravel()
+        answers, errors, biases, coverage, risk, typical = figure.subplots(2, 3).ravel()
         plot_predictions(predictions, ax=answers).set_title("Predictions")
         bins = [(name, CONDITION_COLOURS.get(name, GREEN), evaluation.conditions[name].bins) for name in conditions]
         _draw_bins(bins, ax=errors)
@@ -159,8 +153,6 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
         rows = predictions.where(predictions.trial == ranked[(len(ranked) - 1) // 2])
         plot_margins(rows.where(np.argsort(rows.time_s, kind="stable")).table(), ax=typical)
         typical.set_xlabel("Time (s), in the trial of median error")
-        for part in below:
-            _plot_estimators({"network": evaluation, **estimators}, conditions, axes=part.subplots(1, 2).tolist())
         save_page(figure, path)
 
 
@@ -205,31 +197,6 @@ def _plot_risk(risk: RiskCoverage | None, *, ax: Axes) -> None:
         ax.plot(shares, 100 * np.array(errors), color=colours[name], linestyle=line, label=words[name])
     ax.set_ylim(bottom=0)
     ax.legend(fontsize=8)
-
-
-def _plot_estimators(
-    estimators: Mapping[str, Evaluation | BaselineScores], conditions: list[str], *, axes: Sequence[Axes]
-) -> None:
-    """Draw bars of R2 and of the mean absolute error, a row an estimator."""
-    thick, (first, second) = 0.8 / max(1, len(conditions)), axes
-    for index, name in enumerate(conditions):
-        scores = [estimator.conditions[name] for estimator in estimators.values()]
-        at = np.arange(len(estimators)) + (index - (len(conditions) - 1) / 2) * thick
-        r2 = np.array([np.nan if score.r2 is None else score.r2 for score in scores])
-        mae, colour = np.array([100 * score.mae for score in scores]), CONDITION_COLOURS.get(name, GREEN)
-        for ax, values, form in ((first, r2, " {:.2f}"), (second, mae, " {:.1f}")):
-            bars = ax.barh(at, np.maximum(values, _LOWEST_R2), height=thick, color=colour, label=name)
-            # adding 0 makes 0 of -0; a missing number has no bar and no label
-            labels = [form.format(round(value, 2) + 0.0) if np.isfinite(value) else "" for value in values]
-            ax.bar_label(bars, labels, fontsize=7)
-    first.axvline(0, color=BLACK, linewidth=1)
-    first.set(xlabel="R²", title="Network, and estimators from the markers alone")
-    first.set_xlim(max(first.get_xlim()[0], _LOWEST_R2), 1.08)
-    second.set(xlabel="Mean absolute error (points of Γ)")
-    for ax, names in ((first, list(estimators)), (second, [""] * len(estimators))):
-        ax.set_yticks(range(len(estimators)), names)
-        ax.set_ylim(len(estimators) - 0.4, -0.6)
-        ax.grid(visible=False, axis="y")
 
 
 def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:

@@ -115,8 +115,6 @@ class Training:
     best_validation_mse: Annotated[float, AMOUNT]
     """Lowest validation error of the curve, in squared margin units: that of the weights that were kept."""
     parameters: int
-    processes: int
-    """Processes that shared it, one a device."""
     curve: LearningCurve
 
 
@@ -219,49 +217,6 @@ class RiskCoverage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaselineScores:
-    """How well one estimator reads the margin, by condition."""
-
-    conditions: dict[str, RegressionScores]
-    lead_times: dict[str, LeadTimes]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Baselines:
-    """Scores of model-based estimators, and what they were fitted on."""
-
-    markers: str
-    """Kind of markers that was followed."""
-    hold: str
-    """Where the frame comes from from which motion is counted."""
-    offered_trials: int
-    """Training trials of the data set."""
-    training_trials: int
-    """Trials they were fitted on."""
-    known_trials: int
-    """Of these, trials that also trained or validated the network."""
-    shared_trials: int
-    """Of these, trials that they are also scored on; their scores flatter them then."""
-    training_frames: int
-    """Labelled frames they were fitted on."""
-    followed: float
-    """Share of markers followed while in view, over all frames of the trials fitted on and scored."""
-    failed: dict[str, str]
-    """Trials in which no field could be followed, and why: not fitted on, and answered with the training mean."""
-    estimators: dict[str, BaselineScores]
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaselinePredictions(Columns):
-    """Answer of each estimator on the frames that the network was scored on, in margin units."""
-
-    estimator: Shaped[np.ndarray, " rows"]
-    trial: Shaped[np.ndarray, " rows"]
-    frame: Annotated[Int64[np.ndarray, " rows"], AMOUNT]
-    prediction: Annotated[Float64[np.ndarray, " rows"], ANSWER]
-
-
-@dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """Scores of one network by condition, day and trial, how sure it was, and the predictions behind it all."""
 
@@ -288,9 +243,6 @@ class Evaluation:
     where the ratio does not vary or no force is known."""
     risk: RiskCoverage | None = None
     """Error as more and more frames are withheld; None in a result without it."""
-    baselines: Baselines | None = None
-    """Scores of estimators that read the markers of the same frames; None where none were asked for."""
-    baseline_predictions: BaselinePredictions | None = None
 
     def frame(self) -> pa.Table:
         """Arrow table of the predictions, a row a frame."""

@@ -1,9 +1,8 @@
 """Train a network and measure how well it reads the safety margin."""
 
 from sliplens.training.config import RECIPES, TrainingConfig, get_recipe
-from sliplens.training.evaluation import evaluate, evaluate_frames
+from sliplens.training.evaluation import evaluate, evaluate_frames, lead_times, regression_scores
 from sliplens.training.fitting import fit, train
-from sliplens.training.metrics import lead_times, regression_scores
 from sliplens.training.module import make_trainer
 
 __all__ = [

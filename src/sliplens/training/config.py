@@ -144,11 +144,7 @@ PROJECT = "sliplens"
 """Project in Weights & Biases, and experiment in MLflow."""
 
 
-def _tensorboard(folder: Path, _: str) -> Logger:
-    return TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False)
-
-
-def _wandb(folder: Path, run_name: str) -> Logger:
+def _make_wandb(folder: Path, run_name: str) -> Logger:
     # whoever is logged in for something else has not asked to send this
     offline = "WANDB_MODE" not in os.environ
     os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
@@ -159,7 +155,7 @@ def _wandb(folder: Path, run_name: str) -> Logger:
     return WandbLogger(name=run_name, save_dir=folder, project=PROJECT, offline=offline, settings=settings)
 
 
-def _mlflow(folder: Path, run_name: str) -> Logger:
+def _make_mlflow(folder: Path, run_name: str) -> Logger:
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
     logging.getLogger("lightning.pytorch.loggers.mlflow").setLevel(logging.ERROR)  # "Experiment not found. Creating it"
@@ -171,10 +167,13 @@ def _mlflow(folder: Path, run_name: str) -> Logger:
 
 
 LOGGERS: dict[str, tuple[tuple[str, ...], Callable[[Path, str], Logger]]] = {
-    "tensorboard": (("tensorboard",), _tensorboard),
-    "wandb": (("wandb",), _wandb),
+    "tensorboard": (
+        ("tensorboard",),
+        lambda folder, _: TensorBoardLogger(folder, name="tensorboard", version="", default_hp_metric=False),
+    ),
+    "wandb": (("wandb",), _make_wandb),
     # mlflow-skinny, which lacks the latter, keeps no runs on this machine
-    "mlflow": (("mlflow", "sqlalchemy"), _mlflow),
+    "mlflow": (("mlflow", "sqlalchemy"), _make_mlflow),
 }
 """Packages that each logger needs, and the function that makes it."""
 

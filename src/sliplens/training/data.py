@@ -1,26 +1,27 @@
-"""Frames of a training, their augmentation, and the batches of one or several processes."""
+"""Frames of a training, their augmentation and their order."""
 
 import math
 import os
 import tempfile
+from collections import deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.utils.data import DataLoader, Sampler
 from torch.utils.data import Dataset as TorchDataset
+from torch.utils.data import Sampler
 from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import RecordingError
 from sliplens.extras import pick
-from sliplens.models.backbones import last_layer
+from sliplens.models.backbones import Answers, last_layer
 from sliplens.models.encodings import Encoding
 from sliplens.progress import report_each
 from sliplens.recordings import Dataset, Labels, TrialInfo
@@ -52,8 +53,6 @@ class Augmentation:
     blur_probability: float = 0.25
     blur_sd_px: float = 0.8
     """Share of batches that are blurred, and the largest standard deviation of the blur in pixels."""
-    neutral: float = 0.0
-    """Level of the input that means no change; `colour` scales about it."""
 
     def __call__(
         self, images: Float[Tensor, "batch colours size size"], *, generator: torch.Generator
@@ -80,8 +79,7 @@ class Augmentation:
             images = transforms.gaussian_blur(images, [3, 3], [0.1 + (self.blur_sd_px - 0.1) * float(uniform(1))])
         # one camera saw the reference and the frame
         colour = 1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1).repeat(1, colours // 3, 1, 1)
-        # in place: images of a batch are large, and the sampled ones are ours
-        images.sub_(self.neutral).mul_(colour).add_(self.neutral)
+        images.mul_(colour)  # in place: images of a batch are large, and the sampled ones are ours
         height, width = images.shape[-2:]
         noise = torch.randn((batch, height, width, colours), generator=generator, device=device).permute(0, 3, 1, 2)
         return images.add_(noise.mul_(uniform(batch, 1, 1, 1) * self.noise_sd)).clamp_(0, 1)
@@ -100,10 +98,9 @@ alone. `all-directions` turns images by any angle, mirrors and magnifies them, f
 direction."""
 
 
-def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:
-    """Look up an augmentation by name, for inputs with a neutral level."""
-    augmentation = pick(AUGMENTATIONS, name, noun="augmentation")
-    return None if augmentation is None else replace(augmentation, neutral=neutral)
+def get_augmentation(name: str) -> Augmentation | None:
+    """Look up an augmentation by name."""
+    return pick(AUGMENTATIONS, name, noun="augmentation")
 
 
 UNTOUCHED = -1
@@ -115,8 +112,8 @@ class FrameSet(TorchDataset):
     """Resized 8-bit inputs with their labels; a batch is indexed at once, not frame by frame."""
 
     encoding: Encoding
-    images: UInt8[Tensor, "frames colours size size"]
-    """Compared and resized frames, uint8, as `Encoding.resize` returns them."""
+    images: UInt8[Tensor, "frames colours size size"] | Float32[Tensor, "frames features"]
+    """Compared and resized frames, uint8, as `Encoding.resize` returns them; or features of `extract_features`."""
     safety_margin: Float32[Tensor, " frames"]
     """Labels in [0, 1]."""
     traction_ratio: Float32[Tensor, " frames"]
@@ -133,14 +130,12 @@ class FrameSet(TorchDataset):
     def __len__(self) -> int:
         return len(self.images)
 
-    def __getitem__(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
-        images, margins, ratios = self.__getitems__([index])
-        return images[0], margins[0], ratios[0]
-
     def __getitems__(self, indices: Sequence[int] | Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return a batch of inputs, their margins and their ratios; torch's loader asks for it by this name."""
         rows = torch.as_tensor(indices)
-        return self.encoding.normalise(self.images[rows]), self.safety_margin[rows], self.traction_ratio[rows]
+        images = self.images[rows]
+        inputs = images if images.is_floating_point() else self.encoding.normalise(images)
+        return inputs, self.safety_margin[rows], self.traction_ratio[rows]
 
     def batches(self, size: int, *, report: bool = False) -> Iterator[Tensor]:
         """Iterate over the inputs of all frames, in their order; if `report`, report each batch as done."""
@@ -148,33 +143,23 @@ class FrameSet(TorchDataset):
         for rows in report_each(batches, sizes=[len(rows) for rows in batches]) if report else batches:
             yield self.__getitems__(rows)[0]
 
-
-@dataclass(frozen=True, kw_only=True)
-class FeatureSet(FrameSet):
-    """Inputs of the last layer of a network, computed once: for a training that leaves the other layers as they are."""
-
-    images: Float32[Tensor, "frames features"]  # pyright: ignore[reportIncompatibleVariableOverride]
-
-    def __getitems__(self, indices: Sequence[int] | Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        rows = torch.as_tensor(indices)
-        return self.images[rows], self.safety_margin[rows], self.traction_ratio[rows]
+    def sample(self, count: int, *, batch_size: int) -> Iterator[Tensor]:
+        """Iterate over the inputs of a number of frames at most, spread over all trials."""
+        rows = torch.linspace(0, len(self) - 1, min(len(self), count)).round().long()
+        return (self.__getitems__(some)[0] for some in rows.split(batch_size))
 
 
 @torch.no_grad()
-def extract_features(model: nn.Module, frames: FrameSet, *, batch_size: int) -> FeatureSet:
-    """Compute the input of the last linear layer of a network, in evaluation mode, for each frame."""
-    features: list[Tensor] = []
-    was_training, device = model.training, next(model.parameters()).device
+def extract_features(model: nn.Module, frames: FrameSet, *, batch_size: int) -> FrameSet:
+    """Compute the input of the last linear layer of a network in evaluation mode, to train that layer alone."""
+    features, was_training = [], model.training
     hook = last_layer(model).register_forward_pre_hook(lambda _, inputs: features.append(inputs[0].float().cpu()))
     try:
-        model.eval()
-        for images in frames.batches(batch_size, report=True):
-            model(images.to(device))
+        deque(Answers(model.eval()).run(frames.batches(batch_size, report=True)), maxlen=0)
     finally:
         hook.remove()
         model.train(was_training)
-    columns = {field.name: getattr(frames, field.name) for field in fields(frames)}
-    return FeatureSet(**{**columns, "images": torch.cat(features)})
+    return replace(frames, images=torch.cat(features))
 
 
 def trial_friction(labels: Labels) -> float:
@@ -256,64 +241,31 @@ def load_frames(
 
 def _allocate(shape: tuple[int, int, int, int], scratch: Path | None) -> UInt8[Tensor, "frames colours size size"]:
     """Allocate images in memory, or in an unnamed file that is deleted with the last reference."""
-    size = int(np.prod(shape))
-    if scratch is None or size <= _free_memory() / 2:
+    size, free = int(np.prod(shape)), float("inf")
+    with suppress(AttributeError, OSError, ValueError):  # not every system says
+        free = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if scratch is None or size <= free / 2:
         return torch.empty(shape, dtype=torch.uint8)
     with tempfile.TemporaryFile(dir=scratch) as file:
         file.truncate(size)
         return torch.from_numpy(np.memmap(file, dtype=np.uint8, mode="r+", shape=shape))
 
 
-def _free_memory() -> int:
-    """Return the free memory in bytes; a very large number where the system does not say."""
-    try:
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):
-        return 1 << 62
-
-
 class EpochShuffle(Sampler[int]):
-    """Random order for each epoch that depends on the seed and the epoch alone, so that resuming repeats it.
+    """Random order for each epoch that depends on the seed and the epoch alone, so that resuming repeats it."""
 
-    Each process takes every `processes`-th frame of one order, so that the n-th batches of all processes together are
-    the n-th batch of one. Frames that do not divide are left out of this epoch.
-    """
-
-    def __init__(self, count: int, *, seed: int, drawn: int | None = None, rank: int = 0, processes: int = 1) -> None:
-        self.count, self.drawn, self.seed = count, drawn or count, seed
-        self.rank, self.processes, self.epoch = rank, processes, 0
+    def __init__(self, count: int, *, seed: int, drawn: int | None = None) -> None:
+        self.count, self.drawn, self.seed, self.epoch = count, drawn or count, seed, 0
 
     def set_epoch(self, epoch: int) -> None:
         """Set the epoch; Lightning calls this before each epoch."""
         self.epoch = epoch
 
     def __len__(self) -> int:
-        return self.drawn // self.processes
+        return self.drawn
 
     def __iter__(self) -> Iterator[int]:
-        """Yield the indices of this process: each frame once, or as many as are drawn, none again before all others."""
+        """Yield the indices: each frame once, or as many as are drawn, none again before all others."""
         rng = np.random.default_rng((self.seed, self.epoch))
         rounds = [rng.permutation(self.count) for _ in range(-(-self.drawn // self.count))]
-        order = np.concatenate(rounds)[: self.drawn]
-        return iter(order[self.rank :: self.processes][: len(self)].tolist())
-
-
-def even_shares(count: int, *, batch_size: int, rank: int = 0, processes: int = 1) -> list[list[int]]:
-    """Make the batches of one process over every frame once, equally many in each: they take every step together."""
-    # shares differ by one frame at most, so that no batch is empty
-    batches = math.ceil(math.ceil(count / processes) / batch_size)
-    return [part.tolist() for part in np.array_split(np.arange(count)[rank::processes], batches)]
-
-
-def make_loaders(
-    train: FrameSet, validation: FrameSet, *, shuffle: EpochShuffle, batch_size: int
-) -> tuple[DataLoader, DataLoader]:
-    """Make the loaders of this process; `batch_size` is its share of the batch."""
-    shares = even_shares(len(validation), batch_size=batch_size, rank=shuffle.rank, processes=shuffle.processes)
-    # a last small batch would make batch normalisation noisy
-    shuffled = DataLoader(train, sampler=shuffle, batch_size=batch_size, drop_last=True, collate_fn=_as_is)
-    return shuffled, DataLoader(validation, batch_sampler=shares, collate_fn=_as_is)
-
-
-def _as_is(batch: Any) -> Any:
-    return batch  # FrameSet.__getitems__ has made the batch already
+        return iter(np.concatenate(rounds)[: self.drawn].tolist())

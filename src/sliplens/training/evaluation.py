@@ -1,160 +1,32 @@
-"""Evaluation of a network on labelled trials, beside estimators that use the markers alone."""
+"""Evaluation of a network on labelled trials: errors, coverage, warnings."""
 
-import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sliplens.codec import keep_part, load_result, save_result
-from sliplens.errors import InputError, RecordingError
-from sliplens.extras import import_cv2, pick
-from sliplens.files import output_folder, scratch_folder
+from sliplens.codec import load_result, save_result
+from sliplens.errors import RecordingError
+from sliplens.files import output_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
-from sliplens.markers import KINDS, MarkerStatus, track_markers
-from sliplens.markers.estimators import ESTIMATORS, FieldTrial, field_trial, get_estimator
 from sliplens.models import Network
 from sliplens.models.checkpoint import Estimate, condition_each, open_run
 from sliplens.models.sequence import require_frequent
-from sliplens.progress import OnProgress, add_note, open_stage, report_each, report_file, reporting
+from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting
 from sliplens.recordings import Dataset, TrialInfo
-from sliplens.recordings.dataset import load_dataset, trial_path
-from sliplens.recordings.store import stream_frames
+from sliplens.recordings.dataset import load_dataset
 from sliplens.results.evaluation import (
-    BaselinePredictions,
-    Baselines,
-    BaselineScores,
+    BinScore,
     Evaluation,
+    LeadTimes,
     RegressionScores,
     Reliability,
+    RiskCoverage,
     ScoredFrames,
 )
 from sliplens.training.data import FrameSet, load_frames
-from sliplens.training.metrics import auroc, find_lead_times, risk_coverage, score_predictions
-
-
-@dataclass(frozen=True, kw_only=True)
-class BaselinePlan:
-    """Estimators, and the trials that they are fitted on."""
-
-    estimators: tuple[str, ...]
-    """Rows of `ESTIMATORS`."""
-    training: tuple[TrialInfo, ...]
-    offered_trials: int
-    """Training trials of the data set."""
-    markers: str
-    """Row of `markers.KINDS`."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Followed(FieldTrial):
-    """Displacements of a trial, and the share of its markers that was followed."""
-
-    in_view: int
-    """Markers of all frames that were in view."""
-    followed: int
-
-
-def marker_kind(trials: Sequence[TrialInfo]) -> str:
-    """Return the row of `KINDS` for the trials' sensors, such as chromatouch-3; `auto` if they differ or have none."""
-    kinds = {next((kind for kind in KINDS if f"{trial.sensor}-".startswith(f"{kind}-")), "auto") for trial in trials}
-    return kinds.pop() if len(kinds) == 1 else "auto"
-
-
-def choose_training(trials: Sequence[TrialInfo], count: int) -> tuple[TrialInfo, ...]:
-    """Take a number of trials spread evenly over the table, so that every day has its share."""
-    if count < 1:
-        raise InputError(f"{count} training trials are too few to fit on; give --baseline-trials 1 or more")
-    at = np.linspace(0, len(trials) - 1, min(count, len(trials))).round().astype(int)
-    return tuple(trials[index] for index in at)
-
-
-def evaluate_baselines(
-    plan: BaselinePlan,
-    data: Dataset,
-    predictions: ScoredFrames,
-    *,
-    folder: Path,
-) -> tuple[Baselines, BaselinePredictions]:
-    """Follow markers, fit estimators on training trials, and score them on the frames that a network was scored on.
-
-    The folder keeps the displacements of each trial for an interrupted evaluation.
-    """
-    estimators = {name: get_estimator(name) for name in plan.estimators}
-    tested = set(predictions.trial.tolist())
-    trials = {info.trial: info for info in (*plan.training, *(info for info in data.trials if info.trial in tested))}
-    fields: dict[str, _Followed] = {}
-    failed: dict[str, str] = {}
-    for info in report_each(trials.values()):
-        try:
-            fields[info.trial] = keep_part(folder / info.trial, _Followed, partial(_follow, data, info, plan.markers))
-        except RecordingError:
-            raise
-        except InputError as error:
-            failed[info.trial] = str(error)
-    fitted = [info for info in plan.training if info.trial in fields]
-    for part, usable in (("training", fitted), ("tested", tested - set(failed))):
-        if not usable:
-            name, why = next(iter(failed.items()))
-            raise InputError(
-                f"markers were followed in none of the {part} trials ({name}: {why}); name another kind with --markers"
-            )
-    margins = [_margins(data, info) for info in fitted]
-    mean = float(np.nanmean(np.concatenate(margins)))
-    answers = {}
-    for name, estimator in estimators.items():
-        estimator.fit([fields[info.trial] for info in fitted], margins)
-        prediction = np.full(len(predictions), mean)
-        for trial in tested & set(fields):
-            rows = predictions.trial == trial
-            prediction[rows] = estimator.estimate(fields[trial])[predictions.frame[rows]]
-        answers[name] = replace(predictions, prediction=prediction)
-    scores = Baselines(
-        markers=plan.markers,
-        hold="found in each trial as a whole, by find_hold",
-        offered_trials=plan.offered_trials,
-        training_trials=len(fitted),
-        known_trials=0,
-        shared_trials=sum(info.trial in tested for info in plan.training),
-        training_frames=sum(int(np.isfinite(margin).sum()) for margin in margins),
-        followed=sum(some.followed for some in fields.values()) / max(1, sum(some.in_view for some in fields.values())),
-        failed=failed,
-        estimators={name: _score(answer) for name, answer in answers.items()},
-    )
-    frames = len(predictions)
-    return scores, BaselinePredictions(
-        estimator=np.repeat(list(answers), frames),
-        trial=np.tile(predictions.trial, len(answers)),
-        frame=np.tile(predictions.frame, len(answers)),
-        prediction=np.concatenate([answer.prediction for answer in answers.values()]),
-    )
-
-
-def _follow(data: Dataset, info: TrialInfo, kind: str) -> _Followed:
-    reference = data.read_labels(info).reference
-    tracks = track_markers(stream_frames(trial_path(data.folder, info.trial)), reference, kind)
-    return _Followed(
-        **vars(field_trial(tracks)),
-        in_view=int((tracks.status != MarkerStatus.OUTSIDE).sum()),
-        followed=int(tracks.followed.sum()),
-    )
-
-
-def _margins(data: Dataset, info: TrialInfo) -> Float[np.ndarray, " frames"]:
-    recording = data.read_labels(info)
-    return np.where(recording.labelled, recording.safety_margin, np.nan)
-
-
-def _score(answers: ScoredFrames) -> BaselineScores:
-    conditions = {name: rows for (name,), rows in sorted(answers.groups("condition").items())}
-    return BaselineScores(
-        conditions={name: score_predictions(rows) for name, rows in conditions.items()},
-        lead_times={name: find_lead_times(rows) for name, rows in conditions.items()},
-    )
-
 
 EACH = "each"
 """Value of `friction` for the known friction of every trial."""
@@ -168,9 +40,6 @@ def evaluate(
     split: str = "test",
     friction: FrictionLike | None = None,
     sequence: bool = False,
-    baselines: Sequence[str] = (),
-    baseline_trials: int = 40,
-    markers: str | None = None,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Evaluation:
@@ -191,11 +60,6 @@ def evaluate(
         network that predicts F_t / F_n.
     sequence
         If True, predict each trial in order, as `predict` does; frames without a label are left out.
-    baselines, baseline_trials
-        Estimators to put beside the network, rows of `markers.estimators.ESTIMATORS` or `all`, and how many training
-        trials they are fitted on, spread evenly over those of the data set.
-    markers
-        Kind of markers, a row of `markers.KINDS`; by the sensor's name if None.
     overwrite
         If True, replace a folder `out` of other settings.
     on_progress
@@ -211,35 +75,22 @@ def evaluate(
     trials = data.select(split=split)
     for trial in trials:
         network.require_frame_size((trial.height, trial.width))
-    plan = _plan_baselines(baselines, data, trials, count=baseline_trials, markers=markers) if baselines else None
 
-    def compute(folder: Path) -> Evaluation:
+    def compute() -> Evaluation:
         with open_stage(f"Reading {split} trials ({network.manifest.input})"):
             frames = load_frames(data, trials, encoding=network.encoding, image_size=network.manifest.image_size)
         with open_stage("Predicting frames"):
             evaluation = evaluate_frames(network, frames, split=split, friction=prior, sequence=sequence)
-        evaluation = replace(evaluation, known_trials=len(find_training_trials(trials, network)))
-        if plan is None:
-            return evaluation
-        fields = folder / "fields"
-        with open_stage("Following markers"):
-            scores, predictions = evaluate_baselines(plan, data, evaluation.predictions, folder=fields)
-        shutil.rmtree(fields)
-        scores = replace(scores, known_trials=len(find_training_trials(plan.training, network)))
-        return replace(evaluation, baselines=scores, baseline_predictions=predictions)
+        return replace(evaluation, known_trials=len(find_training_trials(trials, network)))
 
     with reporting(on_progress):
-        firsts = map(data.read_labels, {trial.sensor: trial for trial in reversed(trials)}.values())
-        doubts = [
-            words for first in firsts for words in (network.doubt(first.sensor), network.doubt_colour(first.reference))
-        ]
-        if isinstance(prior, Friction):
-            doubts.append(network.doubt_friction(prior))
+        doubts = [network.doubt_friction(prior)] if isinstance(prior, Friction) else []
+        for first in map(data.read_labels, {trial.sensor: trial for trial in reversed(trials)}.values()):
+            doubts += network.doubt(first.sensor), network.doubt_colour(first.reference)
         for words in dict.fromkeys(filter(None, doubts)):
             add_note(words)
         if out is None:
-            with scratch_folder() as folder:
-                return compute(folder)
+            return compute()
         recipe = {
             "weights_sha256": network.manifest.weights_sha256,
             "data_hash": data.hash,
@@ -247,14 +98,13 @@ def evaluate(
             "split": split,
             "friction": prior.digest if isinstance(prior, Friction) else prior,
             "sequence": network.manifest.sequence if sequence else None,
-            "baselines": plan,
         }
         recipe = {name: value for name, value in recipe.items() if value is not None}
         with output_folder(Path(out), stage="evaluate", config=recipe, overwrite=overwrite) as output:
             if output.complete:
                 evaluation = load_result(output.folder, Evaluation, command="sliplens evaluate")
             else:
-                evaluation = compute(output.folder)
+                evaluation = compute()
                 save_result(evaluation, output.folder)
         report_file(Path(out), "scores and predictions", kept=output.complete)
         return evaluation
@@ -263,22 +113,6 @@ def evaluate(
 def find_training_trials(trials: Sequence[TrialInfo], network: Network) -> tuple[TrialInfo, ...]:
     """Find the trials that trained or validated a network, or the network it started from, by hashes of their files."""
     return tuple(trial for trial in trials if trial.sha256[:12] in network.manifest.trained_on)
-
-
-def _plan_baselines(
-    names: Sequence[str], data: Dataset, trials: Sequence[TrialInfo], *, count: int, markers: str | None
-) -> BaselinePlan:
-    """Check the request before anything is computed."""
-    names = tuple(ESTIMATORS) if tuple(names) == ("all",) else tuple(names)
-    for name in names:
-        get_estimator(name)
-    import_cv2()
-    offered = tuple(trial for trial in data.trials if trial.split == "train")
-    if not offered:
-        raise InputError(f"{data.folder} has no training trials to fit baselines on; divide it with `sliplens split`")
-    training = choose_training(offered, count)
-    kind = marker_kind((*training, *trials)) if markers is None else pick(KINDS, markers, noun="kind of markers").name
-    return BaselinePlan(estimators=names, training=training, offered_trials=len(offered), markers=kind)
 
 
 def evaluate_frames(
@@ -305,10 +139,10 @@ def evaluate_frames(
         if not np.isfinite(frames.friction).all():
             raise RecordingError("not every trial has a coefficient of friction; set it with --friction")
         quantiles = np.array(traction.friction)
-        estimate = network.estimate_batches(batches)
+        estimate = network.estimate(batches)
         estimate = condition_each(estimate, frames.friction, trained_friction=quantiles, calibration=traction.told)
     else:
-        estimate = network.estimate_batches(batches, friction=friction)
+        estimate = network.estimate(batches, friction=friction)
     if sequence:
         estimate = _follow_trials(network, estimate, frames.trial, frames.time_s)
     levels = estimate.calibration.offsets if estimate.calibration else ()
@@ -386,3 +220,140 @@ def _ratio_r2(ratio: Float[np.ndarray, " frames"], frames: FrameSet) -> dict[str
         variance = float(truth[rows].var()) if rows.any() else 0.0
         scores[name] = 1 - float(np.mean((ratio - truth)[rows] ** 2)) / variance if variance > 0 else None
     return scores
+
+
+def auroc(positive: Float[np.ndarray, " _"], negative: Float[np.ndarray, " _"]) -> float | None:
+    """Area under the receiver operating characteristic: how often a positive scores above a negative; ties count half.
+
+    None where a class is empty.
+    """
+    if not (len(positive) and len(negative)):
+        return None
+    from scipy.stats import mannwhitneyu  # noqa: PLC0415 (it takes long to import)
+
+    return float(mannwhitneyu(positive, negative).statistic) / (len(positive) * len(negative))
+
+
+_COVERED = tuple(round(1 - step / 20, 2) for step in range(20))
+
+
+def risk_coverage(
+    errors: Float[np.ndarray, " frames"], trust: Mapping[str, Float[np.ndarray, " frames"] | None]
+) -> RiskCoverage:
+    """Compute the mean absolute error of the remaining frames, as more and more of the least trusted are withheld.
+
+    `trust` is that in each frame, by name; None for a measure that the network lacks. `perfect`, the negative error, is
+    always added.
+
+    References
+    ----------
+    El-Yaniv and Wiener, *On the Foundations of Noise-free Selective Classification*, JMLR 2010.
+    """
+    available = {name: values for name, values in trust.items() if values is not None} | {"perfect": -errors}
+    counts = [max(1, round(share * len(errors))) for share in _COVERED]
+    means = {
+        # stable: frames that are trusted alike are withheld in their order
+        name: np.cumsum(errors[np.argsort(-values, kind="stable")]) / np.arange(1, len(errors) + 1)
+        for name, values in available.items()
+    }
+    return RiskCoverage(
+        covered=_COVERED,
+        error={name: tuple(mean[np.array(counts) - 1].tolist()) for name, mean in means.items()},
+    )
+
+
+THRESHOLD = 0.2
+"""A margin below it is an alarm: people hold 20 to 40 % above the least force."""
+_FALSE_ABOVE = 2.0
+"""An alarm that begins while the true margin is above so many thresholds is false, not early."""
+
+
+def lead_times(
+    trial: Sequence[str],
+    time_s: Float[np.ndarray, " frames"],
+    labels: Float[np.ndarray, " frames"],
+    predictions: Float[np.ndarray, " frames"],
+    *,
+    threshold: float = THRESHOLD,
+) -> LeadTimes:
+    """Measure warnings, predictions below a threshold in margin units, on the labelled frames of some trials.
+
+    A slip is the first frame of a trial with margin 0; what comes after is left out.
+    """
+    names = np.array(trial)
+    leads, ideals, slips, false, minutes = [], [], 0, 0, 0.0
+    for name in dict.fromkeys(trial):
+        rows = np.flatnonzero(names == name)
+        order = rows[np.argsort(time_s[rows], kind="stable")]
+        slipped = labels[order] <= 0
+        slips_at = int(np.argmax(slipped)) if slipped.any() else None
+        before = order if slips_at is None else order[:slips_at]
+        if not len(before):
+            continue
+        alarms = predictions[before] < threshold
+        begins = np.flatnonzero(alarms & ~np.insert(alarms[:-1], 0, False))
+        is_false = labels[before][begins] > _FALSE_ABOVE * threshold
+        false += int(is_false.sum())
+        minutes += float(time_s[before[-1]] - time_s[before[0]]) / 60
+        if slips_at is None:
+            continue
+        slips += 1
+        slip_s = float(time_s[order[slips_at]])
+        # an alarm that began in vain and never ended is true from where the margin is low on
+        due = alarms & (labels[before] <= _FALSE_ABOVE * threshold)
+        if due.any():
+            leads.append(1e3 * (slip_s - float(time_s[before[np.argmax(due)]])))
+        low = labels[before] < threshold
+        ideals.append(1e3 * (slip_s - float(time_s[before[np.argmax(low)]])) if low.any() else 0.0)
+    return LeadTimes(
+        trials=slips,
+        warned=len(leads),
+        median_ms=float(np.median(leads)) if leads else None,
+        ideal_ms=float(np.median(ideals)) if ideals else None,
+        false_per_minute=false / minutes if minutes > 0 else 0.0,
+        threshold=threshold,
+    )
+
+
+_BINS = 10
+
+
+def regression_scores(
+    labels: Float[np.ndarray, " frames"], predictions: Float[np.ndarray, " frames"], *, trials: int = 1
+) -> RegressionScores:
+    """MSE, R2, MAE and the MSE in ten bins of the safety margin (Polak, Table 1 and Fig. 7).
+
+    `RecordingError` if there is no frame, or a label lies outside [0, 1].
+    """
+    if len(labels) == 0:
+        raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
+    if not np.all((labels >= 0) & (labels <= 1)):
+        raise RecordingError("labels must lie in [0, 1]; give the safety margin as a fraction, not in percent")
+    squared = (predictions - labels) ** 2
+    spread = np.sum((labels - labels.mean()) ** 2)
+    # times ten, rounded: 0.3 * 10 must fall in bin 3 although 0.3 is not exact in binary
+    bins = np.minimum(np.floor(np.round(labels * _BINS, 9)), _BINS - 1)
+    errors = [squared[bins == index] for index in range(_BINS)]
+    means = [float(inside.mean()) if len(inside) else None for inside in errors]
+    return RegressionScores(
+        frames=len(labels),
+        trials=trials,
+        mse=float(squared.mean()),
+        r2=float(1 - squared.sum() / spread) if spread > 0 else None,
+        mae=float(np.abs(predictions - labels).mean()),
+        bins=tuple(
+            BinScore(low=index / _BINS, high=(index + 1) / _BINS, frames=len(errors[index]), mse=means[index])
+            for index in range(_BINS)
+        ),
+    )
+
+
+def score_predictions(predictions: ScoredFrames) -> RegressionScores:
+    """Errors of some predictions against their labels."""
+    count = len(set(predictions.trial.tolist()))
+    return regression_scores(predictions.safety_margin, predictions.prediction, trials=count)
+
+
+def find_lead_times(predictions: ScoredFrames) -> LeadTimes:
+    """Warnings of some predictions, see `lead_times`."""
+    return lead_times(predictions.trial.tolist(), predictions.time_s, predictions.safety_margin, predictions.prediction)

@@ -1,9 +1,7 @@
 """Training: fit a network to a data set."""
 
 import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from functools import partial
@@ -16,12 +14,13 @@ import torch
 from jaxtyping import Float
 from lightning.pytorch.callbacks import ModelCheckpoint, Timer
 from lightning.pytorch.loggers import Logger
-from torch import Tensor, nn
+from torch import nn
+from torch.utils.data import DataLoader
 
 from sliplens.codec import save_result
 from sliplens.errors import InputError, ModelError, RecordingError
 from sliplens.extras import pick
-from sliplens.files import output_folder, partial_folder, scratch_folder, versions
+from sliplens.files import output_folder, scratch_folder, versions
 from sliplens.images import has_colour
 from sliplens.models import Manifest, Network, build_model, load_checkpoint, save_checkpoint
 from sliplens.models.backbones import (
@@ -36,7 +35,7 @@ from sliplens.models.calibration import Calibration, Traction, calibrate_histogr
 from sliplens.models.checkpoint import Estimate, Ratio, condition_each, load, sensor_kind
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import fit_novelty
-from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting
+from sliplens.progress import OnProgress, add_note, open_stage, report_each, report_file, reporting
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset
 from sliplens.recordings.trial import Recording
@@ -50,7 +49,6 @@ from sliplens.training.data import (
     get_augmentation,
     has_ratio,
     load_frames,
-    make_loaders,
 )
 from sliplens.training.module import (
     DivergedError,
@@ -60,7 +58,6 @@ from sliplens.training.module import (
     learning_curve,
     make_trainer,
     run_trainer,
-    share_of_batch,
 )
 from sliplens.training.sequence import fit_sequence
 
@@ -88,8 +85,6 @@ class _Options(TrainingChanges, total=False):
     """Options of `train` besides its own parameters."""
 
     accelerator: Literal["auto", "cpu", "gpu"]
-    devices: int
-    num_nodes: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,9 +138,8 @@ def train(
     on_progress
         Callback for progress.
     options
-        `accelerator`, `devices` and `num_nodes`, as Lightning takes them: devices of each node, a process each; all
-        processes but the first end here. And fields of `TrainingConfig` that differ from the recipe, such as `epochs`,
-        `image_size`, `batch_size`, `max_minutes` or `seed`; None leaves a field as it is.
+        `accelerator`, as Lightning takes it, and fields of `TrainingConfig` that differ from the recipe, such as
+        `epochs`, `image_size`, `batch_size`, `max_minutes` or `seed`; None leaves a field as it is.
 
     Raises
     ------
@@ -156,22 +150,16 @@ def train(
     ModelError
         If the network to start from is of another kind, or the loss is no longer finite.
     """
-    accelerator, devices, nodes = (
-        options.pop("accelerator", "auto"), options.pop("devices", 1), options.pop("num_nodes", 1)
-    )  # fmt: skip
+    accelerator = options.pop("accelerator", "auto")
     changes: TrainingChanges = {name: value for name, value in options.items() if value is not None}  # pyright: ignore[reportAssignmentType]
     start = load(start_from) if isinstance(start_from, str | Path) else start_from
     config = _configure(recipe, changes, start)
     input = input or ("difference" if start is None else start.manifest.input)
-    trainer = make_trainer(config, accelerator=accelerator, devices=devices, num_nodes=nodes)
-    share_of_batch(config.batch_size, trainer.world_size)
+    trainer = make_trainer(config, accelerator=accelerator)
     if start is not None:
         require_same_kind(start, config, input)
-    if config.learns == "sequence" and (trainer.world_size > 1 or logger != "csv"):
-        raise InputError(
-            "a head of several frames is trained by one process and writes metrics.csv alone; leave out --devices and "
-            "--logger"
-        )
+    if config.learns == "sequence" and logger != "csv":
+        raise InputError("a head of several frames writes metrics.csv alone; leave out --logger")
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = pick(ENCODINGS, input, noun="input"), _choose_trials(data, condition)
     if start is not None and "head" not in changes and config.head == "margin-and-ratio" and not _stays(config):
@@ -182,24 +170,21 @@ def train(
     if start is not None:
         origin["started_from"] = start.manifest.weights_sha256
 
-    run = partial(
-        _fit_trials, config, data, trials, encoding=encoding, condition=condition, start=start, trainer=trainer
-    )
-    if not trainer.is_global_zero and out is not None:
-        # the target appears when a training is over, which no process leaves before the others: all see the same here
-        if overwrite or not Path(out).exists():
-            # in silence; the output folder is the first process's to write, and on a cluster this disk is nearer
-            with suppress(KeyboardInterrupt, DivergedError):
-                run(partial_folder(Path(out)), scratch=Path(tempfile.gettempdir()))
-        raise SystemExit(0)  # what comes after a training is for one process
+    def run(folder: Path, opened: Logger | None = None) -> Training:
+        if start is not None and config.learns == "sequence":
+            training = fit_sequence(config, start, data, trials, folder)
+        else:
+            training = _fit_trials(
+                config, data, trials, folder, encoding=encoding, start=start, trainer=trainer, logger=opened
+            )
+        return replace(training, condition=condition)
+
     with reporting(on_progress):
-        for sentence in _advise(config, *trials, start=start) if trainer.is_global_zero else ():
+        for sentence in _advise(config, *trials, start=start):
             add_note(sentence)
         if out is None:
-            if trainer.world_size > 1:
-                raise InputError("several processes need a folder that all can see; name one with out")
             with scratch_folder() as folder:
-                training = run(folder, scratch=folder)
+                training = run(folder)
                 return replace(load_checkpoint(folder), training=training)
         out = Path(out)
         with output_folder(out, stage="train", config={**origin, "training": config}, overwrite=overwrite) as output:
@@ -207,7 +192,7 @@ def train(
                 with open_logger(
                     logger, output.folder, run_name=out.name, recipe={**asdict(config), **origin}
                 ) as opened:
-                    training = run(output.folder, scratch=output.folder, logger=opened)
+                    training = run(output.folder, opened)
                 save_result(training, output.folder)
         network = load_checkpoint(out)
         training = network.training
@@ -224,16 +209,11 @@ def _fit_trials(
     folder: Path,
     *,
     encoding: Encoding,
-    condition: str | None,
     start: Network | None,
     trainer: lightning.Trainer,
-    scratch: Path,
-    logger: Logger | None = None,
+    logger: Logger | None,
 ) -> Training:
-    if config.learns == "sequence":
-        assert start is not None
-        return replace(fit_sequence(config, start, data, trials, folder), condition=condition)
-    load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=scratch)
+    load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=folder)
     with open_stage(f"Reading training trials ({encoding.name})"):
         train_frames = load_some(trials[0], untouched_share=config.untouched_share)
     with open_stage(f"Reading validation trials ({encoding.name})"):
@@ -247,8 +227,7 @@ def _fit_trials(
         pull_direction_deg=trained_directions(config, data, trials[0], start),
         trained_on=tuple(trial.sha256[:12] for some in trials for trial in some),
     )
-    training = fit(config, train_frames, validation, folder, origin=origin, start=start, trainer=trainer, logger=logger)
-    return replace(training, condition=condition)
+    return fit(config, train_frames, validation, folder, origin=origin, start=start, trainer=trainer, logger=logger)
 
 
 def _configure(recipe: str, changes: TrainingChanges, start: Network | None) -> TrainingConfig:
@@ -362,45 +341,40 @@ def calibrate(
     `trained_friction`: friction of the training frames, for a network of two outputs; without it the second result is
     None. `margin_calibration`: calibration of the margin, if it is to stay.
     """
-    was_training, device = model.training, next(model.parameters()).device
-    model.eval()
-    network = model.backbone if isinstance(model, HistogramRegressor) else model
+    device = next(model.parameters()).device
+    network = (model.backbone if isinstance(model, HistogramRegressor) else model).eval()
     outputs = torch.cat([network(inputs.to(device)).float().cpu() for inputs in validation.batches(batch_size)])
-    model.train(was_training)
     labels = validation.safety_margin
     if not isinstance(model, HistogramRegressor):
         margins = outputs.reshape(-1).double().numpy()
         return conformal_calibration(margins, None, None, labels, temperature=1.0), None
-    logits, ratio_logits = outputs[:, : len(model.edges) - 1], outputs[:, len(model.edges) - 1 :]
+    logits, ratio_logits = model.split(outputs)
     calibration, probabilities = calibrate_histogram(
         logits, model.edges, model.temperature, labels, calibration=margin_calibration
     )
     if model.ratio_edges is None or model.ratio_temperature is None or trained_friction is None:
         return calibration, None
-    rows = torch.isfinite(validation.traction_ratio) & torch.from_numpy(np.isfinite(validation.friction))
+    finite = torch.isfinite(validation.traction_ratio) & torch.from_numpy(np.isfinite(validation.friction))
+    rows = finite.numpy()
     of_ratio, ratio_probabilities = calibrate_histogram(
-        ratio_logits[rows], model.ratio_edges, model.ratio_temperature, validation.traction_ratio[rows]
+        ratio_logits[finite], model.ratio_edges, model.ratio_temperature, validation.traction_ratio[finite]
     )
-    quantiles = np.quantile(trained_friction[np.isfinite(trained_friction)], np.linspace(0, 1, 11))
-    edges = bin_edges(model)
+    friction, edges = (
+        np.quantile(trained_friction[np.isfinite(trained_friction)], np.linspace(0, 1, 11)),
+        bin_edges(model),
+    )
     estimate = Estimate(
-        margin=probabilities[rows.numpy()] @ model.centres.double().cpu().numpy(),
-        probabilities=probabilities[rows.numpy()],
+        margin=probabilities[rows] @ model.centres.double().cpu().numpy(),
+        probabilities=probabilities[rows],
         edges=edges,
         calibration=None,
         ratio=Ratio(probabilities=ratio_probabilities, edges=model.ratio_edges.double().cpu().numpy()),
     )
-    estimate = condition_each(estimate, validation.friction[rows.numpy()], trained_friction=quantiles)
+    estimate = condition_each(estimate, validation.friction[rows], trained_friction=friction)
     with_friction = conformal_calibration(
-        estimate.margin, estimate.probabilities, edges, labels[rows], temperature=calibration.temperature
+        estimate.margin, estimate.probabilities, edges, labels[finite], temperature=calibration.temperature
     )
-    return calibration, Traction(calibration=of_ratio, told=with_friction, friction=tuple(quantiles.tolist()))
-
-
-def _sample_batches(frames: FrameSet, *, batch_size: int) -> Iterator[Tensor]:
-    """Iterate over encoded frames spread over all trials, at most `_NOVELTY_FRAMES`."""
-    rows = torch.linspace(0, len(frames) - 1, min(len(frames), _NOVELTY_FRAMES)).round().long()
-    return (frames.__getitems__(some)[0] for some in rows.split(batch_size))
+    return calibration, Traction(calibration=of_ratio, told=with_friction, friction=tuple(friction.tolist()))
 
 
 def fit(
@@ -416,9 +390,6 @@ def fit(
 ) -> Training:
     """Train a network and save the weights that were best on the validation frames.
 
-    With several processes, each calls this with the same frames and takes its share of every batch; the first writes.
-    Batch normalisation uses the share alone, so the weights differ from those of one process.
-
     Parameters
     ----------
     config, origin
@@ -427,67 +398,63 @@ def fit(
         Encoded frames, of trials that do not overlap.
     folder
         Gets `model.safetensors`, `manifest.json` and `metrics.csv`; while training runs also checkpoints, from which a
-        call with the same folder continues. All processes must see it.
+        call with the same folder continues.
     start
         Network whose weights it starts from, instead of random ones; it is left as it is.
     trainer, logger
         Trainer of `make_trainer`, used once, and Lightning's logger.
     """
     trainer = trainer or make_trainer(config)
-    rank, processes, first = trainer.global_rank, trainer.world_size, trainer.is_global_zero
-    share = share_of_batch(config.batch_size, processes)
-    _check_frames(config, train, validation, processes)
+    _check_frames(config, train, validation)
     model = _begin(config, train.encoding, start)
-    shuffle = EpochShuffle(len(train), seed=config.seed, drawn=config.epoch_frames, rank=rank, processes=processes)
-    per_epoch = shuffle.drawn // config.batch_size
+    shuffle = EpochShuffle(len(train), seed=config.seed, drawn=config.epoch_frames)
+    per_epoch = len(shuffle) // config.batch_size
     timer = Timer(None if config.max_minutes is None else timedelta(minutes=config.max_minutes), verbose=False)
     progress = Progress(
         steps=config.epochs * per_epoch,
         timer=timer,
         max_minutes=config.max_minutes,
-        metrics_file=folder / "metrics.csv" if first else None,
+        metrics_file=folder / "metrics.csv",
     )
-    frames = train, validation
-    network: nn.Module = model
+    frames, network = (train, validation), model
     if config.learns == "ratio":
-        network, train, validation = _last_layer_alone(model, train, validation, batch_size=config.batch_size)
-    module = Regressor(
-        network,
-        config=config,
-        augmentation=get_augmentation(config.augmentation, neutral=train.encoding.neutral),
-        progress=progress,
-    )
+        network, frames = _last_layer_alone(model, *frames, batch_size=config.batch_size)
+    augmentation = get_augmentation(config.augmentation)
+    module = Regressor(network, config=config, augmentation=augmentation, progress=progress)
     best = ModelCheckpoint(dirpath=folder / "checkpoints", filename="best", monitor="validation_mse")
     # of every epoch: `save_last` writes one only where the best is written too
     last = ModelCheckpoint(dirpath=folder / "checkpoints", filename="last", enable_version_counter=False)
     # in this order: a checkpoint holds what the stopping has counted of the same epoch, and which was best so far
     early = [Patience("validation_mse", patience=config.patience)] if config.patience else []
     trainer.callbacks += [timer, progress, *early, best, last]  # pyright: ignore[reportAttributeAccessIssue]
-    trainer.loggers = [logger] if logger is not None and first else []
+    trainer.loggers = [] if logger is None else [logger]
     trainer.log_every_n_steps = min(50, per_epoch)  # pyright: ignore[reportAttributeAccessIssue]
-    loaders = make_loaders(train, validation, shuffle=shuffle, batch_size=share)
+    # a last small batch would make batch normalisation noisy; `FrameSet.__getitems__` makes batches
+    loader = partial(DataLoader, batch_size=config.batch_size, collate_fn=lambda batch: batch)
+    loaders = loader(frames[0], sampler=shuffle, drop_last=True), loader(frames[1])
 
     def save_best() -> float:
         """Calibrate and save the network of the best epoch; return its validation error."""
         # our own file of tensors and plain numbers, read back without unpickling anything else
         checkpoint = torch.load(best.best_model_path, map_location="cpu", weights_only=True)
         module.load_state_dict(checkpoint["state_dict"])
-        learnt = start if config.learns == "ratio" else None
+        learnt = start.manifest if start is not None and config.learns == "ratio" else None
         calibration, traction = calibrate(
             network,
-            validation,
+            frames[1],
             batch_size=config.batch_size,
             trained_friction=train.friction,
-            margin_calibration=None if learnt is None else learnt.manifest.calibration,
+            margin_calibration=learnt and learnt.calibration,
         )
         if network is not model:  # the last layer and the temperatures were fitted by themselves
             model.load_state_dict(network.state_dict(), strict=False)
             last_layer(model).load_state_dict(last_layer(network).state_dict())
         model.eval()
         if learnt is None:
-            novelty = fit_novelty(model, *(_sample_batches(some, batch_size=config.batch_size) for some in frames))
+            few = (some.sample(_NOVELTY_FRAMES, batch_size=config.batch_size) for some in (train, validation))
+            novelty = fit_novelty(model, *few)
         else:  # the last layer alone was trained: the early layers stay as they were
-            novelty = learnt.manifest.novelty
+            novelty = learnt.novelty
         manifest = Manifest(
             backbone=config.backbone,
             head=config.head,
@@ -510,7 +477,7 @@ def fit(
         with torch.random.fork_rng(devices=[]), open_stage(f"Training ({train.encoding.name})"):
             run_trainer(trainer, module, loaders, folder / "checkpoints" / "last.ckpt")
     except DivergedError as error:
-        if not first or not best.best_model_path:
+        if not best.best_model_path:
             raise
         raise ModelError(
             f"{error} (the best network so far, of validation MSE {save_best():.4g}, is in {folder})"
@@ -524,16 +491,14 @@ def fit(
         train_frames=len(train),
         validation_frames=len(validation),
         seed=config.seed,
-        best_validation_mse=save_best() if first else float(best.best_model_score or np.nan),
+        best_validation_mse=save_best(),
         epochs=progress.rows[-1][0],
         minutes=progress.minutes,
         stopped_by="no gain" if early and early[0].stopped_epoch else "time limit" if late else "epochs",
         parameters=sum(value.numel() for value in model.parameters()),
-        processes=processes,
         curve=learning_curve(progress.rows),
     )
-    if first:
-        shutil.rmtree(folder / "checkpoints")
+    shutil.rmtree(folder / "checkpoints")
     return training
 
 
@@ -556,32 +521,25 @@ def _begin(config: TrainingConfig, encoding: Encoding, start: Network | None) ->
 
 def _last_layer_alone(
     model: nn.Module, *frames: FrameSet, batch_size: int
-) -> tuple[HistogramRegressor, FrameSet, FrameSet]:
+) -> tuple[HistogramRegressor, tuple[FrameSet, ...]]:
     """Make a network of the last layer alone, and training and validation frames of its inputs."""
     alone = HistogramRegressor(last_layer(model), ratio=True)
     for name in ("temperature", "edges", "ratio_edges"):  # edges of a network of the package are rounded
         alone.get_buffer(name).copy_(model.get_buffer(name))
-    features = []
-    for some, name in zip(frames, ("training", "validation"), strict=True):
-        with open_stage(f"Passing {name} frames through the network"):
-            features.append(extract_features(model, some, batch_size=batch_size))
-    return alone, *features
+    with open_stage("Passing frames through the network"):
+        return alone, tuple(extract_features(model, some, batch_size=batch_size) for some in report_each(frames))
 
 
-def _check_frames(config: TrainingConfig, train: FrameSet, validation: FrameSet, processes: int) -> None:
+def _check_frames(config: TrainingConfig, train: FrameSet, validation: FrameSet) -> None:
     if (config.epoch_frames or len(train)) < config.batch_size:
         raise InputError(f"{len(train)} training frames do not fill a batch of {config.batch_size}; lower batch_size")
-    if config.head == "margin-and-ratio":
-        for name, frames in (("training", train), ("validation", validation)):
-            if not (torch.isfinite(frames.traction_ratio).numpy() & np.isfinite(frames.friction)).any():
-                raise InputError(
-                    f"no {name} frame has forces and friction, from which F_t / F_n is learnt; import the trials with "
-                    "their forces, or choose another --head"
-                )
-    if len(validation) < processes:
-        raise InputError(f"{len(validation)} validation frames are too few for {processes} processes; lower --devices")
-    shared = set(train.trial) & set(validation.trial)
-    if shared:
+    for name, frames in (("training", train), ("validation", validation)) if config.head == "margin-and-ratio" else ():
+        if not (torch.isfinite(frames.traction_ratio).numpy() & np.isfinite(frames.friction)).any():
+            raise InputError(
+                f"no {name} frame has forces and friction, from which F_t / F_n is learnt; import the trials with "
+                "their forces, or choose another --head"
+            )
+    if shared := set(train.trial) & set(validation.trial):
         raise InputError(f"trial {min(shared)} is in both training and validation; split by trial")
 
 

@@ -19,8 +19,8 @@ from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.callbacks import Callback, EarlyStopping, Timer
 from pytorch_optimizer import Ranger21
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.utils.data import DataLoader
-from torchmetrics import MeanSquaredError
 
 from sliplens.errors import InputError, ModelError
 from sliplens.files import whole_file
@@ -32,7 +32,7 @@ from sliplens.training.data import Augmentation
 
 
 class DivergedError(ModelError):
-    """A loss or an error is no longer finite; every process of a training raises it together."""
+    """A loss or an error is no longer finite."""
 
 
 class Regressor(lightning.LightningModule):
@@ -54,9 +54,6 @@ class Regressor(lightning.LightningModule):
     ) -> None:
         super().__init__()
         self.model, self.config, self.augmentation, self.progress = model, config, augmentation, progress
-        # sums and counts, added up over the processes: exact however the frames are shared
-        self.train_mse = MeanSquaredError()
-        self.validation_mse = MeanSquaredError()
         edges = ratio_edges(model)
         centres = None if edges is None else torch.from_numpy(bin_centres(edges)).float()
         self.register_buffer("ratio_centres", centres, persistent=False)
@@ -77,19 +74,18 @@ class Regressor(lightning.LightningModule):
         """One step; a loss that is not finite stops the training."""
         images, labels, ratios = batch
         if self.augmentation is not None:
-            # seeded by the step, so that a resumed training draws what it would have drawn; and by the process
-            seed = self.config.seed * 1_000_003 + self.global_step + (self.global_rank << 40)
+            # seeded by the step, so that a resumed training draws what it would have drawn
+            seed = self.config.seed * 1_000_003 + self.global_step
             generator = torch.Generator(device=images.device).manual_seed(seed)
             images = self.augmentation(images, generator=generator)
         loss, margins = margin_loss(self.model, images, labels, ratios)
-        # all stop or none: a process that goes on alone waits for ever
-        if not self.trainer.strategy.reduce_boolean_decision(bool(torch.isfinite(loss))):
+        if not torch.isfinite(loss):
             raise DivergedError(
                 f"the training loss is {loss.item()} in epoch {self.current_epoch + 1}, at step {self.global_step}; "
                 "lower the learning rate and try again"
             )
-        self.train_mse.update(margins.detach(), labels)
-        self.log("train_mse", self.train_mse, on_step=False, on_epoch=True)
+        error = functional.mse_loss(margins.detach(), labels)
+        self.log("train_mse", error, on_step=False, on_epoch=True, batch_size=len(labels))
         if self.trainer.loggers:
             rate = self.trainer.optimizers[0].param_groups[0]["lr"]
             self.log("learning_rate", rate, on_step=True, on_epoch=False)
@@ -102,8 +98,7 @@ class Regressor(lightning.LightningModule):
         if self.ratio_centres is not None and (finite := torch.isfinite(ratios)).any():
             margins = torch.cat([margins, (histograms[1] @ self.ratio_centres)[finite]])
             labels = torch.cat([labels, ratios[finite]])
-        self.validation_mse.update(margins, labels)
-        self.log("validation_mse", self.validation_mse, on_epoch=True)
+        self.log("validation_mse", functional.mse_loss(margins, labels), on_epoch=True, batch_size=len(labels))
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         """Set the learning rate for the share of the training that is done; Ranger21 sets its own."""
@@ -130,19 +125,17 @@ class Regressor(lightning.LightningModule):
 class Progress(Callback):
     """Count the steps, report them, and write a table row after each epoch.
 
-    Its state is part of the checkpoint. With a time limit all processes use the clock of the first, since the learning
-    rate follows it.
+    Its state is part of the checkpoint.
     """
 
     steps: int
     timer: Timer
     """Clock of the training, which also stops it at the time limit; a resumed training has the time that is left."""
     max_minutes: float | None = None
-    metrics_file: Path | None = None
-    """File of the table; None in all processes but the first."""
+    metrics_file: Path
+    """File of the table."""
     step: int = 0
     rows: list[list[float]] = field(default_factory=list)
-    _time_share: float = 0.0
 
     @property
     def minutes(self) -> float:
@@ -151,7 +144,7 @@ class Progress(Callback):
 
     def fraction(self) -> float:
         """Share of the training that is done, in steps or in minutes, whichever is larger."""
-        return min(1.0, max(self.step / self.steps, self._time_share))
+        return min(1.0, max(self.step / self.steps, self.minutes / self.max_minutes if self.max_minutes else 0.0))
 
     def state_dict(self) -> dict[str, list[list[float]]]:
         """Return the rows, for a checkpoint."""
@@ -165,24 +158,15 @@ class Progress(Callback):
         """Restore the step of a checkpoint; from now on a request to end is an interruption."""
         self.step = trainer.global_step
         if threading.current_thread() is threading.main_thread():
-            # Lightning 2.6 would ask the other processes from within its handler, and all would wait for ever; what was
-            # there before comes back when the training is over
+            # what was there before comes back when the training is over
             signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-    def on_train_batch_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, batch: Any, batch_idx: int
-    ) -> None:
-        """Measure the share of the time limit, which the learning rate follows."""
-        if self.max_minutes is not None:
-            self._time_share = trainer.strategy.broadcast(self.minutes) / self.max_minutes
 
     def on_train_batch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Report the step."""
         self.step = trainer.global_step
-        if trainer.is_global_zero:
-            report_progress(round(self.fraction() * self.steps), self.steps)
+        report_progress(round(self.fraction() * self.steps), self.steps)
 
     def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
         """Write the epoch's row; the validation has run by now."""
@@ -192,7 +176,7 @@ class Progress(Callback):
         add_row(self.rows, row, self.metrics_file)
 
 
-def add_row(rows: list[list[float]], row: list[float], file: Path | None) -> None:
+def add_row(rows: list[list[float]], row: list[float], file: Path) -> None:
     """Add epoch, training MSE, validation MSE and minutes to a learning curve, and write all of it to a CSV file.
 
     `DivergedError` if the validation error is not finite.
@@ -202,12 +186,11 @@ def add_row(rows: list[list[float]], row: list[float], file: Path | None) -> Non
             f"the validation error is {row[2]} after epoch {len(rows) + 1}; lower the learning rate and try again"
         )
     rows.append(row)
-    if file is not None:
-        lines = ["epoch,train_mse,validation_mse,minutes"]
-        lines += [f"{r[0]:.3f},{r[1]:.6g},{r[2]:.6g},{r[3]:.4f}" for r in rows]
-        part = file.with_name(file.name + ".part")
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        part.replace(file)
+    lines = ["epoch,train_mse,validation_mse,minutes"]
+    lines += [f"{r[0]:.3f},{r[1]:.6g},{r[2]:.6g},{r[3]:.4f}" for r in rows]
+    part = file.with_name(file.name + ".part")
+    part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    part.replace(file)
 
 
 def learning_curve(rows: list[list[float]]) -> LearningCurve:
@@ -225,18 +208,14 @@ class Patience(EarlyStopping):
             trainer.should_stop = True
 
 
-def make_trainer(
-    config: TrainingConfig, *, accelerator: Literal["auto", "cpu", "gpu"] = "auto", devices: int = 1, num_nodes: int = 1
-) -> lightning.Trainer:
-    """Make the trainer of this process; `devices` is the number of processes of each node, as Lightning takes it."""
+def make_trainer(config: TrainingConfig, *, accelerator: Literal["auto", "cpu", "gpu"] = "auto") -> lightning.Trainer:
+    """Make the trainer of one device."""
     half = config.mixed_precision and accelerator != "cpu" and torch.cuda.is_available()
     try:
         with quiet_lightning():
             return lightning.Trainer(
                 accelerator=accelerator,
-                devices=devices,
-                num_nodes=num_nodes,
-                strategy="ddp" if devices * num_nodes > 1 else "auto",
+                devices=1,
                 plugins=[WholeCheckpoints()],
                 max_epochs=config.epochs,
                 logger=False,
@@ -244,27 +223,13 @@ def make_trainer(
                 enable_progress_bar=False,
                 enable_model_summary=False,
                 num_sanity_val_steps=0,
-                # ours share the frames as the loss and the validation error need it
-                use_distributed_sampler=False,
                 # Ranger21 clips by itself, adaptively
                 gradient_clip_val=1.0 if config.optimizer == "adamw" else None,
                 precision="16-mixed" if half else "32-true",
             )
     except (MisconfigurationException, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split()).rstrip(".")
-        raise InputError(
-            f"this machine cannot train on {devices} x {accelerator} ({reason}); change --devices or --accelerator"
-        ) from None
-
-
-def share_of_batch(batch_size: int, processes: int) -> int:
-    """Return the number of images of a batch that each process takes."""
-    share = max(2, batch_size // processes)  # batch normalisation needs more than one image
-    if share * processes != batch_size:
-        raise InputError(
-            f"batch_size {batch_size} does not divide among {processes} processes; choose {share * processes}"
-        )
-    return share
+        raise InputError(f"this machine cannot train on {accelerator} ({reason}); change --accelerator") from None
 
 
 class WholeCheckpoints(TorchCheckpointIO):
@@ -292,21 +257,13 @@ def run_trainer(
     on_interrupt = signal.getsignal(signal.SIGINT)
     with quiet_lightning():
         try:
-            if trainer.global_rank > 0:
-                # returns when the first process has come so far: by then it has decided whether to go on or begin anew
-                trainer.strategy.setup_environment()
             trainer.fit(module, *loaders, ckpt_path=str(last) if last.is_file() else None, weights_only=True)
-        except BaseException as error:
-            # processes that Lightning started here would wait for this one; a gentler signal does not reach them
-            if not isinstance(error, DivergedError) and trainer.strategy.launcher is not None:
-                trainer.strategy.launcher.kill(getattr(signal, "SIGKILL", signal.SIGTERM))
-            if isinstance(error, SystemExit):
-                # Lightning exits and goes deaf to Ctrl-C; what happens next is the caller's to decide
-                signal.signal(signal.SIGINT, on_interrupt)
-                raise KeyboardInterrupt from None
-            if isinstance(error, torch.OutOfMemoryError):
-                raise ModelError("the memory of the GPU is full; lower --batch-size or --image-size") from None
-            raise
+        except SystemExit:
+            # Lightning exits and goes deaf to Ctrl-C; what happens next is the caller's to decide
+            signal.signal(signal.SIGINT, on_interrupt)
+            raise KeyboardInterrupt from None
+        except torch.OutOfMemoryError:
+            raise ModelError("the memory of the GPU is full; lower --batch-size or --image-size") from None
 
 
 @contextmanager
@@ -330,6 +287,5 @@ _EXPECTED = (
     ".*does not have many workers.*",  # the frames lie in memory: worker processes would only copy them
     ".*Checkpoint directory.*exists and is not empty.*",  # resuming means to go on in such a folder
     ".*LeafSpec.*",  # Lightning 2.6 calls what torch 2.13 deprecates
-    ".*Grad strides do not match bucket view strides.*",  # channels last, which is worth more than this costs
     ".*GPU available but not used.*",  # who asks for --accelerator cpu has a reason
 )

@@ -143,7 +143,6 @@ def fit_sequence(
         stopped_by="epochs",
         best_validation_mse=min(row[2] for row in rows),
         parameters=sum(values.numel() for values in head.parameters()),
-        processes=1,
         curve=learning_curve(rows),
     )
 
