@@ -57,7 +57,7 @@ def test_difference_images_need_no_reference_and_other_networks_do(trained):
 
 def test_a_method_takes_its_options(trained):
     run = trained("difference")
-    assert get_explainer("poly-cam", variant="+") == PolyCam(variant="+")
+    assert get_explainer("poly-cam", level=1) == PolyCam(level=1)
     coarse = sliplens.explain(run, FRAMES[:1], method=get_explainer("occlusion", tile_px=SIZE))
     assert len(np.unique(coarse.relevance["occlusion"])) == 1  # one tile is the whole image
     both = sliplens.explain(run, FRAMES[:1], method=["grad-cam", get_explainer("occlusion", tile_px=32)])

@@ -1,10 +1,7 @@
-import pytest
 import torch
 from torch import nn
 
-from sliplens.errors import InputError
 from sliplens.explainers.gradients import IntegratedGradients
-from sliplens.progress import reporting
 
 
 class Linear(nn.Module):
@@ -50,17 +47,6 @@ def test_steps_grow_until_the_sum_is_complete(network, images, reference):
     assert not any("unexplained" in sentence for sentence in adaptive.warnings)
 
 
-def test_each_image_takes_the_steps_that_it_needs(network, images):
-    model = network("gap")
-    references = torch.stack([images[0] * 0.999, torch.zeros_like(images[0])])  # a short way, and a long one
-    counted = Count(model)
-    IntegratedGradients(steps=1, tolerance=1e-3)(counted, images[:1], reference=references[0])
-    short = sum(counted.batches)
-    counted.batches.clear()
-    IntegratedGradients(steps=1, tolerance=1e-3)(counted, images[:1], reference=references[1])
-    assert short < sum(counted.batches)
-
-
 def test_the_steps_go_where_the_network_changes():
     class Steep(nn.Module):
         """Rises from 0 to 1 within a twentieth of the way."""
@@ -101,24 +87,3 @@ def test_one_pass_is_bounded(network, images):
     counted = Count(network("gap"))
     IntegratedGradients(steps=50, max_steps=50, batch_size=8)(counted, images)
     assert max(counted.batches) <= 8
-
-
-def test_progress_counts_images(network, images):
-    seen = []
-    with reporting(lambda *step: seen.append(step)):
-        IntegratedGradients()(network("gap"), images)
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"steps": 0}, "steps = 0 and max_steps = 1024; give 1 <= steps <= max_steps"),
-        ({"steps": 64, "max_steps": 32}, "steps = 64 and max_steps = 32; give 1 <= steps <= max_steps"),
-        ({"batch_size": 0}, "batch_size is 0; give at least 1"),
-        ({"tolerance": 0.0}, "tolerance is 0.0; give a share above 0"),
-    ],
-)
-def test_rejects_options(options, message):
-    with pytest.raises(InputError, match=message):
-        IntegratedGradients(**options)

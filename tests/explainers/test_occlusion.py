@@ -2,7 +2,6 @@ import pytest
 import torch
 from torch import nn
 
-from sliplens.errors import InputError
 from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.occlusion import Occlusion, marker_regions, tile_regions
 
@@ -72,17 +71,3 @@ def test_markers_of_a_linear_model_add_up(linear, small):
     for region in marker_regions((12, 12), markers, radius_px=2.0).unique():
         inside = marker_regions((12, 12), markers, radius_px=2.0) == region
         assert float(occluded.relevance[0][inside].std()) < 1e-7
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"tile_px": 0}, "occlusion's tile_px is 0; give at least 1 pixel"),
-        ({"batch_size": 0}, "occlusion's batch_size is 0; give at least 1"),
-        ({"markers_px": torch.zeros(1, 2)}, "occlusion has 1 marker.* and no radius_px; a single one's reach"),
-        ({"radius_px": 0.0}, "occlusion's radius_px is 0.0; give a radius above 0 pixels"),
-    ],
-)
-def test_rejects_options(options, message):
-    with pytest.raises(InputError, match=message):
-        Occlusion(**options)

@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from sliplens.errors import ImageError, InputError
+from sliplens.errors import ImageError
 from sliplens.explainers.gradients import ExpectedGradients, IntegratedGradients, SmoothGrad
 
 
@@ -40,19 +40,6 @@ def test_smooth_grad_leaves_the_random_state_alone(network, small):
     assert torch.equal(torch.rand(3), expected)
     assert torch.equal(SmoothGrad(samples=3)(network("gap"), small).relevance, one.relevance)
     assert not torch.equal(SmoothGrad(samples=3, seed=1)(network("gap"), small).relevance, one.relevance)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"samples": 0}, "SmoothGrad's samples is 0; give at least 1"),
-        ({"batch_size": 0}, "SmoothGrad's batch_size is 0; give at least 1"),
-        ({"noise": -0.1}, "SmoothGrad's noise is -0.1; give a standard deviation of at least 0"),
-    ],
-)
-def test_smooth_grad_rejects_options(options, message):
-    with pytest.raises(InputError, match=message):
-        SmoothGrad(**options)
 
 
 def test_expected_gradients_are_the_mean_of_integrated_gradients(small):

@@ -1,6 +1,6 @@
 """Attribution maps of a batch, their checks, and arithmetic on maps."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -29,14 +29,14 @@ def spread(maps: Float[Tensor, "*maps rows columns"], size: tuple[int, int]) -> 
     Pixel p receives sum over cells i of B[p, i] m[i] / sum over p' of B[p', i], B the bilinear weights (corners not
     aligned); plain resizing would change the total where the sizes do not divide.
     """
-    rows, columns = (_received(maps, axis=axis, pixels=pixels) for axis, pixels in zip((-2, -1), size, strict=True))
+
+    def received(cells: int, pixels: int) -> Tensor:
+        identity = torch.eye(cells, dtype=maps.dtype, device=maps.device)[None]
+        weights = functional.interpolate(identity, size=pixels, mode="linear", align_corners=False)
+        return weights.sum(dim=-1)[0].clamp_min(FLOOR)
+
+    rows, columns = (received(cells, pixels) for cells, pixels in zip(maps.shape[-2:], size, strict=True))
     return resize(maps / (rows[:, None] * columns), size)
-
-
-def _received(maps: Tensor, *, axis: int, pixels: int) -> Tensor:
-    identity = torch.eye(maps.shape[axis], dtype=maps.dtype, device=maps.device)
-    weights = functional.interpolate(identity[None], size=pixels, mode="linear", align_corners=False)
-    return weights.sum(dim=-1)[0].clamp_min(FLOOR)
 
 
 def percentile_bounds(
@@ -81,25 +81,22 @@ def combine(
     weights: Sequence[Float[Tensor, " _channels"]],
     *,
     size: tuple[int, int],
-) -> list[Float[Tensor, "height width"]]:
-    """Turn the channel weights of every layer into one saliency a layer, in [0, 1], resized to the image.
+) -> Float[Tensor, "height width"]:
+    """Turn the channel weights of all layers, fine to coarse, into one saliency in [0, 1], resized to the image.
 
     From the last layer on a layer's map is divided by itself resized to the coarser result and back (LNorm), then
-    multiplied by that result; a level's saliency is this product normalised like a mask.
+    multiplied by that result; the finest product is normalised like a mask.
 
     Englebert, Cornu and De Vleeschouwer, *Poly-CAM*, ICPR 2022, section III, and its public code.
     """
-    saliencies = []
-    coarser: Tensor | None = None
-    for activation, weight in zip(reversed(activations), reversed(weights), strict=True):
-        product = layer_map(activation, weight)
-        if coarser is not None:
-            here = product.shape[-2], product.shape[-1]
-            smooth = resize(resize(product, (coarser.shape[-2], coarser.shape[-1])), here)
-            product = torch.relu(product / smooth.clamp_min(FLOOR) * resize(coarser, here))
-        saliencies.append(resize(to_masks(product), size))
-        coarser = product
-    return saliencies[::-1]
+    *finer, coarsest = zip(activations, weights, strict=True)
+    product = layer_map(*coarsest)
+    for layer in reversed(finer):
+        coarser, product = product, layer_map(*layer)
+        here = product.shape[-2], product.shape[-1]
+        smooth = resize(resize(product, (coarser.shape[-2], coarser.shape[-1])), here)
+        product = torch.relu(product / smooth.clamp_min(FLOOR) * resize(coarser, here))
+    return resize(to_masks(product), size)
 
 
 def scale_to(
@@ -157,18 +154,6 @@ def top_overlap(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Level:
-    """Contribution of one layer to a map that is built layer by layer."""
-
-    layer: str
-    """Name of the layer in the network."""
-    saliency: Float[Tensor, "batch height width"]
-    """Map in [0, 1] as it stood at this layer, resized to the image."""
-    weights: Float[Tensor, "batch channels"]
-    """Weight of each channel, >= 0: for the regression score a share of f(x) - f(reference)."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Approximation:
     """Likeness of an approximate map to the exact one, estimated from its measurements."""
 
@@ -204,8 +189,6 @@ class Attribution:
     """Wall-clock time of the call for all images, device work included."""
     warnings: tuple[str, ...] = ()
     """Reasons not to trust a map, one sentence each."""
-    levels: tuple[Level, ...] = ()
-    """Map layer by layer, fine to coarse; empty unless the method has levels and its option `levels` is set."""
     approximations: tuple[Approximation, ...] = ()
     """Likeness of each image's map to the exact one; empty where the maps are exact."""
     engine: str = "torch"
@@ -245,8 +228,6 @@ CLOSE = 0.02  # margin units; a difference below the regressor's error explains 
 GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
 LOWEST, HIGHEST = -0.1, 1.1  # predictions of a regressor on data like its training data
 ALIKE_R, ALIKE_TOP = 0.99, 0.9  # required likeness of an approximate map to the exact one
-EXACT = 1e-4  # allowed difference of two engines' maps in [0, 1]
-_ULPS = 16  # of four predictions that differ, measured at 2 to 9
 FLAT = 0.1  # share of |f(x) - f(reference)| that gradients at the image must make up, all of one sign
 
 
@@ -294,32 +275,6 @@ def check_weights(
                     f"image {index}: every channel of layer {layer} has the weight {float(weight[0]):.3g}, "
                     "so the masked passes chose nothing and the map shows activity only"
                 )
-
-
-def effect_rounding(
-    weights: Sequence[Float[Tensor, " _channels"]], *, prediction: float, reference_prediction: float
-) -> float:
-    """Share of a layer's largest effect that rounding may add or take, the largest of all layers; 0 without effects.
-
-    An effect is the difference of four predictions, each known to a few units in the last place whoever adds up its
-    sums; what is left of that in a map grows as the effects fall. `weights`: effects over f(x) - f(reference).
-    """
-    change, size = abs(prediction - reference_prediction), max(1.0, abs(prediction), abs(reference_prediction))
-    largest = [change * float(shares.abs().max()) for shares in weights if len(shares) and shares.any()]
-    rounding = _ULPS * torch.finfo(weights[0].dtype).eps * size
-    return max((rounding / effect for effect in largest if effect > 0), default=0.0)
-
-
-def check_rounding(
-    weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, predictions: Iterable[tuple[float, float]]
-) -> Iterator[str]:
-    """Warn of images whose change is so small that rounding shows in the map; predictions are f(x) and f(b)."""
-    for index, (shares, (high, low)) in enumerate(zip(weights, predictions, strict=True)):
-        if (share := effect_rounding(shares, prediction=high, reference_prediction=low)) > EXACT:
-            yield (
-                f"image {index}: the effects are so small that rounding makes up to {share:.1g} of the strongest, so "
-                "another engine or machine may give another map"
-            )
 
 
 def check_approximations(approximations: Sequence[Approximation]) -> Iterator[str]:

@@ -25,8 +25,7 @@ def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = Fa
     """Record the output of each named module in every forward pass made inside, by name.
 
     Names are those of `model.named_modules()`; of a module called twice the last output counts. `differentiable`
-    starts the graph anew at each recorded output, so that its gradient can be taken; of several modules only the last
-    one's gradient is whole.
+    starts the graph anew at each recorded output: of several modules only the last one's gradient is whole.
     """
     outputs: dict[str, Tensor] = {}
     modules = dict(model.named_modules())
@@ -42,18 +41,16 @@ def capture(model: nn.Module, names: Sequence[str], *, differentiable: bool = Fa
         yield outputs
 
 
-Shape = tuple[int, int, int]
+Shape: TypeAlias = tuple[int, int, int]
 """Channels, rows and columns of a map."""
 
 
-@dataclass(frozen=True)
-class Layer:
+class Layer(NamedTuple):
     """A module whose output is a map."""
 
     name: str
     """Its name in `model.named_modules()`."""
     shape: Shape
-    """Channels, rows and columns of the map."""
 
     @property
     def channels(self) -> int:
@@ -76,12 +73,11 @@ def find_layers(
 ) -> tuple[Layer, ...]:
     """Find the layers to explain, in the order in which they run: fine to coarse in the usual network.
 
-    The network is run once, with one image, and its main path followed: the modules that the network itself calls,
-    looking into plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more
-    than two, but not into blocks and their branches. Each resolution and width gives its last map; a layer without
-    parameters (pooling) is left out, as are 1 x 1 maps. For TorchVision's ShuffleNetV2 these are conv1, stage2, stage3,
-    stage4 and conv5, for its ResNet-18 relu and layer1 to layer4. With `names`, as `model.named_modules()` has them,
-    those modules are taken instead.
+    The network is run once, with one image, and its main path followed, not into blocks and their branches but into
+    plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more than two.
+    Each resolution and width gives its last map; layers without parameters (pooling) and 1 x 1 maps are left out. For
+    TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and conv5. With `names`, as
+    `model.named_modules()` has them, those modules are taken instead.
 
     Raises
     ------
@@ -161,7 +157,6 @@ def _record(model: nn.Module, images: Tensor) -> _Call:
 
 
 def _map_shape(value: object) -> Shape | None:
-    """Channels, rows and columns of a map, else None."""
     if not isinstance(value, Tensor) or value.ndim != 4:
         return None
     channels, height, width = value.shape[1:]
@@ -200,21 +195,21 @@ def _distinct(steps: list[_Call]) -> tuple[Layer, ...]:
 
 
 def _named(model: nn.Module, root: _Call, names: Sequence[str], *, others: tuple[Layer, ...]) -> tuple[Layer, ...]:
-    available = [name for name, _ in model.named_modules() if name]
+    """Find modules by name, each where it ended last."""
     shapes: dict[str, Shape | None] = {}
     for call in _finished(root):
-        shapes.pop(call.name, None)  # a module called twice counts where it ended last
+        shapes.pop(call.name, None)
         shapes[call.name] = call.output_shape
+    available, choices = [name for name, _ in model.named_modules() if name], [layer.name for layer in others]
     for name in names:
         if name not in available:
-            choices = [layer.name for layer in others] + get_close_matches(name, available, n=3)
+            choices = dict.fromkeys([*choices, *get_close_matches(name, available, n=3)])
             raise ModelError(
-                f"{type(model).__name__} has no layer {name!r}; choose among {', '.join(dict.fromkeys(choices))} "
+                f"{type(model).__name__} has no layer {name!r}; choose among {', '.join(choices)} "
                 "or another name of model.named_modules()"
             )
         if not _is_spatial(shapes.get(name)):
-            choices = ", ".join(layer.name for layer in others)
-            raise ModelError(f"layer {name!r} gives no spatial map; choose among {choices or 'none'}")
+            raise ModelError(f"layer {name!r} gives no spatial map; choose among {', '.join(choices) or 'none'}")
     if not names:
         raise ModelError("the list of layers is empty; name at least one, or pass None to have them found")
     return tuple(Layer(name, shape) for name, shape in shapes.items() if shape is not None and name in names)
@@ -245,24 +240,27 @@ class _Cam(Method):
     has no completeness gap; the reference then only decides what `saliency` shows."""
     relu: bool = False
     """Keep the cells above zero alone, as published: those that raise the prediction, whichever way it went. Their map
-    is then scaled to add up to |f(x) - f(b)|, which is a convention, and says nothing of what one pixel contributes;
-    its pixels are ranked and shown in the published order, where the prediction fell too."""
+    is then scaled to add up to |f(x) - f(b)|, a convention; its pixels are ranked and shown in the published order."""
     batch_size: int = 32
 
     one_sided: ClassVar[bool] = False
-    """True if only gradients along the change of the prediction count. Otherwise the contrast adds up to f(x) - f(b)
-    for a head linear in the mean over space."""
+    """True if only gradients along the change of the prediction count."""
 
     @staticmethod
     @abstractmethod
     def cells(activations: _Maps, gradients: _Maps) -> _Cells:
-        """Relevance of the layer's cells in margin units, before any ReLU."""
+        """Compute the relevance of the layer's cells in margin units, before any ReLU."""
 
     def __post_init__(self) -> None:
         require_at_least_one(type(self).__name__, batch_size=self.batch_size)
 
     def _explain(self, comparison: Comparison) -> Attribution:
-        layer = self._find_layer(comparison)
+        try:
+            names = None if self.layer is None else (self.layer,)
+            layer = cached_layers(comparison.model, comparison.images[:1], names=names)[-1]
+        except ModelError:
+            _ = comparison.change  # a model that gives no number has a greater fault than one without layers
+            raise
         maps, predictions, reference_predictions = [], [], []
         empty = reference_prediction = torch.empty(0)
         parts = torch.arange(len(comparison.images)).split(self.batch_size)
@@ -293,17 +291,9 @@ class _Cam(Method):
         )
         return replace(attribution, raises_only=self.relu)
 
-    def _find_layer(self, comparison: Comparison) -> Layer:
-        names = None if self.layer is None else (self.layer,)
-        try:
-            return cached_layers(comparison.model, comparison.images[:1], names=names)[-1]
-        except ModelError:
-            _ = comparison.change  # a model that gives no number has a greater fault than one without layers
-            raise
-
 
 def _differentiate(comparison: Comparison, batch: Tensor, *, count: int, layer: Layer) -> tuple[Tensor, Tensor, Tensor]:
-    """Activations, gradients of the first `count` predictions in them, and predictions of a batch."""
+    """Compute activations, gradients of the first `count` predictions in them, and predictions of a batch."""
     with capture(comparison.model, [layer.name], differentiable=True) as outputs:
         predictions = comparison.predict(batch)
     if not predictions.requires_grad:
@@ -319,8 +309,8 @@ class GradCam(_Cam):
     """Grad-CAM of one layer against the reference, signed, in margin units.
 
     The relevance of a cell is sum over c of alpha_c (A_c(x) - A_c(b)), alpha_c the mean over space of df/dA_c at x,
-    which for a head linear in the mean over space adds up to f(x) - f(b) exactly, whatever the bias. A regressor's
-    negative evidence is evidence, so the ReLU of the published map is left out.
+    which for a head linear in the mean over space adds up to f(x) - f(b) exactly. A regressor's negative evidence is
+    evidence, so the ReLU of the published map is left out.
 
     References
     ----------
@@ -338,10 +328,9 @@ class GradCam(_Cam):
 
 @dataclass(frozen=True, kw_only=True)
 class HiResCam(_Cam):
-    """HiResCAM of one layer against the reference, signed, in margin units.
+    """HiResCAM: Grad-CAM with each cell weighted by its own gradient.
 
-    As Grad-CAM, but each cell is weighted by its own gradient, so that the map shows where the layers behind look. With
-    the mean over space as head the two are the same. Options are those of `GradCam`.
+    With the mean over space as head the two are the same.
 
     References
     ----------
@@ -359,12 +348,10 @@ class HiResCam(_Cam):
 
 @dataclass(frozen=True, kw_only=True)
 class LayerCam(_Cam):
-    """LayerCAM of one layer against the reference, signed, in margin units.
+    """LayerCAM: HiResCAM of the gradients that point the way the prediction went.
 
-    The published map keeps the cells and channels whose gradient is positive, those that raise a class. A regressor's
-    prediction may have fallen, so kept are those whose gradient points the way the prediction went: with
-    s = sign(f(x) - f(b)) the map is s sum over c of relu(s df/dA_c) (A_c(x) - A_c(b)). The rest is left out, so the map
-    adds up to nothing in particular and has no completeness gap. Options are those of `GradCam`.
+    With s = sign(f(x) - f(b)) the map is s sum over c of relu(s df/dA_c) (A_c(x) - A_c(b)); the published one keeps
+    the gradients above zero, those that raise a class. It adds up to nothing in particular.
 
     References
     ----------

@@ -3,7 +3,7 @@
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
@@ -32,9 +32,7 @@ def frozen(model: nn.Module) -> Iterator[None]:
     training = [(module, module.training) for module in model.modules()]
     trainable = [(parameter, parameter.requires_grad) for parameter in model.parameters()]
     try:
-        model.eval()
-        for parameter, _ in trainable:
-            parameter.requires_grad_(False)
+        model.eval().requires_grad_(requires_grad=False)
         yield
     finally:
         # flag by flag: train() would recurse and undo what a caller had frozen
@@ -84,8 +82,8 @@ class Comparison:
         return self._predict_all(self.references, "reference").expand_as(prediction)
 
     @torch.no_grad()
-    def _predict_all(self, images: Tensor, what: str) -> Tensor:
-        return _require_finite(torch.cat([self.predict(part) for part in images.split(_FORWARD_BATCH)]), what)
+    def _predict_all(self, images: Tensor, name: str) -> Tensor:
+        return _require_finite(torch.cat([self.predict(part) for part in images.split(_FORWARD_BATCH)]), name)
 
     def with_predictions(self, prediction: Tensor, reference_prediction: Tensor) -> "Comparison":
         """Return a comparison with predictions that were made elsewhere, after checking them."""
@@ -149,48 +147,47 @@ def freeze(model: nn.Module, images: Batch, *, reference: Batch | None) -> Itera
     """Check the images and freeze the network, with gradients on and autocast off whatever the caller's mode."""
     _require_images(images)
     reference = _require_reference(reference, images=images)
-    with ExitStack() as stack:
-        # a caller inside no_grad or inference_mode may still ask for gradients of the output
-        stack.enter_context(torch.inference_mode(mode=False))
-        stack.enter_context(torch.enable_grad())
-        stack.enter_context(frozen(model))
+    # a caller inside no_grad or inference_mode may still ask for gradients of the output
+    with torch.inference_mode(mode=False), torch.enable_grad(), frozen(model):
+        weights = next((parameter for parameter in model.parameters() if parameter.is_floating_point()), images)
         # clone: tensors made in inference mode cannot enter a graph
-        images, reference = (_like_model(model, tensor).detach().clone() for tensor in (images, reference))
+        images, reference = (
+            tensor.to(device=weights.device, dtype=weights.dtype).detach().clone() for tensor in (images, reference)
+        )
         # differences of predictions are explained, of which half precision leaves two digits
-        stack.enter_context(torch.autocast(images.device.type, enabled=False))
-        yield Comparison(model=model, images=images, references=reference)
+        with torch.autocast(images.device.type, enabled=False):
+            yield Comparison(model=model, images=images, references=reference)
 
 
-def _require_finite(predictions: Tensor, what: str) -> Tensor:
+def _require_finite(predictions: Tensor, name: str) -> Tensor:
     for index in torch.nonzero(~predictions.isfinite()).flatten().tolist():
-        raise ModelError(f"the model predicts {float(predictions[index])} for {what} {index}; train or load it again")
+        raise ModelError(f"the model predicts {float(predictions[index])} for {name} {index}; train or load it again")
     return predictions
 
 
 def _require_images(images: Batch) -> None:
     """Refuse images that are not float, finite, in [0, 1] and shaped (batch, 3, height, width)."""
-    if images.ndim != 4:
-        raise ImageError(
-            f"images have shape {tuple(images.shape)}, which is not (batch, 3, height, width); "
-            "add a batch axis with images[None]"
-        )
-    if images.shape[0] == 0:
-        raise ImageError("there is no image to explain, the batch is empty; pass at least one image")
-    if images.shape[1] not in {3, 6}:
-        raise ImageError(
-            f"images have {images.shape[1]} channels instead of 3; pass RGB images with the channels on the second axis"
-        )
-    if 0 in images.shape[2:]:
-        raise ImageError(
-            f"images of {images.shape[2]} x {images.shape[3]} pixels are empty; pass images with at least one pixel"
-        )
-    _require_unit_interval(images, what="image")
+    match tuple(images.shape):
+        case (0, _, _, _):
+            raise ImageError("there is no image to explain, the batch is empty; pass at least one image")
+        case (_, 3 | 6, height, width) if 0 in (height, width):
+            raise ImageError(f"images of {height} x {width} pixels are empty; pass images with at least one pixel")
+        case (_, 3 | 6, _, _):
+            _require_unit_interval(images, name="image")
+        case (_, channels, _, _):
+            raise ImageError(
+                f"images have {channels} channels instead of 3; pass RGB images with the channels on the second axis"
+            )
+        case shape:
+            raise ImageError(
+                f"images have shape {shape}, which is not (batch, 3, height, width); add a batch axis with images[None]"
+            )
 
 
 def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
-    """Return the reference with a batch axis of one (shared) or of the batch's length; that of the images if None."""
+    """Return the reference with a batch axis of one (shared) or of the batch's length; the untouched sensor if None."""
     if reference is None:
-        # the untouched sensor: no difference, or the reference beside the frame
+        # no difference, or the reference beside the frame
         return torch.zeros_like(images[:1]) if images.shape[1] == 3 else torch.cat([images[:, 3:]] * 2, dim=1)
     shared = tuple(reference.shape) == tuple(images.shape[1:])
     if not shared and reference.shape != images.shape:
@@ -199,7 +196,7 @@ def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
             f"pass one reference of shape {tuple(images.shape[1:])} or one for each image"
         )
     reference = reference[None] if shared else reference
-    _require_unit_interval(reference, what="reference")
+    _require_unit_interval(reference, name="reference")
     return reference
 
 
@@ -210,27 +207,21 @@ def black_frames(images: Float[Tensor, "*batch colours height width"]) -> Float[
     return black
 
 
-def _require_unit_interval(images: Tensor, *, what: str) -> None:
+def _require_unit_interval(images: Tensor, *, name: str) -> None:
     if not images.is_floating_point():
-        raise ImageError(f"{what} values are {images.dtype} instead of float; divide 8-bit images by 255")
+        raise ImageError(f"{name} values are {images.dtype} instead of float; divide 8-bit images by 255")
     for index, image in enumerate(images):
-        bad = int((~image.isfinite()).sum())
-        if bad:
+        if bad := int((~image.isfinite()).sum()):
             raise ImageError(
-                f"{what} {index} holds NaN or infinity in {bad} of {image.numel()} values; "
+                f"{name} {index} holds NaN or infinity in {bad} of {image.numel()} values; "
                 "read the frame again, or drop it from the batch"
             )
         low, high = (float(bound) for bound in torch.aminmax(image))
         if low < -_SLACK or high > 1 + _SLACK:
             raise ImageError(
-                f"{what} {index} has values from {low:.3g} to {high:.3g}, outside [0, 1]; "
+                f"{name} {index} has values from {low:.3g} to {high:.3g}, outside [0, 1]; "
                 "scale it as the network's training images were"
             )
-
-
-def _like_model(model: nn.Module, images: Tensor) -> Tensor:
-    parameter = next((p for p in model.parameters() if p.is_floating_point()), None)
-    return images if parameter is None else images.to(device=parameter.device, dtype=parameter.dtype)
 
 
 @runtime_checkable

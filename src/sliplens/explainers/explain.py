@@ -60,13 +60,11 @@ def choose_explainers(
     for method in [methods] if isinstance(methods, str) or callable(methods) else methods:
         if not isinstance(method, str):
             explainers[getattr(method, "method", type(method).__name__)] = method
-        elif method == "poly-cam":
-            explainers[method] = poly_cam
         elif method == "expected-gradients":
             free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
             explainers[method] = ExpectedGradients(background=inputs[free] if free else None)
         else:
-            explainers[method] = get_explainer(method)
+            explainers[method] = poly_cam if method == "poly-cam" else get_explainer(method)
 
     def find() -> Sequence[Float[Tensor, "_markers 2"]]:
         if chosen.find_markers is None:
@@ -197,7 +195,12 @@ def input_pictures(network: Network, chosen: ChosenFrames) -> UInt8[np.ndarray, 
     return pictures.permute(0, 2, 3, 1).contiguous().numpy()
 
 
+_MOST_NAMES = 3
+"""Frames that a warning names."""
+
+
 def _notes(pieces: Sequence[MethodMaps], ids: Sequence[str], warnings: Sequence[str]) -> MethodNotes:
+    """Join what is known of a method's maps; a warning of several frames is written once, with their names."""
     frames_of: dict[str, list[str]] = {}
     first = 0
     for piece in pieces:
@@ -207,24 +210,19 @@ def _notes(pieces: Sequence[MethodMaps], ids: Sequence[str], warnings: Sequence[
             text = warning if match is None else warning[match.end() :]
             frames_of.setdefault(text, []).extend(names if match is None else [names[int(match[1])]])
         first += len(piece.relevance)
+    texts = list(warnings)
+    for text, names in frames_of.items():
+        more = ", \N{HORIZONTAL ELLIPSIS}" if len(names) > _MOST_NAMES else ""
+        some = ", ".join(names[:_MOST_NAMES])
+        texts.append(f"{len(names)} of {number_of(len(ids), 'frame')} ({some}{more}): {text}")
     gaps = [piece.completeness_gap for piece in pieces]
     return MethodNotes(
         seconds_per_frame=sum(piece.seconds for piece in pieces) / len(ids),
-        warnings=(*warnings, *(f"{_names(names, len(ids))}: {text}" for text, names in frames_of.items())),
+        warnings=tuple(texts),
         target=pieces[0].target,
         raises_only=pieces[0].raises_only,
         completeness_gap=None if None in gaps else sum((gap for gap in gaps if gap is not None), ()),
     )
-
-
-_MOST_NAMES = 3
-"""Frames that a warning names."""
-
-
-def _names(names: Sequence[str], count: int) -> str:
-    """Name the frames of a warning, and how many of all frames they are."""
-    more = ", \N{HORIZONTAL ELLIPSIS}" if len(names) > _MOST_NAMES else ""
-    return f"{len(names)} of {number_of(count, 'frame')} ({', '.join(names[:_MOST_NAMES])}{more})"
 
 
 def network_inputs(network: Network, explanation: Explanation) -> Float[Tensor, "frames colours size size"]:

@@ -41,7 +41,8 @@ class FrameSelection:
     def __post_init__(self) -> None:
         if self.trials < 1:
             raise InputError(f"--trials must be at least 1, got {self.trials}")
-        require_levels(self.levels)
+        if any(not 0 <= level <= 1 for level in self.levels):
+            raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in self.levels)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,36 +73,31 @@ class ChosenFrames:
         return [rows] if self.together else [[row] for row in rows]
 
 
-def network_images(
-    network: Network,
-    frames: UInt8[np.ndarray, "batch height width 3"],
-    reference: UInt8[np.ndarray, "height width 3"] | None,
-) -> tuple[UInt8[Tensor, "batch colours size size"], UInt8[Tensor, "colours size size"]]:
-    """Compute a network's inputs of frames and of the untouched sensor, in 8 bits before normalisation."""
-    if not len(frames):
-        raise ImageError("there is no frame to explain; give one at least")
-    network.require_frame_size(frames.shape[1:3])
-    encoding, image_size = network.encoding, network.manifest.image_size
-    if reference is not None:
-        compare = partial(encoding.compare_small, reference=reference, image_size=image_size)
-        return compare(frames), compare(reference[None])[0]
-    if not encoding.empty_is_black:
-        raise InputError(
-            f"a network on {encoding.name} images needs the untouched sensor; give it as reference, on the command "
-            "line with --reference IMAGE"
-        )
-    images = encoding.resize(frames, image_size=image_size)
-    return images, torch.zeros_like(images[0])
-
-
 def frames_from_arrays(
     network: Network,
     frames: UInt8[np.ndarray, "batch height width 3"],
     reference: UInt8[np.ndarray, "height width 3"] | None,
 ) -> ChosenFrames:
     """Choose all of an array of camera frames, or without a reference of difference images."""
-    images, untouched = network_images(network, frames, reference)
-    find = partial(_markers_in_frames, frames, image_size=network.manifest.image_size)
+    if not len(frames):
+        raise ImageError("there is no frame to explain; give one at least")
+    network.require_frame_size(frames.shape[1:3])
+    encoding, image_size = network.encoding, network.manifest.image_size
+    if reference is not None:
+        compare = partial(encoding.compare_small, reference=reference, image_size=image_size)
+        images, untouched = compare(frames), compare(reference[None])[0]
+    elif encoding.empty_is_black:
+        images = encoding.resize(frames, image_size=image_size)
+        untouched = torch.zeros_like(images[0])
+    else:
+        raise InputError(
+            f"a network on {encoding.name} images needs the untouched sensor; give it as reference, on the command "
+            "line with --reference IMAGE"
+        )
+
+    def find_markers() -> list[Float[Tensor, "_markers 2"]]:
+        return [markers_in_frame(frame, image_size=image_size) for frame in frames]
+
     return ChosenFrames(
         ids=tuple(f"frame-{number:04d}" for number in range(len(frames))),
         day=(1,) * len(frames),
@@ -112,12 +108,8 @@ def frames_from_arrays(
         references=untouched.expand(len(frames), -1, -1, -1),
         source="real",
         together=True,
-        find_markers=None if reference is None else find,
+        find_markers=None if reference is None else find_markers,
     )
-
-
-def _markers_in_frames(frames: np.ndarray, *, image_size: int) -> list[Float[Tensor, "_markers 2"]]:
-    return [markers_in_frame(frame, image_size=image_size) for frame in frames]
 
 
 def frames_from_dataset(network: Network, data: Dataset, selection: FrameSelection) -> ChosenFrames:
@@ -139,13 +131,6 @@ def frames_from_dataset(network: Network, data: Dataset, selection: FrameSelecti
     return frames_at(network, data, rows)
 
 
-def require_levels(levels: Sequence[float]) -> Sequence[float]:
-    """Return safety margins unchanged if each lies in [0, 1]."""
-    if any(not 0 <= level <= 1 for level in levels):
-        raise InputError(f"levels must lie in [0, 1], got {', '.join(f'{level:g}' for level in levels)}")
-    return levels
-
-
 def require_labels(trial: str, margin: Float[np.ndarray, " frames"] | None) -> Float[np.ndarray, " frames"]:
     """Return the labels of a trial if it has any."""
     if margin is None or not np.isfinite(margin).any():
@@ -155,15 +140,13 @@ def require_labels(trial: str, margin: Float[np.ndarray, " frames"] | None) -> F
 
 def frames_at(network: Network, data: Dataset, frames: Sequence[tuple[str, int]]) -> ChosenFrames:
     """Choose frames of a data set by trial and number, those of a trial one after another."""
-    infos = {info.trial: info for info in data.trials}
-    parts = []
+    infos, parts = {info.trial: info for info in data.trials}, []
     for trial, group in groupby(frames, key=lambda frame: frame[0]):
         if trial not in infos:
             raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
-        (opened,) = open_source(data, trial=trial)
+        (opened,), info = open_source(data, trial=trial), infos[trial]
         part = _take(network, opened, [number for _, number in group], source=data.source)
         ids = len(part.ids)
-        info = infos[trial]
         parts.append(replace(part, trial=(trial,) * ids, day=(info.day,) * ids, condition=(info.condition,) * ids))
 
     def find_markers() -> list[Float[Tensor, "_markers 2"]]:
@@ -191,9 +174,8 @@ def frames_from_folder(
 ) -> ChosenFrames:
     """Choose all images of a folder, in natural order, or all frames of another recording that `open_source` opens.
 
-    They have the size of the network's sensor: camera frames if `reference` is set or the source has one, else
-    absolute difference images |T_n - T_0|. If `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`,
-    hold the safety margin in percent; `sensor` is that of `open_source`.
+    They are camera frames if `reference` is set or the source has one, else absolute difference images |T_n - T_0|. If
+    `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`, hold the safety margin in percent.
 
     Raises
     ------
@@ -203,8 +185,7 @@ def frames_from_folder(
     ImageError
         If an image cannot be read, or has another size or kind of pixels.
     """
-    parts = []
-    captures = open_source(folder, reference=reference, sensor=sensor)
+    parts, captures = [], open_source(folder, reference=reference, sensor=sensor)
     for opened in captures:
         part = _take(network, opened, range(opened.frames), source="real")
         part = replace(part, trial=(folder.name if opened.files else opened.name,) * len(part.ids))
@@ -243,15 +224,13 @@ def _take(network: Network, opened: Capture, numbers: Sequence[int], *, source: 
 
 
 def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
-    return ChosenFrames(
-        ids=sum((part.ids for part in parts), ()),
-        day=sum((part.day for part in parts), ()),
-        trial=sum((part.trial for part in parts), ()),
-        condition=sum((part.condition for part in parts), ()),
+    names = ("ids", "day", "trial", "condition")
+    return replace(
+        parts[0],
+        **{name: sum((getattr(part, name) for part in parts), ()) for name in names},
         safety_margin=np.concatenate([part.safety_margin for part in parts]),
         images=torch.cat([part.images for part in parts]),
         references=torch.cat([part.references for part in parts]),
-        source=parts[0].source,
     )
 
 

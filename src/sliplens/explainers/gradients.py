@@ -1,21 +1,16 @@
-"""Integrated and Expected Gradients, SmoothGrad, and layer-wise relevance propagation by zennit (an extra)."""
+"""Integrated and Expected Gradients, and SmoothGrad."""
 
-import operator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
 import torch
 from captum import attr
 from jaxtyping import Float
-from torch import Tensor, fx, nn
+from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import Attribution, check_slopes, frame_of, with_reference_of
 from sliplens.explainers.contract import Comparison, Method, black_frames, freeze, require_at_least_one
-from sliplens.explainers.folding import fold_batch_norm
-from sliplens.extras import require_packages
-from sliplens.models.backbones import HistogramRegressor
-from sliplens.progress import report_each
 
 _NODES = 4  # of a piece; the slope along the path has kinks, on which more nodes to a piece are wasted
 _ROUNDING = 1e-6  # of |f|: a gap that float32 predictions cannot resolve is no gap
@@ -36,9 +31,8 @@ class IntegratedGradients(Method):
     Relevance is (x - b) times the integral over t in [0, 1] of df/dx at b + t (x - b), summed over the channels; it
     adds up to f(x) - f(b) when the integral is exact.
 
-    The line is cut into pieces, each with a completeness gap of its own, between its part of the integral and the
-    change of f from its start to its end. While the gaps add up to more than `tolerance` the pieces with the largest
-    are halved: nodes spread over the whole line miss the sum of a trained network by percents.
+    The line is cut into pieces. While their completeness gaps add up to more than `tolerance`, the pieces with the
+    largest are halved: nodes spread over the whole line miss the sum of a trained network by percents.
 
     References
     ----------
@@ -165,8 +159,7 @@ class ExpectedGradients(Method):
     """Expected Gradients: the mean of Integrated Gradients over a background of references.
 
     The relevance adds up to f(x) less the mean of f over the background. The published method draws references and
-    points of the line at random; here the background is gone through and each line integrated until it is complete,
-    which gives the same in the limit, without noise and without a seed.
+    points of the line at random; here every line is integrated until it is complete, without noise and a seed.
 
     References
     ----------
@@ -176,9 +169,8 @@ class ExpectedGradients(Method):
 
     method: ClassVar[str] = "expected-gradients"
     background: Float[Tensor, "frames colours height width"] | None = None
-    """Frames without slip as the network takes them, float in [0, 1], shape (frames, 3, height, width); the call's
-    reference is then not used, but that beside each image stays where the network sees one. Without a background the
-    call's reference is the whole of it, and a warning says so."""
+    """Frames without slip as the network takes them, float in [0, 1]; the call's reference is then not used, but that
+    beside each image stays. Without a background the call's reference stands for it, and a warning says so."""
     integrated: IntegratedGradients = field(default_factory=IntegratedGradients)
     """How each line is integrated."""
 
@@ -215,9 +207,8 @@ class ExpectedGradients(Method):
 class SmoothGrad(Method):
     """SmoothGrad times what the image adds to the reference, signed, in margin units.
 
-    Relevance is (x - b) times the mean of df/dx over x plus normal noise, summed over the channels. The gradient alone,
-    which was published, has another unit than the other maps and lights up where the image equals the reference. Only
-    for a linear network it adds up to f(x) - f(b), so it has no completeness gap.
+    Relevance is (x - b) times the mean of df/dx over x plus normal noise, summed over the channels; the gradient alone
+    was published. Only for a linear network it adds up to f(x) - f(b), so it has no completeness gap.
 
     References
     ----------
@@ -262,109 +253,3 @@ class SmoothGrad(Method):
             target="the linear model of f at x",
             warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=change),
         )
-
-
-_TOLERANCE = 0.1  # share of f(x) by which the relevance may miss it without a warning
-
-
-@dataclass(frozen=True, kw_only=True)
-class Lrp(Method):
-    """Layer-wise relevance propagation: alpha-1-beta-0 in convolutions, epsilon in linear layers, flat in the first.
-
-    The prediction is handed back from layer to layer, each giving its inputs their share of its output. A histogram
-    has no share of its own: its mean is handed to the logits as gradient times logit. Biases keep their share, and
-    the prediction itself is handed back, not its difference from the reference, so there is no completeness gap, and
-    the reference only decides what `saliency` shows. Where the network sees the reference beside the frame, the map is
-    what the frame gets back.
-
-    Works on a copy whose batch normalisation is folded into the convolutions, and whose means over space and sums of
-    branches, functions in TorchVision's networks, are made modules: zennit knows rules for modules only.
-
-    References
-    ----------
-    Bach et al., *On pixel-wise explanations for non-linear classifier decisions by layer-wise relevance propagation*,
-    PLOS ONE 2015, eqs. 58 and 60; the composite as in Anders et al., *Software for dataset-wide XAI*, 2021 (zennit).
-    """
-
-    method: ClassVar[str] = "lrp"
-    batch_size: int = 32
-
-    def _explain(self, comparison: Comparison) -> Attribution:
-        require_packages("zennit", extra="lrp", purpose="LRP")
-        prediction = comparison.prediction
-        copy = fold_batch_norm(comparison.model)
-        for module in copy.modules():
-            if isinstance(module, fx.GraphModule):
-                _name_functions(module)
-        parts = comparison.images.split(self.batch_size)
-        relevance = torch.cat(
-            [_propagate(copy, part) for part in report_each(parts, sizes=[len(part) for part in parts])]
-        )
-        shares = (relevance.sum(dim=(1, 2, 3)) / prediction).tolist()
-        return comparison.attribution(
-            frame_of(relevance).sum(dim=1),
-            complete=False,
-            target="f(x)",
-            warnings=[
-                f"image {index}: LRP hands back {share:.3g} times f(x); biases keep some of it, products make more"
-                for index, share in enumerate(shares)
-                if not abs(share - 1) <= _TOLERANCE
-            ],
-        )
-
-
-class _Sum(nn.Module):
-    """A sum of two branches, by the module that zennit has a rule for."""
-
-    def __init__(self, inner: nn.Module) -> None:
-        super().__init__()
-        self.inner = inner
-
-    def forward(self, first: Tensor, second: Tensor) -> Tensor:
-        return self.inner(torch.stack(torch.broadcast_tensors(first, second), dim=-1))
-
-
-def _name_functions(module: fx.GraphModule) -> None:
-    """Replace sums of two branches and means over space by modules."""
-    from zennit.layer import Sum  # noqa: PLC0415  # pyright: ignore[reportMissingImports] (an extra)
-
-    for place, node in enumerate(list(module.graph.nodes)):
-        branches = [argument for argument in node.args if isinstance(argument, fx.Node)]
-        if node.op == "call_function" and node.target in {operator.add, operator.iadd, torch.add}:
-            replacement = _Sum(Sum()) if len(branches) == 2 else None
-        elif node.op == "call_method" and node.target == "mean" and _over_space(node):
-            pool = nn.AdaptiveAvgPool2d(1)
-            replacement = pool if node.kwargs.get("keepdim", False) else nn.Sequential(pool, nn.Flatten())
-        else:
-            replacement = None
-        if replacement is not None:
-            module.add_submodule(name := f"lrp_{place}", replacement)
-            with module.graph.inserting_after(node):
-                call = module.graph.call_module(name, tuple(branches))
-            node.replace_all_uses_with(call)
-            module.graph.erase_node(node)
-    module.recompile()
-
-
-def _over_space(node: fx.Node) -> bool:
-    dims = node.kwargs.get("dim", node.args[1] if len(node.args) > 1 else None)
-    return isinstance(dims, list | tuple) and tuple(dims) in {(2, 3), (-2, -1)}
-
-
-def _propagate(model: nn.Module, images: Tensor) -> Tensor:
-    from zennit.composites import EpsilonPlusFlat  # noqa: PLC0415  # pyright: ignore[reportMissingImports] (an extra)
-
-    composite: Any = EpsilonPlusFlat()
-    images = images.clone().requires_grad_()
-    with composite.context(model) as changed:
-        if isinstance(changed, HistogramRegressor):
-            logits, _ = changed.split(changed.backbone(images))
-            free = logits.detach().requires_grad_()
-            mean = torch.softmax(free / changed.temperature, dim=-1) @ changed.centres
-            (slopes,) = torch.autograd.grad(mean.sum(), free)
-            output, start = logits, slopes * free.detach()
-        else:
-            output = changed(images)
-            start = output.detach()
-        (relevance,) = torch.autograd.grad(output, images, grad_outputs=start)
-    return relevance

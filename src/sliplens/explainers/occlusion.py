@@ -20,7 +20,7 @@ from sliplens.recordings import Recording
 def find_markers(
     image: Float[Tensor, "colours height width"], reference: Float[Tensor, "colours height width"]
 ) -> Float[Tensor, "markers 2"]:
-    """Places (x, y) of the markers that an image shows, in pixels; the reference tells whether they show at all.
+    """Find the markers (x, y) that an image shows, in pixels; the reference tells whether they show at all.
 
     Raises
     ------
@@ -78,8 +78,9 @@ def markers_in_recording(recording: Recording, row: int, *, image_size: int) -> 
     return to_network_px(recording.truth.marker_px[row], recording.frames.shape[1:3], image_size=image_size)
 
 
-Places: TypeAlias = Float[Tensor, "markers 2"]
-FindPlaces: TypeAlias = Callable[[Float[Tensor, "colours height width"], Float[Tensor, "colours height width"]], Places]
+FindPlaces: TypeAlias = Callable[
+    [Float[Tensor, "colours height width"], Float[Tensor, "colours height width"]], Float[Tensor, "markers 2"]
+]
 """From an image and its reference, in [0, 1], to x and y of its markers in pixels."""
 
 
@@ -112,7 +113,7 @@ class RegionMethod(Method):
 
     tile_px: int = 16
     """Side of a tile, in pixels."""
-    markers_px: Places | FindPlaces | None = None
+    markers_px: Float[Tensor, "markers 2"] | FindPlaces | None = None
     """x and y of the markers in the image that the network sees, (markers, 2), or what finds them in each image, such
     as `find_markers`; they are then the regions, and what lies between them is one more."""
     radius_px: float | None = None
@@ -135,15 +136,19 @@ class RegionMethod(Method):
     def _name(self) -> str:
         return type(self).__name__.lower()
 
+    @property
+    def _unit(self) -> str:
+        return f"tiles of {self.tile_px} px" if self.markers_px is None else "markers"
+
     def _regions(self, image: Tensor, empty: Tensor) -> Tensor:
         size = image.shape[-2], image.shape[-1]
         if self.markers_px is None:
-            return tile_regions(size, tile_px=self.tile_px)
+            return tile_regions(size, tile_px=self.tile_px).to(image.device)
         places = self.markers_px if isinstance(self.markers_px, Tensor) else self.markers_px(image, empty)
         self._require_reach(places)
-        return marker_regions(size, places, radius_px=self.radius_px)
+        return marker_regions(size, places, radius_px=self.radius_px).to(image.device)
 
-    def _require_reach(self, places: Places) -> None:
+    def _require_reach(self, places: Tensor) -> None:
         if not len(places) or (self.radius_px is None and len(places) < 2):
             raise InputError(
                 f"{self._name} has {len(places)} marker(s) and no radius_px; a single one's reach must be given"
@@ -177,16 +182,11 @@ class Occlusion(RegionMethod):
         def predict(images: Tensor) -> Tensor:
             return torch.cat(list(engine.run(images.split(engine.batch_size))))
 
-        captum = attr.FeatureAblation(predict)
-
         def effect(index: int) -> Tensor:
-            image, empty = comparison.images[index], comparison.reference[index]
-            regions = self._regions(image, empty).to(image.device)
-            effects = captum.attribute(
-                image[None],
-                baselines=empty[None],
-                feature_mask=regions[None, None],
-                perturbations_per_eval=self.batch_size,
+            image, empty = comparison.images[index, None], comparison.reference[index, None]
+            regions = self._regions(image[0], empty[0])
+            effects = attr.FeatureAblation(predict).attribute(
+                image, baselines=empty, feature_mask=regions[None, None], perturbations_per_eval=self.batch_size
             )
             # Captum gives every pixel and channel the whole effect of its region
             return effects[0, 0] / regions.flatten().bincount()[regions]
@@ -194,7 +194,6 @@ class Occlusion(RegionMethod):
         attribution = comparison.attribution(
             comparison.map_each(effect),
             complete=False,
-            target="f(x) - f(x with one region as in the reference), "
-            + (f"tiles of {self.tile_px} px" if self.markers_px is None else "markers"),
+            target=f"f(x) - f(x with one region as in the reference), {self._unit}",
         )
         return replace(attribution, engine=engine.name)

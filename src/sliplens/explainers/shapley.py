@@ -44,20 +44,16 @@ def shapley_values(
     """Estimate the Shapley values of a game from pairs of coalitions, each with its complement.
 
     Values are those of the weighted least squares whose solution over all coalitions is the Shapley value, on sampled
-    ones. With its complement, each coalition measures the odd part of the game alone, on which the values depend: games
-    of pairs that help or hinder each other are solved exactly. Errors are the sandwich estimate from the residuals.
+    ones; games of pairs that help or hinder each other are solved exactly. Errors are the sandwich estimate.
 
-    With a first guess the values are drawn towards a multiple of it, and no farther than the noise of the coalitions
-    asks for (empirical Bayes): a good guess saves most of the pairs, a poor one costs little, and both fade as pairs
-    are added. Errors are then those of the best linear prediction, that of the multiple included.
+    With a first guess the values are drawn towards a multiple of it, no farther than the noise of the coalitions asks
+    for (empirical Bayes): a good guess saves most of the pairs, a poor one costs little.
 
     `pairs` are sampled, or all of them where there are no more, which is exact; at least twice as many as the players.
 
     Lundberg and Lee, *A Unified Approach to Interpreting Model Predictions* (2017), Theorem 2; Covert and Lee,
-    *Improving KernelSHAP: Practical Shapley Value Estimation via Linear Regression* (2021), section 4.2, pairs.
-    Patterson and Thompson, *Recovery of inter-block information when block sizes are unequal* (1971), for how far to
-    draw: restricted maximum likelihood. Henderson, *Best linear unbiased estimation and prediction under a selection
-    model* (1975), for the errors.
+    *Improving KernelSHAP* (2021), section 4.2, for pairs; Patterson and Thompson (1971), restricted maximum
+    likelihood, for how far to draw; Henderson (1975), best linear prediction, for the errors.
     """
     whole, empty = value(np.array([[True] * players, [False] * players])).tolist()
     if players == 1:
@@ -158,11 +154,8 @@ class Shapley(RegionMethod):
 
     A region that does not take part is as in the reference. The relevance of a region is its Shapley value, spread
     evenly over its pixels, so that a map adds up to f(x) - f(b). Integrated Gradients of few steps, summed over each
-    region, are the first guess (`shapley_values`). Where the contributions are hardly surer than they differ, a warning
-    says so; more `pairs` help.
-
-    Shapley, *A Value for n-Person Games* (1953); Lundberg and Lee, *A Unified Approach to Interpreting Model
-    Predictions* (2017). Estimated by `shapley_values`.
+    region, are the first guess of `shapley_values`. A warning says where the contributions are hardly surer than they
+    differ.
     """
 
     tile_px: int = 28
@@ -180,7 +173,7 @@ class Shapley(RegionMethod):
             with torch.enable_grad():
                 predictions = comparison.prediction[index], comparison.reference_prediction[index]
                 gradients = _GUESS.integrate(comparison, image, empty, *predictions).relevance.float().double().cpu()
-            regions = self._regions(image, empty).to(image.device)
+            regions = self._regions(image, empty)
             # a number that no pixel has, such as that of what lies between markers which cover the image, is no player
             numbers, players = regions.unique(return_inverse=True)
 
@@ -204,8 +197,7 @@ class Shapley(RegionMethod):
         attribution = comparison.attribution(
             relevance,
             complete=True,
-            target="f(x) - f(reference), shared out among "
-            + (f"tiles of {self.tile_px} px" if self.markers_px is None else "markers"),
+            target=f"f(x) - f(reference), shared out among {self._unit}",
             warnings=[warning] if any(unsure) else [],
         )
         return replace(attribution, engine=engine.name)

@@ -80,7 +80,7 @@ _ROWS = {
     "shapley-marker": ExplainerRow(
         title="Shapley values of markers", load=_by_marker("shapley", "Shapley"), line=(0, (3, 1, 1, 1, 1, 1))
     ),
-    "lrp": ExplainerRow(title="LRP", load=_method("gradients", "Lrp"), colour="#6B7280", line=(0, (1, 1))),
+    "lrp": ExplainerRow(title="LRP", load=_method("lrp", "Lrp"), colour="#6B7280", line=(0, (1, 1))),
 }
 EXPLAINERS = Table("method", "sliplens.explainers", _ROWS)
 """Explainers by name. `lrp` needs an extra.

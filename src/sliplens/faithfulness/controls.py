@@ -114,7 +114,7 @@ def even_channels(model: nn.Module, images: Images, references: Images) -> Contr
     for index, pair in enumerate(zip(images, references, strict=True)):
         activations = [outputs[name][index] for name in names]
         even = [torch.ones_like(maps[:, 0, 0]) for maps in activations]
-        maps.append(combine(activations, even, size=size)[0] * local_change(*pair))
+        maps.append(combine(activations, even, size=size) * local_change(*pair))
     return torch.stack(maps)
 
 

@@ -15,7 +15,7 @@ from sliplens.explainers.explain import network_inputs, network_references, with
 from sliplens.explainers.frames import MARGIN_LEVELS as LEVELS
 from sliplens.explainers.frames import nearest_frame
 from sliplens.explainers.occlusion import RegionMethod, to_network_px
-from sliplens.explainers.poly_cam_budget import Likeness
+from sliplens.explainers.poly_cam import Likeness
 from sliplens.explainers.table import EXPLAINERS, get_explainer
 from sliplens.faithfulness.removal import Units, marker_units, tile_units
 from sliplens.markers import track_markers
@@ -220,7 +220,7 @@ def network_places(
 
 
 THESIS_POLY_CAM = "poly-cam-thesis"
-_AS_PUBLISHED = Likeness(pearson_r=0.999, top_overlap=0.97)
+_AS_PUBLISHED: Likeness = (0.999, 0.97)
 """Of the thesis's map, compared with what was published; its weights are nearly all 1, so that this costs little."""
 
 
