@@ -1,1 +1,1 @@
-"""Measures and pictures that tell simulated touch from real touch; used by `sim_vs_real.py`."""
+"""Measures of simulated touch beside real touch."""

@@ -8,7 +8,6 @@ from sliplens.simulation.sensor import CHROMATOUCH
 
 _BLUR_PX = 3
 _BORDER_PX = 12
-_ANNULUS_PX = 8
 
 
 def correlations(real: np.ndarray, simulated: np.ndarray) -> np.ndarray:
@@ -21,13 +20,6 @@ def top_over_bottom(images: np.ndarray) -> np.ndarray:
     """Mean of the upper half over that of the lower half."""
     half = images.shape[1] // 2
     return images[:, :half].mean(axis=(1, 2, 3)) / images[:, half:].mean(axis=(1, 2, 3))
-
-
-def radial_profile(images: np.ndarray) -> np.ndarray:
-    """Mean grey level in rings of 8 px round the apex that lie in the view, (frames, rings)."""
-    distance = _distance(np.asarray([CHROMATOUCH.geometry.centre_px]))[..., 0]
-    rings = [distance // _ANNULUS_PX == index for index in range(int(108 // _ANNULUS_PX))]
-    return np.stack([images.mean(axis=-1)[:, ring].mean(axis=1) for ring in rings], axis=1)
 
 
 def regions(simulated: Simulated, index: int) -> dict[str, np.ndarray]:
@@ -61,32 +53,6 @@ def colour_errors(real: np.ndarray, simulated: Simulated, frames: list[int]) -> 
             error = simulated.images[index][region].mean(axis=0) - image[region].mean(axis=0)
             errors.setdefault(name, []).append(error)
     return {name: np.array(values) for name, values in errors.items()}
-
-
-def background_noise(image: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Green of the background less its local mean; 0 elsewhere."""
-    weight = gaussian_filter(background.astype(float), 8)
-    green = np.where(background, image[..., 1].astype(float), 0)
-    return np.where(background, green - gaussian_filter(green, 8) / np.maximum(weight, 1e-6), 0)
-
-
-def lag_correlations(noise: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """Autocorrelation of the background's noise at lags of 1 and 2 px along x, then along y."""
-    variance = np.mean(noise[background] ** 2)
-    values = []
-    for axis in (1, 0):
-        for lag in (1, 2):
-            both = background & np.roll(background, -lag, axis)
-            values.append(np.mean((noise * np.roll(noise, -lag, axis))[both]) / variance)
-    return np.array(values)
-
-
-def noise_spectrum(noise: np.ndarray, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Frequency in cycles per pixel, and the power there: its mean over frequencies is the noise's variance."""
-    power = np.abs(np.fft.fft2(noise)) ** 2 / background.sum()
-    frequency = np.hypot(np.fft.fftfreq(noise.shape[0])[:, None], np.fft.fftfreq(noise.shape[1])[None, :])
-    bins = np.ceil(frequency * 32).astype(int)
-    return (np.arange(1, 17) - 0.5) / 32, np.array([power[bins == index].mean() for index in range(1, 17)])
 
 
 def _distance(places_px: np.ndarray) -> np.ndarray:
