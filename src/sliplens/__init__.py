@@ -20,11 +20,10 @@ if TYPE_CHECKING:
     from sliplens.models.predictions import predict
     from sliplens.plots.figure import make_profile, plot
     from sliplens.recordings.check import check_dataset
-    from sliplens.recordings.corrections import draft_corrections
+    from sliplens.recordings.corrections import draft_corrections, label_dataset
     from sliplens.recordings.dataset import load_dataset, recover_dataset
     from sliplens.recordings.exporting import export_lerobot, export_mcap
     from sliplens.recordings.importing import import_recordings
-    from sliplens.recordings.relabelling import label_dataset
     from sliplens.recordings.splits import split_dataset
     from sliplens.report.page import write_report
     from sliplens.results.study import StudyConfig
@@ -56,7 +55,7 @@ _MODULES = {
     "export_onnx": "sliplens.models.onnx",
     "hold_grip": "sliplens.grip.hold",
     "import_recordings": "sliplens.recordings.importing",
-    "label_dataset": "sliplens.recordings.relabelling",
+    "label_dataset": "sliplens.recordings.corrections",
     "load": "sliplens.models.checkpoint",
     "load_dataset": "sliplens.recordings.dataset",
     "make_profile": "sliplens.plots.figure",

@@ -572,7 +572,6 @@ def _toml(folder: Path) -> None:
     (folder / "tip.toml").write_text(
         'name = "tip"\ncamera_size_px = [640, 480]\ncrop_px = [80, 0, 480, 480]\nresize_px = [224, 224]\n'
         "frame_rate_hz = 30.0\n"
-        "[undistort]\nfocal_px = [500.0, 500.0]\ncentre_px = [320.0, 240.0]\ndistortion = [0.1, 0.0, 0.0, 0.0]\n"
     )
 
 

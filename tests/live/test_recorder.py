@@ -83,7 +83,7 @@ def test_a_recording_is_what_was_seen(recording: Recording, tmp_path: Path):
 def test_what_is_cut_off_is_whole_up_to_the_cut(recording: Recording, tmp_path: Path, share: float):
     lock, _ = begin_recording(tmp_path / "data", simulated=False)
     header = JournalHeader(facts=FACTS, source="a camera", simulated=False, size=(48, 48))
-    journal, ends = Journal(lock.folder, header, reference=recording.reference), []
+    journal, ends = Journal(tmp_path / "data", header, reference=recording.reference), []
     for frame in frames_of(recording):
         journal.append(frame.image, time_s=frame.time_s, safety_margin=frame.safety_margin, forces=frame.forces)
         ends.append(journal.path.stat().st_size)
@@ -116,7 +116,7 @@ from sliplens.recordings.journal import Journal, JournalHeader
 from sliplens.recordings.trial import TrialFacts
 lock, _ = begin_recording(Path(sys.argv[1]), simulated=False)
 header = JournalHeader(facts=TrialFacts(trial="a"), source="", simulated=False, size=(48, 48))
-journal = Journal(lock.folder, header, reference=None)
+journal = Journal(Path(sys.argv[1]), header, reference=None)
 for number in range(10**6):
     journal.append(np.full((48, 48, 3), number % 256, dtype=np.uint8), time_s=float(number))
     print(number, flush=True)
@@ -162,7 +162,7 @@ def test_a_damaged_journal_is_whole_frames_or_a_sentence(
 ):
     lock, _ = begin_recording(tmp_path / "data", simulated=False)
     header = JournalHeader(facts=FACTS, source="a camera", simulated=False, size=(48, 48))
-    journal = Journal(lock.folder, header, reference=recording.reference)
+    journal = Journal(tmp_path / "data", header, reference=recording.reference)
     for frame in frames_of(recording)[:3]:
         journal.append(frame.image, time_s=frame.time_s, safety_margin=frame.safety_margin, forces=frame.forces)
     journal.close()

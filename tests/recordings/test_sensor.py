@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 from sliplens.errors import ImageError, InputError
 from sliplens.recordings.options import LabelSettings
-from sliplens.recordings.sensor import Lens, SensorProfile, load_profile, profile_text, shipped_profiles
+from sliplens.recordings.sensor import SensorProfile, load_profile, profile_text, shipped_profiles
 from sliplens.recordings.source import open_source
 
 FRAME = np.random.default_rng(0).integers(0, 256, (48, 64, 3), dtype=np.uint8)
-LENS = Lens(focal_px=(60.0, 60.0), centre_px=(31.5, 23.5), distortion=(0.0, 0.0, 0.0, 0.0))
 TIP = SensorProfile(name="tip", camera_size_px=(64, 48), crop_px=(8, 0, 48, 48), resize_px=(24, 24))
 
 
@@ -40,25 +39,6 @@ def test_channels_are_found_where_they_arrive(colours):
     np.testing.assert_array_equal(SensorProfile(name="tip", colours=colours).apply(sent), FRAME)
 
 
-def test_a_lens_without_distortion_changes_nothing_and_one_with_it_is_inverted():
-    cv2 = pytest.importorskip("cv2")
-    profile = SensorProfile(name="tip", camera_size_px=(64, 48), undistort=LENS)
-    np.testing.assert_array_equal(profile.apply(FRAME), FRAME)
-    # a dot of the scene is seen where OpenCV's own camera model puts it, and comes back to where a pinhole sees it
-    bent = replace(LENS, distortion=(-0.3, 0.05, 0.0, 0.0))
-    camera = np.array([[60.0, 0, 31.5], [0, 60.0, 23.5], [0, 0, 1]])
-    point = np.array([[0.35, -0.25, 1.0]])
-    seen = cv2.projectPoints(point, np.zeros(3), np.zeros(3), camera, np.array(bent.distortion))[0].ravel()
-    rows, columns = np.mgrid[:48, :64]
-    blob = 255 * np.exp(-((columns - seen[0]) ** 2 + (rows - seen[1]) ** 2) / 4)
-    frame = np.repeat(blob[..., None], 3, axis=2).astype(np.uint8)
-    straight = replace(profile, undistort=bent).apply(frame)[..., 0].astype(float)
-    found = np.array([(straight * columns).sum(), (straight * rows).sum()]) / straight.sum()
-    # half a pixel: the blob is not small against how fast the distortion changes
-    np.testing.assert_allclose(found, point[0, :2] * 60 + [31.5, 23.5], atol=0.5)
-    assert np.linalg.norm(found - seen) > 1
-
-
 def test_what_is_cropped_and_resized_keeps_its_place_and_its_mean():
     small = TIP.apply(FRAME)
     assert small.shape[:2] == TIP.output_size((48, 64)) == (24, 24)
@@ -76,7 +56,7 @@ def test_another_camera_and_a_stretch_are_refused():
 
 def test_a_profile_comes_back_from_its_text(tmp_path: Path):
     profile = replace(
-        TIP, undistort=LENS, rotate_deg=90, flip="both", colours="bgr", markers="tactip", reference="first still",
+        TIP, rotate_deg=90, flip="both", colours="bgr", markers="tactip",
         reference_frame=3, frame_rate_hz=30.0, normal_axis="z", normal_sign=-1, network='a "b" ü',
     )  # fmt: skip
     path = tmp_path / "tip.toml"
@@ -138,6 +118,6 @@ def test_a_source_is_read_through_its_profile_and_what_is_said_of_the_reference_
 
 
 def test_what_a_user_says_of_forces_counts_more_than_the_profile():
-    profile = replace(TIP, normal_axis="y", normal_sign=-1, reference="first still")
+    profile = replace(TIP, normal_axis="y", normal_sign=-1)
     settings = profile.settings(LabelSettings(normal_axis="x"))
-    assert (settings.normal_axis, settings.normal_sign, settings.reference_method) == ("x", -1, "first still")
+    assert (settings.normal_axis, settings.normal_sign) == ("x", -1)

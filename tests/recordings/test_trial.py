@@ -18,7 +18,7 @@ def test_a_label_outside_the_unit_interval_is_refused(recording: Recording):
 def test_time_must_rise(recording: Recording):
     time = recording.time_s.copy()
     time[4] = time[3]
-    with pytest.raises(RecordingError, match=r"time does not rise at frame 4; mend"):
+    with pytest.raises(RecordingError, match=r"time does not rise at sample 4"):
         replace(recording, time_s=time)
 
 

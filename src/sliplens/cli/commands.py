@@ -243,7 +243,7 @@ def call_import(call: Any, *, audit: bool = True) -> None:
         raise SystemExit(1)
 
 
-@command("label", "recordings.relabelling:label_dataset", "sliplens label runs/mine/data --draft corrections.csv")
+@command("label", "recordings.corrections:label_dataset", "sliplens label runs/mine/data --draft corrections.csv")
 def call_label(call: Any, *, draft: Path | None = None, audit: bool = True, audit_only: bool = False) -> None:
     """Print what the labels rest on.
 

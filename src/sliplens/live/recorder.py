@@ -159,7 +159,7 @@ class Recorder:
             forces=None if frame.forces is None else frame.forces.source,
         )
         fits = reference is not None and reference.shape == frame.image.shape
-        self._journal = Journal(self._lock.folder, header, reference=reference if fits else None)
+        self._journal = Journal(self.folder, header, reference=reference if fits else None)
         self._taken.add(facts.trial)
         self._first_s, self._trial_reference = frame.time_s, reference
 

@@ -1,7 +1,6 @@
 """Audit of an imported trial: one page with its labels and the estimates behind them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from textwrap import wrap
@@ -11,20 +10,17 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
 from sliplens.plots.contact_sheet import (
-    NAMED_STATES,
     STATE_COLOURS,
-    STATE_TINTS,
     TIMES,
     brighten,
     brightening,
     choose_margins,
     plot_margin,
+    state_patches,
 )
 from sliplens.plots.style import (
     BLACK,
@@ -45,14 +41,11 @@ from sliplens.plots.style import (
 from sliplens.progress import OnProgress, number_of, open_stage, report_each, reporting
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.dataset import trial_path
-from sliplens.recordings.labelling import Found, FrictionEstimate, Labelling, Lag
+from sliplens.recordings.labelling import Found, FrictionEstimate, Labelling, Lag, Reason
 from sliplens.recordings.store import load_recording, read_frames, read_header
 
-_MINUS = "\N{MINUS SIGN}"
 _LOOSE = 10.0  # percentage points: beyond, margins 20 points apart are hard to tell apart
 _IMAGE_SIGMAS = 5.0  # an image that moves less at the onset does not confirm a slip
-_SEE_FLAGS = "in doubt: see the flags"
-_NO_TARE = "no untouched sample shows it"
 
 
 class Fact(NamedTuple):
@@ -72,104 +65,89 @@ class Fact(NamedTuple):
 
 def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
     """Describe the declared, estimated and assumed settings behind the labels, and the doubts about them."""
-    basis, reference = labelling.basis, labelling.reference
+    basis, reference, counts = labelling.basis, labelling.reference, recording.count()
+    valid, frames = counts.pop("valid", 0), len(recording)
+    words, doubts = [", ".join(f"{count} {reason}" for reason, count in counts.items())], []
+    sigma = 100 * np.array([0.0] if recording.safety_margin_sigma is None else recording.safety_margin_sigma)
+    if np.nanmax(sigma, initial=0) > 0:
+        words.append(f"Γ known to ± {np.nanmedian(sigma):.1f} % (median), {np.nanmax(sigma):.1f} % at worst")
+        if np.nanmedian(sigma) > _LOOSE:
+            doubts.append(f"beyond ± {_LOOSE:g} %, margins that are far apart look alike")
+    lost = sum(counts.values()) - sum(counts.get(reason, 0) for reason in (Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP))
+    if basis is not None and lost:
+        doubts.append(f"{number_of(lost, 'frame')} in contact, before a slip, without a valid label")
+    facts = [Fact(f"Frames: {valid} of {frames} valid", words, tuple(doubts))]
+    chosen = [reference.method if reference.index is None else f"frame {reference.index}, {reference.method}"]
+    if reference.contact_energy is not None:
+        chosen.append(f"contact energy {reference.contact_energy:.2f} grey levels")
     if basis is None:
-        return _describe_imported(recording, labelling)
-    axes, limit, notes = basis.axes, basis.force_range_n, labelling.notes
-    pressing = f"normal force is {'+' if axes.sign > 0 else _MINUS}{axes.normal}"
-    turned = f", turned by {axes.tilt_deg:.1f} degrees" if axes.direction else ""
-    mounting = f"{pressing}{turned} (axis {_origin(axes.normal_found)}, sign {_origin(axes.sign_found)})"
-    still = f"untouched until {decimals(axes.still_until_s, 2)} s"
-    noise = [f"± {_three(axes.tare_sigma_n)} N", f"noise of a sample {_three(axes.noise_n)} N"]
-    tare = [f"x, y, z: {_three(axes.tare_n, signed)} N", *noise, still]
-    energy, drift = decimals(reference.contact_energy, 2), decimals(reference.drift, 2)
-    means = f"means over {_milli(basis.window_s)} ms; gaps over {_milli(basis.gap_s)} ms count as missing"
-    span = "range of the sensor unknown" if limit is None else f"range of the sensor ± {limit:g} N"
-    chosen = [f"frame {reference.index}, {reference.method}", f"contact energy {energy}, drift {drift} grey levels"]
-    chosen = [reference.method] if reference.index is None else chosen
-    return [
-        _describe_frames(recording),
-        *([Fact("Flags", [], tuple(f"• {flag}" for flag in basis.flags), indent="   ")] if basis.flags else []),
-        Fact("Axes", [mounting], (_SEE_FLAGS,) if any("axis" in note for note in axes.notes) else ()),
-        Fact(f"Tare {_origin(axes.tare_found)}", tare, (_NO_TARE,) if axes.tare_found == Found.ASSUMED else ()),
-        _describe_friction(basis.friction, basis.slip_s),
-        _describe_lag(recording, basis.lag, applied=basis.lag_applied),
-        Fact("Forces", [f"contact from {decimals(basis.contact_threshold_n, 3)} N", means, span]),
-        Fact("Reference", chosen),
-        *([Fact("Notes", [f"• {note}" for note in notes], indent="   ")] if notes else []),
-    ]
-
-
-def _describe_imported(recording: Recording, labelling: Labelling) -> list[Fact]:
-    """Describe labels that came with the recording and were not made from forces."""
-    index, clip = labelling.reference.index, asdict(labelling.clip) if labelling.clip else {}
-    which = "recorded apart from the frames" if index is None else f"frame {index}"
-    labelled = bool(recording.labelled.any())
-    words = ["They came with the recording; nothing was found from forces."] if labelled else ["No frame has one."]
-    facts = [
-        f"{name.replace('_', ' ')}: {('no', 'yes')[value] if isinstance(value, bool) else value}"
-        for name, value in clip.items()
-    ]
-    notes = [f"• {note}" for note in labelling.notes]
-    counts = recording.count()
-    lost = [", ".join(f"{count} {reason}" for reason, count in counts.items() if reason != "valid")]
-    return [
-        Fact(f"Frames: {counts.get('valid', 0)} of {sum(counts.values())} valid", lost),
-        Fact("Labels", words if labelled else [], () if labelled else tuple(words)),
-        *([Fact("Known of the whole clip", facts)] if facts else []),
-        Fact("Reference", [which]),
-        *([Fact("Notes", notes, indent="   ")] if notes else []),
-    ]
-
-
-def _describe_frames(recording: Recording) -> Fact:
-    """Count the frames with a valid label, and the others by the reason."""
-    states, sigma = np.array([str(state) for state in recording.contact_state]), recording.safety_margin_sigma
-    lacking = {
-        "missing samples": np.isnan(recording.normal_force_n),
-        "no contact": states == ContactState.NO_CONTACT,
-        "after gross slip": states == ContactState.FULL_SLIP,
-        "outside the sensor's range": np.isnan(recording.safety_margin),
-    }
-    kinds = np.select([recording.labelled, *lacking.values()], range(5), default=5)
-    counts = dict(zip(("valid", *lacking, "not valid"), np.bincount(kinds, minlength=6).tolist(), strict=True))
-    if recording.reason is not None:
-        counts = {"valid": 0, **recording.count()}
-    words = [", ".join(f"{count} {name}" for name, count in counts.items() if count and name != "valid")]
-    middle = most = 0.0
-    if sigma is not None and np.isfinite(sigma).any():
-        middle, most = 100 * float(np.nanmedian(sigma)), 100 * float(np.nanmax(sigma))
-        words.append(f"Γ known to ± {middle:.1f} % (median), {most:.1f} % at worst")
-    lost = len(states) - sum(counts.get(name, 0) for name in ("valid", "no contact", "after gross slip"))
-    doubts = [f"{number_of(lost, 'frame')} in contact, before a slip, without a valid label"] if lost else []
-    doubts += [f"beyond ± {_LOOSE:g} %, margins that are far apart look alike"] if middle > _LOOSE else []
-    return Fact(f"Frames: {counts['valid']} of {len(states)} valid", words, tuple(doubts))
+        came, none = ["They came with the recording."], ("No frame has one.",)
+        facts.append(Fact("Labels", came) if valid else Fact("Labels", [], none))
+        if (clip := labelling.clip) is not None:
+            about = [
+                f"slips: {'yes' if clip.slips else 'no'}",
+                f"grasp: {clip.grasp}",
+                f"stale frames: {clip.stale_frames}",
+            ]
+            facts.append(Fact("Known of the whole clip", about))
+    else:
+        axes, limit = basis.axes, basis.force_range_n
+        if basis.flags:
+            facts.append(Fact("Flags", [], tuple(f"• {flag}" for flag in basis.flags), indent="   "))
+        turned = f", turned by {axes.tilt_deg:.1f} degrees" if axes.direction else ""
+        origins = f"(axis {_origin(axes.normal_found)}, sign {_origin(axes.sign_found)})"
+        sign = "+" if axes.sign > 0 else "\N{MINUS SIGN}"
+        unsure = ("see the flags",) if any("axis" in note for note in axes.notes) else ()
+        tare = [
+            f"x, y, z: {_three(axes.tare_n, signed)} N",
+            f"± {_three(axes.tare_sigma_n)} N",
+            f"noise of a sample {_three(axes.noise_n)} N",
+            f"untouched until {decimals(axes.still_until_s, 2)} s",
+        ]
+        assumed = ("no untouched sample shows it",) if axes.tare_found is Found.ASSUMED else ()
+        forces = [
+            f"contact from {basis.contact_threshold_n:.3f} N",
+            f"means over {_milli(basis.window_s)} ms; gaps over {_milli(basis.gap_s)} ms count as missing",
+            "range of the sensor unknown" if limit is None else f"range of the sensor ± {limit:g} N",
+        ]
+        facts += [
+            Fact("Axes", [f"normal force is {sign}{axes.normal}{turned} {origins}"], unsure),
+            Fact(f"Tare {_origin(axes.tare_found)}", tare, assumed),
+            _describe_friction(basis.friction, basis.slip_s),
+            _describe_lag(recording, basis.lag, applied=basis.lag_applied),
+            Fact("Forces", forces),
+        ]
+    facts.append(Fact("Reference", chosen))
+    if labelling.notes:
+        facts.append(Fact("Notes", [f"• {note}" for note in labelling.notes], indent="   "))
+    return facts
 
 
 def _describe_friction(friction: FrictionEstimate, slip_s: float | None) -> Fact:
     exact, moved = friction.low == friction.high, friction.image_sigmas
-    ends = f"{decimals(friction.low, 3)} to {decimals(friction.high, 3)}"
-    interval = "taken as exact" if exact else f"68 % interval {ends}"
-    image = [] if moved is None else [f"image moves {moved:.1f} σ more at the slip"]  # noqa: RUF001 (sigma is meant)
+    interval = "taken as exact" if exact else f"68 % interval {friction.low:.3f} to {friction.high:.3f}"
+    words = [f"μ {friction.mu:.3f}, {interval}", friction.method]
+    if moved is not None:
+        words.append(f"image moves {moved:.1f} σ more at the slip")  # noqa: RUF001 (sigma is meant)
     later = "".join(f", and again at {later_s:.3f} s" for later_s in friction.later_onsets_s)
-    slip = "no slip found" if slip_s is None else f"slips at {slip_s:.3f} s{later} on the clock of the forces"
+    words.append("no slip found" if slip_s is None else f"slips at {slip_s:.3f} s{later} on the clock of the forces")
     doubts = ["its uncertainty is unknown, and no label counts it"] if exact else []
-    if friction.found == Found.INFERRED and (moved is None or moved < _IMAGE_SIGMAS):
+    if friction.found is Found.INFERRED and (moved or 0) < _IMAGE_SIGMAS:
         doubts.append("forces alone show the slip: the image hardly moves at it")
-    words = [f"μ {decimals(friction.mu, 3)}, {interval}", friction.method, *image, slip]
-    return Fact(f"Friction {_origin(friction.found)}", words, (*doubts, *([_SEE_FLAGS] if friction.notes else [])))
+    if friction.notes:
+        doubts.append("see the flags")
+    return Fact(f"Friction {_origin(friction.found)}", words, tuple(doubts))
 
 
 def _describe_lag(recording: Recording, lag: Lag | None, *, applied: bool) -> Fact:
     head = f"Lag {'applied' if applied else 'not applied'}"
     if lag is None or lag.doubt:
         return Fact(head, [], (f"unknown: {lag.doubt}" if lag else "not estimated",))
-    late = f"camera late by {_milli(lag.lag_s)} ± {_milli(lag.sigma_s)} ms"
+    words = [f"camera late by {_milli(lag.lag_s)} ± {_milli(lag.sigma_s)} ms"]
+    words.append(f"correlation {decimals(lag.correlation, 2)}")
     # significant, and half a frame or more: the labels are those of another frame
-    least = max(2 * lag.sigma_s, np.ptp(recording.time_s) / (2 * len(recording)))
-    ignored = not applied and abs(lag.lag_s) > least
-    doubts = ("it is not taken off: labels may be those of the frame beside",) if ignored else ()
-    return Fact(head, [late, f"correlation {decimals(lag.correlation, 2)}"], doubts)
+    ignored = not applied and abs(lag.lag_s) > max(2 * lag.sigma_s, np.ptp(recording.time_s) / (2 * len(recording)))
+    return Fact(head, words, ("it is not taken off: labels may be those of the frame beside",) if ignored else ())
 
 
 def _origin(origin: Found) -> str:
@@ -177,29 +155,11 @@ def _origin(origin: Found) -> str:
 
 
 def _milli(value: float) -> str:
-    return decimals(1000 * value, 1).replace("-", _MINUS)
+    return decimals(1000 * value, 1)
 
 
 def _three(values: Sequence[float], write: Callable[..., str] = decimals) -> str:
     return ", ".join(write(value, 3) for value in values)
-
-
-_HIGHEST = 2.5  # times mu_s: under a light touch F_t / F_n is arbitrary
-_HIGHEST_UNKNOWN = 2.0  # where mu_s is unknown
-
-
-def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: Axes) -> None:
-    """Draw F_n and F_t over time, in newtons, and the least F_n of a contact."""
-    forces = {"$F_n$": (recording.normal_force_n, BLUE, "-"), "$F_t$": (recording.tangential_force_n, VERMILLION, "--")}
-    for name, (force, colour, line) in forces.items():
-        label = name if np.isfinite(force).any() else "_unknown"
-        ax.plot(recording.time_s, force, color=colour, linestyle=line, linewidth=_width(recording), label=label)
-    if threshold_n is not None:
-        label = f"contact from {threshold_n:.3g} N"
-        ax.axhline(threshold_n, color=BLACK, linestyle=":", linewidth=1.3, label=label)
-    ax.set(ylabel="Force (N)", xmargin=0)
-    if not np.isfinite(recording.normal_force_n).any():
-        _leave_empty(ax, "no forces were recorded")
 
 
 def force_ratio(recording: Recording) -> Float[np.ndarray, " frames"]:
@@ -212,74 +172,59 @@ def force_ratio(recording: Recording) -> Float[np.ndarray, " frames"]:
 def end_of_ratio(ratio: Float[np.ndarray, " frames"], mu: float, *, above: float = 0.0) -> float:
     """Choose the upper end of a chart of F_t / F_n: a little above ratio, friction and the value `above`."""
     least, largest = max(mu, above), float(np.max(ratio, where=np.isfinite(ratio), initial=0))
-    highest = max(_HIGHEST * mu, least) if mu else _HIGHEST_UNKNOWN
+    highest = max(2.5 * mu, least) if mu else 2.0  # under a light touch the ratio is arbitrary
     return 1.12 * max(least, min(largest, highest)) or 1.0
+
+
+def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: Axes) -> None:
+    """Draw F_n and F_t over time, in newtons, and the least F_n of a contact."""
+    ax.plot(recording.time_s, recording.normal_force_n, color=BLUE, label="$F_n$", **_line(recording))
+    ax.plot(recording.time_s, recording.tangential_force_n, "--", color=VERMILLION, label="$F_t$", **_line(recording))
+    if threshold_n is not None:
+        ax.axhline(threshold_n, color=BLACK, ls=":", lw=1.3, label=f"contact from {threshold_n:.3g} N")
+    ax.set(ylabel="Force (N)", xmargin=0)
+    if not np.isfinite(recording.normal_force_n).any():
+        write_over(ax, "no forces were recorded")
 
 
 def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *, ax: Axes) -> None:
     """Draw F_t / F_n of the frames in contact, and the static friction with its interval."""
-    ratio = force_ratio(recording)
-    drawn = {"color": BLUE, "linewidth": _width(recording), "marker": _marker(recording)}
-    ax.plot(recording.time_s, ratio, label="$F_t/F_n$ in contact" if np.isfinite(ratio).any() else "_", **drawn)
-    mu, low, high = (friction.mu, friction.low, friction.high) if friction else (None, None, None)
-    touches = np.array([state != ContactState.NO_CONTACT for state in recording.contact_state])
-    coefficient = np.where(touches, recording.friction_coefficient, np.nan)
-    if friction is None and np.isfinite(coefficient).any():
-        ax.plot(recording.time_s, coefficient, color=GREEN, linewidth=1.1, label=r"$\mu$ that came with the frames")
-        mu = float(np.nanmax(coefficient))
-    if low is not None and high is not None and low < high:
-        ax.axhspan(low, high, color=GREEN, alpha=0.35, linewidth=0, label="its 68 % interval")
-    if mu is not None and friction is not None:
-        ax.axhline(mu, color=GREEN, linewidth=1.1, label=f"$\\mu_s$ = {mu:.3g}")
-    ax.set(ylabel="$F_t/F_n$", xmargin=0, ylim=(0, end_of_ratio(ratio, mu or 0.0, above=high or 0.0)))
+    ratio, mu, high = force_ratio(recording), 0.0, 0.0
+    ax.plot(recording.time_s, ratio, color=BLUE, label="$F_t/F_n$ in contact", **_line(recording))
+    if friction is not None:
+        mu, high = friction.mu, friction.high
+        ax.axhspan(friction.low, high, color=GREEN, alpha=0.35, lw=0, label="its 68 % interval")
+        ax.axhline(mu, color=GREEN, lw=1.1, label=f"$\\mu_s$ = {mu:.3g}")
+    ax.set(ylabel="$F_t/F_n$", xmargin=0, ylim=(0, end_of_ratio(ratio, mu, above=high)))
     if not np.isfinite(ratio).any():
-        _leave_empty(ax, "F_t / F_n is not known")
+        write_over(ax, "F_t / F_n is not known", parse_math=False)
 
 
 def plot_labels(recording: Recording, *, ax: Axes) -> None:
     """Draw the safety margin with its uncertainty on the colours of the states, and mark frames without a label."""
     plot_margin(recording, ax=ax)
     time_s, valid, margin = recording.time_s, recording.labelled, 100 * recording.safety_margin
-    # margins that are no labels are drawn differently
-    ax.lines[0].set(color=GREY, linestyle=":", linewidth=1.3)
-    sigma = recording.safety_margin_sigma
-    if sigma is not None:
-        low, high = margin - 100 * sigma, margin + 100 * sigma
-        ax.fill_between(time_s, low, high, where=valid, color=PURPLE, alpha=0.75, linewidth=0, label=r"Γ $\pm\,\sigma$")
-    labels = np.where(valid, margin, np.nan)
-    ax.plot(time_s, labels, color=BLACK, linewidth=_width(recording), marker=_marker(recording), label="Γ")
-    ax.plot(time_s, np.where(valid, np.nan, -9), color=GREY, linewidth=4, solid_capstyle="butt", label="no valid label")
+    ax.lines[0].set(color=GREY, linestyle=":", linewidth=1.3)  # margins that are no labels
+    if (sigma := recording.safety_margin_sigma) is not None:
+        ends = margin - 100 * sigma, margin + 100 * sigma
+        ax.fill_between(time_s, *ends, where=valid, color=PURPLE, alpha=0.75, lw=0, label=r"Γ $\pm\,\sigma$")
+    ax.plot(time_s, np.where(valid, margin, np.nan), color=BLACK, label="Γ", **_line(recording))
+    ax.plot(time_s, np.where(valid, np.nan, -9), color=GREY, lw=4, solid_capstyle="butt", label="no valid label")
     ax.set(xlabel="", ylim=(-14, 107))
-    if not np.isfinite(margin).any():
-        write_over(ax, "no frame has a label")
 
 
-def _leave_empty(ax: Axes, words: str) -> None:
-    ax.set(yticks=[])
-    write_over(ax, words, parse_math=False)
-
-
-def _width(recording: Recording) -> float:
-    """Return a smaller line width for so many frames that noise would fill the chart."""
-    return 1.5 if len(recording) <= 1000 else 0.7
-
-
-def _marker(recording: Recording) -> str:
-    """Return dots for so few frames that one alone would draw no line."""
-    return "." if len(recording) <= 60 else ""
+def _line(recording: Recording) -> dict[str, float | str]:
+    """Return thin lines for so many frames that noise would fill the chart, dots where one alone draws no line."""
+    return {"linewidth": 1.5 if len(recording) <= 1000 else 0.7, "marker": "." if len(recording) <= 60 else ""}
 
 
 _SHARES = (0, 1, 0.25, 0.5, 0.75)  # of the way from full stick to the slip; its ends first
 _EVEN = 0.05  # margin by which a frame may be off, to spread frames of similar margins over time
-_ONSET = "slip", r"as the camera sees it (lag $\pm\,\sigma$)"
-# inches; from left to right: facts, then charts above pictures
-_WIDTH, _HEIGHT, _EDGE, _LEFT, _GAP = 12.0, 9.0, 0.2, 3.75, 0.07
-_SPAN = _WIDTH - _LEFT - _EDGE
-_PICTURE = (_SPAN + _GAP) / (1 + len(_SHARES)) - _GAP
-# from top to bottom
-_TOP, _LEGEND, _TICKS, _LEADER, _HEAD, _FOOT, _PICTURE_HEIGHT = 0.78, 0.25, 0.22, 0.26, 0.52, 0.36, (0.6, 1.36)
+# inches: facts at the left, charts above pictures at the right
+_WIDTH, _HEIGHT, _EDGE, _LEFT, _GAP, _TOP, _FOOT = 12.0, 9.0, 0.2, 3.75, 0.07, 0.78, 0.36
+_CHART, _LEGEND, _TICKS, _HEAD = 1.27, 0.25, 0.3, 0.52
+_PICTURE = (_WIDTH - _LEFT - _EDGE + _GAP) / (1 + len(_SHARES)) - _GAP
 _LINE, _WRAP = 0.145, 43  # height of a line of facts, and its characters
-
 
 ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"]]
 """Reads the frames of some numbers, in their order."""
@@ -287,20 +232,11 @@ ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"
 
 def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadFrames | None = None) -> Figure:
     """Draw a page from which to judge the labels of an imported trial."""
-    height = float(np.clip(_PICTURE * recording.reference.shape[0] / recording.reference.shape[1], *_PICTURE_HEIGHT))
-    top = _HEIGHT - _FOOT - 2 * height - _GAP
+    frames = [labelling.reference.index, *choose_along(recording)]
     with drawing_style():
         figure = Figure(figsize=(_WIDTH, _HEIGHT))
-        charts = _draw_charts(figure, recording, labelling, bottom=top - _HEAD - _LEADER - _TICKS)
-        columns = [labelling.reference.index, *choose_along(recording)]
-        read = recording.frames.__getitem__ if read_frames is None else read_frames
-        _draw_pictures(figure, recording, columns, read, top=top, height=height)
-        for column, at in enumerate(columns):
-            if at is None:  # the reference was recorded apart from the frames
-                continue
-            time_s = recording.time_s[at]
-            middle = (_LEFT + column * (_PICTURE + _GAP) + _PICTURE / 2) / _WIDTH
-            _lead(figure, charts, float(time_s), middle, top=top - _HEAD - _LEADER)
+        _draw_charts(figure, recording, labelling, [at for at in frames if at is not None])
+        _draw_pictures(figure, recording, frames, read_frames or recording.frames.__getitem__)
         _write_facts(figure, recording, labelling)
     return figure
 
@@ -339,105 +275,74 @@ def choose_along(recording: Recording) -> list[int]:
     allowed[[begin, end]] = True
     free, way = np.ones(len(recording), dtype=bool), end - begin
     for share in _SHARES[: len(recording)]:
-        wanted = margin[begin] + share * (margin[end] - margin[begin])
+        level = margin[begin] + share * (margin[end] - margin[begin])
         late = np.abs(np.arange(len(recording)) - (begin + share * way)) / max(abs(way), 1)
-        cost = np.abs(margin - wanted) + _EVEN * late + np.where(allowed, 0, 1)
+        cost = np.abs(margin - level) + _EVEN * late + np.where(allowed, 0, 1)
         free[np.argmin(np.where(free, cost, np.inf))] = False
     return [int(at) for at in np.flatnonzero(~free)]
 
 
-def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, *, bottom: float) -> list[Axes]:
-    height = (bottom - _TOP) / 3 - _LEGEND
-    tops = [_TOP + row * (height + _LEGEND) + _LEGEND for row in range(3)]
-    charts = [place_axes(figure, _LEFT, top, _SPAN, height) for top in tops]
-    basis = labelling.basis
+def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, frames: list[int]) -> None:
+    basis, lag = labelling.basis, labelling.basis and labelling.basis.lag
+    tops = [_TOP + _LEGEND + row * (_CHART + _LEGEND) for row in range(3)]
+    charts = [place_axes(figure, _LEFT, top, _WIDTH - _LEFT - _EDGE, _CHART) for top in tops]
     plot_contact_forces(recording, basis and basis.contact_threshold_n, ax=charts[0])
     plot_force_ratio(recording, basis and basis.friction, ax=charts[1])
     plot_labels(recording, ax=charts[2])
-    lag = basis.lag if basis else None
-    shift = lag.lag_s if basis and lag and basis.lag_applied else 0.0
-    shades = [(str(state), STATE_COLOURS[state], STATE_TINTS[state]) for state in NAMED_STATES]
-    tints = [Patch(color=colour, alpha=tint, linewidth=0, label=name) for name, colour, tint in shades]
     for ax in charts:
+        handles = [*ax.get_legend_handles_labels()[0], *(state_patches() if ax is charts[2] else [])]
         if basis is not None and basis.slip_s is not None:
-            slip_s = basis.slip_s + shift
-            ax.axvline(slip_s, color=BLACK, linestyle="-.", linewidth=1.3, label=f"{_ONSET[0]} at {slip_s:.2f} s")
+            shift = lag.lag_s if lag and basis.lag_applied else 0.0
+            slips_s = [basis.slip_s, *basis.friction.later_onsets_s]
+            lines = [ax.axvline(at_s + shift, color=BLACK, ls="-.", lw=1.3, label="_slip") for at_s in slips_s]
+            lines[0].set_label(f"slip at {slips_s[0] + shift:.2f} s")
+            named = lines[:1]
             if lag is not None and not lag.doubt:
-                visible_s = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
-                ax.axvspan(*visible_s, color=SKY, alpha=0.6, linewidth=0, label=_ONSET[1], zorder=0)
-            for later_s in basis.friction.later_onsets_s:
-                ax.axvline(later_s + shift, color=BLACK, linestyle="-.", linewidth=1.3, label="_slip")
+                ends_s = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
+                named.append(ax.axvspan(*ends_s, color=SKY, alpha=0.6, lw=0, zorder=0))
+                named[-1].set_label(r"as the camera sees it (lag $\pm\,\sigma$)")
+            handles += named if ax is charts[1] else []  # equal entries are written once
+        for at in frames:
+            ax.axvline(recording.time_s[at], color=BLACK, lw=0.7, alpha=0.45, zorder=1, label="_frame")
         place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0}
-        handles, names = ax.get_legend_handles_labels()
-        if ax is not charts[1]:  # equal entries are written once
-            handles = [line for line, name in zip(handles, names, strict=True) if not name.startswith(_ONSET)]
-        handles += tints if ax is charts[2] else []
-        ax.legend(
-            handles=handles, ncols=9, columnspacing=1.1, handlelength=1.9, handletextpad=0.5, fontsize=8.5, **place
-        )
+        ax.legend(handles=handles, ncols=9, columnspacing=1.1, handlelength=1.9, fontsize=8.5, **place)
         ax.tick_params(labelbottom=ax is charts[-1], labelsize=8.5)
         ax.xaxis.set_major_formatter("{x:g} s")
         ax.yaxis.set_label_coords(-0.058, 0.5)
         ax.sharex(charts[0])
-    return charts
 
 
-def _lead(figure: Figure, charts: list[Axes], time_s: float, middle: float, *, top: float) -> None:
-    """Mark the time of a frame on the charts, and draw a line from there to its picture."""
-    for ax in charts:
-        ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1, label="_frame")
-    low, high = charts[-1].get_xlim()
-    from_x = (_LEFT + _SPAN * (time_s - low) / (high - low)) / _WIDTH
-    ends = [1 - top / _HEIGHT, 1 - (top + _LEADER - 0.04) / _HEIGHT]
-    figure.add_artist(Line2D([from_x, middle], ends, color=BLACK, linewidth=0.7, alpha=0.45))
-
-
-def _draw_pictures(
-    figure: Figure, recording: Recording, columns: list[int | None], read: ReadFrames, *, top: float, height: float
-) -> None:
-    index, *along = columns
-    reference, second = recording.reference, top + height + _GAP
-    free = [at for at, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
+def _draw_pictures(figure: Figure, recording: Recording, frames: list[int | None], read: ReadFrames) -> None:
+    index, *along = frames
+    reference, time_s, states = recording.reference, recording.time_s, recording.contact_state
+    height = float(np.clip(_PICTURE * reference.shape[0] / reference.shape[1], 0.6, 1.2))
+    top = _TOP + 3 * (_CHART + _LEGEND) + _TICKS + _HEAD
+    free = [at for at, state in enumerate(states) if state == ContactState.NO_CONTACT]
     # the difference of the reference from itself is 0; that of an untouched frame far from it shows the drift
     far = max(free, key=lambda at: abs(at - (index or 0)), default=index)
     images = read([at for at in (*along, far) if at is not None])
-    frames = [reference, *images[: len(along)]]
-    untouched = reference if far is None else images[-1]
-    differences = absolute_difference(np.stack([untouched, *frames[1:]]), reference)
+    shown = [reference, *images[: len(along)]]
+    differences = absolute_difference(np.stack([reference if far is None else images[-1], *shown[1:]]), reference)
     factor = brightening([differences])
-    for text, middle in (("camera", top + height / 2), (f"difference\n{TIMES} {factor:g}", second + height / 2)):
-        turned = {"rotation": 90, "ha": "right", "va": "center", "multialignment": "center"}
-        place_text(figure, _LEFT - 0.06, middle, text, fontsize=8.5, color=GREY, **turned)
-    for column, (at, frame, difference) in enumerate(zip(columns, frames, differences, strict=True)):
-        x = _LEFT + column * (_PICTURE + _GAP)
-        state = ContactState.NO_CONTACT if at is None else recording.contact_state[at]
-        for y, picture in ((top, frame), (second, brighten(difference, factor))):
+    for column, (at, frame, difference) in enumerate(zip(frames, shown, differences, strict=True)):
+        x, state = _LEFT + column * (_PICTURE + _GAP), ContactState.NO_CONTACT if at is None else states[at]
+        for y, picture in ((top, frame), (top + height + _GAP, brighten(difference, factor))):
             ax = place_axes(figure, x, y, _PICTURE, height)
             ax.imshow(picture)
             ax.set(xticks=[], yticks=[])
             ax.spines[:].set(visible=True, color=STATE_COLOURS[state], linewidth=2)
-        title = _margin(recording, at) if at is not None and column else "reference"
-        apart = "" if at is None or recording.labelled[at] or not column else ", not valid"
-        lines = (
-            (title, 0.37, "bold"),
-            ("recorded apart" if at is None else f"{recording.time_s[at]:.2f} s", 0.21, "normal"),
-            (state + apart, 0.06, "normal"),
-        )
-        for text, up, weight in lines:
+        title, when, how = "reference", "recorded apart" if at is None else f"{time_s[at]:.2f} s", str(state)
+        if column and at is not None:
+            margin, sigma = recording.safety_margin[at], recording.safety_margin_sigma
+            band = "" if sigma is None or np.isnan(sigma[at]) else f" ± {100 * sigma[at]:.1f}"
+            title = f"Γ {100 * margin:.0f}{band} %" if np.isfinite(margin) else "no Γ"
+            how += "" if recording.labelled[at] else ", not valid"
+        for text, up, weight in ((title, 0.37, "bold"), (when, 0.21, "normal"), (how, 0.06, "normal")):
             place_text(figure, x + _PICTURE / 2, top - up, text, ha="center", va="bottom", fontsize=8, weight=weight)
     words = f"Differences are $|T_n - T_0|$, brightened {TIMES} {factor:g}"
     if free and far is not None:
-        untouched = f"that of the untouched frame at {recording.time_s[far]:.2f} s"
-        words += f"; beneath the reference {untouched}: it should be dark"
-    place_text(figure, _LEFT, _HEIGHT - _FOOT + 0.08, words, fontsize=8, color=GREY)
-
-
-def _margin(recording: Recording, at: int) -> str:
-    margin, sigma = float(recording.safety_margin[at]), recording.safety_margin_sigma
-    if not np.isfinite(margin):
-        return "no Γ"
-    band = "" if sigma is None or not np.isfinite(sigma[at]) else f" ± {100 * sigma[at]:.1f}"
-    return f"Γ {100 * margin:.0f}{band} %"
+        words += f"; beneath the reference that of the untouched frame at {time_s[far]:.2f} s: it should be dark"
+    place_text(figure, _LEFT, top + 2 * (height + _GAP), words, fontsize=8, color=GREY)
 
 
 def _write_facts(figure: Figure, recording: Recording, labelling: Labelling) -> None:
@@ -447,8 +352,7 @@ def _write_facts(figure: Figure, recording: Recording, labelling: Labelling) -> 
     about = f"{_cut(recording.sensor, 30)}, day {recording.day}, {_cut(recording.condition, 20)}"
     sources = [_cut(words, 50) for words in (labelling.source, labelling.forces) if words]
     place_text(figure, _EDGE, 0.47, "   ·   ".join([about, *sources]), fontsize=9, color=GREY, **plain)
-    top = _TOP + 0.05
-    facts = audit_facts(recording, labelling)
+    top, facts = _TOP + 0.05, audit_facts(recording, labelling)
     if any(fact.doubts for fact in facts):
         place_text(figure, _EDGE, _HEIGHT - _FOOT + 0.08, "▲ may put the labels in doubt", fontsize=8, color=VERMILLION)
     for fact in facts:
@@ -457,8 +361,7 @@ def _write_facts(figure: Figure, recording: Recording, labelling: Labelling) -> 
         lines = lines if len(lines) <= room else [*lines[: room - 1], "…"]
         colour, mark = (VERMILLION, "▲ ") if fact.doubts else (BLACK, "")
         place_text(figure, _EDGE, top, mark + fact.head, fontsize=9, fontweight="bold", color=colour)
-        for row, line in enumerate(lines):
-            place_text(figure, _EDGE, top + (row + 1.15) * _LINE, line, fontsize=8, **plain)
+        place_text(figure, _EDGE, top + 1.15 * _LINE, "\n".join(lines), fontsize=8, linespacing=1.25, **plain)
         top += (len(lines) + 1.8) * _LINE
 
 

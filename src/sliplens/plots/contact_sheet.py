@@ -36,8 +36,7 @@ from sliplens.results.explanation import MARGIN_LEVELS
 STATE_COLOURS = dict(zip(ContactState, (GREY, BLUE, ORANGE, VERMILLION, "white"), strict=True))
 # full slip is darker, so that lightness too separates it from incipient slip
 STATE_TINTS = dict(zip(ContactState, (0.2, 0.2, 0.2, 0.55, 0), strict=True))
-NAMED_STATES = tuple(state for state in ContactState if state is not ContactState.UNKNOWN)
-"""States in legends."""
+_NAMED = tuple(state for state in ContactState if state is not ContactState.UNKNOWN)
 TIMES = "\N{MULTIPLICATION SIGN}"
 
 _BRIGHT_PERCENTILE = 99.5  # of the differences: a few outlying pixels would leave the rest dark
@@ -78,13 +77,9 @@ def plot_margin(recording: Recording, *, ax: Axes) -> Axes:
     return ax
 
 
-def outline_handles(recordings: Sequence[Recording]) -> list[Line2D]:
-    """Create the legend of the outlines, empty where no trial has any."""
-    models = [recording.truth.displacement for recording in recordings if recording.truth is not None]
-    stick = "outline of its stick zone" + (" (nominal)" if "calibrated" in models else "")
-    lines = (("white", "outline of the contact"), (SKY, stick)) if models else ()
-    rim = [Stroke(linewidth=3.4, foreground=BLACK), Normal()]
-    return [Line2D([], [], color=colour, linewidth=1.8, path_effects=rim, label=label) for colour, label in lines]
+def state_patches() -> list[Patch]:
+    """Create the legend of the contact states."""
+    return [Patch(lw=0, label=str(state), color=STATE_COLOURS[state], alpha=STATE_TINTS[state]) for state in _NAMED]
 
 
 _REACHED_WITHIN = 0.1 - 1e-9  # half the distance between two columns: no frame stands in both
@@ -118,12 +113,15 @@ def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = N
                 ax = plot(recording, ax=figure.add_subplot(grid[2 * band + line, -1]))
                 for time_s in recording.time_s[[at for at in row if at is not None]]:
                     ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1)
-        mark = Line2D([], [], color=BLACK, linewidth=0.7, label="frame shown")
-        states = [
-            Patch(linewidth=0, label=str(state), color=STATE_COLOURS[state], alpha=STATE_TINTS[state])
-            for state in NAMED_STATES
+        models = [recording.truth.displacement for recording in recordings if recording.truth is not None]
+        stick = "outline of its stick zone" + (" (nominal)" if "calibrated" in models else "")
+        rim = [Stroke(linewidth=3.4, foreground=BLACK), Normal()]
+        outlines = [
+            Line2D([], [], color=colour, linewidth=1.8, path_effects=rim, label=label)
+            for colour, label in ((("white", "outline of the contact"), (SKY, stick)) if models else ())
         ]
-        figure.legend(handles=[*outline_handles(recordings), mark, *states], ncols=7, loc="outside lower left")
+        mark = Line2D([], [], color=BLACK, linewidth=0.7, label="frame shown")
+        figure.legend(handles=[*outlines, mark, *state_patches()], ncols=7, loc="outside lower left")
     return figure
 
 

@@ -5,26 +5,24 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sliplens.recordings.check import check_dataset
-    from sliplens.recordings.corrections import draft_corrections, read_corrections
+    from sliplens.recordings.corrections import draft_corrections, label_dataset, read_corrections
     from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, recover_dataset
     from sliplens.recordings.exporting import Export, export_lerobot, export_mcap
     from sliplens.recordings.importing import import_recordings
     from sliplens.recordings.labelling import Corrections, Labelling
     from sliplens.recordings.options import LabelSettings, ReadOptions
-    from sliplens.recordings.relabelling import label_dataset
     from sliplens.recordings.splits import split_dataset
     from sliplens.recordings.trial import ContactState, GroundTruth, Labels, Recording, TrialFacts
 
 # module of each name: importing the options alone, as the help of the command line does, imports no file format
 _NAMES = {
     "check": ("check_dataset",),
-    "corrections": ("draft_corrections", "read_corrections"),
+    "corrections": ("draft_corrections", "label_dataset", "read_corrections"),
     "dataset": ("Dataset", "TrialInfo", "load_dataset", "recover_dataset"),
     "exporting": ("Export", "export_lerobot", "export_mcap"),
     "importing": ("import_recordings",),
     "labelling": ("Corrections", "Labelling"),
     "options": ("LabelSettings", "ReadOptions"),
-    "relabelling": ("label_dataset",),
     "splits": ("split_dataset",),
     "trial": ("ContactState", "GroundTruth", "Labels", "Recording", "TrialFacts"),
 }

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
 
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file
@@ -34,10 +33,9 @@ class Violation:
 def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None = None) -> tuple[Violation, ...]:
     """Read every trial of a data set and list its errors.
 
-    For each trial: its file exists, has the hash and the facts of the table, and every image can be decoded; times
-    rise, forces are finite, labels lie in [0, 1] and are missing only without contact, margin and forces agree, contact
-    states follow the margin, and F_t / F_n stays within the friction by 3 sigma, before a slip and after it. For the
-    data set: no trial is listed twice, which would put its frames into two splits, no file is unlisted, and no
+    For each trial: its file exists, has the hash and the facts of the table, and every image can be decoded; forces are
+    finite, labels are missing only without contact, margin and forces agree, and contact states follow the margin. For
+    the data set: no trial is listed twice, which would put its frames into two splits, no file is unlisted, and no
     recording was cut off. Flags on labels, such as faults of the force sensor, are notes and not violations: frames
     at a fault are not valid.
     """
@@ -49,15 +47,12 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
             violations.append(Violation(where=trial, what=f"is listed {count} times, in split {' and '.join(splits)}"))
     listed = {trial_path(folder, info.trial) for info in data.trials}
     listed |= {forces_path(folder, info.trial) for info in data.trials if info.forces_sha256}
-    violations += [
-        Violation(where=str(path.relative_to(folder)), what="is not in the table of the data set")
-        for path in sorted([*(folder / "trials").glob("*"), *(folder / "forces").glob("*")])
-        if path not in listed
-    ]
+    for path in sorted({*(folder / "trials").glob("*"), *(folder / "forces").glob("*")} - listed):
+        where = str(path.relative_to(folder))
+        violations.append(Violation(where=where, what="is not in the table of the data set"))
     if (folder / JOURNAL_FOLDER).is_dir():
-        violations.append(
-            Violation(where=JOURNAL_FOLDER, what="still runs or was cut off; finish it with sliplens recover")
-        )
+        unfinished = "still runs or was cut off; finish it with sliplens recover"
+        violations.append(Violation(where=JOURNAL_FOLDER, what=unfinished))
     # hashes and decoding release the interpreter's lock
     with ThreadPoolExecutor(os.cpu_count()) as pool, reporting(on_progress):
         checked = pool.map(lambda info: tuple(_check_trial(folder, info)), data.trials)
@@ -94,60 +89,25 @@ def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:
 
 
 def _check_laws(recording: Recording) -> Iterator[str]:
-    yield from _first(~np.isfinite(recording.time_s), "the time is not a number")
-    # a force sensor's noise is negative at times, and its samples may be missing, where there is no label;
-    # of a trial whose margins alone are known, none is there
-    measured = bool(np.isfinite(recording.normal_force_n).any())
-    for name in SIGNALS[1:4]:
-        missing = measured & recording.labelled & ~np.isfinite(getattr(recording, name))
-        yield from _first(missing, f"{name} is not a number")
-    negative = recording.labelled & (recording.normal_force_n < 0)
-    yield from _first(negative, "the normal force is negative; flip its sign on import")
-    margin, normal = recording.safety_margin, recording.normal_force_n
-    labelled = np.isfinite(margin)
-    yield from _first(np.isfinite(recording.stick_ratio) != labelled, "only one of margin and stick ratio has a label")
-    capacity = recording.friction_coefficient * normal
-    pressing = labelled & (capacity > 0)
-    expected = np.clip(1 - recording.tangential_force_n / np.where(pressing, capacity, 1), 0, 1)
+    margin, normal, labelled = recording.safety_margin, recording.normal_force_n, recording.labelled
+    present = np.isfinite(margin)
     states = np.array([str(state) for state in recording.contact_state])
+    slips, capacity = states == ContactState.FULL_SLIP, recording.friction_coefficient * normal
+    pressing = present & (capacity > 0)
+    expected = np.clip(1 - recording.tangential_force_n / np.where(pressing, capacity, 1), 0, 1)
     # after a slip the margin stays 0, also where the pull is let go
-    let_go = (states == ContactState.FULL_SLIP) & (recording.tangential_force_n == 0)
-    off = pressing & ~let_go & (np.abs(margin - expected) > _ROUNDING)
-    yield from _first(off, "the safety margin is not 1 - F_t / (mu F_n)")
-    yield from _first((states == ContactState.NO_CONTACT) & labelled, "a frame without contact has a safety margin")
-    slips = states == ContactState.FULL_SLIP
-    yield from _first(slips & labelled & (margin > 0), "full slip has a margin above 0")
-    yield from _check_friction(recording, slips=slips)
-
-
-_LAW_SIGMAS = 3.0
-_PRESSED_SHARE = 0.25  # of the largest normal force: in a lighter touch F_t / F_n is all noise
-
-
-def _check_friction(recording: Recording, *, slips: Bool[np.ndarray, " frames"]) -> Iterator[str]:
-    """Check that F_t / F_n exceeds the static friction by more than 3 sigma neither before a slip nor after it."""
-    normal, coefficient = recording.normal_force_n, recording.friction_coefficient
-    pressed = normal > _PRESSED_SHARE * np.nanmax(normal, initial=0.0)
-    ratio = np.where(pressed, recording.tangential_force_n / np.where(pressed, normal, 1), np.nan)
-    sigma = np.zeros(len(normal)) if recording.safety_margin_sigma is None else recording.safety_margin_sigma
-    basis = recording.labelling.basis if recording.labelling else None
-    # of the margin, and so of the ratio as a share of the friction: at the slip, where all of it is used, no less
-    sigma = np.maximum(np.nan_to_num(sigma), basis.friction.sigma / basis.friction.mu if basis else 0.0)
-    # the last frame before a slip has the friction that holds until then
-    last = np.maximum.accumulate(np.where(recording.labelled & ~slips, np.arange(len(normal)), -1))
-    most = (coefficient * (1 + _LAW_SIGMAS * sigma))[last] + _ROUNDING
-    beyond = (last >= 0) & (ratio > most)
-    # exact labels may have a friction that changes from frame to frame: until the slip it may have grown
-    estimated = recording.safety_margin_sigma is not None
-    after = beyond & slips & np.isfinite(recording.safety_margin) & estimated
-    for wrong, when in ((beyond & ~slips & recording.labelled, "before a slip"), (after, "after a slip")):
+    let_go = slips & (recording.tangential_force_n == 0)
+    # of a trial whose margins alone are known there are no forces; a force sensor's noise is negative at times, and its
+    # samples may be missing, where there is no label
+    measured = labelled & np.isfinite(normal).any()
+    laws = {f"{name} is not a number": measured & ~np.isfinite(getattr(recording, name)) for name in SIGNALS[1:4]} | {
+        "the normal force is negative; flip its sign on import": labelled & (normal < 0),
+        "only one of margin and stick ratio has a label": np.isfinite(recording.stick_ratio) != present,
+        "the safety margin is not 1 - F_t / (mu F_n)": pressing & ~let_go & (np.abs(margin - expected) > _ROUNDING),
+        "a frame without contact has a safety margin": (states == ContactState.NO_CONTACT) & present,
+        "full slip has a margin above 0": slips & present & (margin > 0),
+    }
+    for law, wrong in laws.items():
         if wrong.any():
-            at = int(np.argmax(wrong))
-            allowed = f"the friction {coefficient[last[at]]:.2f} and 3 sigma allow {most[at]:.2f}"
-            yield from _first(wrong, f"F_t / F_n is {ratio[at]:.2f} {when}, and {allowed}; label the trial again")
-
-
-def _first(wrong: np.ndarray, what: str) -> Iterator[str]:
-    if wrong.any():
-        count = f" ({int(wrong.sum())} frames)" if wrong.sum() > 1 else ""
-        yield f"frame {int(np.argmax(wrong))}: {what}{count}"
+            count = f" ({int(wrong.sum())} frames)" if wrong.sum() > 1 else ""
+            yield f"frame {int(np.argmax(wrong))}: {law}{count}"

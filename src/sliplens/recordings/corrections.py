@@ -1,31 +1,61 @@
-"""Table of corrections (CSV): a row a trial, a column a setting; `sliplens label DATA --corrections` applies it."""
+"""Labels of a data set made again, and the table of corrections (CSV) by hand: a row a trial, a column a setting."""
 
 import csv
 import re
-from collections.abc import Callable
-from dataclasses import fields
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.files import MOST_TEXT, require_file, whole_file
-from sliplens.recordings.dataset import Dataset, load_dataset
+from sliplens.files import MOST_TEXT, output_folder, require_file, whole_file
+from sliplens.progress import OnProgress, add_note, number_of, reporting
+from sliplens.recordings.dataset import (
+    Dataset,
+    copy_profiles,
+    load_dataset,
+    report_dataset,
+    trial_path,
+    write_dataset_table,
+)
+from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.labelling import Corrections
+from sliplens.recordings.labels import require_inside
 from sliplens.recordings.manifest import read_csv
+from sliplens.recordings.options import LabelSettings
+from sliplens.recordings.store import read_first_reference, read_header
 from sliplens.recordings.trial import ContactState, Recording
+from sliplens.recordings.trial_writer import TrialJob, TrialWork, write_trials
 
 _SETTINGS = tuple(field.name for field in fields(Corrections))
 _CURRENT = ("reference_frame", "contact_s", "slip_s", "tare", "normal_sign", "mu")
 _COLUMNS = ("trial", *_SETTINGS, *(f"current_{name}" for name in _CURRENT), "valid_frames", "frames", "flags")
 _WORDS = {**dict.fromkeys(("yes", "true", "1", "x"), True), **dict.fromkeys(("no", "false", "0"), False)}
-_CURES = {
-    "exclude": "write yes or no",
-    **dict.fromkeys(("reference_frame", "normal_sign"), "write a whole number"),
-    **dict.fromkeys(("contact_s", "slip_s", "mu"), "write a number with a decimal point"),
-    "tare": "write three numbers, such as 0.01 0 -0.2",
-    "bad_frames": "write spans of frames, such as 10..19 34",
+
+
+def _parse_tare(text: str) -> tuple[float, float, float]:
+    x, y, z = map(float, re.split(r"[\s;]+", text))
+    return x, y, z
+
+
+def _parse_spans(text: str) -> tuple[tuple[int, int], ...]:
+    # two dots: a spreadsheet would take 10-12 for a date
+    ends = [span.split("..") for span in re.split(r"[\s;]+", text)]
+    if any(len(span) > 2 for span in ends):
+        raise ValueError(text)
+    return tuple((int(span[0]), int(span[-1])) for span in ends)
+
+
+_PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
+    "exclude": (lambda text: _WORDS[text.lower()], "write yes or no"),
+    **dict.fromkeys(("reference_frame", "normal_sign"), (int, "write a whole number")),
+    **dict.fromkeys(("contact_s", "slip_s", "mu"), (float, "write a number with a decimal point")),
+    "tare": (_parse_tare, "write three numbers, such as 0.01 0 -0.2"),
+    "bad_frames": (_parse_spans, "write spans of frames, such as 10..19 34"),
 }
+"""Function that parses the cells of a column, and the cure where it cannot."""
 
 
 def read_corrections(path: Path | str) -> dict[str, Corrections]:
@@ -42,44 +72,18 @@ def read_corrections(path: Path | str) -> dict[str, Corrections]:
             raise RecordingError(f"{where}: the column trial is empty; name the trial that the row corrects")
         if cells["trial"] in corrections:
             raise RecordingError(f"{where}: {cells['trial']} has a row already; write one row a trial")
-        corrections[cells["trial"]] = _parse_row(cells, where)
-    return {trial: row for trial, row in corrections.items() if row != Corrections()}
-
-
-def _parse_row(cells: dict[str, str], where: str) -> Corrections:
-    values = {}
-    for name in _SETTINGS:
-        if name in cells:
+        values = {}
+        for name in cells.keys() & _PARSERS.keys():
+            parse, cure = _PARSERS[name]
             try:
-                values[name] = _PARSERS[name](cells[name])
+                values[name] = parse(cells[name])
             except (ValueError, KeyError):
-                raise RecordingError(f"{where}: {name} is {cells[name][:40]!r}; {_CURES[name]}") from None
-    try:
-        return Corrections(**values)
-    except RecordingError as error:
-        raise RecordingError(f"{where}: {error}") from None
-
-
-def _parse_tare(text: str) -> tuple[float, float, float]:
-    x, y, z = map(float, re.split(r"[\s;]+", text))
-    return x, y, z
-
-
-def _parse_spans(text: str) -> tuple[tuple[int, int], ...]:
-    # two dots: a spreadsheet would take 10-12 for a date
-    ends = [span.split("..") for span in re.split(r"[\s;]+", text)]
-    if any(len(span) > 2 for span in ends):
-        raise ValueError(text)
-    return tuple((int(span[0]), int(span[-1])) for span in ends)
-
-
-_PARSERS: dict[str, Callable[[str], object]] = {
-    "exclude": lambda text: _WORDS[text.lower()],
-    **dict.fromkeys(("reference_frame", "normal_sign"), int),
-    **dict.fromkeys(("contact_s", "slip_s", "mu"), float),
-    "tare": _parse_tare,
-    "bad_frames": _parse_spans,
-}
+                raise RecordingError(f"{where}: {name} is {cells[name][:40]!r}; {cure}") from None
+        try:
+            corrections[cells["trial"]] = Corrections(**values)
+        except RecordingError as error:
+            raise RecordingError(f"{where}: {error}") from None
+    return {trial: row for trial, row in corrections.items() if row != Corrections()}
 
 
 def draft_corrections(data: Dataset | Path | str, path: Path | str) -> None:
@@ -108,14 +112,9 @@ def _draft_row(labels: Recording) -> dict[str, str]:
     if (basis := labelling.basis) is not None:
         touching = [state not in (ContactState.NO_CONTACT, ContactState.UNKNOWN) for state in labels.contact_state]
         time_s = labels.time_s if labels.force_time_s is None else labels.force_time_s
-        current |= {
-            "contact_s": float(time_s[np.argmax(touching)]) if any(touching) else None,
-            "slip_s": basis.slip_s,
-            "tare": basis.axes.tare_n,
-            "normal_sign": basis.axes.sign,
-            "mu": basis.friction.mu,
-        }
-        row["flags"] = "; ".join(basis.flags)
+        current["contact_s"] = float(time_s[np.argmax(touching)]) if any(touching) else None
+        current |= {"slip_s": basis.slip_s, "tare": basis.axes.tare_n, "normal_sign": basis.axes.sign}
+        current["mu"], row["flags"] = basis.friction.mu, "; ".join(basis.flags)
     return row | {f"current_{name}": _cell(value) for name, value in current.items()}
 
 
@@ -130,3 +129,103 @@ def _cell(value: object) -> str:
         case tuple():
             return " ".join("..".join(map(str, item)) if isinstance(item, tuple) else _cell(item) for item in value)
     return str(value)
+
+
+def label_dataset(
+    data: Dataset | Path | str,
+    *,
+    out: Path | str | None = None,
+    labelling: LabelSettings | None = None,
+    corrections: Mapping[str, Corrections] | Path | str | None = None,
+    on: str = "serial",
+    retry_failed: bool = False,
+    overwrite: bool = False,
+    on_progress: OnProgress | None = None,
+) -> Dataset:
+    """Label the trials of a data set again, from the frames and force samples that it stores; splits stay.
+
+    Parameters
+    ----------
+    data
+        Data set that stores its force samples, or its folder.
+    out
+        Folder to make. If None, the data set itself gets the new labels once all of them are made.
+    labelling
+        Forces and friction as far as they are known, for all trials.
+    corrections
+        Table of corrections (`sliplens.recordings.corrections`), or the corrections of each trial by its name. They
+        replace those of the last call, and take precedence over `labelling`. If None, those of the last call hold.
+    on, retry_failed
+        See `import_recordings`.
+    """
+    with reporting(on_progress):
+        data = data if isinstance(data, Dataset) else load_dataset(data)
+        labelling, out = labelling or LabelSettings(), data.folder if out is None else Path(out)
+        in_place = out.resolve() == data.folder.resolve()
+        stored = {info.trial: read_header(trial_path(data.folder, info.trial)).labelling for info in data.trials}
+        before = {trial: origin.corrections for trial, origin in stored.items() if origin and origin.corrections}
+        if corrections is None:
+            corrections = before
+        elif not isinstance(corrections, Mapping):
+            corrections = read_corrections(corrections)
+        for trial in corrections:
+            data.find(trial)
+        work = _Relabelling(data=data, labelling=labelling, corrections=corrections)
+        for number in range(len(data.trials)):  # mistakes are found before anything slow
+            work.open(number)
+        for trial, origin in stored.items():
+            excluded = origin is not None and origin.corrections is not None and origin.corrections.exclude
+            if in_place and (origin is None or (origin.basis is None and not excluded)):
+                raise InputError(f"the labels of {trial} did not come from its forces and would be lost; give --output")
+        config = {"labelling": labelling, "data_hash": data.hash, "corrections": dict(corrections)}
+        with output_folder(out, stage="label", config=config, overwrite=overwrite or in_place) as output:
+            if not output.complete:
+                items = [(number, info.trial, info.frames) for number, info in enumerate(data.trials)]
+                with write_trials(
+                    work, items, output.folder, title="Labelling frames", on=on, retry_failed=retry_failed
+                ) as (rows, _):
+                    table = [replace(row, split=info.split) for row, info in zip(rows, data.trials, strict=True)]
+                    write_dataset_table(output.folder, table, simulated=data.simulated, left_out=data.left_out)
+                    copy_profiles(data.folder, output.folder)
+        if corrections:
+            add_note(f"corrections of {number_of(len(corrections), 'trial')} applied")
+        if removed := sorted(before.keys() - corrections.keys()):
+            add_note(f"corrections of {number_of(len(removed), 'trial')} removed, such as {removed[0]}")
+        labelled = load_dataset(out)
+        report_dataset(labelled, existed=output.complete)
+    return labelled
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Relabelling(TrialWork):
+    """Work on the stored trials of a data set, by their numbers in its table."""
+
+    data: Dataset
+    labelling: LabelSettings
+    corrections: Mapping[str, Corrections]
+
+    def open(self, item: int) -> TrialJob:
+        info, folder = self.data.trials[item], self.data.folder
+        capture = read_stored_trial(self.data, info)
+        if capture.forces is None:
+            no_forces = f"{info.trial} of {folder} has no forces, and without them there is no label"
+            raise InputError(f"{no_forces}; import it again with its table of forces")
+        profile, corrections = self.data.profile(capture.sensor), self.corrections.get(info.trial)
+        settings, cure = self.labelling if profile is None else profile.settings(self.labelling), ""
+        if corrections is not None:
+            settings = corrections.apply(settings)
+            command = shlex.join(["sliplens", "label", str(folder), "--draft", "corrections.csv"])
+            cure = f"; correct it in its table of corrections, which `{command}` writes"
+        try:
+            require_inside(settings, frames=len(capture), time_s=capture.forces.time_s)
+        except RecordingError as error:
+            raise RecordingError(f"{info.trial}: {error}{cure}") from None
+        # as it was imported, with the reference from before any correction
+        origin = capture.labels.labelling if capture.labels else None
+        capture = replace(capture, labels=None)
+        if origin is not None:
+            choice = origin.first_reference or origin.reference
+            capture = replace(capture, source=origin.source, notes=origin.notes, reference_choice=choice)
+        if (first := read_first_reference(trial_path(folder, info.trial))) is not None:
+            capture = replace(capture, reference=first)
+        return TrialJob(capture=capture, settings=settings, corrections=corrections, cure=cure)

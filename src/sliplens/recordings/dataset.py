@@ -4,14 +4,16 @@ import shlex
 import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
+
+from filelock import FileLock
 
 from sliplens.codec import from_builtins, save_record
 from sliplens.errors import RecordingError
 from sliplens.files import hash_file, hash_json, read_json, require_folder, whole_file
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
-from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, JournalLock, finish_journal, journals_of
+from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, finish_journal, journals_of, lock_journals
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
 from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header, require_stored
@@ -83,12 +85,11 @@ class Dataset:
 
     def find(self, trial: str) -> TrialInfo:
         """Return the trial of a name; a `RecordingError` lists the trials if there is none."""
-        for info in self.trials:
-            if info.trial == trial:
-                return info
-        names = [info.trial for info in self.trials]
-        more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-        raise RecordingError(f"{self.folder} has no trial {trial}; it has {', '.join(names[:_MOST_NAMES])}{more}")
+        by_name = {info.trial: info for info in reversed(self.trials)}
+        if trial not in by_name:
+            ends = list(dict.fromkeys([*[info.trial for info in self.trials[:5]], self.trials[-1].trial]))
+            raise RecordingError(f"{self.folder} has no trial {trial}; it has {', '.join(ends)}")
+        return by_name[trial]
 
     def select(self, *, split: str | None = None, condition: str | None = None) -> tuple[TrialInfo, ...]:
         """Return the trials of a split and a condition; a `RecordingError` lists both if there is none."""
@@ -118,7 +119,6 @@ class Dataset:
 
 
 _RECORDED_SPLIT = "test"  # nothing was trained on it
-_MOST_NAMES = 10  # trials named in a message before the rest is counted
 
 
 def load_dataset(folder: Path | str) -> Dataset:
@@ -130,10 +130,8 @@ def load_dataset(folder: Path | str) -> Dataset:
     require_folder(folder, what="the data set")
     table, unfinished = _read_table(folder), ""
     if (folder / JOURNAL_FOLDER).is_dir():
-        unfinished = (
-            f"{folder} holds a recording that still runs or was cut off; stop it, or finish it with "
-            f"`{shlex.join(['sliplens', 'recover', str(folder)])}`"
-        )
+        cure = f"stop it, or finish it with `{shlex.join(['sliplens', 'recover', str(folder)])}`"
+        unfinished = f"{folder} holds a recording that still runs or was cut off; {cure}"
     if not table.trials:
         raise RecordingError(unfinished or f"{folder} lists no trials; make or import a data set first")
     if unfinished:
@@ -160,15 +158,14 @@ def recover_dataset(folder: Path | str, *, on_progress: OnProgress | None = None
 
 def _read_table(folder: Path) -> _Table:
     path = folder / DATASET_FILE
-    values = read_json(
-        path, missing=f"make a data set of recordings with `sliplens import {folder} -o DATA`, and name that"
-    )
+    missing = f"make a data set of recordings with `sliplens import {folder} -o DATA`, and name that"
+    values = read_json(path, missing=missing)
     if not isinstance(values, dict) or values.get("schema_version") != SCHEMA_VERSION:
         raise RecordingError(f"{path} is not a sliplens data set of schema {SCHEMA_VERSION}; make it again")
     return from_builtins(values, _Table, where=path, command="sliplens import")
 
 
-def begin_recording(folder: Path, *, simulated: bool) -> tuple[JournalLock, tuple[str, ...]]:
+def begin_recording(folder: Path, *, simulated: bool) -> tuple[FileLock, tuple[str, ...]]:
     """Prepare a new or an existing data set for trials to be recorded into it, after recovering what was cut off."""
     exists = (folder / DATASET_FILE).is_file()
     # a recording that was killed before it wrote its table leaves these alone
@@ -182,24 +179,24 @@ def begin_recording(folder: Path, *, simulated: bool) -> tuple[JournalLock, tupl
     if table.simulated != simulated:
         kinds = ("simulated", "real") if table.simulated else ("real", "simulated")
         raise RecordingError(f"{folder} holds {kinds[0]} trials, these are {kinds[1]}; choose another folder")
-    lock = JournalLock(folder)
+    lock = lock_journals(folder)
     # also without a trial: whoever opens the folder sees a data set, and recovers it if it was cut off
-    write_dataset_table(folder, table.trials, simulated=simulated, left_out=table.left_out)
+    save_record(table, folder / DATASET_FILE)
     return lock, tuple(info.trial for info in table.trials)
 
 
-def finish_recording(folder: Path, lock: JournalLock | None = None) -> None:
+def finish_recording(folder: Path, lock: FileLock | None = None) -> None:
     """Make trials of the journals of a data set; a data set without a trial is removed."""
-    lock = lock or JournalLock(folder)
+    lock = lock or lock_journals(folder)
     try:
         table = _read_table(folder)
         trials = {info.trial: info for info in table.trials}
         for journal in journals_of(folder):
             path = trial_path(folder, journal.stem)
-            if finish_journal(journal, path) is not None:
+            if finish_journal(journal, path):
                 trials[journal.stem] = trial_info(path, split=_RECORDED_SPLIT)
-        write_dataset_table(folder, tuple(trials.values()), simulated=table.simulated, left_out=table.left_out)
-        lock.discard()
+        save_record(replace(table, trials=tuple(trials.values())), folder / DATASET_FILE)
+        shutil.rmtree(folder / JOURNAL_FOLDER)
     finally:
         lock.release()
     if not trials:

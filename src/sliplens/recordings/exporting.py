@@ -91,13 +91,13 @@ def _export(
 ) -> Export:
     data = data if isinstance(data, Dataset) else load_dataset(data)
     chosen = tuple(data.find(trial) for trial in dict.fromkeys(trials)) if trials else data.trials
-    config = {"format": write.__name__, "data_hash": data.hash, "trials": [info.trial for info in chosen]}
+    names, frames = tuple(info.trial for info in chosen), sum(info.frames for info in chosen)
+    config = {"format": write.__name__, "data_hash": data.hash, "trials": list(names)}
     with output_folder(
         folder, stage="export", config=config, overwrite=overwrite, run_file=run_file, resumable=False
     ) as output:
         if not output.complete:
             with open_stage("Writing frames"):
                 write(data, chosen, output.folder)
-    frames = sum(info.frames for info in chosen)
     report_file(folder, f"{number_of(len(chosen), 'trial')}, {number_of(frames, 'frame')}", kept=output.complete)
-    return Export(folder=folder, trials=tuple(info.trial for info in chosen), frames=frames)
+    return Export(folder=folder, trials=names, frames=frames)

@@ -3,9 +3,8 @@
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TypeAlias, TypedDict, Unpack
 
@@ -108,10 +107,6 @@ def import_recordings(
     reading, labelling = reading or ReadOptions(), labelling or LabelSettings()
     if forces is not None:
         reading = replace(reading, forces=Path(forces))
-    if reading.forces is not None and len(paths) > 1:
-        raise InputError("one table of forces goes with one recording; name what belongs together in a manifest (CSV)")
-    if options.get("reference") is not None and labelling.reference_frame is not None:
-        raise InputError("the untouched sensor is named twice; give --reference or --reference-frame, not both")
     last = options.get("validation_trials"), options.get("test_trials")
     if splits is not None and last != (None, None):
         raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
@@ -132,8 +127,7 @@ def import_recordings(
         captures = [job.capture for job in jobs.values()]
         _require_names(captures, left_out)
         plan = None if splits is None else load_splits(splits)
-        deal = partial(_deal, plan=plan, last=None if last == (None, None) else last)
-        dealt = deal(old, captures)  # a mistake in the splits is found before anything slow
+        dealt = _deal(old, captures, plan, last)  # a mistake in the splits is found before anything slow
         config = {**work.recipe(), "splits": plan, "last_trials": last}
         config |= {} if before is None else {"added_to": before.hash}
         with output_folder(Path(out), stage="import", config=config, overwrite=overwrite or add) as output:
@@ -147,27 +141,21 @@ def import_recordings(
                 ) as (rows, failed):
                     names = {info.trial for info in rows}
                     written = [job for job in jobs.values() if job.capture.trial in names]
-                    dealt = deal(old, [job.capture for job in written])
+                    dealt = _deal(old, [job.capture for job in written], plan, last)
+                    for profile in {job.profile.name: job.profile for job in written if job.profile}.values():
+                        save_profile(output.folder, profile)
                     every = zip([*old, *rows], dealt.splits, strict=True)
                     table = [replace(info, split=split) for info, split in every]
-                    _write_table(output.folder, table, written, before, [*left_out, *failed])
+                    # trials left out before stay listed
+                    lost = {trial.trial: trial for trial in (*(before.left_out if before else ()), *left_out, *failed)}
+                    lost = [trial for name, trial in lost.items() if name not in {info.trial for info in table}]
+                    simulated = all(job.capture.simulated for job in written) and (before is None or before.simulated)
+                    write_dataset_table(output.folder, table, simulated=simulated, left_out=lost)
         for message in dealt.notes:
             add_note(message)
         data = load_dataset(out)
         report_dataset(data, existed=output.complete)
         return data
-
-
-def _write_table(
-    folder: Path, rows: Sequence[TrialInfo], jobs: Sequence[TrialJob], before: Dataset | None, left_out: list[LeftOut]
-) -> None:
-    """Write the table of a data set and the profiles of its sensors; trials left out before stay listed."""
-    for profile in {job.profile.name: job.profile for job in jobs if job.profile}.values():
-        save_profile(folder, profile)
-    names = {trial.trial for trial in (*rows, *left_out)}
-    earlier = [] if before is None else [trial for trial in before.left_out if trial.trial not in names]
-    simulated = all(job.capture.simulated for job in jobs) and (before is None or before.simulated)
-    write_dataset_table(folder, rows, simulated=simulated, left_out=[*earlier, *left_out])
 
 
 def _prepare_work(
@@ -180,6 +168,10 @@ def _prepare_work(
 ) -> "_ImportWork":
     """List the recordings, each with the facts that its manifest or else the call gives."""
     reference, format = options.get("reference"), options.get("format")
+    if reading.forces is not None and len(paths) > 1:
+        raise InputError("one table of forces goes with one recording; name what belongs together in a manifest (CSV)")
+    if reference is not None and labelling.reference_frame is not None:
+        raise InputError("the untouched sensor is named twice; give --reference or --reference-frame, not both")
     profile = load_profile(sensor) if sensor is not None and is_profile(sensor) else None
     defaults = ManifestRow(
         trial="",
@@ -192,16 +184,14 @@ def _prepare_work(
         mu=labelling.mu,
         reference=labelling.reference_frame if reference is None else Path(reference),
     )
-    rows = tuple(_list_rows(paths, defaults, single=format is not None or reading.forces is not None))
-    return _ImportWork(rows=rows, reading=reading, labelling=labelling, profile=profile, format=format)
-
-
-def _list_rows(paths: Sequence[Path], defaults: ManifestRow, *, single: bool) -> Iterator[ManifestRow]:
-    """List the recordings of manifests and folders; a path that is one recording becomes a row without a name."""
+    single = format is not None or reading.forces is not None
+    rows = []
     for path in paths:
-        for row in (None if single else find_rows(path)) or ({"video": path},):
-            values = row if isinstance(row, dict) else vars(row)
-            yield replace(defaults, **{name: value for name, value in values.items() if value is not None})
+        # a path that is one recording becomes a row without a name
+        for row in (None if single else find_rows(path)) or (replace(defaults, video=path),):
+            values = {name: value for name, value in vars(row).items() if value is not None}
+            rows.append(replace(defaults, **values))
+    return _ImportWork(rows=tuple(rows), reading=reading, labelling=labelling, profile=profile, format=format)
 
 
 _Item: TypeAlias = tuple[int, int]  #: Number of a row, and of a trial in it.
@@ -247,29 +237,21 @@ class _ImportWork(TrialWork):
         settings = replace(self.labelling, reference_frame=index, mu=row.mu)
         facts = {"sensor": profile.name if profile else row.sensor, "day": row.day}
         facts |= {"object": row.object, "condition": row.condition}
-        captures = [
-            replace(capture, **{name: fact for name, fact in facts.items() if fact is not None})
-            for capture in open_source(
-                row.video,
-                reference=image,
-                format=self.format,
-                options=replace(self.reading, forces=row.forces),
-                sensor=profile,
-                whole=True,
-            )
-        ]
+        facts = {name: fact for name, fact in facts.items() if fact is not None}
+        options = replace(self.reading, forces=row.forces)
+        opened = open_source(
+            row.video, reference=image, format=self.format, options=options, sensor=profile, whole=True
+        )
+        captures = [replace(capture, **facts) for capture in opened]
         if row.trial:
             captures = [replace(captures[0], trial=row.trial)] if len(captures) == 1 else captures
             _require_names(captures)
             for capture in captures:
                 require_forces(capture)
+        settings = settings if profile is None else profile.settings(settings)
         for index, capture in enumerate(captures):
-            self.jobs[number, index] = TrialJob(
-                capture=capture,
-                settings=settings if profile is None else profile.settings(settings),
-                profile=profile,
-                one_of_many=bool(row.trial),
-            )
+            job = TrialJob(capture=capture, settings=settings, profile=profile, one_of_many=bool(row.trial))
+            self.jobs[number, index] = job
 
     def recipe(self) -> dict:
         """Return all that shapes the trials; a change of a file beside them changes nothing."""
@@ -312,12 +294,10 @@ def _link_trials(source: Path, folder: Path) -> None:
 
 
 def _require_names(captures: Sequence[Capture], left_out: Sequence[LeftOut] = ()) -> None:
-    if not captures and left_out:
-        raise RecordingError(f"no trial could be imported; the first: {left_out[0].why}")
     if not captures:
-        raise RecordingError("there is no trial to import; name a recording")
-    twice = [name for name, count in Counter(capture.trial for capture in captures).items() if count > 1]
-    if twice:
+        first = f"no trial could be imported; the first: {left_out[0].why}" if left_out else ""
+        raise RecordingError(first or "there is no trial to import; name a recording")
+    if twice := [name for name, count in Counter(capture.trial for capture in captures).items() if count > 1]:
         raise InputError(f"several recordings are named {', '.join(twice)}; rename their files")
     for capture in captures:
         if not capture.sensor:
@@ -327,17 +307,16 @@ def _require_names(captures: Sequence[Capture], left_out: Sequence[LeftOut] = ()
 def _deal(
     old: Sequence[TrialInfo],
     captures: Sequence[Capture],
-    *,
     plan: Mapping[str, str] | Group | None,
-    last: tuple[int | None, int | None] | None,
+    last: tuple[int | None, int | None],
 ) -> SplitResult:
     """Deal the splits of all trials, the old ones first: by a plan, or the last new trials validate and test."""
     if plan is not None:
         trials = [*old, *captures]
         return assign_splits(trials, plan) if isinstance(plan, Mapping) else deal_splits(trials, by=plan)
     splits = [capture.split or "train" for capture in captures]
-    if last is not None:
-        validation, test = last[0] or 0, last[1] or 0
+    if last != (None, None):
+        validation, test = (number or 0 for number in last)
         if validation < 0 or test < 0:
             raise InputError(f"numbers of trials are not negative, got {validation} and {test}; give 0 or more")
         training = len(captures) - validation - test

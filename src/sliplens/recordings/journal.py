@@ -3,7 +3,6 @@
 Each frame is passed to the system before the next is taken: a process that is killed loses the one it was writing.
 """
 
-import shutil
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -27,14 +26,10 @@ from sliplens.recordings.trial import TrialFacts, labels_of_margins
 JOURNAL_FOLDER = "recording"  #: Folder of a data set with the journals of recordings that run or were cut off.
 LOCK_FILE = "lock"
 _HEADER, _REFERENCE = b"sliplens", b"reference"
+_NUMBER = pa.float64()
 _SCHEMA = pa.schema(
-    {
-        "time_s": pa.float64(),
-        "safety_margin": pa.float64(),
-        "force_time_s": pa.list_(pa.float64()),
-        "force_n": pa.list_(pa.float64()),
-        "image": pa.binary(),
-    }
+    {"time_s": _NUMBER, "safety_margin": _NUMBER, "force_time_s": pa.list_(_NUMBER), "force_n": pa.list_(_NUMBER)}
+    | {"image": pa.binary()}
 )
 
 
@@ -50,13 +45,13 @@ class JournalHeader:
 
 
 class Journal:
-    """Journal of one trial; frames are appended one by one, with rising times."""
+    """Journal of one trial of a data set; frames are appended one by one, with rising times."""
 
-    def __init__(self, folder: Path, header: JournalHeader, *, reference: Frame | None) -> None:
+    def __init__(self, data: Path, header: JournalHeader, *, reference: Frame | None) -> None:
         metadata = {_HEADER: msgspec.json.encode(to_builtins(header))}
         if reference is not None:
             metadata[_REFERENCE] = encode_png(reference)
-        self.path = folder / f"{header.facts.trial}.arrow"
+        self.path = data / JOURNAL_FOLDER / f"{header.facts.trial}.arrow"
         self._file = self.path.open("xb")
         self._writer = pa.ipc.new_stream(pa.PythonFile(self._file, mode="w"), _SCHEMA.with_metadata(metadata))
 
@@ -78,27 +73,16 @@ class Journal:
             self._file.close()
 
 
-class JournalLock:
-    """Lock of a data set into which trials are recorded; the system releases it when the process ends, even killed."""
-
-    def __init__(self, data: Path) -> None:
-        self.folder = data / JOURNAL_FOLDER
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = FileLock(self.folder / LOCK_FILE, blocking=False)
-        try:
-            self._lock.acquire()
-        except Timeout:
-            message = f"{data} is being recorded; stop the recording first, or choose another folder"
-            raise RecordingError(message) from None
-
-    def release(self) -> None:
-        """Release the lock; the journals stay to be recovered."""
-        self._lock.release()
-
-    def discard(self) -> None:
-        """Remove the journals, which are trials now, and release the lock."""
-        shutil.rmtree(self.folder)
-        self.release()
+def lock_journals(data: Path) -> FileLock:
+    """Lock a data set for recording into it; the system releases the lock when the process ends, even killed."""
+    folder = data / JOURNAL_FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK_FILE, blocking=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise RecordingError(f"{data} is being recorded; stop the recording first, or choose another folder") from None
+    return lock
 
 
 def journals_of(data: Path) -> list[Path]:
@@ -106,19 +90,16 @@ def journals_of(data: Path) -> list[Path]:
     return sorted((data / JOURNAL_FOLDER).glob("*.arrow"))
 
 
-def finish_journal(journal: Path, trial: Path) -> JournalHeader | None:
-    """Make a trial, and the file of its force samples, of a journal; None where it holds no complete frame."""
+def finish_journal(journal: Path, trial: Path) -> bool:
+    """Make a trial, and the file of its force samples, of a journal; False where it holds no complete frame."""
     require_file(journal, missing="move it away")
     try:
         with pa.memory_map(str(journal)) as file:
-            head = _read_head(file)
-            rows = [] if head is None else [row.drop_columns(["image"]) for row in _rows(file)]
-        if head is None or not rows:
-            return None
-        header, picture = head
-        numbers = pa.Table.from_batches(rows)
-        labels = labels_of_margins(numbers.column("safety_margin").to_numpy())
-        with pa.memory_map(str(journal)) as file:
+            rows = [row.drop_columns(["image"]) for row in _rows(file)]
+            if not rows:
+                return False
+            header, picture = _read_head(file)
+            numbers = pa.Table.from_batches(rows)
             images = (row.column("image")[0].as_py() for row in _rows(file))
             if picture is None:
                 first = next(images)
@@ -130,40 +111,47 @@ def finish_journal(journal: Path, trial: Path) -> JournalHeader | None:
                 reference, notes = decode_png(picture, where=f"the reference frame of {journal}"), ()
                 choice = ReferenceChoice(method="recorded apart from the frames")
             labelling = Labelling(source=header.source, forces=header.forces, notes=notes, reference=choice)
-            _save_forces(numbers, header, forces_path(trial.parent.parent, trial.stem))
+            samples_s, samples_n = (
+                numbers.column(name).combine_chunks().flatten().to_numpy() for name in ("force_time_s", "force_n")
+            )
+            # a sensor slower than the camera repeats its samples
+            rising = samples_s > np.maximum.accumulate(np.concatenate([[-np.inf], samples_s]))[:-1]
+            if rising.any():
+                source, force_n = header.forces or "the force sensor", samples_n.reshape(-1, 3)[rising]
+                forces = Forces(time_s=samples_s[rising], force_n=force_n, source=source)
+                save_forces(forces, forces_path(trial.parent.parent, trial.stem))
             write_trial(
                 trial,
                 iter(lambda: list(islice(images, ROW_GROUP)), []),
                 facts=header.facts,
                 time_s=numbers.column("time_s").to_numpy(),
-                labels=replace(labels, labelling=labelling),
+                labels=replace(labels_of_margins(numbers.column("safety_margin").to_numpy()), labelling=labelling),
                 reference=reference,
             )
     except pa.ArrowException as error:
         raise RecordingError(f"{journal} is damaged ({one_line(error)}); move it away") from None
-    return header
+    return True
 
 
-def _read_head(file: pa.NativeFile) -> tuple[JournalHeader, bytes | None] | None:
-    """Read the facts of the trial and the image of the untouched sensor; None where the journal ends before them."""
-    try:
-        schema = pa.ipc.open_stream(file).schema
-    except pa.ArrowInvalid:
-        return None
-    except OSError as error:  # of no disk: the file is mapped
-        raise pa.ArrowInvalid(str(error)) from None
+def _read_head(file: pa.NativeFile) -> tuple[JournalHeader, bytes | None]:
+    """Read the facts of the trial and the image of the untouched sensor."""
     file.seek(0)
-    if not schema.equals(_SCHEMA):
-        raise pa.ArrowInvalid("it has other columns than a recording")
-    where, metadata = "the header of a journal", schema.metadata or {}
+    metadata, where = pa.ipc.open_stream(file).schema.metadata or {}, "the header of a journal"
     values = parse_json(metadata.get(_HEADER, b""), where=where, cure="move it away")
-    header = from_builtins(values, JournalHeader, where=where, command="sliplens live")
-    return header, metadata.get(_REFERENCE)
+    return from_builtins(values, JournalHeader, where=where, command="sliplens live"), metadata.get(_REFERENCE)
 
 
 def _rows(file: pa.NativeFile) -> Iterator[pa.RecordBatch]:
-    """Read the complete frames, from the first to the end of the journal."""
-    reader = pa.ipc.open_stream(file)
+    """Read the complete frames, from the first to the end of the journal; none where it ends before its header does."""
+    file.seek(0)
+    try:
+        reader = pa.ipc.open_stream(file)
+    except pa.ArrowInvalid:
+        return
+    except OSError as error:  # of no disk: the file is mapped
+        raise pa.ArrowInvalid(str(error)) from None
+    if not reader.schema.equals(_SCHEMA):
+        raise pa.ArrowInvalid("it has other columns than a recording")
     while True:
         try:
             row = reader.read_next_batch()
@@ -174,13 +162,3 @@ def _rows(file: pa.NativeFile) -> Iterator[pa.RecordBatch]:
         if len(row) != 1 or gaps or len(row["force_n"][0]) != 3 * len(row["force_time_s"][0]):
             raise pa.ArrowInvalid("a row is no frame")
         yield row
-
-
-def _save_forces(numbers: pa.Table, header: JournalHeader, path: Path) -> None:
-    """Write the samples, without repeated ones."""
-    time_s = numbers.column("force_time_s").combine_chunks().flatten().to_numpy()
-    force_n = numbers.column("force_n").combine_chunks().flatten().to_numpy().reshape(-1, 3)
-    rising = time_s > np.maximum.accumulate(np.concatenate([[-np.inf], time_s]))[:-1]
-    if rising.any():
-        source = header.forces or "the force sensor"
-        save_forces(Forces(time_s=time_s[rising], force_n=force_n[rising], source=source), path)

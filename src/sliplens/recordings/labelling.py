@@ -118,10 +118,6 @@ class ReferenceChoice:
     method: str
     contact_energy: float | None = None
     """Mean absolute high-pass difference from the median untouched frame, in grey levels; None where not measured."""
-    drift: float | None = None
-    """Mean absolute difference of the first and the last untouched frames, in grey levels; None if too few."""
-    drift_span: tuple[int, int] | None = None
-    """First and last untouched frame: without a release, both before the contact. None if there is none."""
 
 
 @dataclass(frozen=True, kw_only=True)

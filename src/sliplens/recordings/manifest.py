@@ -4,9 +4,10 @@ import csv
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.formats import recognise
@@ -54,14 +55,15 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
     """
     tables: dict[str, list[Path]] = {}
     recordings: dict[str, list[Path]] = {}
-    paths = [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]
-    for path in paths:
+    for path in (paths := [path for path in sorted(folder.iterdir()) if not path.name.startswith(".")]):
         bag = path.is_dir() or path.suffix in {".mcap", ".db3"}
         if path.suffix.lower() in _VIDEOS or (bag and recognise(path) not in {None, "sliplens"}):
-            recordings.setdefault(_normalise(path.stem if path.is_file() else path.name), []).append(path)
+            # some systems write an umlaut as two characters
+            name = unicodedata.normalize("NFC", path.stem if path.is_file() else path.name)
+            recordings.setdefault(name, []).append(path)
     for path in paths:
         if path.is_file() and path.suffix.lower() in _TABLES:
-            stem = _normalise(path.stem)
+            stem = unicodedata.normalize("NFC", path.stem)
             # a recording may itself be named lift_ft
             tables.setdefault(stem if stem in recordings else _FORCE_SUFFIX.sub("", stem), []).append(path)
     if not recordings:
@@ -76,13 +78,7 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
         ManifestRow(trial=trial_name(stem), video=path, forces=tables.get(stem, [None])[0])
         for stem, (path,) in recordings.items()
     )
-    _require_unique(rows, folder)
-    return rows
-
-
-def _normalise(name: str) -> str:
-    """Compose characters: some systems write an umlaut as two."""
-    return unicodedata.normalize("NFC", name)
+    return _require_unique(rows, folder)
 
 
 def read_rows(path: Path) -> tuple[ManifestRow, ...]:
@@ -93,14 +89,14 @@ def read_rows(path: Path) -> tuple[ManifestRow, ...]:
     rows = tuple(_parse_row(cells, path.parent, where) for where, cells in read_csv(path, _COLUMNS, what="a manifest"))
     if not rows:
         raise RecordingError(f"{path} lists no trial; write a row for each below the header")
-    _require_unique(rows, path)
-    return rows
+    return _require_unique(rows, path)
 
 
-def _require_unique(rows: Sequence[ManifestRow], where: Path) -> None:
+def _require_unique(rows: tuple[ManifestRow, ...], where: Path) -> tuple[ManifestRow, ...]:
     repeated = [name for name, count in Counter(row.trial for row in rows).items() if count > 1]
     if repeated:
         raise RecordingError(f"{where} has several trials named {', '.join(repeated)}; give each a name of its own")
+    return rows
 
 
 def _read_header(path: Path) -> tuple[list[str], str]:
@@ -141,23 +137,18 @@ def _parse_row(cells: dict[str, str], folder: Path, where: str) -> ManifestRow:
     for name, text in cells.items():
         if max(map(len, re.split(r"[/\\]", text))) > _LONGEST_NAME:
             raise RecordingError(f"{where}: {name} has {len(text):,} characters, which no name has; correct it")
-    numbers: dict[str, float | int] = {}
+    facts: dict[str, Any] = {name: cells[name] for name in ("sensor", "object", "condition") if name in cells}
     for name, kind in (("day", int), ("mu", float)):
         if name in cells:
             try:
-                numbers[name] = kind(cells[name])
+                facts[name] = kind(cells[name])
             except ValueError:
                 raise RecordingError(f"{where}: {name} is {cells[name]!r}, which is no number; correct it") from None
-    sensor, reference = cells.get("sensor"), cells.get("reference")
-    if sensor is not None and sensor.endswith(".toml"):
-        sensor = str(folder / sensor)
-    return ManifestRow(
-        trial=trial_name(cells.get("trial") or Path(cells["video"]).stem),
-        video=folder / cells["video"],
-        forces=folder / cells["forces"] if "forces" in cells else None,
-        sensor=sensor,
-        object=cells.get("object"),
-        condition=cells.get("condition"),
-        reference=None if reference is None else int(reference) if reference.isdecimal() else folder / reference,
-        **numbers,  # pyright: ignore[reportArgumentType]
-    )
+    if facts.get("sensor", "").endswith(".toml"):
+        facts["sensor"] = str(folder / facts["sensor"])
+    if "forces" in cells:
+        facts["forces"] = folder / cells["forces"]
+    if "reference" in cells:
+        facts["reference"] = int(cells["reference"]) if cells["reference"].isdecimal() else folder / cells["reference"]
+    video = folder / cells["video"]
+    return ManifestRow(trial=trial_name(cells.get("trial") or Path(cells["video"]).stem), video=video, **facts)

@@ -3,11 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal, TypeAlias, get_args
-
-ReferenceMethod: TypeAlias = Literal["least contact energy", "first still"]
-REFERENCE_METHODS: tuple[str, ...] = get_args(ReferenceMethod)
-
+from typing import Literal, TypeAlias
 
 Budget: TypeAlias = Literal["frames", "pixels", "samples", "span"]
 LIMITS: dict[Budget, int] = {"frames": 1_000_000, "pixels": 2**25, "samples": 20_000_000, "span": 86_400}
@@ -97,8 +93,6 @@ class LabelSettings:
     """Least normal force of a contact, in newtons; chosen from the noise if not given."""
     force_range: float | None = None
     """Range of each axis of the force sensor, in newtons; frames beyond are not valid."""
-    reference_method: ReferenceMethod = "least contact energy"
-    """How to choose the untouched frame among those before the contact, where the source has none."""
     reference_frame: int | None = None
     """Number of the untouched frame."""
     contact_s: float | None = None

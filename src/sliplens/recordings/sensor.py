@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
@@ -15,10 +14,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from sliplens.errors import ImageError, InputError
-from sliplens.extras import import_cv2
 from sliplens.files import read_toml
 from sliplens.recordings.capture import Capture, Frame
-from sliplens.recordings.options import LabelSettings, ReferenceMethod
+from sliplens.recordings.options import LabelSettings
 
 _MOST_STRETCH = 0.02  # of width against height: markers stay round, and distances mean the same along both
 _SHIPPED = Path(str(files("sliplens"))) / "sensors"
@@ -27,44 +25,19 @@ SENSORS_FOLDER = "sensors"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lens:
-    """Pinhole camera with the lens distortion of Brown and Conrady, as camera calibrations give it.
-
-    References
-    ----------
-    Zhang, *A flexible new technique for camera calibration*, IEEE Transactions on Pattern Analysis and Machine
-    Intelligence 22 (2000).
-    """
-
-    focal_px: tuple[float, float]
-    """Focal lengths along x and y, in pixels of a frame of the camera's size."""
-    centre_px: tuple[float, float]
-    """Principal point (x, y)."""
-    distortion: tuple[float, ...]
-    """Coefficients k1, k2, p1, p2, and k3 if there is one."""
-
-    def __post_init__(self) -> None:
-        if len(self.distortion) not in {4, 5} or min(self.focal_px) <= 0:
-            raise ValueError("a lens has positive focal lengths and 4 or 5 distortion coefficients")
-
-
-@dataclass(frozen=True, kw_only=True)
 class SensorProfile:
     """Facts about a sensor and its camera: how to prepare its frames, and how to label them.
 
-    A frame is first brought to red, green and blue, then undistorted, cropped, rotated, flipped and resized, in this
-    order. Steps that are not set are left out.
+    A frame is first brought to red, green and blue, then cropped, rotated, flipped and resized, in this order. Steps
+    that are not set are left out.
     """
 
     name: str
     """Name of the sensor in trials and networks."""
     camera_size_px: tuple[int, int] | None = None
-    """Width and height of the frames to which crop and lens refer. For frames of another size and the same shape both
-    are scaled."""
+    """Width and height of the frames to which the crop refers; it is scaled for others of the same shape."""
     colours: Literal["rgb", "rbg", "grb", "gbr", "brg", "bgr"] = "rgb"
     """Order in which the channels arrive."""
-    undistort: Lens | None = None
-    """Lens whose distortion is removed."""
     crop_px: tuple[int, int, int, int] | None = None
     """Left, top, width and height of the gel."""
     rotate_deg: Literal[0, 90, 180, 270] = 0
@@ -75,8 +48,6 @@ class SensorProfile:
     """Width and height of prepared frames, of the same shape; those a network was trained on."""
     markers: str | None = None
     """Kind of markers, a row of `markers.KINDS`; None where there are none, or unknown."""
-    reference: ReferenceMethod = "least contact energy"
-    """How to choose the untouched frame among those before the contact, where forces were recorded."""
     reference_frame: int | None = None
     """Number of the untouched frame where the source has none, as in a video without forces."""
     frame_rate_hz: float | None = None
@@ -98,8 +69,8 @@ class SensorProfile:
         for what, size in (("camera_size_px", self.camera_size_px), ("resize_px", self.resize_px)):
             if size is not None and min(size) <= 0:
                 raise ValueError(f"{what} is {size}; widths and heights are positive")
-        if self.camera_size_px is None and (self.crop_px is not None or self.undistort is not None):
-            raise ValueError("crop_px and undistort are in pixels of a frame; set its camera_size_px, too")
+        if self.camera_size_px is None and self.crop_px is not None:
+            raise ValueError("crop_px is in pixels of a frame; set its camera_size_px, too")
         if self.crop_px is not None and self.camera_size_px is not None:
             x, y, width, height = self.crop_px
             inside = x + width <= self.camera_size_px[0] and y + height <= self.camera_size_px[1]
@@ -137,9 +108,6 @@ class SensorProfile:
         height, width = self.output_size(size)
         if self.colours != "rgb":
             frame = frame[..., [self.colours.index(channel) for channel in "rgb"]]
-        if self.undistort is not None:
-            cv2 = import_cv2()
-            frame = cv2.remap(np.ascontiguousarray(frame), *_undistorting(self.undistort, self._scale(size), size), 1)
         if self.crop_px is not None:
             x0, y0, x1, y1 = self._box(size)
             frame = frame[y0:y1, x0:x1]
@@ -176,14 +144,10 @@ class SensorProfile:
         )
 
     def settings(self, settings: LabelSettings) -> LabelSettings:
-        """Return settings with the axis, sign and reference of the profile where the user set none."""
-        axis, sign, method = settings.normal_axis, settings.normal_sign, settings.reference_method
-        return replace(
-            settings,
-            normal_axis=self.normal_axis if axis is None else axis,
-            normal_sign=self.normal_sign if sign is None else sign,
-            reference_method=self.reference if method == LabelSettings.reference_method else method,
-        )
+        """Return settings with the axis and sign of the profile where the user set none."""
+        axis, sign = settings.normal_axis, settings.normal_sign
+        axis, sign = self.normal_axis if axis is None else axis, self.normal_sign if sign is None else sign
+        return replace(settings, normal_axis=axis, normal_sign=sign)
 
     def _scale(self, size: tuple[int, int]) -> tuple[float, float]:
         """Return how many times wider and higher a frame is than `camera_size_px`."""
@@ -204,20 +168,6 @@ class SensorProfile:
         x, y, width, height = self.crop_px
         box = (round(x * across), round(y * down), round((x + width) * across), round((y + height) * down))
         return box[0], box[1], min(box[2], size[1]), min(box[3], size[0])
-
-
-@lru_cache(maxsize=4)
-def _undistorting(lens: Lens, scale: tuple[float, float], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the maps that OpenCV's `remap` takes, from pixels of the straight image to the camera's."""
-    cv2 = import_cv2()
-    (across, down), (focal_x, focal_y), (centre_x, centre_y) = scale, lens.focal_px, lens.centre_px
-    camera = np.array(
-        # pixel centres are whole numbers in both sizes
-        [[focal_x * across, 0, (centre_x + 0.5) * across - 0.5], [0, focal_y * down, (centre_y + 0.5) * down - 0.5],
-         [0, 0, 1]]
-    )  # fmt: skip
-    distortion, straight = np.array(lens.distortion), np.eye(3)
-    return cv2.initUndistortRectifyMap(camera, distortion, straight, camera, (size[1], size[0]), 5)
 
 
 def shipped_profiles() -> tuple[str, ...]:
@@ -261,14 +211,6 @@ def is_profile(sensor: Path | str | SensorProfile) -> bool:
 
 def profile_text(profile: SensorProfile, *, notes: tuple[str, ...] = ()) -> str:
     """Write a profile as TOML, with notes as comments before it."""
-    rows, tables = [f"# {note}" for note in notes], []
-    for field in fields(SensorProfile):
-        value = getattr(profile, field.name)
-        if value is None:
-            continue
-        if isinstance(value, Lens):
-            tables += ["", f"[{field.name}]", *(f"{name} = {json.dumps(part)}" for name, part in vars(value).items())]
-        else:
-            # texts, numbers and lists of numbers are equal in JSON and TOML
-            rows.append(f"{field.name} = {json.dumps(value, ensure_ascii=False)}")
-    return "\n".join([*rows, *tables]) + "\n"
+    # texts, numbers and lists of numbers are equal in JSON and TOML
+    values = {name: json.dumps(value, ensure_ascii=False) for name, value in vars(profile).items() if value is not None}
+    return "\n".join([*(f"# {note}" for note in notes), *(f"{name} = {text}" for name, text in values.items()), ""])

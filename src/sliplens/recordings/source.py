@@ -21,13 +21,11 @@ from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import LIMITS, Budget, ReadOptions, option_flags
-from sliplens.recordings.repeats import inspect_repeats
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.runner import LONGEST, Part, part
 
 Frames: TypeAlias = UInt8[np.ndarray, "frames height width 3"]  #: RGB images of the camera, one after another.
 Other = TypeVar("Other")
-_INSPECTED = 8  #: Recordings whose first frames are checked for repeats.
 
 
 class SourceOptions(TypedDict, total=False):
@@ -171,36 +169,33 @@ class Trials:
         return {**self.options, "reference": image}
 
     def reader(self) -> Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]:
-        """Return a function that opens a shard: its trial, and its frames with their numbers."""
+        """Return a function that opens a part: its trial, and its frames with their numbers."""
         source, options = self.source, self.options
         opened = open_source(source, **options) if isinstance(source, Path) else source
         by_name = {} if isinstance(opened, Dataset) else {capture.name: capture for capture in opened}
-        following: tuple[tuple[str, int], Iterator[tuple[int, Frame]]] | None = None
+        # the next part of a trial goes on where this one ended: frames before it are not decoded again
+        following: dict[tuple[str, int], Iterator[tuple[int, Frame]]] = {}
+
+        def read_part(capture: Capture, first: int, count: int) -> Iterator[tuple[int, Frame]]:
+            frames = following.pop((capture.name, first), None)
+            following.clear()
+            if frames is None:
+                frames = islice(enumerate(capture.read_frames()), first, None)
+            number = first - 1
+            for number, frame in islice(frames, count):
+                require_rgb(frame, what=f"levels of frame {number} of {capture.source}")
+                yield number, frame
+            if number + 1 < first + count:
+                ends = f"ends after {number + 1} of its {first + count} frames"
+                raise RecordingError(f"{capture.source} {ends}; make or copy it again")
+            following[capture.name, first + count] = frames
 
         def read(trial: str, first: int, count: int) -> tuple[Capture, Iterator[tuple[int, Frame]]]:
-            nonlocal following
             if isinstance(source, Dataset):
                 (capture,) = open_source(source, **{**options, "trial": trial})
             else:
                 capture = by_name[trial]
-            if following is not None and following[0] == (trial, first):
-                frames = following[1]
-            else:
-                frames = islice(enumerate(capture.read_frames()), first, None)
-            following = None  # until this shard is read to its end: a failure leaves the iterator anywhere
-
-            def read_shard() -> Iterator[tuple[int, Frame]]:
-                nonlocal following
-                number = first - 1
-                for number, frame in islice(frames, count):
-                    require_rgb(frame, what=f"levels of frame {number} of {capture.source}")
-                    yield number, frame
-                if number + 1 < first + count:
-                    ends = f"ends after {number + 1} of its {first + count} frames"
-                    raise RecordingError(f"{capture.source} {ends}; make or copy it again")
-                following = (trial, first + count), frames
-
-            return capture, read_shard()
+            return capture, read_part(capture, first, count)
 
         return read
 
@@ -228,12 +223,10 @@ def open_trials(
     if len({capture.name for capture in captures}) < len(captures):
         raise InputError("two of the trials have the same name; give each its own")
     sha256 = hash_tree(source) if resumable and isinstance(source, Path) else ""
-    # of many recordings a few: to inspect all takes long
-    kinds = tuple(replace(each, notes=(*each.notes, *inspect_repeats(each))) for each in captures[:_INSPECTED])
     return Trials(
         source=source if isinstance(source, Path) else captures,
         options=options,
-        kinds=(*kinds, *captures[_INSPECTED:]),
+        kinds=captures,
         rows=tuple((capture.name, capture.frames, sha256) for capture in captures),
     )
 
@@ -242,9 +235,22 @@ def _read_captures(
     source: Path | Frames, format: str | None, options: ReadOptions, *, whole: bool
 ) -> Sequence[Capture]:
     if isinstance(source, Path):
-        if not whole and set(options.given()) <= {"frame_rate"} and (format or recognise(source)) == "images":
-            return [_read_images(source, options.frame_rate)]
-        return open_captures(source, format=format, options=options)
+        images = set(options.given()) <= {"frame_rate"} and (format or recognise(source)) == "images"
+        if whole or not images:
+            return open_captures(source, format=format, options=options)
+        # unlike on import, the times of images may stay unknown
+        paths = list_images(source)
+        size, count = frame_size(paths[0]), len(paths)
+        return [
+            Capture(
+                trial=trial_name(source.resolve().name),
+                source=str(source),
+                frame_time_s=_frame_times(count, options.frame_rate),
+                frame_size=size,
+                read_frames=lambda: (read_frame(path, size=size) for path in paths),
+                files=tuple(path.name for path in paths),
+            )
+        ]
     if not len(source):
         raise InputError("there is no frame; give one or more")
     require_rgb(source)
@@ -284,20 +290,6 @@ def _choose_trial(names: Sequence[str], trial: str | None, source: str) -> Seque
     if trial not in names:
         raise InputError(f"{source} has no trial {trial}; choose one such as {names[0]}")
     return [names.index(trial)]
-
-
-def _read_images(folder: Path, frame_rate: float | None) -> Capture:
-    """Open images as one trial; unlike on import, their times may stay unknown."""
-    paths = list_images(folder)
-    size, count = frame_size(paths[0]), len(paths)
-    return Capture(
-        trial=trial_name(folder.resolve().name),
-        source=str(folder),
-        frame_time_s=_frame_times(count, frame_rate),
-        frame_size=size,
-        read_frames=lambda: (read_frame(path, size=size) for path in paths),
-        files=tuple(path.name for path in paths),
-    )
 
 
 def _frame_times(count: int, frame_rate: float | None) -> Float[np.ndarray, " frames"]:

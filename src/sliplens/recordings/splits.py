@@ -63,15 +63,12 @@ def assign_splits(trials: Sequence[TrialFacts], table: Mapping[str, str]) -> Spl
     >>> assign_splits(trials, {"mug-2": "validation", "mug-*": "train", "*": "test"}).splits
     ('train', 'validation', 'test')
     """
-    _require_unique(trials)
-    rows = {
-        trial.trial: next((row for row in table if row == trial.trial or fnmatchcase(trial.trial, row)), None)
-        for trial in trials
-    }
-    if unmatched := [trial for trial, row in rows.items() if row is None]:
+    names = _unique_names(trials)
+    rows = [next((row for row in table if row == name or fnmatchcase(name, row)), "") for name in names]
+    if unmatched := [name for name, row in zip(names, rows, strict=True) if not row]:
         raise InputError(f"no row of the table of splits matches {_list(unmatched)}; add rows, or a last row for *")
-    splits = tuple(table[row] for row in rows.values() if row is not None)
-    unused = [row for row in table if row not in rows.values()]
+    splits = tuple(table[row] for row in rows)
+    unused = [row for row in table if row not in rows]
     notes = [f"without effect in the table of splits: {_list(unused)}"] if unused else []
     return SplitResult(splits=splits, notes=(*notes, *_remarks(trials, splits)))
 
@@ -93,40 +90,30 @@ def deal_splits(
     >>> splits[::2] == splits[1::2], sorted(splits[::2])
     (True, ['test', 'train', 'validation'])
     """
-    _require_unique(trials)
+    names = _unique_names(trials)
     if by not in get_args(Group):
         raise InputError(f"trials cannot be dealt by {by!r}; choose {', '.join(get_args(Group))}")
     if any(not (math.isfinite(share) and share >= 0) for share in shares) or abs(sum(shares) - 1) > _SUM_TOLERANCE:
         raise InputError(f"the shares are {', '.join(map(str, shares))}; give three, none below 0, that sum to 1")
-    group_of = {trial.trial: str(getattr(trial, by)) for trial in trials}
-    unknown = sorted(trial for trial, group in group_of.items() if not group)
-    if len(unknown) == len(group_of):
+    group_of = [str(getattr(trial, by)) for trial in trials]
+    unknown = sorted(name for name, group in zip(names, group_of, strict=True) if not group)
+    if len(unknown) == len(trials):
         raise InputError(f"the {by} of {_list(unknown)} is unknown; name it on import, or deal by trial")
-    groups = sorted(set(group_of.values()), key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
-    counts = _apportion(len(groups), dict(zip(SPLITS, shares, strict=True)))
-    order = [split for split, count in counts.items() for _ in range(count)]
-    split_of = dict(zip(groups, order, strict=True))
-    splits = tuple(split_of[group_of[trial.trial]] for trial in trials)
+    groups = sorted(set(group_of), key=lambda name: hashlib.sha256(f"{seed}:{name}".encode()).digest())
+    # the decimals as they were written: 0.15 of 20 is 3, with no rounding error to decide a tie
+    parts = {split: Fraction(repr(share)) for split, share in zip(SPLITS, shares, strict=True) if share}
+    exact = {split: part * len(groups) / sum(parts.values()) for split, part in parts.items()}
+    counts = {split: int(quota) for split, quota in exact.items()}
+    # both searches are stable: of equal remainders the first split wins
+    for _ in range(len(groups) - sum(counts.values())):
+        counts[min(exact, key=lambda split: counts[split] - exact[split])] += 1
+    while len(groups) >= len(counts) and 0 in counts.values():
+        counts[next(split for split in counts if not counts[split])] += 1
+        counts[max((each for each in counts if counts[each] > 1), key=lambda each: counts[each] - exact[each])] -= 1
+    split_of = dict(zip(groups, (split for split in counts for _ in range(counts[split])), strict=True))
+    splits = tuple(split_of[group] for group in group_of)
     notes = [f"the {by} of {_list(unknown)} is unknown; dealt as one {by}"] if unknown else []
     return SplitResult(splits=splits, notes=(*notes, *_remarks(trials, splits)))
-
-
-def _apportion(count: int, shares: Mapping[str, float]) -> dict[str, int]:
-    """Count the groups of each split: largest remainders, and none without if there are enough."""
-    # the decimals as they were written: 0.15 of 20 is 3, with no rounding error to decide a tie
-    parts = {split: Fraction(repr(share)) for split, share in shares.items() if share}
-    exact = {split: part * count / sum(parts.values()) for split, part in parts.items()}
-    counts = {split: int(quota) for split, quota in exact.items()}
-    # the sort is stable: of equal remainders the first split wins
-    by_remainder = sorted(exact, key=lambda split: counts[split] - exact[split])
-    for split in by_remainder[: count - sum(counts.values())]:
-        counts[split] += 1
-    while count >= len(counts) and 0 in counts.values():
-        giver = max((split for split in counts if counts[split] > 1), key=lambda split: counts[split] - exact[split])
-        taker = next(split for split, groups in counts.items() if groups == 0)
-        counts[giver] -= 1
-        counts[taker] += 1
-    return counts
 
 
 def load_splits(splits: Mapping[str, str] | Path | str) -> Mapping[str, str] | Group:
@@ -171,10 +158,11 @@ def split_dataset(
     return result
 
 
-def _require_unique(trials: Sequence[TrialFacts]) -> None:
-    repeated = [name for name, count in Counter(trial.trial for trial in trials).items() if count > 1]
-    if repeated:
+def _unique_names(trials: Sequence[TrialFacts]) -> list[str]:
+    names = [trial.trial for trial in trials]
+    if repeated := [name for name, count in Counter(names).items() if count > 1]:
         raise InputError(f"listed more than once: {_list(repeated)}; a trial belongs to one split, list it once")
+    return names
 
 
 def _remarks(trials: Sequence[TrialFacts], splits: Sequence[str]) -> list[str]:
@@ -183,15 +171,10 @@ def _remarks(trials: Sequence[TrialFacts], splits: Sequence[str]) -> list[str]:
     if missing := [split for split in SPLITS if split not in splits]:
         notes.append(f"no trial is in {' or '.join(missing)}: to train takes train and validation, to evaluate test")
     for fact in ("object", "day"):
-        of_split = {
-            name: {getattr(trial, fact) for trial, split in zip(trials, splits, strict=True) if split == name}
-            for name in ("train", "test")
-        }
-        if both := sorted((of_split["train"] & of_split["test"]) - {""}):
-            notes.append(
-                f"{fact} {_list([str(value) for value in both])} in both train and test: the test does not show how "
-                f"well a new {fact} is predicted"
-            )
+        pairs = {(str(getattr(trial, fact)), split) for trial, split in zip(trials, splits, strict=True)}
+        if both := sorted(value for value, split in pairs if value and split == "train" and (value, "test") in pairs):
+            unseen = f"the test does not show how well a new {fact} is predicted"
+            notes.append(f"{fact} {_list(both)} in both train and test: {unseen}")
     return notes
 
 

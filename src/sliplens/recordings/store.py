@@ -2,8 +2,6 @@
 
 import os
 import re
-import tempfile
-from array import array
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -51,7 +49,7 @@ def encode_pixels(pixels: Pixels) -> bytes:
 
 def encode_frames(frames: Iterable[Pixels]) -> Iterator[list[bytes]]:
     """Encode frames in threads while the next are made; yields them in chunks of a row group."""
-    images = in_turn(encode_pixels, frames)  # Zstandard releases the interpreter's lock
+    images = in_turn(encode_pixels, frames)
     yield from iter(lambda: list(islice(images, ROW_GROUP)), [])
 
 
@@ -69,49 +67,16 @@ def in_turn(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Ite
             yield waiting.popleft().result()
 
 
-class Spool:
-    """Temporary file without a name, in which pieces are stored to be read again in any order."""
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (closed on exit)
-        self._ends = array("q", [0])
-
-    def append(self, piece: bytes) -> None:
-        """Store a piece."""
-        self._file.write(piece)
-        self._ends.append(self._ends[-1] + len(piece))
-
-    def __len__(self) -> int:
-        return len(self._ends) - 1
-
-    def __getitem__(self, place: int) -> bytes:
-        begin, end = self._ends[place : place + 2]
-        self._file.seek(begin)
-        return self._file.read(end - begin)
-
-    def chunks(self, size: int) -> Iterator[list[bytes]]:
-        """Yield the pieces in their order, in lists of a size."""
-        for first in range(0, len(self), size):
-            yield [self[place] for place in range(first, min(first + size, len(self)))]
-
-    def __enter__(self) -> "Spool":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-
 def decode_pixels(data: bytes | pa.Buffer, *, size: Sequence[int], where: str) -> Pixels:
     """Decode the pixels of an image of known size (height, width, and channels if any)."""
-    count = int(np.prod(size))
+    count = prod(size)
     try:
         raw = pa.decompress(data, decompressed_size=count, codec="zstd")
     except (pa.ArrowInvalid, OSError, ValueError) as error:
-        raise RecordingError(f"{where} cannot be read ({error}); make the data set again") from None
+        raise RecordingError(f"{where} cannot be read ({error}); {_AGAIN}") from None
     rows = np.frombuffer(raw, dtype=np.uint8)
     if rows.size != count:
-        raise RecordingError(f"{where} holds {rows.size} bytes, {count} are expected; make the data set again")
+        raise RecordingError(f"{where} holds {rows.size} bytes, {count} are expected; {_AGAIN}")
     return np.cumsum(rows.reshape(size), axis=0, dtype=np.uint8)
 
 
@@ -178,11 +143,9 @@ def _open(path: Path) -> tuple[pq.ParquetFile, TrialHeader]:
     needed = {name: kind for name, kind in _KINDS.items() if name not in OPTIONAL_LABELS}
     file = open_parquet(path, needed, cure=_AGAIN, error=RecordingError)
     metadata: dict[bytes, bytes] = file.schema_arrow.metadata or {}
-    missing = [key.decode() for key in (_HEADER, b"reference") if key not in metadata]
-    if missing:
+    if missing := [key.decode() for key in (_HEADER, b"reference") if key not in metadata]:
         raise RecordingError(f"{path} lacks {', '.join(missing)} in its metadata; {_AGAIN}")
-    codec = metadata.get(b"codec", b"png")
-    if codec != CODEC.encode():
+    if (codec := metadata.get(b"codec", b"png")) != CODEC.encode():
         raise RecordingError(f"{path} keeps its images as {str(codec[:40])[2:-1]}, {CODEC} is needed; {_AGAIN}")
     where = f"the header of {path}"
     values = parse_json(metadata[_HEADER], where=where, cure=_AGAIN)
@@ -239,15 +202,12 @@ def write_trial(
         labelling=labels.labelling,
         truth=truth_header,
     )
-    metadata = {
-        _HEADER: msgspec.json.encode(to_builtins(header)),
-        b"codec": CODEC.encode(),
-        b"reference": encode_png(reference),
-    }
-    if first_reference is not None:
-        metadata[_FIRST_REFERENCE] = encode_png(first_reference)
-    table = pa.table(columns)
-    schema = pa.schema([pa.field("frame", pa.int64()), *table.schema, pa.field("image", pa.binary())], metadata)
+    metadata = {_HEADER: msgspec.json.encode(to_builtins(header)), b"codec": CODEC.encode()}
+    for key, image in ((b"reference", reference), (_FIRST_REFERENCE, first_reference)):
+        if image is not None:
+            metadata[key] = encode_png(image)
+    table = pa.table({"frame": np.arange(len(time_s)), **columns})
+    schema = pa.schema([*table.schema, pa.field("image", pa.binary())], metadata)
     written = 0
     with (
         whole_file(path) as part,
@@ -255,31 +215,18 @@ def write_trial(
         pq.ParquetWriter(part, schema, compression="none", use_dictionary=False) as writer,
     ):
         for chunk in images:
-            rows = table.slice(written, len(chunk)).combine_chunks()
-            numbers = pa.array(np.arange(written, written + len(chunk)))
-            arrays = [numbers, *(column.combine_chunks() for column in rows.columns), _in_place(chunk)]
-            writer.write_table(pa.Table.from_arrays(arrays, schema=writer.schema))
+            rows = table.slice(written, len(chunk)).append_column("image", pa.array(chunk, pa.binary()))
+            writer.write_table(rows.combine_chunks())
             written += len(chunk)
 
 
-def _in_place(images: list[bytes]) -> pa.ChunkedArray:
-    """Wrap encoded images in Arrow without copying them."""
-    ends = (pa.py_buffer(np.array([0, len(image)], dtype=np.int32)) for image in images)
-    parts = [
-        pa.Array.from_buffers(pa.binary(), 1, [None, end, pa.py_buffer(image)])
-        for end, image in zip(ends, images, strict=True)
-    ]
-    return pa.chunked_array(parts, type=pa.binary())
-
-
 def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Recording:
-    """Read a trial written by `save_recording`."""
-    truth = truth and pixels
+    """Read a trial written by `save_recording`; without `pixels` every frame is the reference, without truth."""
     file, header = _open(path)
     with file:
-        there, metadata = file.schema_arrow.names, file.schema_arrow.metadata
-    wanted = {name: kind for name, kind in _KINDS.items() if name in there and (pixels or name != "image")}
-    wanted |= _TRUTH_KINDS if truth and header.truth else {}
+        present, metadata = file.schema_arrow.names, file.schema_arrow.metadata
+    exact = header.truth if truth and pixels else None
+    kinds = {name: kind for name, kind in _KINDS.items() if name in present and (pixels or name != "image")}
     size, frames = (header.height, header.width, 3), header.frames
     reference = decode_png(metadata[b"reference"], where=f"the reference frame of {path}")
     if reference.shape != size:
@@ -288,28 +235,25 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
         raise RecordingError(f"trial {header.trial} has no frames; leave it out or record it again")
     if pixels and frames * prod(size) > _MOST_BYTES:
         raise RecordingError(f"{path} claims {frames:,} frames, more than memory holds; {_AGAIN}")
-    table = read_parquet(path, wanted, cure=_AGAIN, error=RecordingError)
+    table = read_parquet(path, kinds | (_TRUTH_KINDS if exact else {}), cure=_AGAIN, error=RecordingError)
     labels: dict[str, Any] = {
-        name: table.column(name).to_pylist()
+        name: tuple(table.column(name).to_pylist())
         if kind == "texts"
         else table.column(name).to_numpy().astype(np.float64 if kind == "numbers" else np.bool_)
-        for name, kind in wanted.items()
-        if name in _KINDS and name != "image"
+        for name, kind in kinds.items()
+        if name != "image"
     }
     if strange := set(labels["contact_state"]) - set(ContactState):
         raise RecordingError(f"{path} holds the contact state {min(strange)[:40]!r}, which is none; {_AGAIN}")
     labels["contact_state"] = tuple(map(ContactState, labels["contact_state"]))
-    if "reason" in labels:
-        labels["reason"] = tuple(labels["reason"])
+    images = table.column("image") if pixels else None
     return Recording(
         **{name: getattr(header, name) for name in _FACTS},
         **labels,
         labelling=header.labelling,
         reference=reference,
-        frames=_decode(table.column("image"), size=size, where=f"of {path}")
-        if pixels
-        else np.broadcast_to(reference, (frames, *size)),
-        truth=_read_truth(table, header.truth, size[:2], path) if truth and header.truth else None,
+        frames=np.broadcast_to(reference, (frames, *size)) if images is None else _decode(images, size, f"of {path}"),
+        truth=None if exact is None else _read_truth(table, exact, size[:2], path),
     )
 
 
@@ -368,12 +312,12 @@ def _read_truth(table: pa.Table, header: TruthHeader, size: tuple[int, ...], pat
         displacement=header.displacement,
         marker_rest_px=np.array(header.marker_rest_px, dtype=np.float32).reshape(-1, 2),
         marker_px=flat.to_numpy().astype(np.float32).reshape(table.num_rows, rest, 2),
-        contact_map=_decode(table.column("contact_map"), size=size, where=f"(contact map) of {path}"),
+        contact_map=_decode(table.column("contact_map"), size, f"(contact map) of {path}"),
         **{name: table.column(name).to_numpy().astype(np.float64) for name in _TRUTH_SIGNALS},
     )
 
 
-def _decode(images: pa.ChunkedArray, *, size: tuple[int, ...], where: str) -> UInt8[np.ndarray, "frames ..."]:
+def _decode(images: pa.ChunkedArray, size: tuple[int, ...], where: str) -> UInt8[np.ndarray, "frames ..."]:
     """Decode the images of a trial in threads."""
     pixels = np.empty((len(images), *size), dtype=np.uint8)
 

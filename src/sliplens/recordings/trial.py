@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.mechanics import stick_ratio
-from sliplens.progress import number_of
 from sliplens.recordings.labelling import Labelling
 
 OUTSIDE, SLIPS, STICKS = 0, 1, 2  #: Values of a contact map.
@@ -56,7 +55,6 @@ class Labels:
     and is NaN. Lengths that disagree are a `RecordingError`.
     """
 
-    # sizes that must agree are left open here and checked below, in the user's words
     normal_force_n: Float[np.ndarray, " _"]
     tangential_force_n: Float[np.ndarray, " _"]
     friction_coefficient: Float[np.ndarray, " _"]
@@ -72,18 +70,18 @@ class Labels:
     labelling: Labelling | None = None  #: Provenance of the labels; None where it is unknown.
 
     def __post_init__(self) -> None:
-        self._require_one_each(len(self.safety_margin), f"there are {len(self.safety_margin)} safety margins but")
-        self._require_possible("")
+        self._require_consistent(len(self.safety_margin), "")
 
-    def _require_one_each(self, count: int, begin: str, *more: str) -> None:
-        for name in (*LABEL_SIGNALS, "contact_state", *OPTIONAL_LABELS, *more):
-            values = getattr(self, name)
-            if values is not None and len(values) != count:
-                raise RecordingError(f"{begin} {len(values)} values of {name}; give one value a frame")
-
-    def _require_possible(self, where: str) -> None:
-        for name in LABEL_BOUNDS:
-            if (values := getattr(self, name)) is not None:
+    def _require_consistent(self, count: int, where: str) -> None:
+        """Check that there is one value a frame, each in its range."""
+        for name in (*SIGNALS, "contact_state", *OPTIONAL_LABELS):
+            values = getattr(self, name, None)
+            if values is None:
+                continue
+            if len(values) != count:
+                begin = f"trial {where} has" if where else "there are"
+                raise RecordingError(f"{begin} {len(values)} values of {name} for {count} frames; give one a frame")
+            if name in LABEL_BOUNDS:
                 require_possible(values, name=name, where=where)
 
     @property
@@ -135,7 +133,6 @@ class GroundTruth:
     recipe: str  #: Hash of the recipe that made the trial.
     displacement: str
     """Model that moved the markers; the stick zone of `calibrated` is nominal, that of `half-space` exact."""
-    # sizes that must agree are left open here and checked below, in the user's words
     marker_rest_px: Float32[np.ndarray, "_ 2"]  #: Markers of the untouched sensor.
     marker_px: Float32[np.ndarray, "_ _ 2"]  #: Markers in every frame, in the order of those at rest.
     static_friction: Float[np.ndarray, " _"]
@@ -146,14 +143,13 @@ class GroundTruth:
     """Contact of the skin as the camera sees it: 0 none, 1 slipping, 2 sticking."""
 
     def __post_init__(self) -> None:
-        count = len(self.marker_px)
         for name in ("static_friction", "contact_radius_m", "stick_radius_m", "contact_map"):
-            if len(getattr(self, name)) != count:
-                raise RecordingError(f"the truth has {count} frames of markers but another of {name}; give as many")
+            if len(getattr(self, name)) != len(self.marker_px):
+                raise RecordingError(f"the truth has another number of frames of {name} than of markers; give as many")
         if self.marker_px.shape[1:] != self.marker_rest_px.shape:
             raise RecordingError("the truth has other markers at rest than in its frames; give each a place in both")
-        if np.any(self.stick_radius_m > self.contact_radius_m):
-            at = int(np.argmax(self.stick_radius_m > self.contact_radius_m))
+        if np.any(sticking := self.stick_radius_m > self.contact_radius_m):
+            at = int(np.argmax(sticking))
             raise RecordingError(f"frame {at} sticks beyond its contact; make the stick radius at most the contact's")
 
 
@@ -172,17 +168,11 @@ class Recording(TrialFacts, Labels):
             raise RecordingError(f"trial {self.trial} has no frames; leave it out or record it again")
         if self.frames.shape[1:] != self.reference.shape:
             raise RecordingError(f"trial {self.trial} has a reference of another size than frames; record both alike")
-        begin = f"trial {self.trial} has {number_of(count, 'frame')} but"
-        self._require_one_each(count, begin, "time_s")
+        self._require_consistent(count, self.trial)
         if self.truth is not None and len(self.truth.marker_px) != count:
-            raise RecordingError(f"{begin} the truth of {len(self.truth.marker_px)}; give the truth of every frame")
-        if not np.isfinite(self.time_s).all():
-            at = int(np.argmin(np.isfinite(self.time_s)))
-            raise RecordingError(f"trial {self.trial}: the time of frame {at} is {self.time_s[at]}; mend its stamp")
-        if not np.all(np.diff(self.time_s) > 0):
-            at = int(np.argmax(~(np.diff(self.time_s) > 0))) + 1
-            raise RecordingError(f"trial {self.trial}: time does not rise at frame {at}; mend the stamps")
-        self._require_possible(self.trial)
+            truth = len(self.truth.marker_px)
+            raise RecordingError(f"trial {self.trial} has {count} frames but the truth of {truth}; give that of each")
+        require_rising(self.time_s, what=f"trial {self.trial}")
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -190,6 +180,7 @@ class Recording(TrialFacts, Labels):
 
 CLOCK_S = (-1e6, 1e10)
 """Range of plausible times: seconds since the start of a recording or since 1970; others are in another unit."""
+_STEPS_S = (1e-6, 86400.0)  # least median and largest step of time of a camera or a force sensor
 MOST_FORCE_N = 1e4  #: Largest force on a fingertip, in newtons; a larger number is in another unit.
 _FORCES = (-MOST_FORCE_N, MOST_FORCE_N, "give it in newtons")
 _FRACTION = (0.0, 1.0, "give it as a fraction, not in percent")
@@ -210,3 +201,21 @@ def require_possible(values: Float[np.ndarray, " frames"], *, name: str, where: 
     if outside.any():
         at, of = int(np.argmax(outside)), f"trial {where}: " if where else ""
         raise RecordingError(f"{of}{name} of frame {at} is {values[at]:.4g}, outside [{low:g}, {high:g}]; {cure}")
+
+
+def require_rising(time_s: Float[np.ndarray, " samples"], *, what: str) -> None:
+    """Check that times are numbers in seconds, and rise."""
+    with np.errstate(invalid="ignore"):  # of infinite times, which the first law refuses
+        steps = np.diff(time_s, prepend=time_s[:1] - 1)
+    laws = (
+        (np.isfinite(time_s), "the time of sample {at} is {time:g}, no number; mend its stamp"),
+        (steps > 0, "time does not rise at sample {at} ({time:.6f} s); sort or mend the stamps"),
+        ((time_s >= CLOCK_S[0]) & (time_s <= CLOCK_S[1]), "times reach {time:.4g} s, as none do; give seconds"),
+        (steps <= _STEPS_S[1], "sample {at} comes more than a day late; mend or drop its stamp"),
+    )
+    for holds, message in laws:
+        if not holds.all():
+            at = int(np.argmin(holds))
+            raise RecordingError(f"{what}: {message.format(at=at, time=time_s[at])}")
+    if len(time_s) > 1 and (step_s := np.median(steps[1:])) < _STEPS_S[0]:
+        raise RecordingError(f"{what}: samples are {step_s:.3g} s apart; declare the right unit of time")

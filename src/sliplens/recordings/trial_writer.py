@@ -1,14 +1,16 @@
 """Recordings written as labelled trials of a data set, each complete or not at all."""
 
+import tempfile
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from array import array
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from threadpoolctl import threadpool_limits
 
 from sliplens.codec import RESULT_FILE, load_record, save_record
@@ -19,13 +21,11 @@ from sliplens.progress import open_stage, report_progress
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import LeftOut, TrialInfo, trial_info, trial_path
 from sliplens.recordings.labelling import Corrections, Labelling, ReferenceChoice
-from sliplens.recordings.labels import Reason, choose_reference, label_trial, measure_motion
+from sliplens.recordings.labels import Reason, choose_reference, describe_repeats, label_trial, measure_motion
 from sliplens.recordings.options import LabelSettings
-from sliplens.recordings.repeats import describe_repeats
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.store import (
     ROW_GROUP,
-    Spool,
     decode_pixels,
     encode_pixels,
     forces_path,
@@ -33,7 +33,7 @@ from sliplens.recordings.store import (
     save_forces,
     write_trial,
 )
-from sliplens.recordings.trial import Labels, labels_of_margins
+from sliplens.recordings.trial import labels_of_margins
 from sliplens.runner import MakePart, Work, part, run_parts
 
 
@@ -64,22 +64,24 @@ class TrialWork(Work):
 
     @abstractmethod
     def open(self, item: Any) -> TrialJob:
-        """Open the trial of a shard."""
+        """Open the trial of a part."""
 
     def begin(self) -> MakePart:
         """Make data sets of one trial."""
-        leave_cores()
+        # matrix products are small here: idle threads would spin on all cores
+        threadpool_limits(1, user_api="blas")
 
         def make(item: Any, path: Path) -> None:
             job = self.open(item)
-            capture = job.capture
+            capture, settings = job.capture, job.settings
             trial, samples = trial_path(path, capture.trial), forces_path(path, capture.trial)
+            # random numbers that do not depend on the other trials
+            rng = np.random.default_rng((settings.seed, *capture.trial.encode()))
             try:
-                # random numbers that do not depend on the other trials
-                rng = np.random.default_rng((job.settings.seed, *capture.trial.encode()))
                 import_trial(
-                    capture, trial, settings=job.settings, corrections=job.corrections, rng=rng, forces_file=samples
+                    capture, trial, settings=settings, corrections=job.corrections, rng=rng, forces_file=samples
                 )
+                written = WrittenTrial(info=trial_info(trial, split=""))
             except SliplensError as error:
                 if job.cure:
                     raise RecordingError(f"{error}{job.cure}") from None
@@ -87,16 +89,9 @@ class TrialWork(Work):
                     raise
                 samples.unlink(missing_ok=True)
                 written = WrittenTrial(left_out=LeftOut(trial=capture.trial, source=capture.source, why=str(error)))
-            else:
-                written = WrittenTrial(info=trial_info(trial, split=""))
             save_record(written, path / RESULT_FILE)
 
         return make
-
-
-def leave_cores() -> AbstractContextManager:
-    """Run NumPy's matrix products, which are small here, in one thread: idle ones would spin on all cores."""
-    return threadpool_limits(1, user_api="blas")
 
 
 @contextmanager
@@ -105,24 +100,20 @@ def write_trials(
 ) -> Iterator[tuple[list[TrialInfo], list[LeftOut]]]:
     """Write trials into the folder of a data set; yields their rows, and the trials that were left out of many."""
     parts = folder / "parts"
-
     # the folder is of these recordings and settings alone (`files.output_folder`)
     every = [part(item, trial=name, frames=frames, recipe="trial", content=name) for item, name, frames in trials]
-
     rows: list[TrialInfo] = []
     left_out: list[LeftOut] = []
-    with leave_cores(), open_stage(title):
+    with threadpool_limits(1, user_api="blas"), open_stage(title):
         try:
             run_parts(work, every, parts, title=title, on=on, retry_failed=retry_failed)
         except PartError as error:
             failed = {name: work.open(item) for item, name, _ in trials if name in error.errors}
             if len(failed) == len(trials) or not all(job.one_of_many for job in failed.values()):
                 raise
-            again = "the same command with --add tries it again"
-            left_out = [
-                LeftOut(trial=name, source=job.capture.source, why=f"{error.errors[name]}; {again}")
-                for name, job in failed.items()
-            ]
+            for name, job in failed.items():
+                why = f"{error.errors[name]}; the same command with --add tries it again"
+                left_out.append(LeftOut(trial=name, source=job.capture.source, why=why))
     set_aside = {trial.trial for trial in left_out}
     for made in (parts / each.path for each in every if each.name not in set_aside):
         written = load_record(made / RESULT_FILE, WrittenTrial, command="the interrupted command")
@@ -142,6 +133,13 @@ def write_trials(
     remove(parts)
 
 
+def require_forces(capture: Capture) -> None:
+    """Refuse a recording that has neither labels nor forces to make them from."""
+    if capture.labels is None and capture.forces is None:
+        cure = "give the table of the force sensor with --forces FILE, or under the name of the recording"
+        raise RecordingError(f"{capture.source} has no forces, and without them there is no label; {cure}")
+
+
 def import_trial(
     capture: Capture,
     path: Path,
@@ -153,108 +151,107 @@ def import_trial(
 ) -> None:
     """Write a recording as a trial of a data set, with its own or automatic labels; complete or not at all."""
     require_forces(capture)
-    with Spool(path.parent) as images:
-        motion, read = _read_footage(capture, images)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    settings = settings or LabelSettings()
+    with tempfile.TemporaryFile(dir=path.parent) as file:
+        footage = _Footage(capture, file)
+        motion = measure_motion(footage.soften())
         try:
-            reference, labels = _label_footage(
-                capture, motion, read, settings=settings or LabelSettings(), corrections=corrections, rng=rng
-            )
+            labels, untouched, basis = capture.labels, None, None
+            if labels is None and corrections is not None and corrections.exclude:
+                labels = labels_of_margins(np.full(len(capture), np.nan))
+                labels = replace(labels, reason=(Reason.EXCLUDED,) * len(capture))
+            elif labels is None:
+                assert capture.forces is not None
+                labels = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
+                basis, untouched = labels.basis, np.array([reason is Reason.NO_CONTACT for reason in labels.reason])
+                if (doubt := describe_repeats(motion, capture.frame_time_s)) is not None:
+                    basis = replace(basis, doubts=(*basis.doubts, doubt))
+            reference, choice = _choose_reference(footage, settings=settings, untouched=untouched)
         except RecordingError as error:
             raise RecordingError(f"{capture.source}: {error}") from None
+        first = None
+        if capture.reference is not None and corrections is not None and corrections.reference_frame is not None:
+            # for who takes the correction back
+            first = capture.reference_choice or ReferenceChoice(method="came with the recording")
+        labelling = labels.labelling or Labelling(
+            source=capture.source,
+            forces=capture.forces.source if capture.forces else None,
+            notes=capture.notes,
+            reference=choice,
+            clip=capture.clip,
+            basis=basis,
+            corrections=corrections,
+            first_reference=first,
+        )
         # before the trial, whose file means that all of it is there
         if forces_file is not None and capture.forces is not None:
             save_forces(capture.forces, forces_file)
-        replaced = labels.labelling is not None and labels.labelling.first_reference is not None
         write_trial(
             path,
-            images.chunks(ROW_GROUP),
+            footage.chunks(),
             facts=capture,
             time_s=capture.frame_time_s,
-            labels=labels,
+            labels=replace(labels, labelling=labelling),
             reference=reference,
-            first_reference=capture.reference if replaced else None,
+            first_reference=capture.reference if labelling.first_reference is not None else None,
         )
 
 
-def _read_footage(
-    capture: Capture, images: Spool
-) -> tuple[Float[np.ndarray, " frames"], Callable[[Sequence[int]], Iterator[Frame]]]:
-    """Decode and spool the frames of a recording; returns their motion, and how to read frames of rising numbers."""
+class _Footage:
+    """Frames of a recording, decoded once and spooled to a temporary file, to be read again in any order."""
 
-    def spool() -> Iterator[Soft]:
-        for image, soft in in_turn(lambda frame: (encode_pixels(frame), soften(frame)), _check_frames(capture)):
-            images.append(image)
+    def __init__(self, capture: Capture, file: IO[bytes]) -> None:
+        self.capture, self._file, self._ends = capture, file, array("q", [0])
+
+    def soften(self) -> Iterator[Soft]:
+        """Decode and spool the frames; yields them softened."""
+        for image, soft in in_turn(lambda frame: (encode_pixels(frame), soften(frame)), self._decode()):
+            self._file.write(image)
+            self._ends.append(self._file.tell())
             yield soft
-            report_progress(len(images), len(capture))
+            report_progress(len(self._ends) - 1, len(self.capture))
 
-    def read(places: Sequence[int]) -> Iterator[Frame]:
+    def _decode(self) -> Iterator[Frame]:
+        """Read the frames, which must be of one size and as many as promised."""
+        capture, count = self.capture, 0
+        for count, frame in enumerate(capture.read_frames(), start=1):
+            require_rgb(frame, what=f"levels of frame {count - 1} of {capture.source}")
+            if frame.shape[:2] != capture.frame_size:
+                raise RecordingError(
+                    f"frame {count - 1} of {capture.source} is of another size; cut the recording there"
+                )
+            yield frame
+        if count != len(capture):
+            raise RecordingError(f"{capture.source} promised {len(capture)} frames but gave {count}; copy it again")
+
+    def _image(self, place: int) -> bytes:
+        self._file.seek(self._ends[place])
+        return self._file.read(self._ends[place + 1] - self._ends[place])
+
+    def read(self, places: Sequence[int]) -> Iterator[Frame]:
+        """Read some frames."""
         for place in places:
-            where = f"frame {place} of {capture.source}"
-            yield decode_pixels(images[place], size=(*capture.frame_size, 3), where=where)
+            where = f"frame {place} of {self.capture.source}"
+            yield decode_pixels(self._image(place), size=(*self.capture.frame_size, 3), where=where)
 
-    return measure_motion(spool()), read
-
-
-def require_forces(capture: Capture) -> None:
-    """Refuse a recording that has neither labels nor forces to make them from."""
-    if capture.labels is None and capture.forces is None:
-        cure = "give the table of the force sensor with --forces FILE, or under the name of the recording"
-        raise RecordingError(f"{capture.source} has no forces, and without them there is no label; {cure}")
-
-
-def _label_footage(
-    capture: Capture,
-    motion: Float[np.ndarray, " frames"],
-    read: Callable[[Sequence[int]], Iterator[Frame]],
-    *,
-    settings: LabelSettings,
-    corrections: Corrections | None,
-    rng: np.random.Generator,
-) -> tuple[Frame, Labels]:
-    """Return the image of the untouched sensor and the labels: those of the recording, or automatic ones."""
-    labels, basis, untouched = capture.labels, None, None
-    if labels is None and corrections is not None and corrections.exclude:
-        labels = labels_of_margins(np.full(len(capture), np.nan))
-        labels = replace(labels, reason=(Reason.EXCLUDED,) * len(capture))
-    elif labels is None:
-        assert capture.forces is not None
-        automatic = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
-        labels, basis = automatic, automatic.basis
-        untouched = np.array([reason is Reason.NO_CONTACT for reason in automatic.reason])
-        if (doubt := describe_repeats(motion, capture.frame_time_s)) is not None:
-            basis = replace(basis, doubts=(*basis.doubts, doubt))
-    image, choice = _choose_reference(capture, read, settings=settings, untouched=untouched)
-    first = None
-    if capture.reference is not None and corrections is not None and corrections.reference_frame is not None:
-        # for who takes the correction back
-        first = capture.reference_choice or ReferenceChoice(method="came with the recording")
-    labelling = labels.labelling or Labelling(
-        source=capture.source,
-        forces=capture.forces.source if capture.forces else None,
-        notes=capture.notes,
-        reference=choice,
-        clip=capture.clip,
-        basis=basis,
-        corrections=corrections,
-        first_reference=first,
-    )
-    return image, replace(labels, labelling=labelling)
+    def chunks(self) -> Iterator[list[bytes]]:
+        """Yield the encoded frames in chunks of a row group."""
+        for first in range(0, len(self.capture), ROW_GROUP):
+            yield [self._image(place) for place in range(first, min(first + ROW_GROUP, len(self.capture)))]
 
 
 def _choose_reference(
-    capture: Capture,
-    read: Callable[[Sequence[int]], Iterator[Frame]],
-    *,
-    settings: LabelSettings,
-    untouched: Bool[np.ndarray, " frames"] | None,
+    footage: _Footage, *, settings: LabelSettings, untouched: Bool[np.ndarray, " frames"] | None
 ) -> tuple[Frame, ReferenceChoice]:
     """Return the image of the untouched sensor: the one named, the recorded one, or one of the untouched frames."""
+    capture = footage.capture
     index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
     if capture.reference is not None and index is None:
         method = "came with the recording" if untouched is None else "recorded apart from the frames"
         return capture.reference, capture.reference_choice or ReferenceChoice(method=method)
     if untouched is not None:
-        choice = choose_reference(read, untouched, index=index, method=settings.reference_method)
+        choice = choose_reference(footage.read, untouched, index=index)
     elif index is None:
         raise RecordingError("no frame is known to be untouched; name one with --reference-frame")
     elif not 0 <= index < len(capture):
@@ -262,18 +259,5 @@ def _choose_reference(
     else:
         choice = ReferenceChoice(index=index, method="named")
     assert choice.index is not None
-    (image,) = read([choice.index])
+    (image,) = footage.read([choice.index])
     return image, choice
-
-
-def _check_frames(capture: Capture) -> Iterator[Frame]:
-    """Read the frames of a capture; they must be of one size and as many as promised."""
-    count = 0
-    for frame in capture.read_frames():
-        require_rgb(frame, what=f"levels of frame {count} of {capture.source}")
-        if frame.shape[:2] != capture.frame_size:
-            raise RecordingError(f"frame {count} of {capture.source} is of another size; cut the recording there")
-        count += 1
-        yield frame
-    if count != len(capture):
-        raise RecordingError(f"{capture.source} promised {len(capture)} frames but gave {count}; copy it again")

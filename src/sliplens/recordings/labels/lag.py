@@ -23,6 +23,44 @@ def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
     return np.array(motion, dtype=np.float64)
 
 
+# Lossless repeats change nothing, and repeats of lossy video up to an eighth of what the frames beside them do; noise
+# alone makes frames of a working camera differ by more, and what rests does so for longer than three frames.
+_STILL = 0.15
+_MOST_IN_A_ROW = 3
+_LEAST_SHARE, _FEWEST = 0.1, 5
+
+
+def describe_repeats(motion: Float[np.ndarray, " frames"], time_s: Float[np.ndarray, " frames"]) -> str | None:
+    """Describe how many frames repeat the one before, by their `measure_motion`; None where next to none does.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.recordings.labels import describe_repeats
+    >>> doubled = np.tile([1.0, 0.0], 30)  # every second frame shows nothing new
+    >>> describe_repeats(doubled, np.arange(60) / 30).split(";")[0]
+    '28 of 60 frames repeat the one before: the camera took about 16 frames a second, and the file says 30'
+    """
+    change = motion[1:]
+    if len(change) < _FEWEST:
+        return None
+    still = np.zeros(len(change), dtype=bool)
+    for count in range(1, _MOST_IN_A_ROW + 1):
+        for at in range(1, len(change) - count):
+            if change[at : at + count].max() < _STILL * min(change[at - 1], change[at + count]):
+                still[at : at + count] = True
+    repeats = int(still.sum())
+    if repeats < max(_FEWEST, _LEAST_SHARE * len(motion)):
+        return None
+    rate_hz = (len(time_s) - 1) / float(time_s[-1] - time_s[0])
+    taken_hz = rate_hz * (1 - repeats / len(motion))
+    return (
+        f"{repeats} of {len(motion)} frames repeat the one before: the camera took about {taken_hz:.3g} frames a "
+        f"second, and the file says {rate_hz:.3g}; record at the camera's rate, or leave the repeats out on export "
+        "(`ffmpeg -vf mpdecimate`)"
+    )
+
+
 Intervals: TypeAlias = Float[np.ndarray, " intervals"]
 # lags tried in the time of a frame, and least step between them; between them the peak is a parabola's
 _STEPS_A_FRAME, _LEAST_LAG_S = 16, 5e-4
