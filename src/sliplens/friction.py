@@ -15,17 +15,15 @@ from sliplens.files import hash_json
 LOWEST, HIGHEST = 0.05, 2.0
 """Range of an unknown coefficient of friction: ice on steel to clean rubber on glass."""
 GRASP_SPREAD = 0.06
-"""Standard deviation of an object's friction from grasp to grasp, as a share of it: the trials of a simulated day lie
-evenly within a tenth of its friction."""
+"""Standard deviation of an object's friction from grasp to grasp, as a share of it; measured on simulated days."""
 MOST_FRICTION = 20.0
 """Largest coefficient: with more, something sticks, or the number is wrong."""
 LEARNT = "learnt from slips"
 """Note of friction learnt from slips."""
-_REACH = 4.0
-"""Standard deviations to either side that a distribution of friction covers."""
-_NODES = 400
-"""Values over two decades, in steps of 1 %: finer than any slip shows."""
+_REACH = 4.0  # standard deviations to either side that a distribution of friction covers
+_NODES = 400  # values over two decades, in steps of 1 %: finer than any slip shows
 _NEGLIGIBLE = 1e-6
+_MOST_RATIOS, _FRESH_S = 120, 0.3  # ratios in memory; largest age of a ratio at a slip: an older one is too small
 
 
 def require_friction(value: float) -> None:
@@ -52,11 +50,6 @@ class Friction:
         Probability of each value, scaled to sum to 1; equal if None.
     note
         Origin, for tables and pages.
-
-    Raises
-    ------
-    InputError
-        If a value is not positive and finite, or weights are negative, all zero or not one a value.
 
     Examples
     --------
@@ -144,15 +137,11 @@ class Friction:
         Exact friction stays; a slip far outside the possible values leaves the nearest of them.
         """
         if not (math.isfinite(ratio) and ratio > 0 and math.isfinite(sigma) and sigma > 0):
-            raise InputError(
-                f"a slip needs a positive ratio F_t / F_n and a positive sigma, got {ratio:g} and {sigma:g}"
-            )
+            raise InputError(f"a slip needs a positive F_t / F_n and a positive sigma, got {ratio:g} and {sigma:g}")
         values, weights = self.nodes
-        exponent = -0.5 * ((values - ratio) / sigma) ** 2
         with np.errstate(divide="ignore"):
-            posterior = np.log(weights) + exponent
-        posterior = np.exp(posterior - posterior.max())
-        return Friction(values, posterior, note=LEARNT)._without_negligible()
+            posterior = np.log(weights) - 0.5 * ((values - ratio) / sigma) ** 2
+        return _likely(values, np.exp(posterior - posterior.max()), note=LEARNT)
 
     def next_grasp(self, spread: float = GRASP_SPREAD) -> "Friction":
         """Friction of another grasp of the same object, whose share differs with the standard deviation `spread`."""
@@ -165,13 +154,7 @@ class Friction:
         grid, _ = _unknown(values, spread=spread).nodes
         share = np.exp(-0.5 * (np.log(grid / values[:, None]) / spread) ** 2)
         moved = weights @ (share / np.maximum(share.sum(axis=1, keepdims=True), 1e-300))
-        return Friction(grid, moved, note=self.note)._without_negligible()
-
-    def _without_negligible(self) -> "Friction":
-        """Drop values that are a million times less likely than the likeliest."""
-        values, weights = self.nodes
-        likely = weights > _NEGLIGIBLE * weights.max()
-        return Friction(values[likely], weights[likely], note=self.note)
+        return _likely(grid, moved, note=self.note)
 
     @property
     def nodes(self) -> tuple[Float[np.ndarray, " values"], Float[np.ndarray, " values"]]:
@@ -212,14 +195,11 @@ class Friction:
 class SlipLearner:
     """Friction of the object in the grip, learnt from the first gross slip of each grasp.
 
-    As a contact begins to slip, F_t / F_n is the static friction; while it slides, the ratio is less. So the last ratio
-    before the beginning of the slip counts, if it is at most 0.3 s older; otherwise nothing is learnt. Later slips of
-    the same contact teach nothing either: a network's error is the same at each of them, so that they would reduce the
-    uncertainty and not the error.
-
-    The next grasp may be of another object. So the learnt friction ends with its grasp, unless `same_object` is set:
-    then it counts in the next grasps, with a slightly larger uncertainty. Without friction beforehand it counts from
-    the next grasp on, so that a controller's constants do not change during its reaction to the slip.
+    The last ratio F_t / F_n before the beginning of the slip counts, if it is at most 0.3 s older: while the contact
+    slides, the ratio is less. Later slips of the same contact would reduce the uncertainty and not the network's error.
+    The learnt friction ends with its grasp, unless `same_object` is set: then it counts in the next grasps, with a
+    slightly larger uncertainty. Without friction beforehand it counts from the next grasp on, so that a controller's
+    constants do not change during its reaction to the slip.
 
     Parameters
     ----------
@@ -279,24 +259,12 @@ class SlipLearner:
             self._slipped = False
 
 
-_MOST_RATIOS = 120
-"""Number of ratios in memory, for more time than the detection of a slip takes."""
-_FRESH_S = 0.3
-"""Largest age of a ratio at the beginning of a slip. Frames may be withheld while the pull grows, and an older ratio
-would give too little friction."""
-
-
 FrictionLike: TypeAlias = Friction | float | tuple[float, float] | str
 """Friction as a parameter: `Friction`, one number, (low, high), or as text 0.62, 0.5..0.8 or 0.58+-0.05."""
 
 
 def as_friction(friction: FrictionLike) -> Friction:
     """Convert a number, range or text to a coefficient of friction.
-
-    Raises
-    ------
-    InputError
-        If it is not valid.
 
     Examples
     --------
@@ -315,13 +283,18 @@ def as_friction(friction: FrictionLike) -> Friction:
     except (TypeError, ValueError):
         numbers = []
     if len(numbers) not in {1, 2}:
-        raise InputError(
-            f"{friction!r} is no friction; give a number such as 0.62, a range such as 0.5..0.8, or mean and spread "
-            "such as 0.58+-0.05"
-        )
+        cure = "give a number such as 0.62, a range such as 0.5..0.8, or mean and spread such as 0.58+-0.05"
+        raise InputError(f"{friction!r} is no friction; {cure}")
     if len(numbers) == 1:
         return Friction(numbers[0])
     return Friction.about(*numbers) if about else Friction.between(*numbers)
+
+
+def _likely(values: Float[np.ndarray, " values"], weights: Float[np.ndarray, " values"], *, note: str) -> Friction:
+    """Return friction without values that are a million times less likely than the likeliest."""
+    weights = weights / weights.sum()
+    likely = weights > _NEGLIGIBLE * weights.max()
+    return Friction(values[likely], weights[likely], note=note)
 
 
 def _unknown(near: Float[np.ndarray, " values"] | None = None, *, spread: float = GRASP_SPREAD) -> Friction:

@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from sliplens.plots.audit import choose_along, draw_audit
+from sliplens.plots.audit import choose_frames, draw_audit
 from sliplens.plots.contact_sheet import STATE_COLOURS
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.labelling import (
@@ -247,14 +247,13 @@ def test_a_touch_that_does_not_press_has_no_ratio():
 
 
 @pytest.mark.parametrize("changes", [{}, {"lowest": 0.4}, {"pull": 700}, {"pull": 2}])
-def test_six_pictures_are_the_reference_and_five_frames_in_the_order_of_time(changes):
+def test_pictures_are_the_reference_and_frames_in_the_order_of_time(changes):
     trial = make_trial(**changes)
     camera, difference = pictures(draw_audit(trial, make_labelling()))
 
-    along = choose_along(trial)
-    assert len(camera) == len(difference) == 6
-    assert len(set(along)) == 5
-    assert along == sorted(along)
+    along = choose_frames(trial)
+    assert len(camera) == len(difference) == 1 + len(along)
+    assert along == sorted(set(along))
     np.testing.assert_array_equal(camera[0].images[0].get_array(), trial.reference)
     for ax, index in zip(camera[1:], along, strict=True):
         np.testing.assert_array_equal(ax.images[0].get_array(), trial.frames[index])
@@ -275,27 +274,15 @@ def test_a_trial_without_its_pixels_has_those_read_that_are_shown():
     for row, other in zip(pictures(shown), pictures(expected), strict=True):
         for ax, whole in zip(row, other, strict=True):
             np.testing.assert_array_equal(ax.images[0].get_array(), whole.images[0].get_array())
-    # the five frames, and an untouched one to tell the drift
-    assert len(asked) == 6
-
-
-@pytest.mark.parametrize("lowest", [0.0, 0.4, 0.8])
-def test_margins_shown_are_evenly_spaced_down_to_the_slip(lowest):
-    trial = make_trial(lowest=lowest, pull=81)
-
-    along = choose_along(trial)
-
-    margins = trial.safety_margin[along]
-    assert trial.contact_state[along[0]] == CONTACT
-    assert (trial.contact_state[along[-1]] == FULL_SLIP) == (lowest == 0)
-    np.testing.assert_allclose(np.diff(margins), (lowest - 1) / 4, atol=0.06)
+    # the six frames, and an untouched one to tell the drift
+    assert len(asked) == 7
 
 
 def test_marks_stand_where_the_frames_were_taken():
     trial = make_trial()
     figure = draw_audit(trial, make_labelling())
 
-    taken = trial.time_s[[2, *choose_along(trial)]]
+    taken = trial.time_s[[2, *choose_frames(trial)]]
     for ax in charts(figure):
         marks = [np.asarray(line.get_xdata())[0] for line in ax.lines if line.get_label() == "_frame"]
         np.testing.assert_array_equal(marks, taken)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from data_sets import save_dataset
 
-from sliplens.cli import main
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.check import check_dataset
 from sliplens.recordings.dataset import trial_path
@@ -86,13 +85,3 @@ def test_a_broken_law_is_found_at_its_frame(tmp_path: Path, recording: Recording
     found = whats(save_dataset(tmp_path / "bad", replace(recording, **change(recording))).folder)
     assert len(found) == 1
     assert f"trial: {message}" in found[0]
-
-
-def test_the_command_lists_what_is_wrong(tmp_path: Path, recording: Recording, capsys: pytest.CaptureFixture[str]):
-    assert main(["check", str(save_dataset(tmp_path / "good", recording).folder)]) == 0
-    assert "is sound: 1 trial, 12 frames" in capsys.readouterr().out
-    bad = replace(recording, safety_margin=changed(recording.safety_margin, 5, 0.123))
-    assert main(["check", str(save_dataset(tmp_path / "bad", bad).folder)]) == 2
-    captured = capsys.readouterr()
-    assert "frame 5" in captured.out
-    assert "has 1 error, listed above; correct or make these trials again" in captured.err

@@ -11,8 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import RecordingError
-from sliplens.recordings import Dataset, Recording, load_dataset
-from sliplens.recordings.dataset import write_dataset_table
+from sliplens.recordings import Recording, load_dataset
 from sliplens.recordings.store import (
     ROW_GROUP,
     decode_pixels,
@@ -29,18 +28,6 @@ def test_a_trial_comes_back_without_loss(tmp_path: Path, recording: Recording):
     back = load_recording(tmp_path / "a.parquet")
     for field in fields(Recording):
         np.testing.assert_array_equal(getattr(back, field.name), getattr(recording, field.name))
-
-
-def test_trust_in_the_labels_comes_back_with_them(tmp_path: Path, recording: Recording):
-    trusted = np.arange(12) % 3 > 0
-    doubted = replace(recording, valid=trusted, safety_margin_sigma=np.linspace(0.01, 0.2, 12))
-    save_recording(doubted, tmp_path / "a.parquet")
-    back = load_recording(tmp_path / "a.parquet")
-    np.testing.assert_array_equal(back.valid, trusted)
-    np.testing.assert_array_equal(back.safety_margin_sigma, doubted.safety_margin_sigma)
-    # the first frame has no contact, so no margin to trust
-    np.testing.assert_array_equal(back.labelled, trusted & (np.arange(12) > 0))
-    assert recording.labelled.sum() == 11
 
 
 def test_a_trial_of_many_chunks_comes_back_whole(tmp_path: Path, recording: Recording):
@@ -118,17 +105,6 @@ def test_a_stored_trial_with_labels_that_no_trial_has_is_refused(
     pq.write_table(table.set_column(place, column, pa.array([value] * table.num_rows)), path)
     with pytest.raises(RecordingError, match=rf"a\.parquet holds .*{said}.*; make the data set again"):
         load_recording(path)
-
-
-def test_a_condition_that_is_not_there_is_refused(small_dataset: Dataset):
-    with pytest.raises(RecordingError, match=r"no trial with split train and condition wet; it has test/dry, test/wet"):
-        small_dataset.select(split="train", condition="wet")
-
-
-def test_a_data_set_without_trials_is_refused(tmp_path: Path):
-    write_dataset_table(tmp_path, [])
-    with pytest.raises(RecordingError, match="lists no trials"):
-        load_dataset(tmp_path)
 
 
 def test_a_data_set_of_another_schema_is_refused(tmp_path: Path):

@@ -33,13 +33,6 @@ def test_recordings_that_end_like_tables_and_names_of_any_script_find_theirs(tmp
     }
 
 
-def test_a_data_set_made_of_a_folder_in_that_folder_is_no_recording(tmp_path: Path):
-    touch(tmp_path, "cup.mp4")
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "dataset.json").touch()
-    assert [row.trial for row in pair_recordings(tmp_path)] == ["cup"]
-
-
 @pytest.mark.parametrize(
     ("names", "words"),
     [

@@ -8,7 +8,7 @@ from sliplens.errors import ImageError, InputError
 from sliplens.images import write_png
 from sliplens.recordings import Dataset
 from sliplens.recordings.formats import ReadOptions
-from sliplens.recordings.source import open_source, open_trials
+from sliplens.recordings.source import open_source
 
 
 @pytest.fixture
@@ -30,14 +30,6 @@ def test_a_folder_and_an_array_give_the_same_frames(folder):
             np.testing.assert_array_equal(np.stack(list(trial.read_frames())), frames)
         np.testing.assert_array_equal(there(trial.read_reference)(), frames[1])
         assert trial.time_s is None
-
-
-def test_a_folder_is_hashed_only_where_its_parts_are_kept(folder):
-    path, frames = folder
-    (kept,) = {shown for _, _, shown in open_trials(path).rows}
-    assert open_trials(path, resumable=False).rows == (("frames", 3, ""),)
-    write_png(path / "f1.png", frames[0])  # neither the first nor the last
-    assert open_trials(path).rows != (("frames", 3, kept),)
 
 
 def test_images_and_frames_in_memory_have_times_where_their_rate_is_told(folder):

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -178,8 +179,8 @@ def end_of_ratio(ratio: Float[np.ndarray, " frames"], mu: float, *, above: float
 
 def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: Axes) -> None:
     """Draw F_n and F_t over time, in newtons, and the least F_n of a contact."""
-    ax.plot(recording.time_s, recording.normal_force_n, color=BLUE, label="$F_n$", **_line(recording))
-    ax.plot(recording.time_s, recording.tangential_force_n, "--", color=VERMILLION, label="$F_t$", **_line(recording))
+    _draw_line(recording, recording.normal_force_n, BLUE, "$F_n$", ax=ax)
+    _draw_line(recording, recording.tangential_force_n, VERMILLION, "$F_t$", ax=ax, style="--")
     if threshold_n is not None:
         ax.axhline(threshold_n, color=BLACK, ls=":", lw=1.3, label=f"contact from {threshold_n:.3g} N")
     ax.set(ylabel="Force (N)", xmargin=0)
@@ -190,7 +191,7 @@ def plot_contact_forces(recording: Recording, threshold_n: float | None, *, ax: 
 def plot_force_ratio(recording: Recording, friction: FrictionEstimate | None, *, ax: Axes) -> None:
     """Draw F_t / F_n of the frames in contact, and the static friction with its interval."""
     ratio, mu, high = force_ratio(recording), 0.0, 0.0
-    ax.plot(recording.time_s, ratio, color=BLUE, label="$F_t/F_n$ in contact", **_line(recording))
+    _draw_line(recording, ratio, BLUE, "$F_t/F_n$ in contact", ax=ax)
     if friction is not None:
         mu, high = friction.mu, friction.high
         ax.axhspan(friction.low, high, color=GREEN, alpha=0.35, lw=0, label="its 68 % interval")
@@ -208,22 +209,24 @@ def plot_labels(recording: Recording, *, ax: Axes) -> None:
     if (sigma := recording.safety_margin_sigma) is not None:
         ends = margin - 100 * sigma, margin + 100 * sigma
         ax.fill_between(time_s, *ends, where=valid, color=PURPLE, alpha=0.75, lw=0, label=r"Γ $\pm\,\sigma$")
-    ax.plot(time_s, np.where(valid, margin, np.nan), color=BLACK, label="Γ", **_line(recording))
+    _draw_line(recording, np.where(valid, margin, np.nan), BLACK, "Γ", ax=ax)
     ax.plot(time_s, np.where(valid, np.nan, -9), color=GREY, lw=4, solid_capstyle="butt", label="no valid label")
     ax.set(xlabel="", ylim=(-14, 107))
 
 
-def _line(recording: Recording) -> dict[str, float | str]:
-    """Return thin lines for so many frames that noise would fill the chart, dots where one alone draws no line."""
-    return {"linewidth": 1.5 if len(recording) <= 1000 else 0.7, "marker": "." if len(recording) <= 60 else ""}
+def _draw_line(
+    recording: Recording, values: Float[np.ndarray, " frames"], colour: str, label: str, *, ax: Axes, style: str = "-"
+) -> None:
+    """Draw values over time: thin where frames are many, with dots where one alone draws no line."""
+    width, marker = 1.5 if len(recording) <= 1000 else 0.7, "." if len(recording) <= 60 else ""
+    ax.plot(recording.time_s, values, style, color=colour, label=label, linewidth=width, marker=marker)
 
 
-_SHARES = (0, 1, 0.25, 0.5, 0.75)  # of the way from full stick to the slip; its ends first
-_EVEN = 0.05  # margin by which a frame may be off, to spread frames of similar margins over time
+_FRAMES = 6  # beside the reference
 # inches: facts at the left, charts above pictures at the right
 _WIDTH, _HEIGHT, _EDGE, _LEFT, _GAP, _TOP, _FOOT = 12.0, 9.0, 0.2, 3.75, 0.07, 0.78, 0.36
 _CHART, _LEGEND, _TICKS, _HEAD = 1.27, 0.25, 0.3, 0.52
-_PICTURE = (_WIDTH - _LEFT - _EDGE + _GAP) / (1 + len(_SHARES)) - _GAP
+_PICTURE = (_WIDTH - _LEFT - _EDGE + _GAP) / (1 + _FRAMES) - _GAP
 _LINE, _WRAP = 0.145, 43  # height of a line of facts, and its characters
 
 ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"]]
@@ -232,7 +235,7 @@ ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"
 
 def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadFrames | None = None) -> Figure:
     """Draw a page from which to judge the labels of an imported trial."""
-    frames = [labelling.reference.index, *choose_along(recording)]
+    frames = [labelling.reference.index, *choose_frames(recording)]
     with drawing_style():
         figure = Figure(figsize=(_WIDTH, _HEIGHT))
         _draw_charts(figure, recording, labelling, [at for at in frames if at is not None])
@@ -263,23 +266,11 @@ def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None 
     return drawn
 
 
-def choose_along(recording: Recording) -> list[int]:
-    """Choose five frames in the order of time, or all if there are fewer, evenly spaced in their margins."""
+def choose_frames(recording: Recording) -> list[int]:
+    """Choose the frames nearest to Γ = 100, 80, ... 0 %, in the order of time; evenly spread without margins."""
     if not np.isfinite(recording.safety_margin).any():
-        return np.unique(np.linspace(0, len(recording) - 1, len(_SHARES)).round().astype(int)).tolist()
-    margins, margin = choose_margins(recording), np.nan_to_num(recording.safety_margin)
-    allowed = recording.labelled.copy()
-    places = np.flatnonzero(allowed) if allowed.any() else np.arange(len(recording))
-    begin = int(places[0]) if margins[0] is None else margins[0]
-    end = int(places[np.argmin(margin[places])]) if margins[-1] is None else margins[-1]
-    allowed[[begin, end]] = True
-    free, way = np.ones(len(recording), dtype=bool), end - begin
-    for share in _SHARES[: len(recording)]:
-        level = margin[begin] + share * (margin[end] - margin[begin])
-        late = np.abs(np.arange(len(recording)) - (begin + share * way)) / max(abs(way), 1)
-        cost = np.abs(margin - level) + _EVEN * late + np.where(allowed, 0, 1)
-        free[np.argmin(np.where(free, cost, np.inf))] = False
-    return [int(at) for at in np.flatnonzero(~free)]
+        return np.unique(np.linspace(0, len(recording) - 1, _FRAMES).round().astype(int)).tolist()
+    return sorted({at for at in choose_margins(recording) if at is not None})
 
 
 def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, frames: list[int]) -> None:
@@ -296,7 +287,7 @@ def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, fra
             slips_s = [basis.slip_s, *basis.friction.later_onsets_s]
             lines = [ax.axvline(at_s + shift, color=BLACK, ls="-.", lw=1.3, label="_slip") for at_s in slips_s]
             lines[0].set_label(f"slip at {slips_s[0] + shift:.2f} s")
-            named = lines[:1]
+            named: list[Artist] = [*lines[:1]]
             if lag is not None and not lag.doubt:
                 ends_s = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
                 named.append(ax.axvspan(*ends_s, color=SKY, alpha=0.6, lw=0, zorder=0))

@@ -34,15 +34,6 @@ def test_tare_and_noise_come_back(trial: Trial, rng: np.random.Generator):
     assert axes.still_until_s < TOUCH_S
 
 
-def test_a_spike_before_the_touch_does_not_move_the_tare(trial: Trial, rng: np.random.Generator):
-    clean = trial.forces(noise_n=0.02, rng=rng, tare_n=TARE)
-    force = clean.force_n.copy()
-    force[100, 2] += 0.25
-    spiked = infer_axes(Forces(time_s=clean.time_s, force_n=force, source="sensor"))
-    # one sample of 225 fewer moves a mean by less than its uncertainty
-    assert np.all(np.abs(np.subtract(spiked.tare_n, infer_axes(clean).tare_n)) < spiked.tare_sigma_n)
-
-
 def test_noise_with_a_memory_makes_the_tare_less_certain(trial: Trial, rng: np.random.Generator):
     white = rng.normal(0, 0.02, (len(trial.time_s) + 24, 3))
     # means over 25 samples, as of a sensor that filters: the same spread sample by sample, a 25th as many of them
@@ -108,14 +99,6 @@ def test_a_press_that_is_pulled_from_the_touch_on_is_no_tilt(trial: Trial, rng: 
     force = np.stack((normal, pull, 0 * pull), axis=1) + rng.normal(0, 0.02, (len(normal), 3))
     axes = infer_axes(Forces(time_s=trial.time_s, force_n=force, source="sensor"))
     assert (axes.normal, axes.direction) == ("x", None)
-
-
-def test_two_columns_give_no_tilt(trial: Trial):
-    # a tangential force that is a length has no direction to turn
-    force = np.stack((trial.contact_n[:, 0], 0.9 * trial.contact_n[:, 0], 0 * trial.time_s), axis=1)
-    axes = infer_axes(Forces(time_s=trial.time_s, force_n=force, source="sensor"))
-    assert axes.direction is None
-    assert "the normal axis is doubtful: x" in axes.notes[0]
 
 
 def test_moved_samples_give_no_drift(trial: Trial, rng: np.random.Generator):

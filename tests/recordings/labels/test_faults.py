@@ -94,12 +94,6 @@ def test_labels_are_those_of_the_sound_samples(trial: Trial, fault: str, every: 
     assert labels.basis.flags
 
 
-@pytest.mark.parametrize("every", [1, 5])
-def test_a_sound_trial_has_no_fault_and_the_labels_it_had(trial: Trial, every: int):
-    labels = label(trial, spoilt(trial, lambda _time, _force: None, every=every))
-    assert not labels.basis.flags
-
-
 def test_a_slip_in_a_sample_is_no_step_for_the_image_sees_it(trial: Trial):
     # in conftest the force falls within 30 ms; here from one sample to the next
     sudden = sudden_slip(trial)
@@ -213,17 +207,6 @@ def test_coarse_and_repeated_readings_are_no_fault(trial: Trial):
         assert screen_forces(spoilt(trial, spoil)).faults == ()
 
 
-def test_exact_forces_that_hold_still_are_not_stuck(trial: Trial):
-    assert screen_forces(trial.forces()).faults == ()
-
-
-def test_a_gap_is_told(trial: Trial):
-    forces = spoilt(trial, lambda _time, _force: None)
-    kept = ~span(forces.time_s, 0.3)
-    labels = label(trial, replace(forces, time_s=forces.time_s[kept], force_n=forces.force_n[kept]))
-    assert labels.basis.flags == ("missing samples at 3.00 s, 0.30 s in all: frames there are not valid",)
-
-
 def test_a_drift_counts_as_an_error_of_its_size(trial: Trial):
     def drift(time: np.ndarray, force: np.ndarray) -> None:
         force[:, 1] += 0.12 * time
@@ -238,18 +221,6 @@ def test_a_drift_counts_as_an_error_of_its_size(trial: Trial):
     assert error.max() > 0.1
 
 
-def test_a_drift_is_read_from_the_untouched_sensor_at_the_end(trial: Trial):
-    time = trial.time_s
-    lifted = trial.contact_n * np.clip((5.3 - time) / 0.15, 0, 1)[:, None]
-    released = replace(trial, contact_n=lifted)
-
-    def drift(time: np.ndarray, force: np.ndarray) -> None:
-        force += 0.02 * time[:, None]
-
-    moved = np.array(label(released, spoilt(released, drift)).basis.axes.drift_n_s)
-    np.testing.assert_allclose(moved, 0.02, rtol=0.15)
-
-
 def test_a_friction_that_no_fingertip_has_is_refused_or_flagged(trial: Trial):
     strong = replace(trial, contact_n=trial.contact_n * np.array([1, 20, 20]))
     forces = strong.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
@@ -262,16 +233,6 @@ def test_a_friction_that_no_fingertip_has_is_refused_or_flagged(trial: Trial):
     with pytest.raises(RecordingError, match=r"comes out as 12.., and that of a fingertip lies between 0.05 and 4"):
         friction(None)
     assert any(flag.startswith("a friction of 9 was given") for flag in friction(9.0).basis.flags)
-
-
-@pytest.mark.parametrize("given", [True, False])
-@pytest.mark.parametrize(("mu", "doubted"), [(1.4, False), (1.6, True), (3.0, True)])
-def test_a_friction_beyond_that_of_rubber_is_doubted(trial: Trial, given: bool, mu: float, doubted: bool):
-    strong = replace(trial, contact_n=trial.contact_n * np.array([1, mu / STATIC, mu / STATIC]))
-    forces = strong.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
-    settings = LabelSettings(mu=mu if given else None)
-    labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=np.random.default_rng(2))
-    assert any("seldom exceeds 1.5" in flag for flag in labels.basis.flags) == doubted
 
 
 def test_a_normal_force_that_mostly_pulls_is_flagged(trial: Trial):
@@ -289,11 +250,3 @@ def test_frames_by_a_clock_of_another_speed_than_the_forces_are_flagged(trial: T
     (flag,) = [flag for flag in labels.basis.flags if flag.startswith("the frames last")]
     assert f"the frames last {np.ptp(trial.frame_time_s) / speed:.2f} s and the forces 5.50 s" in flag
     assert "--frame-rate" in flag
-
-
-def test_frames_of_a_part_of_the_forces_are_in_no_doubt_where_they_fit(trial: Trial):
-    forces = trial.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
-    part = slice(np.searchsorted(trial.frame_time_s, 2.5))
-    assert not label(
-        replace(trial, frame_time_s=trial.frame_time_s[part], motion=trial.motion[part]), forces
-    ).basis.flags

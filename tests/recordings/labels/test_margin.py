@@ -96,14 +96,6 @@ def test_a_frame_is_valid_exactly_where_it_has_no_reason_not_to_be(trial: Trial)
     assert np.all(np.isnan(labels.safety_margin_sigma[~labels.valid]))
 
 
-def test_a_contact_that_is_not_pulled_is_no_incipient_slip_however_exact_the_forces(trial: Trial):
-    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
-    held = (trial.frame_time_s > TOUCH_S + 0.1) & (trial.frame_time_s < PULL_S - 0.1)
-    # a margin of 100 % with no uncertainty but rounding
-    assert np.all(labels.safety_margin_sigma[held] < 1e-12)
-    assert {state for state, here in zip(labels.contact_state, held, strict=True) if here} == {ContactState.CONTACT}
-
-
 def test_a_margin_that_tells_full_stick_hardly_from_slip_is_not_valid(trial: Trial):
     # a friction known to a third: 1 - Gamma is then known to a third, which passes 0.2 at 0.6
     friction = replace(FRICTION, low=STATIC * 2 / 3, high=STATIC * 4 / 3)
@@ -141,14 +133,6 @@ def test_forces_outside_the_range_have_no_label(trial: Trial):
     assert Reason.OUT_OF_RANGE not in reasons(everything)
 
 
-def test_range_is_that_of_the_sensor_not_of_the_contact(trial: Trial):
-    contact = trial.contact()
-    offset = replace(contact.recorded, force_n=contact.recorded.force_n + np.array([5.0, 0, 0]))
-    turned = apply_axes(offset, replace(contact.axes, tare_n=(5.0, 0.0, 0.0)))
-    labels = label_frames(trial.frame_time_s, turned, friction=FRICTION, settings=LabelSettings(force_range=6.0))
-    assert Reason.OUT_OF_RANGE in reasons(labels)
-
-
 def test_a_lag_is_applied_only_when_asked(trial: Trial):
     plain = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
     known = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, lag=LAG)
@@ -183,8 +167,6 @@ def test_a_doubtful_lag_is_not_applied(trial: Trial):
     doubtful = replace(LAG, doubt="several lags fit alike")
     with pytest.raises(RecordingError, match="the lag cannot be applied: several lags fit alike; give the lag by hand"):
         label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, lag=doubtful, settings=APPLIED)
-    with pytest.raises(RecordingError, match="the lag cannot be applied: it is not estimated"):
-        label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, settings=APPLIED)
 
 
 def test_friction_moves_the_margin_by_its_share(trial: Trial):
@@ -192,16 +174,6 @@ def test_friction_moves_the_margin_by_its_share(trial: Trial):
     labels = label_frames(trial.frame_time_s, trial.contact(), friction=friction)
     valid = labels.valid
     np.testing.assert_allclose(labels.safety_margin_sigma[valid], 0.05 * (1 - labels.safety_margin[valid]), atol=1e-6)
-
-
-def test_drifting_friction_is_known_best_at_the_slip(trial: Trial):
-    labels = label_frames(
-        trial.frame_time_s, trial.contact(), friction=FRICTION, settings=LabelSettings(friction_change=0.15)
-    )
-    late = labels.valid & (trial.frame_time_s > SLIP_S - 0.1)
-    middle = labels.valid & (np.abs(trial.frame_time_s - 2.5) < 0.1)
-    # two thirds of the pull are used up at the end, one at 2.5 s: where the friction may have changed most of its way
-    assert labels.safety_margin_sigma[late].max() < labels.safety_margin_sigma[middle].min()
 
 
 def test_the_band_of_the_margin_covers(trial: Trial):

@@ -82,9 +82,3 @@ def test_no_untouched_frame_is_refused():
     with pytest.raises(RecordingError, match="no frame is known to be untouched; name the reference frame by hand"):
         choose_reference(film.read, film.untouched)
     assert choose_reference(film.read, film.untouched, index=0).index == 0
-
-
-def test_a_frame_that_is_not_there_is_refused():
-    film = Film()
-    with pytest.raises(RecordingError, match="the reference is frame 20 of 20; name one from 0 on"):
-        choose_reference(film.read, film.untouched, index=20)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
@@ -66,6 +66,21 @@ def half_window(time_s: Samples, at_s: Times, *, window_s: float, until_s: float
     """Return half the length of the windows of `mean_force`."""
     room = np.minimum(at_s - time_s[0], time_s[-1] - at_s)
     return np.clip(np.minimum(room, np.abs(at_s - until_s)), 0, window_s / 2)
+
+
+def find_spans(time_s: Samples, inside: Bool[np.ndarray, " samples"], *, apart_s: float) -> list[tuple[int, int]]:
+    """Find the stretches of samples inside something, as slices; closer ones are one."""
+    spans: list[tuple[int, int]] = []
+    for start, end in np.flatnonzero(np.diff(inside, prepend=False, append=False)).reshape(-1, 2).tolist():
+        again = bool(spans) and time_s[start] - time_s[spans[-1][1] - 1] < apart_s
+        spans.append((spans.pop()[0] if again else start, end))
+    return spans
+
+
+def robust_spread(values: Times) -> tuple[float, float]:
+    """Return the median, and the standard deviation of a Gaussian with the median absolute deviation."""
+    middle = float(np.median(values))
+    return middle, _MAD_TO_SIGMA * float(np.median(np.abs(values - middle)))
 
 
 def middles(time_s: Samples, start_s: float, end_s: float, *, width_s: float) -> Times:

@@ -11,7 +11,14 @@ from jaxtyping import Float, Int
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import ForceFault, Lag, Reason
-from sliplens.recordings.labels.axes import infer_axes, mean_force, noise_sigma, turn_matrix, typical_step
+from sliplens.recordings.labels.axes import (
+    infer_axes,
+    mean_force,
+    noise_sigma,
+    robust_spread,
+    turn_matrix,
+    typical_step,
+)
 from sliplens.recordings.labels.lag import estimate_lag, force_changes
 from sliplens.recordings.trial import MOST_FORCE_N
 
@@ -455,8 +462,7 @@ def _make_motion_test(frame_time_s: Times, image_motion: Times, forces: Forces, 
         beside = ~near & (apart_s <= reach_s + _QUIET_S)
         if not near.any() or beside.sum() < _BESIDE:
             return True
-        quiet = float(np.median(motion[beside]))
-        spread = 1.4826 * float(np.median(np.abs(motion[beside] - quiet)))
+        quiet, spread = robust_spread(motion[beside])
         return bool(motion[near].max() - quiet > max(_MOVES_SHARE * per_newton * size_n, _MOVES_SIGMAS * spread))
 
     return image_moves

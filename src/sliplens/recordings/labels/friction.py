@@ -9,7 +9,16 @@ from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.labelling import Found, FrictionEstimate
-from sliplens.recordings.labels.axes import ContactForces, Samples, Times, magnitude, mean_force, typical_step
+from sliplens.recordings.labels.axes import (
+    ContactForces,
+    Samples,
+    Times,
+    find_spans,
+    magnitude,
+    mean_force,
+    robust_spread,
+    typical_step,
+)
 
 _REACH_S, _TRIES = 0.08, 41  # how far the break may lie from the rough guess, and breaks tried over that reach
 # lengths of the fall that are tried, from a sudden drop to that of a soft fingertip
@@ -164,12 +173,7 @@ def find_contacts(forces: ContactForces, *, contact_threshold_n: float) -> tuple
     """Find the contacts: spans of time, in seconds, each from a touch to its release; light or short ones are none."""
     time = forces.time_s
     normal = mean_force(time, forces.normal_n, time, window_s=_STEP_S)
-    edges = np.flatnonzero(np.diff(normal > contact_threshold_n, prepend=False, append=False))
-    spans: list[tuple[int, int]] = []
-    for start, end in edges.reshape(-1, 2).tolist():
-        again = bool(spans) and time[start] - time[spans[-1][1] - 1] < _APART_S
-        spans.append((spans.pop()[0] if again else start, end))
-    least = _PRESSED_SHARE * float(normal.max())
+    spans, least = find_spans(time, normal > contact_threshold_n, apart_s=_APART_S), _PRESSED_SHARE * normal.max()
     return tuple((float(time[start]), float(time[end - 1])) for start, end in spans if normal[start:end].max() >= least)
 
 
@@ -417,6 +421,5 @@ def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float | None:
     burst = image.motion[1:][(after[1:] >= -2 * step) & (after[1:] <= 3 * step)]
     if len(quiet) < 3 or len(burst) == 0:
         return None
-    middle = np.median(quiet)
-    spread = 1.4826 * np.median(np.abs(quiet - middle))
+    middle, spread = robust_spread(quiet)
     return float((burst.max() - middle) / max(spread, 1e-9))

@@ -10,7 +10,7 @@ from sliplens.errors import RecordingError
 from sliplens.images import Soft
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import Lag
-from sliplens.recordings.labels.axes import infer_axes, mean_force, typical_step
+from sliplens.recordings.labels.axes import find_spans, infer_axes, mean_force, typical_step
 
 
 def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
@@ -124,8 +124,14 @@ def estimate_lag(
     curves = _correlations(weights, motion, changes=changes, covered=covered)
     peaks = np.array([_peak(lags, curve) for curve in curves])
     low, high = np.quantile(peaks[1:], (0.16, 0.84))
-    lag, sigma, correlation = float(peaks[0]), float(high - low) / 2, float(curves[0].max())
-    return Lag(lag_s=lag, sigma_s=sigma, correlation=correlation, doubt=_doubt(lag, sigma, correlation, lags))
+    lag, sigma, correlation, doubt = float(peaks[0]), float(high - low) / 2, float(curves[0].max()), ""
+    if correlation < _LEAST_CORRELATION:
+        doubt = f"image motion and force rate correlate by {correlation:.2f} only, {_LEAST_CORRELATION} is needed"
+    elif lag in (lags[0], lags[-1]):
+        doubt = f"the correlation still rises at {lag:.3f} s, the longest lag tried"
+    elif sigma > (lags[-1] - lags[0]) / 8:
+        doubt = f"the lag is uncertain by {sigma:.3f} s: several lags fit alike"
+    return Lag(lag_s=lag, sigma_s=sigma, correlation=correlation, doubt=doubt)
 
 
 def _find_release(forces: Forces, *, sudden_s: float) -> tuple[float, float] | None:
@@ -193,18 +199,13 @@ def doubt_agreement(
 
 def _find_loads(forces: Forces) -> list[tuple[float, float]]:
     """Find the stretches, in seconds, in which the force departs from that of the untouched sensor."""
-    axes = infer_axes(forces, normal="x", sign=1)
+    axes, time = infer_axes(forces, normal="x", sign=1), forces.time_s
     if axes.still_until_s is None:
         return []
-    time = forces.time_s
     load = np.linalg.norm(mean_force(time, forces.force_n - axes.tare_n, time, window_s=_LOAD_WINDOW_S), axis=1)
     loaded = (load > _LOADED_SHARE * float(np.quantile(load, 0.95))) & (time >= axes.still_until_s)
-    edges = np.flatnonzero(np.diff(loaded, prepend=False, append=False)).reshape(-1, 2)
-    spans: list[tuple[float, float]] = []
-    for start, end in edges.tolist():
-        again = bool(spans) and time[start] - spans[-1][1] < _APART_S
-        spans.append((spans.pop()[0] if again else float(time[start]), float(time[end - 1])))
-    return spans
+    spans = find_spans(time, loaded, apart_s=_APART_S)
+    return [(float(time[start]), float(time[end - 1])) for start, end in spans]
 
 
 def _agreement(change_n: Intervals, motion: Intervals) -> float:
@@ -255,13 +256,3 @@ def _block_weights(intervals: int, *, draws: int, rng: np.random.Generator) -> F
     weights = np.zeros((draws, intervals))
     np.add.at(weights, (np.arange(draws)[:, None, None], drawn), 1.0)
     return weights
-
-
-def _doubt(lag: float, sigma: float, correlation: float, lags: Float[np.ndarray, " lags"]) -> str:
-    if correlation < _LEAST_CORRELATION:
-        return f"image motion and force rate correlate by {correlation:.2f} only, {_LEAST_CORRELATION} is needed"
-    if lag in (lags[0], lags[-1]):
-        return f"the correlation still rises at {lag:.3f} s, the longest lag tried"
-    if sigma > (lags[-1] - lags[0]) / 8:
-        return f"the lag is uncertain by {sigma:.3f} s: several lags fit alike"
-    return ""

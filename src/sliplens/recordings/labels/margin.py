@@ -146,7 +146,7 @@ def label_frames(
     at = forces_at(time)
     contact = (at.normal_n >= threshold) & (time >= (-np.inf if settings.contact_s is None else settings.contact_s))
     used = _used(at, friction, threshold)
-    # a chord as short as the lag's uncertainty would count the noise of its ends, which `_variance` counts already
+    # a chord as short as the lag's uncertainty would count the noise of its ends, which `variance` counts already
     reach = max(unsure, _RATE_STEPS * typical_step(frame_time_s), 1e-9)
     # up to the slip only: beyond it there is no margin to be wrong about, and a window at it would shrink to a sample
     end = np.where(time < onset, np.minimum(time + reach, onset - window / 2), time + reach)
@@ -156,7 +156,13 @@ def label_frames(
     if contact.any():  # distance in time from the slip, as a share of the time from touch to slip, at most 1
         touch, last = time[np.argmax(contact)], min(onset, time[-1])
         drift = settings.friction_change * np.clip(np.abs(last - time) / max(last - touch, 1e-9), 0, 1)
-    sigma = np.sqrt(_variance(at, friction, threshold) + swing**2 + (used * drift) ** 2)
+    normal = np.maximum(at.normal_n, threshold)
+    variance = (
+        (at.tangential_sigma_n / (friction.mu * normal)) ** 2
+        + (used * at.normal_sigma_n / normal) ** 2
+        + (used * friction.sigma / friction.mu) ** 2
+    )
+    sigma = np.sqrt(variance + swing**2 + (used * drift) ** 2)
 
     fault = np.zeros(len(time), dtype=np.int64) if screened is None else screened.codes_at(time, window_s=window)
     for first, last in settings.bad_frames:
@@ -166,7 +172,11 @@ def label_frames(
     if slip_s is None and np.any(outside := reliable & (used > 1 + sigma)):
         slip_s = float(time[np.argmax(outside)])
     onsets = () if slip_s is None else (slip_s, *(later_s - window / 2 for later_s in friction.later_onsets_s))
-    slipped = _after_slips(time, onsets, find_contacts(forces, contact_threshold_n=threshold))
+    # a contact that has slipped has no label until it is released and loaded again
+    slipped, touches = np.zeros(len(time), dtype=bool), find_contacts(forces, contact_threshold_n=threshold)
+    for onset_s in onsets:
+        anew_s = next((start_s for start_s, _ in touches if start_s > onset_s), np.inf)
+        slipped |= (time >= onset_s) & (time < anew_s)
     margin = safety_margin(np.where(contact, at.normal_n, 0.0), at.tangential_n, friction.mu)
     margin = np.where(at.missing | at.out_of_range | (fault > 0), np.nan, np.where(slipped & contact, 0.0, margin))
     valid = reliable & ~slipped & (sigma <= LARGEST_SIGMA)
@@ -212,27 +222,6 @@ def label_frames(
 def _used(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Frames:
     """Compute the used share of the friction, F_t / (mu F_n), with at least the threshold for F_n."""
     return at.tangential_n / (friction.mu * np.maximum(at.normal_n, threshold_n))
-
-
-def _variance(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Frames:
-    """Return the variance of the margin from that of the forces and of the friction."""
-    normal, used = np.maximum(at.normal_n, threshold_n), _used(at, friction, threshold_n)
-    return (
-        (at.tangential_sigma_n / (friction.mu * normal)) ** 2
-        + (used * at.normal_sigma_n / normal) ** 2
-        + (used * friction.sigma / friction.mu) ** 2
-    )
-
-
-def _after_slips(
-    time_s: Frames, onsets_s: Sequence[float], contacts: Sequence[tuple[float, float]]
-) -> Bool[np.ndarray, " frames"]:
-    """Find the frames of a contact that has slipped, until it is released and loaded again."""
-    slipped = np.zeros(len(time_s), dtype=bool)
-    for onset_s in onsets_s:
-        anew_s = next((start_s for start_s, _ in contacts if start_s > onset_s), np.inf)
-        slipped |= (time_s >= onset_s) & (time_s < anew_s)
-    return slipped
 
 
 _STATES = (ContactState.NO_CONTACT, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
@@ -335,54 +324,39 @@ def _label_screened(
         lost = np.isin(screened.recorded.time_s[pull], forces.time_s, invert=True)
         if lost.sum() > _MOST_LOST * len(lost):
             raise RecordingError("most samples between touch and slip are faulty; give the friction with --mu")
+    spans = {"frames_s": float(np.ptp(frame_time_s)), "forces_s": float(np.ptp(screened.recorded.time_s))}
+    doubts = (
+        *screened.doubts,
+        *_find_doubts(contact, friction, threshold, **spans, lag=lag),
+        *doubt_agreement(frame_time_s, image_motion, forces, lag),
+    )
     return label_frames(
-        frame_time_s,
-        contact,
-        friction=friction,
-        lag=lag,
-        settings=settings,
-        screened=screened,
-        doubts=(
-            *screened.doubts,
-            *_find_doubts(contact, friction, threshold),
-            *doubt_agreement(frame_time_s, image_motion, forces, lag),
-            *_doubt_clocks(frame_time_s, screened.recorded, lag),
-        ),
+        frame_time_s, contact, friction=friction, lag=lag, settings=settings, screened=screened, doubts=doubts
     )
 
 
-def _find_doubts(forces: ContactForces, friction: FrictionEstimate, threshold_n: float) -> tuple[str, ...]:
-    """Describe what no fingertip does: an implausible friction, a contact that pulls more than it presses."""
+def _find_doubts(
+    forces: ContactForces, friction: FrictionEstimate, threshold_n: float, *, frames_s: float, forces_s: float, lag: Lag
+) -> tuple[str, ...]:
+    """Describe an implausible friction, a contact that pulls more than it presses, and clocks of different lengths."""
     doubts = []
     low, high = _PLAUSIBLE_FRICTION
     usual = f"that of a fingertip lies between {low:g} and {high:g}"
     if not low <= friction.mu <= high:
         if friction.found is Found.INFERRED:
-            raise RecordingError(
-                f"the friction comes out as {friction.mu:.3g}, and {usual}; give --normal-axis, or --mu"
-            )
+            cure = "give --normal-axis, or --mu"
+            raise RecordingError(f"the friction comes out as {friction.mu:.3g}, and {usual}; {cure}")
         doubts.append(f"a friction of {friction.mu:.3g} was given, and {usual}")
     elif friction.mu > _USUAL_FRICTION:
-        doubts.append(
-            f"the friction is {friction.mu:.3g}, and that of a fingertip seldom exceeds {_USUAL_FRICTION:g}: check "
-            "--normal-axis and --mu"
-        )
+        seldom = f"that of a fingertip seldom exceeds {_USUAL_FRICTION:g}: check --normal-axis and --mu"
+        doubts.append(f"the friction is {friction.mu:.3g}, and {seldom}")
     pulls, presses = (np.mean(side > threshold_n) for side in (-forces.normal_n, forces.normal_n))
     if pulls > presses:
-        doubts.append(
-            f"the normal force is negative in {100 * pulls:.0f} % of the samples, positive in {100 * presses:.0f} %; "
-            "give its sign with --normal-sign"
-        )
-    return tuple(doubts)
-
-
-def _doubt_clocks(frame_time_s: Frames, forces: Forces, lag: Lag) -> tuple[str, ...]:
-    """Describe frames and forces of different lengths, unless the image moves as the force changes."""
-    frames_s, forces_s = float(np.ptp(frame_time_s)), float(np.ptp(forces.time_s))
+        samples = f"{100 * pulls:.0f} % of the samples, positive in {100 * presses:.0f} %"
+        doubts.append(f"the normal force is negative in {samples}; give its sign with --normal-sign")
     fits = not lag.doubt and lag.correlation is not None and abs(lag.lag_s) <= _NEAR_LAG_S
-    if fits or min(frames_s, forces_s) >= _LIKE_SPANS * max(frames_s, forces_s):
-        return ()
-    return (
-        f"the frames last {frames_s:.2f} s and the forces {forces_s:.2f} s, the image does not move with the force; "
-        "if a clock runs wrong, give --frame-rate or --time-unit on import",
-    )
+    if not fits and min(frames_s, forces_s) < _LIKE_SPANS * max(frames_s, forces_s):
+        lengths = f"the frames last {frames_s:.2f} s and the forces {forces_s:.2f} s"
+        cure = "if a clock runs wrong, give --frame-rate or --time-unit on import"
+        doubts.append(f"{lengths}, the image does not move with the force; {cure}")
+    return tuple(doubts)
