@@ -137,7 +137,9 @@ class Friction:
         Exact friction stays; a slip far outside the possible values leaves the nearest of them.
         """
         if not (math.isfinite(ratio) and ratio > 0 and math.isfinite(sigma) and sigma > 0):
-            raise InputError(f"a slip needs a positive F_t / F_n and a positive sigma, got {ratio:g} and {sigma:g}")
+            raise InputError(
+                f"a slip needs a positive ratio F_t / F_n and a positive sigma, got {ratio:g} and {sigma:g}"
+            )
         values, weights = self.nodes
         with np.errstate(divide="ignore"):
             posterior = np.log(weights) - 0.5 * ((values - ratio) / sigma) ** 2

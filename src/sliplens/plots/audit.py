@@ -287,12 +287,12 @@ def _draw_charts(figure: Figure, recording: Recording, labelling: Labelling, fra
             slips_s = [basis.slip_s, *basis.friction.later_onsets_s]
             lines = [ax.axvline(at_s + shift, color=BLACK, ls="-.", lw=1.3, label="_slip") for at_s in slips_s]
             lines[0].set_label(f"slip at {slips_s[0] + shift:.2f} s")
-            named: list[Artist] = [*lines[:1]]
+            entries: list[Artist] = [*lines[:1]]
             if lag is not None and not lag.doubt:
                 ends_s = basis.slip_s + lag.lag_s + np.array([-1, 1]) * lag.sigma_s
-                named.append(ax.axvspan(*ends_s, color=SKY, alpha=0.6, lw=0, zorder=0))
-                named[-1].set_label(r"as the camera sees it (lag $\pm\,\sigma$)")
-            handles += named if ax is charts[1] else []  # equal entries are written once
+                entries.append(ax.axvspan(*ends_s, color=SKY, alpha=0.6, lw=0, zorder=0))
+                entries[-1].set_label(r"as the camera sees it (lag $\pm\,\sigma$)")
+            handles += entries if ax is charts[1] else []  # equal entries are written once
         for at in frames:
             ax.axvline(recording.time_s[at], color=BLACK, lw=0.7, alpha=0.45, zorder=1, label="_frame")
         place = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.1, "borderpad": 0}
@@ -312,10 +312,10 @@ def _draw_pictures(figure: Figure, recording: Recording, frames: list[int | None
     # the difference of the reference from itself is 0; that of an untouched frame far from it shows the drift
     far = max(free, key=lambda at: abs(at - (index or 0)), default=index)
     images = read([at for at in (*along, far) if at is not None])
-    shown = [reference, *images[: len(along)]]
-    differences = absolute_difference(np.stack([reference if far is None else images[-1], *shown[1:]]), reference)
+    pictures = [reference, *images[: len(along)]]
+    differences = absolute_difference(np.stack([reference if far is None else images[-1], *pictures[1:]]), reference)
     factor = brightening([differences])
-    for column, (at, frame, difference) in enumerate(zip(frames, shown, differences, strict=True)):
+    for column, (at, frame, difference) in enumerate(zip(frames, pictures, differences, strict=True)):
         x, state = _LEFT + column * (_PICTURE + _GAP), ContactState.NO_CONTACT if at is None else states[at]
         for y, picture in ((top, frame), (top + height + _GAP, brighten(difference, factor))):
             ax = place_axes(figure, x, y, _PICTURE, height)
