@@ -67,10 +67,3 @@ def test_curves_of_a_network_that_averages_pixels_have_a_closed_form(rng: np.ran
     # means of 192 float32 numbers
     np.testing.assert_allclose(curves[:, 1:], np.stack([expected, expected]), atol=1e-6)
     np.testing.assert_allclose(curves[:, 0], 1, atol=1e-6)
-
-
-def test_the_chunk_size_does_not_change_the_curve(rng: np.random.Generator):
-    images = torch.rand(2, 3, 8, 8)
-    orders = np.stack([rng.permutation(64) for _ in range(2)])
-    small, large = (delete_pixels(mean_of_pixels, images, orders, fill="grey", batch_size=size) for size in (3, 128))
-    np.testing.assert_allclose(small, large, atol=1e-6)

@@ -7,7 +7,6 @@ import torch
 from sliplens.errors import InputError
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import (
-    AREAS,
     random_unit_order,
     removal_curves,
     score_maps,
@@ -95,17 +94,6 @@ def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Ten
     half = scores["half"]
     for curve in (half.most_first, half.least_first, half.random):
         np.testing.assert_allclose(curve[:, -1], -values.sum(axis=(1, 2)), atol=1e-12)
-
-
-def test_at_equal_areas_the_curves_can_be_read(images: torch.Tensor, weights: torch.Tensor, rng):
-    maps = {"truth": contributions(images, weights)}
-    units = [tile_units((SIZE, SIZE), size=2)] * IMAGES
-    score = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, towards=UP)["truth"]
-    np.testing.assert_array_equal(score.areas, AREAS)
-    step = AREAS.index(0.05)
-    assert np.all(score.most_first[:, step] > score.random[:, step])
-    assert np.all(score.random[:, step] > score.least_first[:, step])
-    np.testing.assert_allclose(score.most_first[:, -1], maps["truth"].sum(axis=(1, 2)), atol=1e-12)
 
 
 def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Tensor, rng):

@@ -45,18 +45,18 @@ def test_one_trial_is_shown_whole_and_every_trial_is_scored_at_three_levels(choi
     assert len({pick.id for pick in choice.frames}) == len(choice.frames) == 9
 
 
-def test_frames_with_nothing_to_explain_are_not_scored(material: Material):
-    explained = material.explained
+def test_frames_with_nothing_to_explain_are_not_scored(material: Material, choice: Choice):
+    explained, scored = material.explained, tuple(frame for frame in choice.frames if frame.scored)
 
     def changing_by(*changes: float) -> Explanation:
         frames = zip(explained.frames, changes, strict=True)
         changed = (replace(one, prediction=one.reference_prediction + by) for one, by in frames)
         return replace(explained, frames=tuple(changed))
 
-    found = worth_scoring(material.chosen, changing_by(0.3, 1e-4, -1e-4, -0.3, 0.0199, -0.0201))
+    found = worth_scoring(scored, changing_by(0.3, 1e-4, -1e-4, -0.3, 0.0199, -0.0201))
     assert [frame.id for frame in found] == [explained.frames[row].id for row in (0, 3, 5)]
     # a network that tells none from the untouched sensor: each explanation says so
-    assert worth_scoring(material.chosen, changing_by(*[1e-4] * 6)) == material.chosen
+    assert worth_scoring(scored, changing_by(*[1e-4] * 6)) == scored
 
 
 # at levels 1 and 0 a constant answer c is wrong by about max(1 - c, c): 0.5 by half, 0.9 by nine tenths

@@ -11,11 +11,10 @@ from sliplens.faithfulness.scoring import (
     influences,
     ranking_alarms,
 )
-from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import Faithfulness, RemovalCurve
 from sliplens.results.study import Setting
 from sliplens.study.choice import Material
-from sliplens.study.scoring import STUDY_AREAS, Influence, Removal
+from sliplens.study.scoring import STUDY_AREAS, Removal
 
 PIXELS = Setting(fill="grey", unit="pixel")
 MARKERS = Setting(fill="reference", unit="marker")
@@ -106,36 +105,6 @@ def test_an_interrupted_run_goes_on_after_the_last_trial(material: Material, tmp
     assert all(done >= 3 for done, _ in calls[before:])
     assert calls[-1] == (12, 12)
     assert again.scores == scored.scores
-
-
-def test_a_trial_is_scored_as_it_is_among_others(material: Material, scored: Faithfulness):
-    alone = material.take(material.explained.trials[material.explained.frames[0].trial])
-    found = removal_of(alone, PIXELS).make()
-    key = (PIXELS.fill, PIXELS.unit, "grad-cam")
-    one, other = found.curves[key], scored.curves[key]
-    assert other.frame_ids[:3] == one.frame_ids
-    np.testing.assert_allclose(one.most_first, other.most_first[:3], atol=1e-6)
-    np.testing.assert_allclose(one.random, other.random[:3], atol=1e-6)  # the seeds of the first trial
-
-
-def test_curves_found_in_another_way_are_kept_over_an_interruption(material: Material, tmp_path: Path):
-    asked = []
-
-    def draw(part: Explanation, maps: Influence, _: int) -> dict[str, RemovalCurve]:
-        asked.append("drawn")
-        return {name: straight(0.2, 0.1, frames=len(part.frames)) for name in maps}
-
-    def stop(*_: object) -> dict[str, RemovalCurve]:
-        raise KeyboardInterrupt
-
-    true, other = Setting(fill="true", unit="marker"), Setting(fill="other", unit="marker")
-    removal = removal_of(material)
-    with pytest.raises(KeyboardInterrupt):
-        replace(removal, further={true: draw, other: stop}).make(tmp_path)
-    found = replace(removal, further={true: draw, other: draw}).make(tmp_path)
-    assert asked == ["drawn"] * 4  # two trials of the first setting once, two of the second once
-    by_fill = {score.fill: score.srg.estimate for score in found.scores if score.method == "grad-cam"}
-    assert by_fill == pytest.approx({"true": 0.075, "other": 0.075})
 
 
 def test_fills_that_rank_the_methods_backwards_are_named():

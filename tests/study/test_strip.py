@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from sliplens.codec import load_result, save_result
 from sliplens.errors import RecordingError
 from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.models import load_checkpoint
@@ -39,14 +38,6 @@ def test_a_strip_reads_as_the_network_does(strip, run):
     # float32 answers of the same passes, kept as float64
     assert strip.readings.prediction == pytest.approx(answers, abs=1e-6)
     assert np.isnan(strip.readings.safety_margin[0])
-
-
-def test_a_strip_comes_back_from_its_folder(strip, tmp_path):
-    save_result(strip, tmp_path)
-    back = load_result(tmp_path, Strip, command="sliplens demo")
-    assert (back.trial, back.shown, back.method) == (strip.trial, strip.shown, strip.method)
-    assert np.array_equal(back.relevance, strip.relevance)
-    assert np.array_equal(back.readings.prediction, strip.readings.prediction)
 
 
 def test_a_trial_without_labels_is_refused(run):

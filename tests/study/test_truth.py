@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -328,26 +327,6 @@ def test_a_gain_is_put_to_the_test_by_several_trials_or_not_at_all(trials, holds
     assert test.gap is not None
     assert test.gap.estimate == pytest.approx(0.2, abs=0.03)
     assert test.holds == holds
-
-
-def test_an_interrupted_judgement_goes_on_after_the_last_frame(
-    given: tuple[Network, Explanation, Dataset], maps: dict[str, np.ndarray], judged: Truth, tmp_path: Path
-):
-    def interrupt(done: int, total: int) -> None:
-        assert total == len(LEVELS)
-        raise KeyboardInterrupt
-
-    stage = judge(*given, maps=maps, fills=("reference", "grey"), pairs=PAIRS)
-    with pytest.raises(KeyboardInterrupt):
-        stage.make(tmp_path, on_progress=interrupt)
-    (first,) = tmp_path.glob("trial=*/*/arrays.npz")
-    before = first.stat().st_mtime_ns
-    kept = []
-    again = stage.make(tmp_path, on_progress=lambda *_: kept.append(first.stat().st_mtime_ns))
-    assert kept == [before] * len(LEVELS)
-    assert again.methods.keys() == judged.methods.keys()
-    for one, other in zip(again.meta, judged.meta, strict=True):
-        assert (one.oracle, one.degraded) == pytest.approx((other.oracle, other.degraded), abs=1e-6)
 
 
 def test_curves_under_the_true_fill_know_the_oracle(trained, explained, data, maps, judged):

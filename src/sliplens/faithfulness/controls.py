@@ -154,10 +154,8 @@ def lead_over_controls(
 ) -> Lead:
     """Compute the mean of a score of frames less that of the strongest control, with a 95 % interval.
 
-    No control is chosen beforehand: each end is the lowest of those over all of them. A lead is sure only where the
-    method is ahead of each for sure, whichever would be the strongest in other trials, which needs no correction. To be
-    behind it is enough to be behind any, so the upper ends are those of as many comparisons as there are controls. The
-    score is one that is 0 by chance, which stands among the controls.
+    Each end is the lowest of those over all controls, chance (0) among them: a lead is sure only where the method is
+    ahead of each for sure, which needs no correction. The upper ends are those of as many comparisons as controls.
 
     Berger, *Multiparameter hypothesis testing and acceptance sampling* (1982): intersection-union tests, and the
     union-intersection tests that Bonferroni's inequality bounds.
@@ -177,9 +175,8 @@ def lead_over_controls(
 def cascade(model: nn.Module, *, seed: int, stages: int, images: Images) -> Iterator[tuple[int, nn.Module]]:
     """Draw the weights of a copy of a network anew, layer by layer from the output to the input.
 
-    Gives, at so many stages, evenly spread, how many layers have new weights, and the network; the next stage changes
-    it. Normalisation gets the statistics of the images, two at least: with those of an untrained network new weights
-    shrink what passes through them layer by layer, until it gives one answer to every image.
+    Yield, at so many stages, evenly spread, how many layers have new weights, and the network; the next stage changes
+    it. Normalisation gets the statistics of the images, two at least, or every image would get one answer.
 
     Adebayo et al., *Sanity Checks for Saliency Maps* (2018): cascading randomisation.
     """

@@ -168,9 +168,8 @@ _ROWS: dict[str, Fill] = {
 FILLS = Table("fill", "sliplens.fills", _ROWS)
 """Fills by name; an installed package adds its own by the entry point `sliplens.fills`.
 
-`background` is the median colour of the image, what most of it shows; `reference` puts the untouched sensor in
-place; `noisy-linear` (ROAD) blends the pixels around, with a little noise, so that the shape of what was removed tells
-less.
+`background` is the median colour of the image, `reference` the untouched sensor; `noisy-linear` (ROAD) blends the
+pixels around, with a little noise.
 """
 
 

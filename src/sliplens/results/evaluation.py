@@ -30,7 +30,7 @@ AMOUNT = Meta(ge=0)
 """Of counts, sizes and squares."""
 _ROUNDED = 1 + 1e-6
 AT_MOST_ONE = Meta(le=_ROUNDED)
-SHARE, CORRELATION = Meta(ge=0, le=_ROUNDED), Meta(ge=-_ROUNDED, le=_ROUNDED)
+SHARE = Meta(ge=0, le=_ROUNDED)
 EXCESS = PLACE = Meta(ge=-1)
 """Of a ratio less one, and of a number in a list, -1 for none."""
 PIXEL = Meta(ge=-1e5, le=1e5)
@@ -188,9 +188,8 @@ class ScoredFrames(Columns):
     high_90: Annotated[Float64[np.ndarray, " frames"], MARGIN, UNKNOWN]
     """Ends of the interval that should hold 90 % of the labels; NaN for a network that was not calibrated."""
     withheld: Shaped[np.ndarray, " frames"]
-    """Reason for which the network withholds the margin, with the cure; empty where it does not. Direction of the pull
-    and motion of the camera, which `predict` checks too, are not checked. Scores count these frames all the same, as
-    their labels are known; figures of a trial leave them out."""
+    """Reason for which the network withholds the margin, with the cure; empty where it does not. Scores count these
+    frames too; figures of a trial leave them out."""
 
 
 @dataclass(frozen=True, kw_only=True)

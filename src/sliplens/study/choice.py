@@ -50,11 +50,11 @@ def choose_frames(
     trials: int = 14,
     tolerance: float = 0.03,
 ) -> Choice:
-    """Choose trials in which every network reads the frames along the margin within a tolerance, in margin units.
+    """Choose trials in which every network predicts the frames along the margin within a tolerance, in margin units.
 
-    An explanation of a wrong answer explains the error. Where fewer trials qualify than are wanted, those whose worst
-    error is smallest are taken too; where more do, the first of them in the data set's order. In each the frames
-    nearest to `LEVELS` are taken: those at `SCORED_LEVELS`, and all of the trial that the panels show, the best read.
+    Where fewer trials qualify than are wanted, those whose worst error is smallest are taken too; where more do, the
+    first in the data set's order. In each the frames nearest to `SCORED_LEVELS` are taken, and those nearest to all
+    `LEVELS` in the trial that the panels show, the one predicted best.
 
     Polak, section 4: 14 trials read within 3 %, 6 levels, 42 frames to score.
     """
@@ -254,22 +254,10 @@ class Material:
     """Inputs of the network, in [0, 1]."""
     references: Float[Tensor, "frames colours size size"]
     """The untouched sensor for each frame."""
-    chosen: tuple[ChosenFrame, ...]
     markers: Mapping[str, MarkerPlaces]
     """By frame, in camera pixels; frames in which none could be followed are absent."""
     explainers: Mapping[str, Explainer]
     """By name, with the options that made the maps."""
-
-    def take(self, rows: Sequence[int]) -> "Material":
-        """Select frames by their numbers."""
-        chosen = list(rows)
-        return replace(
-            self,
-            explained=self.explained.take(chosen),
-            inputs=self.inputs[chosen],
-            references=self.references[chosen],
-            chosen=tuple(self.chosen[row] for row in chosen),
-        )
 
     def units(self) -> dict[str, list[Units]]:
         """Units of removal of each frame: pixels, tiles, and markers where they are known in every frame."""
@@ -301,12 +289,9 @@ def worth_scoring(chosen: Iterable[ChosenFrame], explained: Explanation) -> tupl
     return tuple(frame for frame in scored if changes[frame.id] >= CLOSE) or scored
 
 
-_TRIALS = 1000
-
-
 def trial_seed(seed: int, number: int) -> int:
     """Seed of a trial of a study by its number there, of which none has a thousand: that of no other study."""
-    return _TRIALS * seed + number
+    return 1000 * seed + number
 
 
 def gather(
@@ -326,7 +311,6 @@ def gather(
         explained=counted,
         inputs=inputs,
         references=network_references(trained, counted),
-        chosen=chosen,
         markers=markers,
         explainers=with_markers(explainers, inputs, lambda: marker_places(trained, chosen, markers)),
     )

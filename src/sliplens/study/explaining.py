@@ -172,7 +172,11 @@ def explain(
                         retry_failed=running.get("retry_failed", False),
                         on_record=_draw_first(output.folder, network, chosen) if colours == "signed" else None,
                     )
-                    _note_warnings(explanation)
+                    notes = explanation.methods
+                    # inside the stage: warnings that differ in numbers alone are then shown once
+                    for warning in dict.fromkeys(text for each in notes.values() for text in each.warnings):
+                        methods = [name for name, each in notes.items() if warning in each.warnings]
+                        add_note(f"{', '.join(methods)}: {warning}")
                 draw_explanation(explanation, output.folder, colours=colours)
                 save_result(explanation, output.folder)
                 remove(output.folder / "parts")  # not before: if drawing or saving fails, the next call continues
@@ -207,13 +211,6 @@ def _choose(
         labels_in_names=labels_in_names,
         sensor=None if sensor is None else load_profile(sensor),
     )
-
-
-def _note_warnings(explanation: Explanation) -> None:
-    # inside the stage: warnings that differ in numbers alone are then shown once
-    for warning in dict.fromkeys(warning for notes in explanation.methods.values() for warning in notes.warnings):
-        methods = [method for method, notes in explanation.methods.items() if warning in notes.warnings]
-        add_note(f"{', '.join(methods)}: {warning}")
 
 
 def _draw_first(folder: Path, network: Network, chosen: ChosenFrames) -> Callable[[tuple[str, int], MethodMaps], None]:

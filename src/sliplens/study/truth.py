@@ -303,11 +303,9 @@ def _summarise(truth: Truth) -> str:
 class JudgingByTruth(Stage[Truth]):
     """Markers of every frame, a part, put back alone and in company, and maps compared with what that does.
 
-    There are two truths: what putting a marker back alone changes, and its Shapley value, the mean of what it changes
-    over all the company of markers that may be put back already. The latter add up to the change of the answer.
-
-    A map's mass is that of its positive part, what works towards the answer: a share of a sum needs one sign. Marker by
-    marker the mean of the map is compared with the effect along the answer's change, both signed.
+    There are two truths: the change by putting a marker back alone, and its Shapley value, which add up to the change
+    of the answer. Marker by marker the mean of a map is compared with both, signed, along the answer's change; a map's
+    mass is that of its positive part.
     """
 
     record = FrameEffects
