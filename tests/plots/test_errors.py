@@ -40,7 +40,7 @@ def draw(name: str, results: Results, ax: Axes) -> Axes:
         "bins": lambda: plot_bins({key: one.conditions["dry"].bins for key, one in evaluations.items()}, ax=ax),
         "predictions": lambda: plot_predictions(evaluations["raw"].predictions, colour=ORANGE, ax=ax),
         "learning": lambda: plot_learning_curves(results.trainings, ax=ax),
-        "faithfulness": lambda: plot_faithfulness(scored.curves, pixels=24 * 24, ax=ax),
+        "faithfulness": lambda: plot_faithfulness(scored.curves, ax=ax),
     }[name]()
 
 
@@ -87,13 +87,12 @@ def test_faithfulness_curve_is_the_mean_over_frames(results, ax):
     assert len(ax.collections) == 4
 
 
-def test_answers_outside_the_range_are_shown(results, ax):
+def test_predictions_outside_the_range_are_shown(results, ax):
     draw("predictions", results, ax)
-
-    answers = 100 * results.evaluations["raw"].predictions.prediction
+    predictions = 100 * results.evaluations["raw"].predictions.prediction
     low, high = ax.get_ylim()
-    assert low < answers.min()
-    assert high > answers.max()
+    assert low < predictions.min()
+    assert high > predictions.max()
 
 
 def evaluation(*, sure: bool = True) -> Evaluation:

@@ -81,8 +81,8 @@ def strip() -> Strip:
 def test_a_strip_says_what_was_read_and_what_was_true(strip):
     figure = draw_strip(strip)
     titles = [ax.get_title(loc="center") for ax in figure.axes]
-    assert "1: 90 % predicted\n100 % true" in titles
-    assert "2: 18 % predicted\n20 % true" in titles
+    assert "1: predicted 90\xa0%\ntrue 100\xa0%" in titles
+    assert "2: predicted 18\xa0%\ntrue 20\xa0%" in titles
 
 
 def test_colours_tell_the_sign_and_nothing_is_coloured_where_nothing_speaks(strip):
@@ -106,7 +106,7 @@ def test_a_withheld_moment_shows_no_margin_and_a_grey_chart(strip):
     readings = replace(strip.readings, **values, withheld=np.where(gap, "strange; train it", ""))
     figure = draw_strip(replace(strip, readings=readings))
     titles = [ax.get_title(loc="center") for ax in figure.axes]
-    assert "2: withheld\n20 % true" in titles
+    assert "2: withheld\ntrue 20\xa0%" in titles
     chart = next(ax for ax in figure.axes if ax.get_xlabel() == "Time (s)")
     legend = chart.get_legend()
     assert legend is not None

@@ -70,16 +70,6 @@ def test_the_page_does_not_scroll_sideways(opened):
     assert set(boxes) == {0}
 
 
-def test_words_are_legible(opened):
-    page, _, _ = opened
-
-    sizes = page.evaluate(
-        "[...document.querySelectorAll('p, td, th, dd, li, figcaption')]"
-        ".map(one => parseFloat(getComputedStyle(one).fontSize))"
-    )
-    assert min(sizes) >= 11
-
-
 @pytest.fixture
 def window(browser: Any) -> Iterator[Any]:
     """A window that counts what runs though it should not."""

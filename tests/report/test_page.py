@@ -1,6 +1,7 @@
 import json
 import re
 import shutil
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pyarrow as pa
@@ -8,10 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import InputError
-from sliplens.plots.saliency import choose_columns
 from sliplens.report import load_results, write_report
-from sliplens.report.page import set_code
-from sliplens.results.explanation import ExplainedFrame
+from sliplens.report.plates import choose_frames
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -101,23 +100,18 @@ def test_tables_hold_the_numbers_of_the_results(reader, complete):
     for scored in results.scores.values():
         for score in scored.methods.values():
             assert f"{score.mean:.3f} ± {score.sd:.3f}" in reader.cells
-            assert f"{score.last_step_mean:.3f}" in reader.cells
 
 
 def test_the_thesis_stands_beside_and_is_marked(text, reader):
     assert {"0.0187", "0.0507", "0.0144", "0.0402", "0.85", "0.57", "0.89", "0.66"} <= set(reader.cells)
     assert {"0.325 ± 0.106", "0.272 ± 0.158", "0.200 ± 0.146", "0.539 ± 0.101"} <= set(reader.cells)
-    assert text.count("thesis (real touch, other data)") == 2
+    assert text.count("thesis (real touch, other data)") == 3
 
 
 def test_warnings_and_alarms_are_shown(text):
     assert "On 3 frames the filled image is answered like the frame itself." in text
-    assert "Integrated Gradients, real touch: completeness gap 1.8 % on 2 frames." in text
-    assert "<li>Frames in which the fill decides, rather than the map: 1 (raw images 1)</li>" in text
-
-
-def test_what_stands_between_backticks_is_code_and_all_is_escaped():
-    assert set_code("run `a & b` < `c`") == "run <code>a &amp; b</code> &lt; <code>c</code>"
+    assert "Integrated Gradients: completeness gap 1.8 % on 2 frames." in text
+    assert "<li>Deletion: alarms, raw images: 1.</li>" in text
 
 
 def test_same_results_make_the_same_page(text, complete, tmp_path):
@@ -131,10 +125,6 @@ def test_what_was_not_asked_for_is_not_missed(build, workspace):
 
     assert "not run yet" not in text
     assert "<h2>Deletion" not in text
-
-
-def test_what_limits_the_verdict_stands_before_it(text):
-    assert text.index("depends on the fill of a removed pixel") < text.index("Predicts the margin on dry objects")
 
 
 def test_hostile_names_are_escaped(build, workspace):
@@ -183,64 +173,30 @@ def test_page_is_not_written_where_a_result_is_malformed(workspace, tmp_path):
     assert not list(tmp_path.glob("*report.html*"))
 
 
-def test_output_that_is_a_folder_is_told(workspace, tmp_path):
-    with pytest.raises(InputError, match=r"is a folder; name the HTML file to write, such as .*report.html"):
-        write_report(workspace, tmp_path)
+@pytest.mark.parametrize(
+    ("labels", "chosen"),
+    [
+        # evenly spread by their labels, those of the condition that most frames have
+        ([1.0, 0.9, 0.2, 0.0, 0.4, 0.6, 0.7, 0.5, 0.3, 0.1, 0.8], [1.0, 0.8, 0.6, 0.4, 0.2, 0.0]),
+        ([0.0, 1.0, 0.25], [1.0, 0.25, 0.0]),
+        ([None] * 9, [None] * 6),
+    ],
+)
+def test_frames_fall_from_stick_to_slip_and_without_labels_stand_in_order(complete, labels, chosen):
+    results = load_results(complete[0])
+    explained = results.explanations["raw", "simulated"]
+    frames = [replace(explained.frames[0], id=str(at), safety_margin=label) for at, label in enumerate(labels)]
+    frames.append(replace(explained.frames[0], id="wet", condition="wet", safety_margin=0.5))
+    many = explained.take([0] * len(frames))
+    rows = choose_frames(results, replace(many, frames=tuple(frames)))
+    assert [frames[row].safety_margin for row in rows] == chosen
 
 
-def frame(name: str, margin: float | None, condition: str = "dry") -> ExplainedFrame:
-    return ExplainedFrame(
-        id=name, trial="t", condition=condition, safety_margin=margin, prediction=0.5, reference_prediction=1.0
-    )
-
-
-def test_panel_takes_the_nearest_labels_of_one_condition():
-    frames = (frame("a", 0.97), frame("b", 1.0, "wet"), frame("c", 0.22), frame("d", 0.19), frame("e", 0.03))
-    frames += (frame("f", 0.96), frame("g", 0.95), frame("h", 0.94))
-
-    condition, chosen = choose_columns(frames)
-
-    assert condition == "dry"
-    assert chosen == [(1.0, 0), (0.8, None), (0.6, None), (0.4, None), (0.2, 3), (0.0, 4)]
-
-
-def test_frames_without_labels_are_shown_in_their_order():
-    frames = tuple(frame(str(index), None) for index in range(9))
-
-    assert choose_columns(frames) == ("dry", [(None, index) for index in range(6)])
-
-
-def test_simulation_alone_makes_a_page(build, workspace):
-    keep(workspace, "data")
-
-    text = build()
-
-    assert "There is nothing to judge yet" in text
-    assert "not run yet" not in text
-
-
-def test_scores_alone_make_a_page(build, workspace):
-    keep(workspace, "score-raw")
-
-    assert "Deletion score D of the thesis on simulated touch while pixels become grey" in build()
-
-
-def test_training_that_wrote_no_epoch_makes_a_page(build, workspace):
-    keep(workspace, "network-raw")
-    (workspace / "network-raw" / "metrics.csv").write_text("epoch,train_mse,validation_mse,minutes\n")
-
-    assert "Learning curves" in build()
-
-
-def test_output_that_cannot_be_written_is_told(workspace, tmp_path):
+@pytest.mark.parametrize(
+    ("page", "message"), [(".", "is a folder; name the HTML file"), ("file/report.html", "cannot write")]
+)
+def test_a_page_that_cannot_be_written_is_refused(workspace, tmp_path, page, message):
     keep(workspace, "data")
     (tmp_path / "file").write_text("")
-
-    with pytest.raises(InputError, match=r"cannot write .*report.html"):
-        write_report(workspace, tmp_path / "file" / "report.html")
-
-
-def test_few_frames_are_all_shown_from_stick_to_slip():
-    frames = (frame("a", 0.0), frame("b", 1.0), frame("c", 1.0), frame("d", 0.25), frame("e", 0.9, "wet"))
-
-    assert choose_columns(frames) == ("dry", [(1.0, 1), (1.0, 2), (0.25, 3), (0.0, 0)])
+    with pytest.raises(InputError, match=message):
+        write_report(workspace, tmp_path / page)

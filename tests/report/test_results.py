@@ -1,12 +1,19 @@
+"""What a workspace holds is loaded whole, and refused in one sentence where it is malformed."""
+
 import json
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from sliplens.errors import InputError
 from sliplens.report import load_results
+
+from .study_results import FILLS, METHODS
 
 
 def change(path: Path, **fields):
@@ -20,7 +27,6 @@ def test_every_stage_is_found_whatever_its_folder_is_called(workspace):
 
     results = load_results(workspace)
 
-    assert results.simulation is not None
     assert set(results.trainings) == set(results.evaluations) == {"raw", "difference"}
     assert set(results.explanations) == {
         (name, source) for name in ("raw", "difference") for source in ("simulated", "real")
@@ -56,34 +62,27 @@ def test_of_two_results_of_one_kind_the_later_is_kept_and_said(workspace):
     assert "test-raw" in results.notes[0]
 
 
-def test_workspace_without_result_is_told(tmp_path):
+def test_a_workspace_without_a_result_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"holds no result to report; run `sliplens simulate`"):
         load_results(tmp_path)
+    with pytest.raises(InputError, match=r"the workspace .*nowhere does not exist; check the path"):
+        load_results(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "message"),
+    ("file", "text", "message"),
     [
         ("test-raw", "{", r"test-raw/result.json is not valid JSON"),
-        (
-            "test-raw",
-            "[]",
-            r"test-raw/result.json holds no JSON object; make it again with `sliplens evaluate`",
-        ),
-        ("test-raw", '{"input": "raw"}', r"test-raw/result.json .*missing required field `split`.*; make it again"),
-        ("test-raw", '{"input": "raw", "conditions": NaN}', r"test-raw/result.json is not valid JSON"),
+        ("test-raw", "[]", r"test-raw/result.json holds no JSON object; make it again with `sliplens evaluate`"),
         ("network-raw", '{"input": 3}', r"expected `str`, got `int` at input; .*`sliplens train`"),
-        ("network-raw", '{"input": "raw", "image_size": true}', r"expected `int`, got `bool` at image_size"),
         ("maps-raw-real", '{"input": "raw", "frames": 3}', r"is not what was written: .* make it again with"),
         ("score-raw", '{"input": "raw", "source": "simulated"}', r"missing required field `fill`.*`sliplens score`"),
     ],
 )
-def test_malformed_result_is_told_in_one_sentence(workspace, name, text, message):
-    (workspace / name / "result.json").write_text(text)
-
+def test_a_malformed_result_is_refused_in_one_sentence(workspace, file, text, message):
+    (workspace / file / "result.json").write_text(text)
     with pytest.raises(InputError, match=message) as caught:
         load_results(workspace)
-
     assert "\n" not in str(caught.value)
 
 
@@ -92,57 +91,119 @@ def test_malformed_result_is_told_in_one_sentence(workspace, name, text, message
     [
         ("test-raw/result.json", r"result.json does not exist"),
         ("test-raw/predictions.parquet", r"predictions.parquet does not exist; .*`sliplens evaluate`"),
-        ("network-raw/curve.parquet", r"curve.parquet does not exist; .*`sliplens train`"),
         ("maps-raw-real/arrays.npz", r"arrays.npz does not exist; .*`sliplens explain`"),
         ("score-raw/table.parquet", r"table.parquet does not exist; .*`sliplens score`"),
     ],
 )
-def test_missing_file_is_told(workspace, name, message):
+def test_a_missing_file_is_refused(workspace, name, message):
     (workspace / name).unlink()
-
     with pytest.raises(InputError, match=message):
         load_results(workspace)
-
-
-def test_curves_with_a_missing_step_are_told(workspace):
-    path = workspace / "score-raw" / "table.parquet"
-    pq.write_table(pq.read_table(path).slice(1), path)
-
-    with pytest.raises(InputError, match=r"lacks steps of some frames under 'grad-cam'"):
-        load_results(workspace)
-
-
-def change_arrays(workspace: Path, **arrays: np.ndarray) -> None:
-    path = workspace / "maps-raw-real" / "arrays.npz"
-    np.savez(path, allow_pickle=False, **(dict(np.load(path)) | arrays))
 
 
 @pytest.mark.parametrize(
-    ("arrays", "message"),
+    ("file", "place", "value", "message"),
     [
-        (
-            {"relevance/grad-cam": np.zeros((6, 12, 12))},
-            r"holds float64 of shape \(6, 12, 12\) as 'relevance/grad-cam'",
-        ),
-        ({"relevance/grad-cam": np.zeros((5, 24, 24), np.float32)}, r"holds float32 of shape \(5, 24, 24\) as"),
-        ({"images": np.zeros((6, 3, 20, 20), np.uint8)}, r"of shape \(6, 3, 24, 24\) as 'references' where UInt8"),
+        ("choice", ("trials", 0, "qualified"), "yes", r"expected `bool`, got `str` at trials\[0\].qualified"),
+        ("faithfulness-raw", ("scores", 0, "method"), "none", r"lacks the curves of reference / pixel / none"),
+        ("score-raw", ("methods", "none"), {"mean": 0, "sd": 0, "last_step_mean": 0, "frames": 1}, r"curves of none"),
+        ("randomisation-raw", ("methods", "poly-cam", "layers"), [1], r"has 1 layers but 4 similarities"),
+        ("truth-raw", ("areas",), [], r"expected `object`, got `array` at areas"),
     ],
 )
-def test_arrays_that_do_not_fit_their_frames_are_told(workspace, arrays, message):
-    change_arrays(workspace, **arrays)
+def test_malformed_fields_of_a_study_are_refused(study, file, place, value, message):
+    path = study / file / "result.json"
+    inside = whole = json.loads(path.read_text(encoding="utf-8"))
+    for key in place[:-1]:
+        inside = inside[key]
+    inside[place[-1]] = value
+    path.write_text(json.dumps(whole), encoding="utf-8")
+    with pytest.raises(InputError, match=message) as caught:
+        load_results(study)
+    assert re.search("again with `sliplens (study|score)`", str(caught.value))
 
+
+@pytest.mark.parametrize(
+    ("file", "message"),
+    [
+        ("score-raw", r"lacks steps of some frames under 'grad-cam'"),
+        ("faithfulness-raw", r"lacks areas of some frames under reference / pixel / grad-cam"),
+    ],
+)
+def test_curves_with_a_missing_row_are_refused(study, file, message):
+    path = study / file / "table.parquet"
+    pq.write_table(pq.read_table(path).slice(1), path)
     with pytest.raises(InputError, match=message):
-        load_results(workspace)
+        load_results(study)
 
 
-def test_a_method_without_maps_is_told(workspace):
+def test_arrays_that_do_not_fit_their_frames_are_refused(workspace, study):
     path = workspace / "maps-raw-real" / "arrays.npz"
-    np.savez(path, allow_pickle=False, **{k: v for k, v in np.load(path).items() if k != "relevance/grad-cam"})
-
-    with pytest.raises(InputError, match=r"holds no relevance of grad-cam; make it again with `sliplens explain`"):
+    arrays = dict(np.load(path))
+    np.savez(path, allow_pickle=False, **(arrays | {"relevance/grad-cam": np.zeros((5, 24, 24), np.float32)}))
+    with pytest.raises(InputError, match=r"holds float32 of shape \(5, 24, 24\) as"):
         load_results(workspace)
+    maps = dict.fromkeys(("shapley_maps", "network_maps", "margin_maps"), np.zeros((2, 4, 4), dtype=np.float32))
+    np.savez(study / "truth-raw" / "arrays.npz", allow_pickle=False, **maps)
+    with pytest.raises(InputError, match=r"holds maps of shape \(2, 4, 4\) where 18 finite ones belong"):
+        load_results(study)
 
 
-def test_missing_folder_is_told(tmp_path):
-    with pytest.raises(InputError, match=r"the workspace .*nowhere does not exist; check the path"):
-        load_results(tmp_path / "nowhere")
+def test_maps_of_real_touch_do_not_stand_for_the_studys_own(study):
+    real = shutil.copytree(study / "explain-raw", study / "explain-real")
+    change(real / "result.json", source="real")
+    change(real / "run.json", finished="2026-11-22T00:00:00+00:00")
+
+    results = load_results(study)
+
+    assert set(results.explanations) == {("raw", "simulated"), ("raw", "real")}
+    assert results.study.explanations["raw"].source == results.study.deletion["raw"].source == "simulated"
+
+
+def test_curves_and_scores_tell_the_same(study):
+    faithful = load_results(study).study.faithfulness["raw"]
+
+    assert {key[:2] for key in faithful.curves} == set(FILLS)
+    for score in faithful.scores:
+        curve = faithful.curves[score.key]
+        assert curve.most_first.shape == (18, 21)
+        assert curve.symmetric_gain.mean() == pytest.approx(score.srg.estimate)
+
+
+def test_rows_may_stand_in_any_order(study):
+    path = study / "faithfulness-raw" / "table.parquet"
+    before = load_results(study).study.faithfulness["raw"].curves
+    table = pq.read_table(path)
+    pq.write_table(table.take(np.random.default_rng(0).permutation(table.num_rows)), path)
+
+    after = load_results(study).study.faithfulness["raw"].curves
+
+    assert set(after) == set(before)
+    for key, curve in after.items():
+        assert curve.frame_ids == before[key].frame_ids
+        np.testing.assert_array_equal(curve.clusters, before[key].clusters)
+        np.testing.assert_array_equal(curve.least_first, before[key].least_first)
+
+
+def test_markers_keep_their_places(study):
+    states = load_results(study).study.states
+
+    assert states is not None
+    assert len(states.markers) == 6
+    for frame in states.markers.values():
+        assert frame.rest_px.shape == frame.now_px.shape == (36, 2)
+        # one marker was not followed
+        assert np.isnan(frame.now_px[0]).all()
+        assert np.isfinite(frame.now_px[1:]).all()
+
+
+def test_methods_unknown_to_the_report_are_kept(study):
+    path = study / "faithfulness-raw" / "table.parquet"
+    table = pq.read_table(path)
+    own = table.filter(pa.array([name == "poly-cam" for name in table["method"].to_pylist()]))
+    named = own.set_column(own.column_names.index("method"), "method", pa.array(["my-cam"] * own.num_rows))
+    pq.write_table(pa.concat_tables([table, named]), path)
+
+    curves = load_results(study).study.faithfulness["raw"].curves
+
+    assert {method for _, _, method in curves} >= {*METHODS, "my-cam"}

@@ -1,3 +1,5 @@
+"""Networks are judged by their errors."""
+
 import json
 
 import numpy as np
@@ -5,56 +7,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from sliplens.explainers.attribution import check_slopes
 from sliplens.report import load_results
-from sliplens.report.alarms import count_alarms, group_alarms
-from sliplens.report.verdict import cautions, judge
-
-
-def test_alarms_of_one_kind_are_one_line_with_a_count():
-    alarms = ["grad-cam does not beat a random order: its symmetric gain is -0.1", "the network is asleep"]
-    alarms += ["under grey: occlusion does not beat a random order: its symmetric gain is -0.2", alarms[0]]
-
-    groups = group_alarms(alarms)
-
-    assert [(kind, len(sentences)) for kind, sentences in groups.items()] == [
-        ("Methods that do not beat a random order", 2),
-        ("The network is asleep.", 1),
-    ]
-    assert next(iter(groups.values()))[0] == "Grad-CAM does not beat a random order: its symmetric gain is -0.1."
-
-
-def test_warnings_of_explainers_are_grouped_by_kind_not_told_frame_by_frame():
-    warnings = [
-        *check_slopes([0.001, 0.002], change=[-0.5, -0.6]),
-        *(f"f{row}: the map leaves 0.{row} of f(x) - f(reference) = -0.9 unexplained, more than 1%" for row in (1, 2)),
-        *(
-            f"f{row}: f(x) = 1 is within 0.02 of f(reference) = 1, so there is next to nothing to explain"
-            for row in (1, 2)
-        ),
-        *(
-            f"f{row}: contributions hardly surer than they differ in 1 of 1 frames; ask for more pairs"
-            for row in (1, 2)
-        ),
-    ]
-
-    groups = group_alarms(warnings)
-
-    assert [len(sentences) for sentences in groups.values()] == [2, 2, 2, 2]
-
-
-def test_alarms_are_counted_by_network(workspace):
-    assert count_alarms(load_results(workspace)) == (
-        "Frames in which the fill decides, rather than the map: 1 (raw images 1)",
-        "Integrated Gradients, real touch: completeness gap 1.8 % on 2 frames: 1 (raw images 1)",
-    )
+from sliplens.report.comparisons import compare_errors
+from sliplens.report.verdict import judge_results
+from sliplens.results.evaluation import ScoredFrames
 
 
 @pytest.fixture
 def verdict(workspace, rng):
     """Rows of the workspace as it is when called, by claim and network."""
     return lambda: {
-        (row.claim, row.subject): row for table in judge(load_results(workspace), rng=rng) for row in table.rows
+        (row.claim, row.subject): row for table in judge_results(load_results(workspace), rng=rng) for row in table.rows
     }
 
 
@@ -70,7 +33,6 @@ def replace(path, column, values):
 
 
 DIFFERENCE, RAW = "Difference images", "Raw images"
-TOUCH = "Predicts real touch better than a constant"
 
 
 def test_accuracy_has_its_numbers(workspace, verdict):
@@ -100,72 +62,52 @@ def test_a_smaller_error_holds_only_beyond_the_interval(workspace, verdict, rng)
     assert verdict()[claim].outcome == "undecided"
 
 
-def test_a_method_holds_where_it_beats_a_random_order(workspace, verdict):
-    methods = load_results(workspace).scores["difference", "simulated"].methods
-    row = verdict()["Poly-CAM beats a random order", DIFFERENCE]
-    assert row.outcome == "holds"
-    assert row.number == f"{methods['poly-cam'].mean:.3f} ± {methods['poly-cam'].sd:.3f}"
-    assert f"a random order has {methods['random'].mean:.3f}" in row.sentence
-
-
-def test_a_method_that_loses_to_a_random_order_does_not_hold(workspace, verdict):
-    folder = workspace / "score-raw"
-    table = pq.read_table(folder / "table.parquet")
-    method, score = np.array(table["method"].to_pylist()), table["score"].to_numpy().copy()
-    score[method == "random"] = 0.1
-    replace(folder / "table.parquet", "score", score)
-    edit(folder / "result.json", lambda value: value["methods"]["random"].update(mean=0.1, sd=0.0))
-    assert verdict()["Poly-CAM beats a random order", RAW].outcome == "does not hold"
-
-
-def test_without_control_nothing_is_claimed(workspace, verdict):
-    edit(workspace / "score-raw" / "result.json", lambda value: value["methods"].pop("random"))
-    row = verdict()["Poly-CAM beats a random order", RAW]
-    assert row.outcome == "undecided"
-    assert "no random control was scored" in row.sentence
-
-
-def test_real_touch_is_compared_with_a_constant(workspace, verdict):
-    def constant(value):
-        for frame in value["frames"]:
-            frame["prediction"] = 0.9
-
-    edit(workspace / "maps-raw-real" / "result.json", constant)
-    row = verdict()[TOUCH, RAW]
-    assert (row.outcome, row.number) == ("does not hold", "43 points")
-    assert "the best constant is off by 30 points; 0 of 15 pairs of frames are in order" in row.sentence
-
-
 @pytest.mark.parametrize(
-    ("labels", "sign", "order"),
+    ("labels", "prediction", "expected"),
     [
-        ((1.0, 0.8, 0.6, 0.4, 0.2, 0.0), 1, "15 of 15 pairs"),
-        # frames with equal labels have no order
-        ((1.0, 0.5, 0.5, 0.5, 0.5, 0.0), 1, "9 of 9 pairs"),
-        ((1.0, 0.5, 0.5, 0.5, 0.5, 0.0), -1, "0 of 9 pairs"),
+        ((1.0, 0.8, 0.6, 0.4, 0.2, 0.0), None, ("holds", "0 points")),
+        # the best constant is off by 30
+        ((1.0, 0.8, 0.6, 0.4, 0.2, 0.0), 0.9, ("does not hold", "43 points")),
+        ((None,) * 6, 0.9, ("undecided", "")),
     ],
 )
-def test_pairs_of_real_frames_are_in_order_or_not(workspace, verdict, labels, sign, order):
+def test_real_touch_is_compared_with_the_best_constant(workspace, verdict, labels, prediction, expected):
     def label(value):
         for frame, margin in zip(value["frames"], labels, strict=True):
-            frame.update(safety_margin=margin, prediction=sign * margin)
+            frame.update(safety_margin=margin, prediction=margin if prediction is None else prediction)
 
     edit(workspace / "maps-raw-real" / "result.json", label)
-    row = verdict()[TOUCH, RAW]
-    assert order in row.sentence
-    assert row.outcome == ("holds" if sign > 0 else "does not hold")
+    row = verdict()["Predicts real touch better than a constant", RAW]
+    assert (row.outcome, row.number) == expected
 
 
-def test_real_frames_without_labels_decide_nothing(workspace, verdict):
-    def unlabel(value):
-        for frame in value["frames"]:
-            frame["safety_margin"] = None
+def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> ScoredFrames:
+    trials, frames = error.shape
+    rows = np.arange(error.size) if order is None else order
+    return ScoredFrames(
+        trial=np.repeat([f"t{index}" for index in range(trials)], frames)[rows],
+        condition=np.full(error.size, "dry")[rows],
+        day=np.zeros(error.size, dtype=np.int64),
+        frame=np.tile(np.arange(frames), trials)[rows],
+        time_s=np.zeros(error.size),
+        safety_margin=np.full(error.size, 0.5),
+        prediction=(0.5 + error.ravel())[rows],
+        **{name: np.full(error.size, np.nan) for name in ("sigma", "low_90", "high_90")},
+        withheld=np.full(error.size, ""),
+    )
 
-    edit(workspace / "maps-raw-real" / "result.json", unlabel)
-    assert verdict()[TOUCH, RAW].outcome == "undecided"
+
+def test_errors_differ_by_the_means_of_their_squares_over_trials(rng):
+    first, second = rng.normal(size=(2, 8, 5))
+    gap = compare_errors(predictions(first), predictions(second), rng=rng)
+    assert gap is not None
+    assert gap.estimate == pytest.approx(np.mean(first**2) - np.mean(second**2))
+    assert gap.units == 8
 
 
-def test_limits_of_the_verdict_are_named(workspace):
-    (fill,) = cautions(load_results(workspace))
-    assert "depends on the fill of a removed pixel" in fill
-    assert "grey" in fill
+def test_rows_are_matched_whatever_their_order_and_other_frames_are_not_compared(rng):
+    error = rng.normal(size=(8, 5))
+    gap = compare_errors(predictions(error), predictions(error, order=rng.permutation(40)), rng=rng)
+    assert gap is not None
+    assert (gap.low, gap.estimate, gap.high) == (0, 0, 0)
+    assert compare_errors(predictions(error), predictions(error[:7]), rng=rng) is None

@@ -454,7 +454,7 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
     Parameters
     ----------
     plot
-        Picture to draw: margin with its interval over time, and label and forces if they are known.
+        Picture to draw: margin with its interval over time, and label if it is known.
     """
     if plot is not None:
         from sliplens.plots.style import require_picture_path

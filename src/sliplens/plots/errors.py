@@ -21,6 +21,7 @@ from sliplens.plots.style import (
     VERMILLION,
     conditions_in_order,
     drawing_style,
+    in_order,
     inputs_in_order,
     method_colour,
     method_line,
@@ -39,48 +40,45 @@ from sliplens.results.evaluation import (
     ScoredFrames,
     Training,
 )
-from sliplens.results.faithfulness import CHANCE, DeletionCurve
+from sliplens.results.faithfulness import DeletionCurve, RemovalCurve
 
 _MSE_LABEL, _EPOCH_LABEL = "MSE (Γ as a fraction, squared)", "Epoch (passes over the training frames)"
 
 
-def plot_bins(bins: Mapping[str, tuple[BinScore, ...]], *, ax: Axes) -> Axes:
-    """Draw the MSE in each bin of the safety margin as bars, one colour an input (thesis, Fig. 7)."""
-    names = inputs_in_order(bins)
-    _draw_bins([(short_input_name(name), INPUT_COLOURS.get(name, PURPLE), bins[name]) for name in names], ax=ax)
+def plot_bins(bins: Mapping[str, Sequence[BinScore]], *, ax: Axes) -> Axes:
+    """Draw the MSE in each bin of the safety margin as bars, a colour an input or condition (thesis, Fig. 7)."""
+    width, names = 0.8 / max(1, len(bins)), in_order(bins, (*INPUT_COLOURS, *CONDITION_COLOURS))
     edges = next(iter(bins.values()), ())
-    ax.set_xticks(
-        np.arange(len(edges) + 1) - 0.5,
-        [f"{100 * edge:.0f}" for edge in [*(row.low for row in edges), 1.0]][: len(edges) + 1],
-    )
+    for index, name in enumerate(names):
+        at = np.arange(len(edges)) + (index - (len(names) - 1) / 2) * width
+        heights = [np.nan if score.mse is None else score.mse for score in bins[name]]
+        colour = (INPUT_COLOURS | CONDITION_COLOURS).get(name, PURPLE)
+        label = short_input_name(name) if name in INPUT_COLOURS else name
+        ax.bar(at, heights, width=width, color=colour, label=label)
+    ends = [f"{100 * edge:.0f}" for edge in [*(row.low for row in edges), 1.0]]
+    ax.set_xticks(np.arange(len(edges) + 1) - 0.5, ends[: len(edges) + 1])
     ax.grid(visible=False, axis="x")
     ax.set(xlabel=MARGIN_LABEL, ylabel=_MSE_LABEL, xlim=(-0.6, len(edges) - 0.4))
-    _legend_above(ax)
+    # right of the title, where it can hide no data
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3, borderaxespad=0.2, columnspacing=1.2)
     return ax
-
-
-def _draw_bins(rows: Sequence[tuple[str, str, Sequence[BinScore]]], *, ax: Axes) -> None:
-    """Draw bars of the MSE in each bin, side by side, each row with its name and colour."""
-    width = 0.8 / max(1, len(rows))
-    for index, (name, colour, bins) in enumerate(rows):
-        at = np.arange(len(bins)) + (index - (len(rows) - 1) / 2) * width
-        heights = [np.nan if score.mse is None else score.mse for score in bins]
-        ax.bar(at, heights, width=width, color=colour, label=name)
 
 
 def plot_predictions(predictions: ScoredFrames, *, ax: Axes, colour: str | None = None) -> Axes:
     """Draw prediction against label of every frame, in percent, in one colour, or in one a condition."""
-    groups = {"one frame": predictions} if colour is not None else {}
-    for name in conditions_in_order(predictions.condition) if colour is None else ():
-        groups[name] = predictions.where(predictions.condition == name)
+    conditions = [] if colour else conditions_in_order(predictions.condition)
+    groups = {name: predictions.where(predictions.condition == name) for name in conditions}
     ax.plot([0, 100], [0, 100], color=BLACK, linestyle="--", linewidth=1, label="perfect")
-    for name, frames in groups.items():
+    for name, frames in (groups or {"one frame": predictions}).items():
         some = frames.where(np.arange(0, len(frames), max(1, len(frames) // _MOST_DOTS)))
         size = np.clip(3000 / max(len(some), 1), 5, 30)  # few dots are seen as well as many
         dots: Any = {"s": size, "alpha": 0.45, "color": colour or CONDITION_COLOURS.get(name, GREEN), "label": name}
         # thousands of dots as vectors would swell the page
         ax.scatter(100 * some.safety_margin, 100 * some.prediction, linewidths=0, rasterized=True, **dots)
-    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103), ylim=_limits(predictions.prediction))
+    ax.set(xlabel="True Γ (%)", ylabel="Predicted Γ (%)", xlim=(-3, 103))
+    # predictions are not clipped to 0-100 %: show all of them
+    ends = 100 * predictions.prediction.min(initial=0.0), 100 * predictions.prediction.max(initial=1.0)
+    ax.set_ylim(ends[0] - 5, ends[1] + 5)
     ax.legend(loc="best")
     return ax
 
@@ -97,31 +95,35 @@ def plot_learning_curves(trainings: Mapping[str, Training], *, ax: Axes) -> Axes
     return ax
 
 
-def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, pixels: int, ax: Axes) -> Axes:
+def plot_faithfulness(curves: Mapping[str, DeletionCurve], *, ax: Axes) -> Axes:
     """Draw the mean deletion score D while pixels go, most salient first (thesis, Fig. 9).
 
     The band holds the middle half of the frames.
     """
+    pixels = max(int(curve.pixels_removed.max()) for curve in curves.values())
     for name in methods_in_order(curves):
         curve, colour = curves[name], method_colour(name)
         share = 100 * curve.pixels_removed / pixels
         low, high = np.quantile(curve.scores, [0.25, 0.75], axis=0)
         ax.fill_between(share, low, high, color=colour, alpha=0.12, linewidth=0)
-        line = {"linestyle": method_line(name), "linewidth": 2.2 if name != CHANCE else 2.4}
-        ax.plot(share, curve.scores.mean(axis=0), color=colour, label=method_name(name), **line)
+        ax.plot(share, curve.scores.mean(axis=0), color=colour, label=method_name(name), linestyle=method_line(name))
     ax.set(xlabel="Pixels removed (%)", ylabel="Deletion score D (no unit)", xlim=(0, 100), ylim=(0, 1.03))
     ax.legend()
     return ax
 
 
-def _legend_above(ax: Axes) -> None:
-    # right of the title, where it can hide no data
-    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3, borderaxespad=0.2, columnspacing=1.2)
+def plot_removal(curve: RemovalCurve, *, colour: str, ax: Axes) -> Axes:
+    """Draw the evidence lost while parts go: most supporting first, least supporting first, and at random.
 
-
-def _limits(prediction: np.ndarray) -> tuple[float, float]:
-    # predictions are not clipped to 0-100 %: show all of them
-    return min(-5.0, 100 * float(prediction.min()) - 3), max(105.0, 100 * float(prediction.max()) + 3)
+    The band holds the middle half of the frames.
+    """
+    share = 100 * curve.areas
+    low, high = np.quantile(curve.most_first, [0.25, 0.75], axis=0)
+    ax.fill_between(share, low, high, color=colour, alpha=0.15, linewidth=0)
+    ax.plot(share, curve.most_first.mean(axis=0), color=colour, label="most supporting first")
+    ax.plot(share, curve.least_first.mean(axis=0), color=colour, linestyle="--", label="least supporting first")
+    ax.plot(share, curve.random.mean(axis=0), color=BLACK, linestyle=":", label="random orders")
+    return ax
 
 
 _MOST_DOTS = 4000
@@ -139,13 +141,10 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
     with drawing_style():
         figure = Figure(figsize=(12, 7.5), layout="constrained")
         figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", parse_math=False)
-        answers, errors, biases, coverage, risk, typical = figure.subplots(2, 3).ravel()
-        plot_predictions(predictions, ax=answers).set_title("Predictions")
-        bins = [(name, CONDITION_COLOURS.get(name, GREEN), evaluation.conditions[name].bins) for name in conditions]
-        _draw_bins(bins, ax=errors)
-        errors.set(xlabel="True Γ, lower edge of the bin (%)", ylabel=_MSE_LABEL, title="Error by margin")
-        errors.set_xticks(range(10), [str(10 * edge) for edge in range(10)])
-        errors.legend()
+        scatter, errors, biases, coverage, risk, typical = figure.subplots(2, 3).ravel()
+        plot_predictions(predictions, ax=scatter).set_title("Predictions")
+        plot_bins({name: evaluation.conditions[name].bins for name in conditions}, ax=errors)
+        errors.set_title("Error by margin")
         _plot_trials(predictions, conditions, ax=biases)
         _plot_coverage(evaluation.reliability, conditions, ax=coverage)
         _plot_risk(evaluation.risk, ax=risk)

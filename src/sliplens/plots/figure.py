@@ -1,7 +1,6 @@
 """One figure for each kind of result, and one of a proposed sensor profile."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from textwrap import fill as wrap
 from typing import Any
@@ -17,7 +16,7 @@ from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, require_new_file, whole_file
 from sliplens.intervals import Difference
 from sliplens.markers.gel import SensorProposal, propose_profile
-from sliplens.plots.errors import plot_faithfulness, plot_learning_curves, plot_predictions
+from sliplens.plots.errors import plot_faithfulness, plot_learning_curves, plot_predictions, plot_removal
 from sliplens.plots.margins import column, plot_grip_force, plot_hold, plot_margins, plot_readings
 from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import (
@@ -37,7 +36,7 @@ from sliplens.recordings.sensor import profile_text
 from sliplens.recordings.source import Frames
 from sliplens.results.evaluation import Diagnosis
 from sliplens.results.explanation import Explanation
-from sliplens.results.faithfulness import DeletionScores, Faithfulness, is_control
+from sliplens.results.faithfulness import Faithfulness, is_control
 from sliplens.results.study import Study, Truth
 
 
@@ -100,11 +99,6 @@ def _explanation(explanation: Explanation, ax: Axes, index: int) -> None:
     ax.set_title(f"{method_name(explanation.method)}: {why}\norange lowers, blue raises")
 
 
-def _deletion(scores: DeletionScores, ax: Axes, _: int) -> None:
-    pixels = max(int(curve.pixels_removed.max()) for curve in scores.curves.values())
-    plot_faithfulness(scores.curves, pixels=pixels, ax=ax).set_title(input_name(scores.input))
-
-
 def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int) -> None:
     if not faithfulness.scores:
         raise InputError("these scores hold no method; score some explanations first")
@@ -112,15 +106,8 @@ def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int) -> None:
     gains = {score.method: score.srg for score in faithfulness.scores if (score.fill, score.unit) == (fill, unit)}
     methods = [name for name in gains if not is_control(name)]
     if len(methods) == 1:
-        curve = faithfulness.curves[fill, unit, methods[0]]
-        lines = (
-            (curve.most_first, "most influential first", BLUE, "-"),
-            (curve.least_first, "least influential first", BLUE, "--"),
-            (curve.random, "random orders", BLACK, ":"),
-        )
-        for values, name, colour, line in lines:
-            ax.plot(100 * curve.areas, values.mean(axis=0), color=colour, linestyle=line, label=name)
-        ax.set(xlabel="Removed (% of the image)", ylabel="Change of the prediction (margin units)", xlim=(0, 100))
+        plot_removal(faithfulness.curves[fill, unit, methods[0]], colour=BLUE, ax=ax)
+        ax.set(xlabel="Removed (% of the image)", ylabel="Evidence lost (margin units)", xlim=(0, 100))
         ax.set_title(f"{method_name(methods[0])} ({fill_name(fill, unit)})")
         ax.legend()
         return
@@ -139,12 +126,8 @@ def _truth(truth: Truth, ax: Axes, _: int) -> None:
 def _diagnosis(diagnosis: Diagnosis, ax: Axes, _: int) -> None:
     if not diagnosis.slices:
         raise InputError("this diagnosis tested no slice of the trials; diagnose a network on more trials")
-    rows = []
-    for part in diagnosis.slices:
-        ends = {name: getattr(part.excess, name) for name in ("estimate", "low", "high")}
-        points = {name: None if end is None else 100 * end for name, end in ends.items()}
-        rows.append((wrap(part.name, 32), replace(part.excess, **points), BLUE if part.holds else GREY))
-    _plot_gaps(rows, ax)
+    rows = [(wrap(part.name, 32), part.excess, BLUE if part.holds else GREY) for part in diagnosis.slices]
+    _plot_gaps(rows, ax, scale=100)
     ax.set(xlabel="Mean |error| less elsewhere (points of Γ, 95 % interval)")
     ax.set_title(f"{input_name(diagnosis.input)}: where the error is")
 
@@ -155,12 +138,12 @@ def _plot_methods(values: Mapping[str, Difference], ax: Axes) -> None:
     _plot_gaps([(method_name(name), values[name], GREY if is_control(name) else BLUE) for name in names], ax)
 
 
-def _plot_gaps(rows: Sequence[tuple[str, Difference, str]], ax: Axes) -> None:
+def _plot_gaps(rows: Sequence[tuple[str, Difference, str]], ax: Axes, *, scale: float = 1) -> None:
     """Draw estimates with their intervals, each with a name and colour, the first on top."""
     for place, (_, gap, colour) in enumerate(rows):
         if gap.low is not None and gap.high is not None:
-            ax.plot([gap.low, gap.high], [place, place], color=colour)
-        ax.plot([gap.estimate], [place], color=colour, marker="o")
+            ax.plot([scale * gap.low, scale * gap.high], [place, place], color=colour)
+        ax.plot([scale * gap.estimate], [place], color=colour, marker="o")
     ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")
     ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
     ax.invert_yaxis()
@@ -202,7 +185,7 @@ DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
     "Evaluation": lambda result, ax, _: plot_predictions(result.predictions, ax=ax),
     "Training": lambda result, ax, _: plot_learning_curves({result.input: result}, ax=ax),
     "Explanation": _explanation,
-    "DeletionScores": _deletion,
+    "DeletionScores": lambda result, ax, _: plot_faithfulness(result.curves, ax=ax).set_title(input_name(result.input)),
     "Faithfulness": _faithfulness,
     "Study": _study,
     "Truth": _truth,

@@ -18,58 +18,41 @@ from sliplens.plots.saliency import SIGN_COLOURS, full_colour, overlay_relevance
 from sliplens.plots.style import (
     BLACK,
     BLUE,
-    GREEN,
     GREY,
-    INPUT_NAMES,
-    ORANGE,
-    SOURCE_NAMES,
     VERMILLION,
     drawing_style,
+    input_name,
     method_name,
+    percent,
+    reading_words,
     require_picture_path,
     save_page,
     shade_withheld,
+    source_name,
 )
 from sliplens.results.explanation import Strip
 
 MARGIN_LABEL = "Safety margin Γ (%)"
 MOST_TRIALS = 6
 """Trials on one page."""
-_FORCES = (("normal_force_n", "normal", GREEN), ("tangential_force_n", "tangential", ORANGE))
 
 
 def draw_margins(rows: pa.Table, path: Path, *, title: str) -> int:
     """Save a page of predictions as .png, .pdf or .svg: a trial a row, at most `MOST_TRIALS`; gives how many.
 
-    `rows` are those of `sliplens.predict`. Labels and forces are drawn where they are in the table.
+    `rows` are those of `sliplens.predict`; labels are drawn where they are in the table.
     """
     require_picture_path(path, example="margins.png")
     names = rows["trial"].unique().to_pylist()
     if not names:
         raise InputError("there is no frame to draw; predict at least one")
     drawn = names[:MOST_TRIALS]
-    forced = any(np.isfinite(column(rows, name)).any() for name, _, _ in _FORCES if name in rows.column_names)
-    heights = [2.4, 1.2] if forced else [2.4]
     with drawing_style():
-        figure = Figure(figsize=(9.0, 0.5 + (sum(heights) + 0.5) * len(drawn)), layout="constrained")
+        figure = Figure(figsize=(9.0, 0.5 + 2.9 * len(drawn)), layout="constrained")
         more = "" if len(names) == len(drawn) else f", the first {len(drawn)} of {len(names)} trials"
         figure.suptitle(f"{title}{more}", x=0.01, ha="left", fontsize=12, fontweight="bold", parse_math=False)
-        axes = figure.subplots(len(heights) * len(drawn), 1, squeeze=False, height_ratios=heights * len(drawn))[:, 0]
-        for number, name in enumerate(drawn):
-            trial = rows.filter(pc.field("trial") == name)
-            chart = axes[len(heights) * number]
-            plot_margins(trial, ax=chart)
-            if forced:
-                below = axes[len(heights) * number + 1]
-                below.sharex(chart)
-                across, label = _across(trial)
-                for force, words, colour in _FORCES:
-                    line = "-" if words == "normal" else "--"
-                    below.plot(across, column(trial, force), color=colour, label=words, linestyle=line)
-                below.set(xlabel=label, ylabel="Force (N)")
-                below.legend(loc="upper left", ncols=2)
-                chart.set_xlabel("")
-                chart.tick_params(labelbottom=False)
+        for name, ax in zip(drawn, figure.subplots(len(drawn), 1, squeeze=False)[:, 0], strict=True):
+            plot_margins(rows.filter(pc.field("trial") == name), ax=ax)
     save_page(figure, path)
     return len(drawn)
 
@@ -79,7 +62,8 @@ def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
 
     Frames whose margin is withheld are grey, and the legend says why.
     """
-    across, label = _across(rows)
+    timed = "time_s" in rows.column_names and rows["time_s"].null_count == 0
+    across = column(rows, "time_s" if timed else "frame")
     shade_withheld(across, rows["withheld"].to_pylist(), ax=ax)
     nothing = np.full(len(rows), np.nan)
     prediction, low, high, true = (
@@ -88,8 +72,8 @@ def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
     )
     _plot_prediction(across, prediction, low, high, true, ax=ax)
     ax.axhline(0, color=GREY, linewidth=0.8)
-    ax.set(xlabel=label, ylabel=MARGIN_LABEL)
-    if label == "Frame":
+    ax.set(xlabel="Time (s)" if timed else "Frame", ylabel=MARGIN_LABEL)
+    if not timed:
         ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     low, high = ax.get_ylim()
     ax.set_ylim(min(low, -4), max(high, 104))
@@ -97,11 +81,6 @@ def plot_margins(rows: pa.Table, *, ax: Axes) -> Axes:
     lines = -(-len(ax.get_legend_handles_labels()[0]) // 2)
     ax.set_title(rows["trial"][0].as_py(), parse_math=False, pad=6 + 15 * lines)
     return ax
-
-
-def _across(rows: pa.Table) -> tuple[Float[np.ndarray, " frames"], str]:
-    timed = "time_s" in rows.column_names and rows["time_s"].null_count == 0
-    return (column(rows, "time_s"), "Time (s)") if timed else (column(rows, "frame"), "Frame")
 
 
 def column(rows: pa.Table, name: str) -> Float[np.ndarray, " frames"]:
@@ -120,9 +99,9 @@ def draw_strip(strip: Strip) -> Figure:
     limit, count = full_colour(points), len(strip.shown)
     with drawing_style():
         figure = Figure(figsize=(10, 4.6 + 8.2 / count), layout="constrained")
-        network = INPUT_NAMES.get(strip.input, strip.input).lower()
+        network = input_name(strip.input).lower()
         figure.suptitle(
-            f"A {strip.condition} grip from stick to slip ({SOURCE_NAMES[strip.source]})\nFrames under the map of "
+            f"A {strip.condition} grip from stick to slip ({source_name(strip.source)})\nFrames under the map of "
             f"{method_name(strip.method)}, network on {network}: orange lowers its margin, blue raises it",
             x=0.01, ha="left", fontsize=11,
         )  # fmt: skip
@@ -131,8 +110,8 @@ def draw_strip(strip: Strip) -> Figure:
         for number, (frame, picture, relevance) in enumerate(zip(strip.shown, strip.pictures, points, strict=True)):
             axes[number].imshow(overlay_relevance(picture, relevance / limit))
             axes[number].set_axis_off()
-            read, true = (_percent(values[frame]) for values in (readings.prediction, readings.safety_margin))
-            words = f"{number + 1}: {'withheld' if readings.withheld[frame] else f'{read} predicted'}\n{true} true"
+            read = reading_words(float(readings.prediction[frame]), readings.withheld[frame])
+            words = f"{number + 1}: {read}\ntrue {percent(float(readings.safety_margin[frame]))}"
             axes[number].set_title(words, fontsize=9.5, loc="center", fontweight="normal")
         bar = figure.colorbar(ScalarMappable(Normalize(-limit, limit), SIGN_COLOURS), ax=axes, aspect=15)
         bar.set_label("points of margin\nper 1 % of the image", fontsize=8)
@@ -175,10 +154,6 @@ def _plot_prediction(
         ax.plot(across, 100 * true, color=BLACK, linestyle="--", label="true")
 
 
-def _percent(value: float) -> str:
-    return f"{100 * value:.0f} %" if np.isfinite(value) else "-"
-
-
 def plot_grip_force(trace: pa.Table, *, ax: Axes) -> Axes:
     """Draw the grip force over the least force that holds, and detected slips."""
     time_s, force_n, least_n = (column(trace, name) for name in ("time_s", "force_n", "least_force_n"))
@@ -211,11 +186,9 @@ def plot_grip(trace: pa.Table, *, axes: Sequence[Axes]) -> None:
     force, margin, slip = axes
     plot_grip_force(trace, ax=force).set_title("Force")
     time_s, slip_m = column(trace, "time_s"), column(trace, "slip_m")
-    predicted, low, high, true = (100 * column(trace, name) for name in ("margin", "low", "high", "true_margin"))
-    margin.fill_between(time_s, low, high, color=ORANGE, alpha=0.2, linewidth=0)
-    margin.plot(time_s, predicted, color=ORANGE, linewidth=1, label="predicted, with 90 % interval")
-    margin.plot(time_s, true, color=BLACK, linestyle="--", label="true")
-    margin.set(xlabel="Time (s)", ylabel="Safety margin Γ (%)", ylim=(-3, 103), title="Margin")
+    predicted, low, high, true = (column(trace, name) for name in ("margin", "low", "high", "true_margin"))
+    _plot_prediction(time_s, predicted, low, high, true, ax=margin)
+    margin.set(xlabel="Time (s)", ylabel=MARGIN_LABEL, ylim=(-3, 103), title="Margin")
     margin.legend(loc="lower right")
     slip.plot(time_s, 1e3 * slip_m, color=GREY)
     slip.set(xlabel="Time (s)", ylabel="Slip (mm)", ylim=(0, max(1.0, 1.05e3 * float(slip_m.max()))), title="Slip")

@@ -181,8 +181,8 @@ def tell_ends(gap: Difference, write: Callable[[float], str], *, title: str = ""
 
 
 def percent(value: float | None, *, digits: int = 0) -> str:
-    """Write a share as a percentage, or a dash for None; without the sign of a negative zero."""
-    return UNKNOWN if value is None else f"{decimals(100 * value, digits)}\N{NO-BREAK SPACE}%"
+    """Write a share as a percentage, or a dash for None and NaN; without the sign of a negative zero."""
+    return UNKNOWN if value is None or np.isnan(value) else f"{decimals(100 * value, digits)}\N{NO-BREAK SPACE}%"
 
 
 def reading_words(prediction: float, withheld: str | None) -> str:

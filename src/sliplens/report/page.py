@@ -16,13 +16,11 @@ from markupsafe import Markup, escape
 
 from sliplens.errors import InputError
 from sliplens.plots.style import written_whole
-from sliplens.report.alarms import count_alarms
-from sliplens.report.comparisons import CITATION, tell_interval
-from sliplens.report.pictures import plate_strip
-from sliplens.report.plates import FOLDER, Plate, write_plates
-from sliplens.report.results import Results, load_results
-from sliplens.report.sections import Section, build_sections
-from sliplens.report.verdict import Verdict, cautions, judge
+from sliplens.report.comparisons import CITATION, write_gap
+from sliplens.report.plates import FOLDER, Plate, plate_strip, write_plates
+from sliplens.report.results import load_results
+from sliplens.report.sections import Notes, build_sections
+from sliplens.report.verdict import Verdict, cautions, judge_results
 from sliplens.results.study import Study
 
 PAGE = "report.html"
@@ -72,32 +70,20 @@ def write_report(
     # one stream, seeded: the same results give the same intervals
     rng = np.random.default_rng(0)
     sections = build_sections(results, rng=rng)
-    claims = [block for section in sections for block in section.blocks if isinstance(block, Verdict)]
-    verdict = judge(results, claims=claims, rng=rng)
-    opening = None if results.strip is None else plate_strip(results.strip)
-    text = _render(results, verdict, sections, opening=opening, waiting_for=waiting_for)
-    plates = [] if opening is None else [opening]
-    plates += [block for section in sections for block in section.blocks if isinstance(block, Plate)]
-    # the figures first: a page that is there has all that it names
-    figures = write_plates(plates, page.parent / FOLDER)
-    with written_whole(page) as part:
-        part.write_text(text, encoding="utf-8")
-    return Written(page=page, figures=figures)
-
-
-def _render(
-    results: Results,
-    verdict: tuple[Verdict, ...],
-    sections: tuple[Section, ...],
-    *,
-    opening: Plate | None,
-    waiting_for: Sequence[str],
-) -> str:
-    """Lay a report out as HTML."""
+    blocks = [block for section in sections for block in section.blocks]
+    verdict = judge_results(results, claims=[block for block in blocks if isinstance(block, Verdict)], rng=rng)
+    opening = [] if results.strip is None else [plate_strip(results.strip)]
     runs = list(results.runs.values())
-    versions = {tuple(sorted(run.versions.items())) for run in runs}
-    mixed = "The stages were run with different versions of the libraries; see the versions of each run.json."
-    return render_page(
+    alarms = [*results.notes]
+    if len({tuple(sorted(run.versions.items())) for run in runs}) > 1:
+        alarms.append(
+            "The stages were run with different versions of the libraries; see the versions of each run.json."
+        )
+    for section in sections:
+        notes = [block for block in section.blocks if isinstance(block, Notes) and block.tone == "caution"]
+        counts = [f"{block.title[:1].lower()}{block.title[1:]}: {len(block.sentences)}" for block in notes]
+        alarms += [f"{section.short_title}: {'; '.join(counts)}."] if counts else []
+    text = render_page(
         "report.html.j2",
         name=results.workspace.resolve().name,
         finished=runs[-1].finished[:16].replace("T", " at "),
@@ -106,25 +92,37 @@ def _render(
         opening=opening,
         verdict=verdict,
         cautions=cautions(results),
-        alarms=[*results.notes, *([mixed] if len(versions) > 1 else []), *count_alarms(results)],
+        alarms=alarms,
         sections=sections,
         study=bool(results.study),
         runs=results.runs,
         recipes=[json.dumps(run.config, indent=2, ensure_ascii=False) for run in runs],
         facts={**runs[-1].versions, **vars(runs[-1].machine)},
-        interval=tell_interval,
+        interval=write_gap,
     )
+    # the figures first: a page that is there has all that it names
+    plates = [*opening, *(block for block in blocks if isinstance(block, Plate))]
+    figures = write_plates(plates, page.parent / FOLDER)
+    write_page(page, text)
+    return Written(page=page, figures=figures)
+
+
+def write_page(page: Path, text: str) -> None:
+    """Write a page; it appears when complete."""
+    with written_whole(page) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def render_page(template: str, *, script: str = "", **values: Any) -> str:
     """Fill a template of a page: every text is escaped, and only the style and script of the package work on it."""
     loader = PackageLoader("sliplens.report")
     pages = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    folder = files("sliplens.report") / "templates"
-    inline = {"style": "report.css"} | ({"script": script} if script else {})
-    texts = {kind: (folder / name).read_text(encoding="utf-8") for kind, name in inline.items()}
     pages.filters["code"] = set_code
-    allowed = [f"{kind}-src 'sha256-{_sha256(text)}'" for kind, text in texts.items()]
+    inline = {"style": "report.css"} | ({"script": script} if script else {})
+    folder = files("sliplens.report") / "templates"
+    texts = {kind: (folder / name).read_text(encoding="utf-8") for kind, name in inline.items()}
+    hashes = {kind: b64encode(sha256(text.encode()).digest()).decode() for kind, text in texts.items()}
+    allowed = [f"{kind}-src 'sha256-{code}'" for kind, code in hashes.items()]
     policy = "; ".join(["default-src 'none'", "img-src data:", *allowed, "base-uri 'none'", "form-action 'none'"])
     return pages.get_template(template).render(policy=policy, **texts, **values)
 
@@ -132,7 +130,3 @@ def render_page(template: str, *, script: str = "", **values: Any) -> str:
 def set_code(text: str) -> Markup:
     """Escape a text, and set what stands between backticks as code."""
     return Markup(re.sub(r"`([^`]+)`", r"<code>\1</code>", str(escape(text))))
-
-
-def _sha256(text: str) -> str:
-    return b64encode(sha256(text.encode()).digest()).decode()

@@ -1,136 +1,67 @@
-"""Figures of a study: each on the page, as a PDF and as a table of its numbers."""
+"""Figures of a page: each on the page, as a PDF and as a table of its numbers."""
 
 import csv
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from textwrap import fill
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float, UInt8
-from matplotlib.axes import Axes
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from sliplens.grip.records import Grip
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
-from sliplens.plots.saliency import choose_columns, overlay_saliency, plot_colour_bar, stretch_saliency
+from sliplens.plots.margins import draw_strip
+from sliplens.plots.saliency import (
+    SIGN_BAR,
+    FrameU8,
+    PictureRow,
+    draw_pictures,
+    full_colour,
+    overlay_points,
+    overlay_relevance,
+)
 from sliplens.plots.style import (
     Picture,
-    drawing_style,
     figure_picture,
-    place_axes,
-    place_text,
+    input_name,
+    listed,
+    method_name,
+    methods_in_order,
+    percent,
+    reading_words,
     save_page,
-    write_over,
+    source_name,
     written_whole,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import Explanation
-
-CELL_IN = 1.5
-_GAP_IN, _LEFT_IN, _HEAD_IN, _WORDS_IN, _BAR_IN = 0.06, 1.25, 0.42, 0.2, 0.75
-_EDGE_IN = 0.1
-_HEAD_LETTERS = 20
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """A picture, and words below it."""
-
-    picture: UInt8[np.ndarray, "height width 3"] | None
-    words: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Grid:
-    """A figure of pictures, its axes by row and column, and where the next thing below may begin."""
-
-    figure: Figure
-    axes: list[list[Axes]]
-    bottom_in: float
-
-
-def draw_grid(
-    rows: Sequence[tuple[str, Sequence[Cell]]],
-    *,
-    heads: Sequence[str] = (),
-    below_in: float = 0.0,
-    bar: bool = False,
-    cell_in: float = CELL_IN,
-) -> Grid:
-    """Draw pictures in rows."""
-    columns = max(len(cells) for _, cells in rows)
-    worded = [any(cell.words for cell in cells) for _, cells in rows]
-    shape = next((cell.picture.shape for _, cells in rows for cell in cells if cell.picture is not None), (1, 1, 3))
-    high = cell_in * shape[0] / shape[1]
-    head = _HEAD_IN if heads else _EDGE_IN
-    rest = len(rows) * (high + _GAP_IN) + sum(worded) * _WORDS_IN
-    width = _LEFT_IN + columns * (cell_in + _GAP_IN) + _EDGE_IN
-    height = head + rest + below_in + (_BAR_IN if bar else 0) + _EDGE_IN
-    with drawing_style():
-        figure = Figure(figsize=(width, height))
-        axes, top = [], head
-        for (name, cells), has_words in zip(rows, worded, strict=True):
-            aside = {"ha": "right", "va": "center", "fontsize": 9, "wrap": True, "parse_math": False}
-            place_text(figure, _LEFT_IN - 0.1, top + high / 2, name, **aside)
-            axes.append([])
-            for column, cell in enumerate(cells):
-                left_in = _LEFT_IN + column * (cell_in + _GAP_IN)
-                ax = place_axes(figure, left_in, top, cell_in, high)
-                _show(cell.picture, ax=ax)
-                axes[-1].append(ax)
-                if cell.words:
-                    below = {"ha": "center", "fontsize": 7.5, "parse_math": False}
-                    place_text(figure, left_in + cell_in / 2, top + high + 0.03, cell.words, **below)
-            top += high + _GAP_IN + (_WORDS_IN if has_words else 0)
-        for column, words in enumerate(heads):
-            place = _LEFT_IN + column * (cell_in + _GAP_IN) + cell_in / 2
-            lines = words if "\n" in words else fill(words, _HEAD_LETTERS)
-            place_text(figure, place, head - 0.06, lines, ha="center", va="bottom", fontsize=9, parse_math=False)
-        if bar:
-            plot_colour_bar(ax=place_axes(figure, _LEFT_IN, top + 0.14, min(4.2, width - _LEFT_IN - _EDGE_IN), 0.14))
-    return Grid(figure=figure, axes=axes, bottom_in=top)
-
-
-def show_map(
-    picture: UInt8[np.ndarray, "height width 3"], saliency: Float[np.ndarray, "height width"]
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Lay a map over its picture, stretched for viewing."""
-    return overlay_saliency(picture, stretch_saliency(saliency))
-
-
-def _show(picture: UInt8[np.ndarray, "height width 3"] | None, *, ax: Axes) -> None:
-    ax.set(xticks=[], yticks=[])
-    ax.grid(visible=False)
-    ax.spines[:].set_visible(False)
-    if picture is None:
-        write_over(ax, "no frame", fontsize=8)
-    else:
-        ax.imshow(picture, interpolation="none")
-
+from sliplens.results.explanation import Explanation, Strip
+from sliplens.results.faithfulness import is_control
 
 FOLDER = "figures"
 """Beside the page."""
-
-Numbers = Mapping[str, Sequence[Any] | np.ndarray]
-"""Columns of equal length, by name."""
+_TRUTH_FRAMES = _TRUTH_METHODS = 3
+_MOST_FRAMES = 6
+_THESIS_NUMBERS = {"difference": 15, "raw": 16}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plate:
-    """A figure with all that goes with it."""
+    """A figure with its caption, its description in words and its numbers."""
 
     layout: ClassVar[str] = "plate"
 
     name: str
-    """Name of its files, without suffix."""
+    """Name of its files, without suffix; `fig-09-...` is figure 9 of the thesis."""
     figure: Figure
     alt: str
-    """Description in words."""
     caption: str
-    numbers: Numbers
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+    """Numbers of the figure."""
     pixels: bool = False
     """True where it is made of photographs."""
 
@@ -145,19 +76,9 @@ class Plate:
     @property
     def files(self) -> str:
         """Where its files are found."""
-        records = re.match(r"fig-(\d+)-", self.name)
-        text = f"Fig. {int(records[1])} of the thesis, for this data;" if records else "Also"
+        number = re.match(r"fig-(\d+)-", self.name)
+        text = f"Fig. {int(number[1])} of the thesis, for this data;" if number else "Also"
         return f"{text} {FOLDER}/{self.name}.pdf, numbers in {self.name}.csv."
-
-
-def named_columns(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, list]:
-    """Turn rows into named columns."""
-    return {name: [row[place] for row in rows] for place, name in enumerate(names)}
-
-
-def rows_of(*arrays: np.ndarray) -> list[tuple[Any, ...]]:
-    """Turn columns of equal length into rows of Python's own values."""
-    return list(zip(*(array.tolist() for array in arrays), strict=True))
 
 
 def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[Path, ...]:
@@ -168,24 +89,140 @@ def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[Path, ...]:
         save_page(plate.figure, page)
         with written_whole(table) as part, part.open("w", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream)
-            writer.writerow(plate.numbers)
-            writer.writerows(zip(*(_cells(column) for column in plate.numbers.values()), strict=True))
+            writer.writerow(plate.columns)
+            # nine digits: more would be noise of the arithmetic, and differ between machines
+            writer.writerows([f"{cell:.9g}" if isinstance(cell, float) else cell for cell in row] for row in plate.rows)
         written += [page, table]
     return tuple(written)
 
 
-def _cells(column: Sequence[Any] | np.ndarray) -> list[Any]:
-    values = column.tolist() if isinstance(column, np.ndarray) else list(column)
-    # nine digits: more would be noise of the arithmetic, and differ between machines
-    return [f"{value:.9g}" if isinstance(value, float) else value for value in values]
+def rows_of(*columns: Iterable[Any]) -> list[tuple[Any, ...]]:
+    """Turn columns of equal length into rows of Python's own values."""
+    return list(
+        zip(*(column.tolist() if isinstance(column, np.ndarray) else column for column in columns), strict=True)
+    )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShownFrame:
-    """Frame of a plate: the margin it stands for (None if unknown), and its place among the explained frames."""
+def plate_strip(strip: Strip) -> Plate:
+    """Draw one trial from stick to slip, its true and predicted margin, and the maps of a few frames."""
+    readings = strip.readings
+    ends = [reading_words(float(readings.prediction[at]), readings.withheld[at]) for at in strip.shown]
+    return Plate(
+        name="strip",
+        figure=draw_strip(strip),
+        alt=f"Camera frames of a {strip.condition} grip from stick to slip under the maps of a network, and below them "
+        f"the true and the predicted safety margin over time: {ends[0]} at first and {ends[-1]} at last.",
+        caption=f"One grip of {source_name(strip.source)} from stick to slip: the first {strip.condition} trial that "
+        f"tests, chosen by its place alone. Above: the camera's frames under the map of {method_name(strip.method)}, "
+        "one scale for all. Below: the true margin, the predicted margin, and the interval that should hold 90 % of "
+        "the labels.",
+        columns=list(vars(readings)),
+        rows=rows_of(*vars(readings).values()),
+        pixels=True,
+    )
 
-    level: float | None
-    index: int
+
+def plate_states(results: Results, explained: Explanation) -> Plate:
+    """Draw every method across the states of one trial (thesis, Figs. 15 and 16)."""
+    rows = choose_frames(results, explained)
+    frames = [explained.frames[row] for row in rows]
+    methods = methods_in_order(name for name in explained.relevance if not is_control(name))
+    what = f"Methods across the contact states, {input_name(explained.input).lower()}, {source_name(explained.source)}"
+    pictures, title = bright_pictures(explained, rows)
+    heads = [f"Γ {percent(frame.safety_margin)}\n{reading_words(frame.prediction, frame.withheld)}" for frame in frames]
+    lines = [PictureRow(name=title, pictures=pictures)]
+    for method in methods:
+        relevance = explained.relevance[method][rows]
+        lines.append(PictureRow(name=method_name(method), pictures=overlay_points(pictures, relevance)))
+    number = _THESIS_NUMBERS.get(explained.input)
+    name = f"fig-{number}-methods-{explained.input}" if number else f"methods-{explained.input}"
+    off = [abs(frame.prediction - frame.safety_margin) for frame in frames if frame.safety_margin is not None]
+    errors = f" The network is off by at most {100 * max(off):.1f} percentage points on these frames." if off else ""
+    return Plate(
+        name=f"real-{explained.input}" if explained.source == "real" else name,
+        figure=draw_pictures(lines, heads=heads, bar=SIGN_BAR),
+        alt=f"{what}: {listed([method_name(method) for method in methods])} from stick to slip",
+        caption=f"{what}, from full stick to full slip.{errors} Orange lowers the margin against the untouched sensor, "
+        "blue raises it; one scale a method, so that its frames compare and methods do not.",
+        columns=("input", "method", "frame_id", "safety_margin", "prediction", "relevance"),
+        rows=[
+            (explained.input, method, frame.id, frame.safety_margin, frame.prediction, float(relevance.sum()))
+            for method in methods
+            for frame, relevance in zip(frames, explained.relevance[method][rows], strict=True)
+        ],
+        pixels=True,
+    )
+
+
+def plate_truth(results: Results, name: str) -> Plate | None:
+    """Draw frames, effects of each marker on prediction and margin, and the maps nearest to these; None without."""
+    truth, explained = results.study.truth.get(name), explained_of(results, name)
+    if truth is None or explained is None:
+        return None
+    places = {frame.id: index for index, frame in enumerate(explained.frames)}
+    rows = spread_frames(explained, [places[key] for key in truth.frame_ids if key in places], _TRUTH_FRAMES)
+    if not rows:
+        return None
+    likeness = {
+        method: record.shapley.estimate
+        for method, record in truth.methods.items()
+        if method in explained.relevance and not is_control(method) and record.shapley is not None
+    }
+    methods = sorted(methods_in_order(likeness), key=lambda method: -likeness[method])[:_TRUTH_METHODS]
+    pictures, title = bright_pictures(explained, rows)
+    lines = []
+    for row, picture in zip(rows, pictures, strict=True):
+        frame = explained.frames[row]
+        at = truth.frame_ids.index(frame.id)
+        effects = [maps[at] for maps in (truth.shapley_maps, truth.network_maps, truth.margin_maps)]
+        lines.append(
+            PictureRow(
+                name=f"Γ {percent(frame.safety_margin)}\n{reading_words(frame.prediction, frame.withheld)}",
+                pictures=[
+                    picture,
+                    *(_painted(picture, values, percentile=100.0) for values in effects),
+                    *(_painted(picture, explained.relevance[method][row]) for method in methods),
+                ],
+                words=["", *(f"up to {100 * np.abs(values).max():.1f} points" for values in effects)],
+            )
+        )
+    columns = ("frame_id", "marker", "x_px", "y_px", "shapley", "shapley_error", "network", "margin", "state")
+    titles = [method_name(method) for method in methods]
+    heads = [title, "Shapley values", "Put back alone:\nprediction", "Put back alone:\nmargin", *titles]
+    return Plate(
+        name=f"truth-{name}",
+        figure=draw_pictures(lines, heads=heads),
+        alt=f"{input_name(name)}: Shapley value and single effect of each marker in the prediction, and its effect on "
+        f"the best estimate of the margin, beside the maps of {listed(titles or ['no method'])}",
+        caption=f"{input_name(name)}: what each marker does to the network's prediction, in whatever company of "
+        "markers (Shapley value) and alone, and to the best estimate of the margin, in percentage points (value less "
+        "value with that marker put back where it rested), beside the maps nearest to the first. Orange lowers, blue "
+        "raises; full colour at the largest effect of each picture.",
+        columns=columns,
+        rows=rows_of(*(getattr(truth.effects, column) for column in columns)),
+        pixels=True,
+    )
+
+
+def plate_moments(grip: Grip) -> Plate:
+    """Draw frames of the first finger, and the maps that explain their predictions."""
+    heads = [f"{time_s:g} s" for time_s in grip.moments_s]
+    maps = overlay_points(grip.pictures, grip.maps)
+    rows = [PictureRow(name="camera", pictures=list(grip.pictures)), PictureRow(name="why", pictures=maps)]
+    return Plate(
+        name="grip-moments",
+        figure=draw_pictures(rows, heads=heads, bar=SIGN_BAR),
+        alt=f"Camera frames and maps at {', '.join(heads)}",
+        caption="Frames of the first finger, and their relevance: orange lowers the margin against the untouched "
+        "sensor, blue raises it. How far to trust such maps: run `sliplens study`.",
+        columns=("time_s", "relevance"),
+        rows=rows_of(grip.moments_s, grip.maps.sum(axis=(1, 2)).astype(np.float64)),
+        pixels=True,
+    )
+
+
+def _painted(picture: FrameU8, values: Float[np.ndarray, "rows columns"], *, percentile: float = 99.5) -> FrameU8:
+    return overlay_relevance(picture, values / full_colour(values, percentile=percentile))
 
 
 def explained_of(results: Results, name: str) -> Explanation | None:
@@ -193,29 +230,33 @@ def explained_of(results: Results, name: str) -> Explanation | None:
     return results.explanations.get((name, results.study.source))
 
 
-def shown_frames(results: Results, explained: Explanation) -> list[ShownFrame]:
-    """Frames of one trial from full stick to full slip; without a choice, those a panel would show."""
+def choose_frames(results: Results, explained: Explanation) -> list[int]:
+    """Numbers of the frames to show: those of the study's choice, else a few of one condition; the margin falls."""
     places = {frame.id: index for index, frame in enumerate(explained.frames)}
     choice = results.study.choice
-    rows = [frame for frame in choice.frames if frame.shown and frame.id in places] if choice else []
-    if rows:
-        first = rows[0].trial
-        ranked = sorted((row for row in rows if row.trial == first), key=lambda row: -row.level)
-        return [ShownFrame(level=row.level, index=places[row.id]) for row in ranked]
-    _, chosen = choose_columns(explained.frames)
-    return [ShownFrame(level=level, index=index) for level, index in chosen if index is not None]
+    chosen = [frame for frame in choice.frames if frame.shown and frame.id in places] if choice else []
+    if chosen:
+        chosen = [frame for frame in chosen if frame.trial == chosen[0].trial]
+        return [places[frame.id] for frame in sorted(chosen, key=lambda frame: -frame.level)]
+    conditions = [frame.condition for frame in explained.frames]
+    most = max(sorted(set(conditions)), key=conditions.count)
+    rows = [row for row, condition in enumerate(conditions) if condition == most]
+    return spread_frames(explained, rows, _MOST_FRAMES) or rows[:_MOST_FRAMES]
 
 
-def bright_pictures(
-    explained: Explanation, indices: Sequence[int]
-) -> tuple[dict[int, UInt8[np.ndarray, "height width 3"]], str]:
-    """Pictures of some frames, and what to call them; differences are made brighter all alike, to be seen."""
-    factor, name = picture_brightness(explained.input, [explained.pictures[index] for index in indices])
-    return {index: brighten(explained.pictures[index], factor) for index in indices}, name
+def spread_frames(explained: Explanation, rows: Iterable[int], count: int) -> list[int]:
+    """Choose a few of the labelled frames, evenly from high to low margin; predictions play no part."""
+    labels = {row: margin for row in rows if (margin := explained.frames[row].safety_margin) is not None}
+    ranked = sorted(labels, key=lambda row: -labels[row])
+    places = np.linspace(0, len(ranked) - 1, min(count, len(ranked))).round().astype(int)
+    return [ranked[place] for place in places]
 
 
-def picture_brightness(name: str, pictures: Iterable[UInt8[np.ndarray, "height width 3"]]) -> tuple[float, str]:
-    """By how much to brighten pictures of an input, all alike, and what to call them then."""
+def bright_pictures(explained: Explanation, rows: Sequence[int]) -> tuple[list[FrameU8], str]:
+    """Pictures of some frames, and their title; differences, which are dark, are brightened by one factor."""
+    pictures = [explained.pictures[row] for row in rows]
     # where no change is black; elsewhere the ground would turn white
-    factor = brightening([picture[None] for picture in pictures]) if name in {"difference", "amplitude"} else 1.0
-    return factor, "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"
+    dark = explained.input in {"difference", "amplitude"}
+    factor = brightening([picture[None] for picture in pictures]) if dark else 1.0
+    title = "Input" if factor == 1 else f"Input {TIMES}\N{NO-BREAK SPACE}{factor:g}"
+    return [brighten(picture, factor) for picture in pictures], title

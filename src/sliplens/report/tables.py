@@ -1,14 +1,14 @@
 """Tables of the page: cells as text, so that the template only lays them out."""
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 
+from sliplens.grip.records import Grip
 from sliplens.intervals import Difference
 from sliplens.plots.style import (
-    FILL_NAMES,
     UNKNOWN,
     conditions_in_order,
     decimals,
@@ -18,9 +18,8 @@ from sliplens.plots.style import (
     method_name,
     methods_in_order,
     percent,
-    short_input_name,
     signed,
-    source_name,
+    tell_ends,
 )
 from sliplens.progress import number_of
 from sliplens.report.comparisons import (
@@ -29,33 +28,27 @@ from sliplens.report.comparisons import (
     MARK,
     NETWORK_PIXELS,
     SECONDS,
-    against_control,
     settings,
-    tell_bounds,
-    tell_interval,
-    tell_over,
     thesis_row,
+    write_ends,
+    write_gap,
+    write_over,
 )
 from sliplens.report.results import Results
+from sliplens.results.evaluation import Diagnosis
 from sliplens.results.faithfulness import (
     CHANCE,
     DeletionScores,
     Faithfulness,
-    Lead,
     MethodScore,
     RemovalScore,
     is_control,
 )
-from sliplens.results.study import MAP_MEASURES, REGIONS, Choice, MapQuality, Randomisation, Timing, Truth
+from sliplens.results.study import MAP_MEASURES, REGIONS, MapQuality, Randomisation, Timing, Truth
 
 Kind = Literal["name", "number", "best", "thesis"]
-_LOOK_NAMES = {
-    "resolution": "Resolution",
-    "total_variation": "Total variation",
-}
-_REGION_NAMES = {"markers": "markers", "slip_annulus": "slip annulus", "edges": "marker edges"}
-_CORRELATIONS = ("With Shapley values", "Lead over controls", "With markers put back alone", "With the best reading")
-_GAINS = ("SRG of the truth", "SRG, damaged", "Truth less damaged", "SRG of |x - b|")
+Record = TypeVar("Record")
+_LOOK_NAMES = ("Resolution", "Total variation")
 _TRUTHS = ("oracle", "degraded-oracle")
 
 
@@ -68,7 +61,7 @@ class Cell:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
+class CellTable:
     """A table with its caption."""
 
     layout: ClassVar[str] = "table"
@@ -78,306 +71,260 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
 
 
-def make_table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str | Cell]], *, names: int = 1) -> Table:
-    """Make a table of texts: names in the first columns, then numbers, the thesis's own where the head says so."""
-    heads = tuple(Cell(text=text, kind="thesis" if "thesis" in text.lower() else "name") for text in head)
+def make_table(
+    caption: str, columns: Mapping[str, Callable[[Record], str | Cell]], records: Iterable[Record], *, names: int = 1
+) -> CellTable:
+    """Make a table of records from its columns: a head, and what each record has there.
+
+    The first columns hold names, the others numbers; those with "thesis" in their head are marked.
+    """
     kinds: list[Kind] = [
-        "name" if place < names else "thesis" if cell.kind == "thesis" else "number" for place, cell in enumerate(heads)
+        "name" if place < names else "thesis" if "thesis" in head.lower() else "number"
+        for place, head in enumerate(columns)
     ]
-    cells = tuple(
+    rows = [
         tuple(
-            record if isinstance(record, Cell) else Cell(text=record, kind=kind)
-            for record, kind in zip(row, kinds, strict=True)
+            cell if isinstance(cell := write(record), Cell) else Cell(text=cell, kind=kind)
+            for write, kind in zip(columns.values(), kinds, strict=True)
         )
-        for row in rows
-    )
-    return Table(caption=caption, head=heads, rows=cells)
+        for record in records
+    ]
+    head = tuple(Cell(text=text, kind="thesis" if "thesis" in text.lower() else "name") for text in columns)
+    return CellTable(caption=caption, head=head, rows=tuple(rows))
 
 
-def tell_spread(mean: float, sd: float) -> str:
-    """Write a mean with its standard deviation."""
-    return f"{mean:.3f} ± {sd:.3f}"
-
-
-def _each_method(records: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
+def _each_method(
+    records: Mapping[str, MapQuality] | Mapping[str, Randomisation] | Mapping[str, Timing],
+) -> Iterator[tuple[str, str, Any]]:
     """Input, method, and what a record of the input holds of the method, in the order they are read."""
-    result = {name: records[name].methods for name in inputs_in_order(records)}
-    return [(name, method, methods[method]) for name, methods in result.items() for method in methods_in_order(methods)]
+    for name in inputs_in_order(records):
+        methods = records[name].methods
+        yield from ((name, method, methods[method]) for method in methods_in_order(methods))
 
 
 def _best(text: str, best: bool) -> Cell:
     return Cell(text=text, kind="best" if best else "number")
 
 
-def table_accuracy(results: Results) -> Table:
+def table_accuracy(results: Results) -> CellTable:
     """Tabulate MSE, R2 and MAE by condition and input (thesis, Table 1)."""
-    evaluations, rows = results.evaluations, []
-    for condition in conditions_in_order(name for evaluation in evaluations.values() for name in evaluation.conditions):
-        scores = {
-            name: evaluations[name].conditions[condition]
-            for name in inputs_in_order(evaluations)
-            if condition in evaluations[name].conditions
-        }
-        lowest = min(score.mse for score in scores.values())
-        for name, score in scores.items():
-            thesis_mse, thesis_r2 = ACCURACY.get((name, condition), (None, None))
-            mse = _best(decimals(score.mse, 4), score.mse == lowest and len(scores) > 1)
-            r2, mae, counts = decimals(score.r2, 3), decimals(100 * score.mae, 1), f"{score.frames} / {score.trials}"
-            thesis = decimals(thesis_mse, 4), decimals(thesis_r2, 2)
-            rows.append((condition.capitalize(), input_name(name), mse, thesis[0], r2, thesis[1], mae, counts))
+    evaluations = {name: results.evaluations[name] for name in inputs_in_order(results.evaluations)}
+    conditions = conditions_in_order(name for evaluation in evaluations.values() for name in evaluation.conditions)
+    rows = [
+        (condition, name, evaluation.conditions[condition], ACCURACY.get((name, condition), (None, None)))
+        for condition in conditions
+        for name, evaluation in evaluations.items()
+        if condition in evaluation.conditions
+    ]
+    lowest = {condition: min(score.mse for key, _, score, _ in rows if key == condition) for condition in conditions}
     text = "".join(
-        f" {input_name(name)}: the network was told the friction, {evaluations[name].friction}."
-        for name in inputs_in_order(evaluations)
-        if evaluations[name].friction
+        f" {input_name(name)}: the network was told the friction, {evaluation.friction}."
+        for name, evaluation in evaluations.items()
+        if evaluation.friction
     )
     return make_table(
-        "How well each network reads the safety margin on test trials. MSE in squared margin units (Γ from 0 to 1), "
-        f"MAE in percentage points of Γ; the lower MSE of each condition is bold. Grey columns: the {MARK}.{text}",
-        ("Objects", "Input", "MSE", "MSE, thesis", "R²", "R², thesis", "MAE (points)", "Frames / trials"),
+        "Error of each network on test trials. MSE in squared margin units (Γ from 0 to 1), MAE in percentage points "
+        f"of Γ; the lower MSE of each condition is bold. Grey columns: the {MARK}.{text}",
+        {
+            "Objects": lambda row: row[0].capitalize(),
+            "Input": lambda row: input_name(row[1]),
+            "MSE": lambda row: _best(decimals(row[2].mse, 4), len(evaluations) > 1 and row[2].mse == lowest[row[0]]),
+            "MSE, thesis": lambda row: decimals(row[3][0], 4),
+            "R²": lambda row: decimals(row[2].r2, 3),
+            "R², thesis": lambda row: decimals(row[3][1], 2),
+            "MAE (points)": lambda row: decimals(100 * row[2].mae, 1),
+            "Frames / trials": lambda row: f"{row[2].frames} / {row[2].trials}",
+        },
         rows,
         names=2,
     )
 
 
-def table_deletion(scores: Mapping[str, DeletionScores], *, rng: np.random.Generator) -> Table:
-    """Tabulate the deletion score by input and method, with the random control (thesis, Table 2)."""
-    rows, gaps = [], []
-    for name, method, score in _each_method(scores):
-        scored = scores[name]
-        lowest = min((method.mean for other, method in scored.methods.items() if other != CHANCE), default=None)
-        gaps.append(against_control(scored, method, rng=rng))
-        against = _interval(gaps[-1], digits=3)
-        last, thesis = decimals(score.last_step_mean, 3), _thesis_score(name, method, scored.methods)
-        cells = (_score_cell(score, lowest), against, last, thesis, str(score.frames))
-        rows.append((input_name(name), method_name(method), *cells))
-    sources = " and ".join(sorted({source_name(scored.source) for scored in scores.values()}))
-    return make_table(
-        f"Deletion score D on {sources}, averaged over all steps, mean ± standard deviation over frames; lower = more "
-        "faithful, and the lowest of each input is bold. “Against random”: mean difference from the random control "
-        f"with a 95 % interval over {tell_over(gaps)}; below zero = better than chance. “Last step”: D once every "
-        f"pixel is filled, which no map has a part in. Grey column: the {MARK}.",
-        ("Input", "Method", "Score D", "Against random", "Last step", "Score D, thesis", "Frames"),
-        rows,
-        names=2,
-    )
-
-
-def table_scores(faithful: Faithfulness, scored: DeletionScores | None) -> Table:
+def table_scores(name: str, faithful: Faithfulness | None, scored: DeletionScores | None) -> CellTable:
     """Tabulate the thesis's deletion score (its Table 2) beside the symmetric gain under every fill."""
-    fills = settings(faithful)
-    scores = {score.key: score for score in faithful.scores}
-    gains = [(key[:2], score.srg.estimate) for key, score in scores.items() if not score.control]
-    top = {fill: max((gain for setting, gain in gains if setting == fill), default=None) for fill in fills}
+    scores = {} if faithful is None else {score.key: score for score in faithful.scores}
     plain = {} if scored is None else scored.methods
-    methods = {*(score.method for score in faithful.scores), *plain}
-    lowest = min((record.mean for name, record in plain.items() if not is_control(name)), default=None)
+    methods, lowest = {*(method for _, _, method in scores), *plain}, _lowest(plain)
     fill = f", {scored.fill} fill" if scored else ""
+    gains = {
+        f"SRG, {fill_name(*setting)}": lambda method, setting=setting: _gain_cell(scores.get((*setting, method)))
+        for setting in (settings(faithful) if faithful else ())
+    }
+    text = (
+        " Symmetric relevance gain, SRG, in margin units (0 = uninformative), with 95 % intervals over "
+        f"{write_over(score.srg for score in scores.values())}; * = excludes zero. Bold: ahead of every control beyond "
+        "the interval of the difference; otherwise the method has shown nothing about this network under that fill."
+    )
     return make_table(
-        f"{input_name(faithful.input)}: deletion score D of the thesis{fill} (mean ± standard deviation; lower = more "
-        "faithful) and symmetric relevance gain, SRG, in margin units (0 = uninformative), with 95 % intervals over "
-        f"{tell_over(score.srg for score in faithful.scores)}; * = excludes zero. Bold: best of its column, controls "
-        f"left out. Grey column: the {MARK}.",
-        ("Method", "Score D", "Score D, thesis", *(f"SRG, {fill_name(*setting)}" for setting in fills)),
-        [
-            (
-                method_name(method),
-                _score_cell(plain.get(method), lowest),
-                _thesis_score(faithful.input, method, methods),
-                *(_gain_cell(scores.get((*setting, method)), top[setting]) for setting in fills),
-            )
-            for method in methods_in_order(methods)
-        ],
+        f"{input_name(name)}: deletion score D of the thesis{fill}, mean ± standard deviation over frames; lower = "
+        f"more faithful, the lowest is bold.{text if scores else ''} Grey column: the {MARK}.",
+        {
+            "Method": method_name,
+            "Score D": lambda method: _score_cell(plain.get(method), lowest),
+            "Score D, thesis": lambda method: _thesis_score(name, method, methods),
+            **gains,
+        },
+        methods_in_order(methods),
     )
 
 
-def table_leads(faithful: Faithfulness) -> Table:
-    """Tabulate the symmetric gain of each method less that of the strongest control, under every fill."""
-    fills = settings(faithful)
-    leads = {score.key: lead for score in faithful.scores if (lead := score.lead_over_controls) is not None}
-
-    def tell(lead: Lead | None) -> Cell | str:
-        if lead is None:
-            return UNKNOWN
-        control = method_name(lead.control).removesuffix(" (control)")
-        return _best(f"{tell_interval(lead.gap)}, {control}", lead.shows_something)
-
-    return make_table(
-        f"{input_name(faithful.input)}: symmetric relevance gain of each method less that of the strongest control, "
-        "named beside it, in margin units with 95 % intervals. Bold: ahead of every control. Otherwise the method has "
-        "shown nothing about this network under that fill.",
-        ("Method", *(fill_name(*setting) for setting in fills)),
-        [
-            (method_name(method), *(tell(leads.get((*setting, method))) for setting in fills))
-            for method in methods_in_order({key[2] for key in leads})
-        ],
-    )
-
-
-def table_looks(looks: Mapping[str, MapQuality]) -> Table:
+def table_looks(looks: Mapping[str, MapQuality]) -> CellTable:
     """Tabulate what the eye judges of maps."""
     return make_table(
         f"Looks of the maps, means over {number_of(max(record.frames for record in looks.values()), 'frame')}. "
         "Resolution: depth of the valley between neighbouring markers (1 = told apart). Total variation: mean step "
         "between pixels over the map's range (noise has 1/3).",
-        ("Input", "Method", *(_LOOK_NAMES[measure] for measure in MAP_MEASURES)),
-        [
-            (
-                input_name(name),
-                method_name(method),
-                *(decimals(getattr(measures, record), 3) for record in MAP_MEASURES),
-            )
-            for name, method, measures in _each_method(looks)
-        ],
+        {
+            "Input": lambda row: input_name(row[0]),
+            "Method": lambda row: method_name(row[1]),
+            **{
+                title: lambda row, name=name: decimals(getattr(row[2], name), 3)
+                for title, name in zip(_LOOK_NAMES, MAP_MEASURES, strict=True)
+            },
+        },
+        _each_method(looks),
         names=2,
     )
 
 
-def table_randomisation(randomisation: Mapping[str, Randomisation]) -> Table:
+def table_randomisation(randomisation: Mapping[str, Randomisation]) -> CellTable:
     """Tabulate what is left of a map once every layer has new weights."""
-    counts = {
-        method.layers[0] for records in randomisation.values() for method in records.methods.values() if method.layers
-    }
-    first = f"{counts.pop()} layers new" if len(counts) == 1 else "First layers new"
     return make_table(
         "Weights drawn anew, layer by layer from the output: similarity of the map to the trained network's (1 = "
         "unchanged: such a map does not depend on what was learned).",
-        ("Input", "Method", first, "All layers new"),
-        [
-            (
-                input_name(name),
-                method_name(method),
-                *(decimals(record.similarity[place] if record.similarity else None, 2) for place in (0, -1)),
-            )
-            for name, method, record in _each_method(randomisation)
-        ],
+        {
+            "Input": lambda row: input_name(row[0]),
+            "Method": lambda row: method_name(row[1]),
+            "First layers new": lambda row: decimals(next(iter(row[2].similarity), None), 2),
+            "All layers new": lambda row: decimals(next(reversed(row[2].similarity), None), 2),
+        },
+        _each_method(randomisation),
         names=2,
     )
 
 
-def table_times(timing: Mapping[str, Timing]) -> Table:
+def table_times(timing: Mapping[str, Timing]) -> CellTable:
     """Tabulate seconds a frame, with the forward pass and without it, beside those of the thesis."""
-    names = inputs_in_order(timing)
-    rows, methods = [], {method for name in names for method in timing[name].methods}
-    for method in methods_in_order(methods):
-        cells = []
-        for whole, record in ((timing[name].frames, timing[name].methods.get(method)) for name in names):
-            part = f" on {number_of(record.frames, 'frame')}" if record is not None and record.frames < whole else ""
-            spread = "" if record is None else f" ({_seconds(record.low)} to {_seconds(record.high)}{part})"
-            cells.append(UNKNOWN if record is None else f"{_seconds(record.seconds)}{spread}")
-            cells.append(_seconds(None if record is None else record.seconds_without_forward))
-        rows.append((method_name(method), *cells, _thesis_seconds(method, methods)))
-    text = "; ".join(
-        f"{input_name(name).lower()}: {record.device}"
-        f"{f' with {record.threads} threads' if record.threads and record.device == 'cpu' else ''}, "
-        f"{number_of(record.frames, 'frame')}, a forward pass takes {_seconds(record.forward_seconds)} s"
-        for name in names
-        for record in [timing[name]]
+    methods = {method for record in timing.values() for method in record.methods}
+    machines = "; ".join(
+        f"{input_name(name).lower()}: {timing[name].device} with {number_of(timing[name].threads, 'thread')}, "
+        f"{number_of(timing[name].frames, 'frame')}, a forward pass takes {_seconds(timing[name].forward_seconds)} s"
+        for name in inputs_in_order(timing)
     )
-    heads = [f"{short_input_name(name)}, {what}" for name in names for what in ("with forward pass", "without")]
     return make_table(
-        f"Seconds to explain one frame: median over the sample's frames after a warm-up, their range, and on how many "
-        f"of them a slow method was timed ({text}). The thesis "
+        f"Seconds to explain one frame: median over frames after a warm-up, and their range ({machines}). The thesis "
         f"timed images of {NETWORK_PIXELS} px on an RTX 3060 Ti without waiting for the GPU, and left Grad-CAM's "
         "forward pass out.",
-        ("Method", *heads, "Thesis"),
-        rows,
-    )
-
-
-def table_trials(choice: Choice) -> Table:
-    """Tabulate the trials of the study, and how far each network was off at worst."""
-    names = inputs_in_order({*choice.inputs, *(name for trial in choice.trials for name in trial.worst_error)})
-    return make_table(
-        f"The {number_of(len(choice.trials), 'trial')} of the study ({choice.condition}): the worst error of "
-        f"each network at the chosen margins, in percentage points; within {percent(choice.tolerance)} at all of "
-        "them it qualifies.",
-        ("Trial", "Qualified", *(f"Worst error, {short_input_name(name).lower()}" for name in names), "Frames scored"),
-        [
-            (
-                trial.trial,
-                "yes" if trial.qualified else "no",
-                *(percent(trial.worst_error.get(name), digits=1) for name in names),
-                str(sum(frame.trial == trial.trial and frame.scored for frame in choice.frames)),
-            )
-            for trial in choice.trials
-        ],
+        {
+            "Input": lambda row: input_name(row[0]),
+            "Method": lambda row: method_name(row[1]),
+            "With forward pass": lambda row: _seconds(row[2].seconds),
+            "Range": lambda row: f"{_seconds(row[2].low)} to {_seconds(row[2].high)}",
+            "Without": lambda row: _seconds(row[2].seconds_without_forward),
+            "Frames": lambda row: str(row[2].frames),
+            "Thesis": lambda row: decimals(SECONDS.get(thesis_row(row[1], methods)), 3),
+        },
+        _each_method(timing),
         names=2,
     )
 
 
-def table_localisation(truth: Truth) -> Table:
+def table_localisation(truth: Truth) -> CellTable:
     """Tabulate where relevance lies, and how well maps rank the markers."""
-    names = [
-        *methods_in_order(set(truth.methods) - set(_TRUTHS)),
-        *(record for record in _TRUTHS if record in truth.methods),
-    ]
-    heads = [f"Mass, {_REGION_NAMES[region]}" for region in REGIONS]
-    rows = []
-    for name in names:
-        records, lead = truth.methods[name], truth.methods[name].lead_over_controls
-        gaps = (records.shapley, lead and lead.gap, records.network, records.margin)
-        shares = [percent(records.mass[region]) for region in REGIONS]
-        title = "Random map (control)" if name == CHANCE else method_name(name)  # here it is a map, not an order
-        rows.append((title, *shares, *map(_interval, gaps)))
-    nothing = ("A map that knows nothing", *(percent(truth.areas[region]) for region in REGIONS), *4 * ["0"])
+    perfect = [name for name in _TRUTHS if name in truth.methods]
+    areas = ", ".join(f"{region.replace('_', ' ')} {percent(truth.areas[region])}" for region in REGIONS)
+    masses = {
+        f"Mass, {region.replace('_', ' ')}": lambda name, region=region: percent(truth.methods[name].mass[region])
+        for region in REGIONS
+    }
+
+    def write(gap: Difference | None) -> str:
+        return write_gap(gap, digits=2)
+
     return make_table(
-        f"{input_name(truth.input)}, {number_of(truth.frames, 'simulated frame')}: share of the relevance in "
-        "three regions; signed rank correlation of the map's means over the markers with their "
-        "Shapley values, single effects, and effects on the best estimate of the margin (95 % interval over "
-        f"{tell_over(method.shapley for method in truth.methods.values())}). Lead: the first less that of the "
+        f"{input_name(truth.input)}, {number_of(truth.frames, 'simulated frame')}: share of the relevance in three "
+        f"regions (share of the image: {areas}); signed rank correlation of the map's means over the markers with "
+        "their Shapley values, single effects, and effects on the best estimate of the margin (95 % interval over "
+        f"{write_over(method.shapley for method in truth.methods.values())}). Lead: the first less that of the "
         "strongest control; a method whose interval includes zero has shown nothing about this network.",
-        ("Method", *heads, *_CORRELATIONS),
-        [*rows, nothing],
+        {
+            # here chance is a map, not an order
+            "Method": lambda name: "Random map (control)" if name == CHANCE else method_name(name),
+            **masses,
+            "With Shapley values": lambda name: write(truth.methods[name].shapley),
+            "Lead over controls": lambda name: write((lead := truth.methods[name].lead_over_controls) and lead.gap),
+            "With markers put back alone": lambda name: write(truth.methods[name].network),
+            "With the best estimate": lambda name: write(truth.methods[name].margin),
+        },
+        [*methods_in_order(set(truth.methods) - set(perfect)), *perfect],
     )
 
 
-def table_meta(truth: Truth) -> Table | None:
-    """Tabulate whether the score itself ranks a perfect map above a damaged one above chance; None if not tested."""
-    if not truth.meta:
-        return None
+def table_slices(diagnosis: Diagnosis) -> CellTable:
+    """Tabulate slices with their error on held-out trials, and whether it is larger than elsewhere."""
+
+    def points(margin: float) -> str:
+        return signed(100 * margin, 1)
+
     return make_table(
-        f"{input_name(truth.input)}: test of the score. The map of the Shapley values must gain more than the same "
-        "map with half of the markers shuffled, beyond the 95 % interval; a fill where it does not has no vote. Where "
-        "|x - b| comes near the truth, the setting mostly measures the input.",
-        ("Fill", "Holds", *_GAINS),
-        [
-            (
-                FILL_NAMES.get(test.fill, test.fill),
-                "yes" if test.holds else "no",
-                *(decimals(value, 3) for value in (test.oracle, test.degraded)),
-                _interval(test.gap, digits=3),
-                decimals(test.changed, 3),
-            )
-            for test in truth.meta
-        ],
-        names=2,
+        f"Where the error is, {input_name(diagnosis.input).lower()}, in percentage points of Γ: slices that a tree "
+        "found on half of the trials, tested on the other half. Larger: beyond the 95 % interval, on five trials.",
+        {
+            "Slice": lambda part: part.name.replace(", ", ",\n"),
+            "Frames": lambda part: f"{part.frames:,}",
+            "Trials": lambda part: str(part.trials),
+            "Mean |error|": lambda part: f"{100 * part.error:.1f}",
+            "Mean error": lambda part: points(part.bias),
+            "Less elsewhere (95 %)": lambda part: (
+                f"{points(part.excess.estimate)} ({tell_ends(part.excess, points)}){', larger' if part.holds else ''}"
+            ),
+        },
+        diagnosis.slices,
     )
 
 
-def _interval(gap: Difference | None, value: float | None = None, *, digits: int = 2) -> str:
-    """Write an interval; the value alone where none is known."""
-    return decimals(value, digits) if gap is None else tell_interval(gap, digits=digits)
+def table_episodes(grip: Grip) -> CellTable:
+    """Tabulate the episodes of a grip."""
+    setup = grip.setup
+    return make_table(
+        f"{number_of(len(grip.episodes), 'episode')}: {setup.object}, {setup.condition}, "
+        f"controller {setup.controller}.",
+        {
+            "Episodes": lambda rows: f"{len(rows):,}",
+            "Friction known": lambda rows: f"{int((rows.known_friction > 0).sum()):,}",
+            "Dropped": lambda rows: percent(float(rows.dropped.mean()), digits=1),
+            "Crushed": lambda rows: percent(float(rows.crushed.mean()), digits=1),
+            "Slip, median": lambda rows: f"{1e3 * float(np.median(rows.slip_m)):.1f} mm",
+            "Mean force": lambda rows: f"{float(rows.mean_force_n.mean()):.2f} N",
+            "Over the least (quartiles)": lambda rows: " / ".join(
+                percent(float(excess)) for excess in np.quantile(rows.force_excess, (0.25, 0.5, 0.75))
+            ),
+            "Under 20 %": lambda rows: f"{float(rows.under_20_s.mean()):.2f} s",
+        },
+        [grip.episodes],
+    )
+
+
+def _lowest(methods: Mapping[str, MethodScore]) -> float | None:
+    return min((score.mean for name, score in methods.items() if not is_control(name)), default=None)
 
 
 def _thesis_score(name: str, method: str, among: Collection[str]) -> str:
-    thesis = DELETION.get((name, thesis_row(method, among) or ""))
-    return tell_spread(*thesis) if thesis else UNKNOWN
-
-
-def _thesis_seconds(method: str, among: Collection[str]) -> str:
-    return decimals(SECONDS.get(thesis_row(method, among) or ""), 3)
+    mean, sd = DELETION.get((name, thesis_row(method, among)), (None, None))
+    return UNKNOWN if mean is None else f"{mean:.3f} ± {sd:.3f}"
 
 
 def _score_cell(score: MethodScore | None, best: float | None) -> Cell:
-    return Cell(text=UNKNOWN) if score is None else _best(tell_spread(score.mean, score.sd), score.mean == best)
+    return Cell(text=UNKNOWN) if score is None else _best(f"{score.mean:.3f} ± {score.sd:.3f}", score.mean == best)
 
 
-def _gain_cell(score: RemovalScore | None, best: float | None) -> Cell:
+def _gain_cell(score: RemovalScore | None) -> Cell:
     if score is None:
         return Cell(text=UNKNOWN)
+    lead = score.lead_over_controls
     # in two lines, so that every fill fits beside the others
-    text = f"{signed(score.srg.estimate, 3)}{'*' if score.srg.sure else ''}\n{tell_bounds(score.srg)}"
-    return _best(text, not score.control and score.srg.estimate == best)
+    text = f"{signed(score.srg.estimate, 3)}{'*' if score.srg.sure else ''}\n{write_ends(score.srg)}"
+    return _best(text, lead is not None and lead.shows_something)
 
 
 def _seconds(value: float | None) -> str:

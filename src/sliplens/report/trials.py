@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from sliplens.plots.style import UNKNOWN, decimals, percent, written_whole
+from sliplens.plots.style import UNKNOWN, decimals, percent
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.store import load_recording, read_frames
 from sliplens.recordings.trial import Recording
-from sliplens.report.page import render_page
+from sliplens.report.page import render_page, write_page
 
 PAGE = "trials.html"
 _THUMBNAIL_PX = 72
@@ -25,16 +25,14 @@ _POINTS = 80
 
 @dataclass(frozen=True, kw_only=True)
 class _Row:
-    """A trial on the page: texts, and the numbers that it is sorted by."""
+    """A trial on the page: texts, and the numbers that it is sorted by (NaN sorts last)."""
 
     info: TrialInfo
     pictures: tuple[str, ...]
-    """The sensor untouched, and where the margin is least, as data addresses."""
+    """The untouched sensor, and the frame of the least margin, as data addresses."""
     curves: tuple[str, ...]
     """Points of the margins' runs, as SVG takes them."""
-    curve_words: str
-    valid: str
-    valid_share: float
+    valid: int
     margin: str
     least: float
     friction: str
@@ -74,8 +72,7 @@ def write_trials_page(data: Dataset | Path | str, out: Path | str | None = None)
         counts=f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}",
         curve=_CURVE,
     )
-    with written_whole(page) as part:
-        part.write_text(text, encoding="utf-8")
+    write_page(page, text)
     return page
 
 
@@ -83,31 +80,22 @@ def _row(data: Dataset, info: TrialInfo) -> _Row:
     path = trial_path(data.folder, info.trial)
     trial = load_recording(path, pixels=False)
     margin = np.where(trial.labelled, trial.safety_margin, np.nan)
-    known, counts = margin[np.isfinite(margin)], trial.count()
-    shown = int(np.nanargmin(margin)) if len(known) else len(margin) // 2
-    basis = trial.labelling.basis if trial.labelling else None
-    friction, mu = UNKNOWN, np.nan
-    if basis is not None:
-        mu, low, high = basis.friction.mu, basis.friction.low, basis.friction.high
-        friction = (
-            f"{decimals(mu, 2)} given"
-            if low == high
-            else f"{decimals(mu, 2)} [{decimals(low, 2)}, {decimals(high, 2)}]"
-        )
-    else:
-        estimates = trial.friction_coefficient[np.isfinite(trial.friction_coefficient)]
-        if len(estimates):
-            mu = float(np.median(estimates))
-            friction = decimals(mu, 2)
-    least, most = (float(known.min()), float(known.max())) if len(known) else (np.nan, np.nan)
+    labelled = bool(np.isfinite(margin).any())
+    least, most = (float(np.nanmin(margin)), float(np.nanmax(margin))) if labelled else (np.nan, np.nan)
+    frame = int(np.nanargmin(margin)) if labelled else len(margin) // 2
+    basis, counts = trial.labelling.basis if trial.labelling else None, trial.count()
+    estimates = trial.friction_coefficient[np.isfinite(trial.friction_coefficient)]
+    mu = basis.friction.mu if basis else float(np.median(estimates)) if len(estimates) else np.nan
+    friction = decimals(mu, 2) if np.isfinite(mu) else UNKNOWN
+    if basis:
+        low, high = (decimals(end, 2) for end in (basis.friction.low, basis.friction.high))
+        friction += " given" if basis.friction.low == basis.friction.high else f" [{low}, {high}]"
     return _Row(
         info=info,
-        pictures=(_thumbnail(trial.reference), _thumbnail(read_frames(path, [shown])[0])),
+        pictures=(_thumbnail(trial.reference), _thumbnail(read_frames(path, [frame])[0])),
         curves=_curves(trial, margin),
-        curve_words=f"margin from {percent(least)} to {percent(most)}" if len(known) else "no valid margin",
-        valid=f"{counts.get('valid', 0)} of {info.frames}",
-        valid_share=counts.get("valid", 0) / info.frames,
-        margin=f"{percent(least)} to {percent(most)}" if len(known) else UNKNOWN,
+        valid=counts.get("valid", 0),
+        margin=f"{percent(least)} to {percent(most)}" if labelled else UNKNOWN,
         least=least,
         friction=friction,
         mu=mu,
