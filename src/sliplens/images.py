@@ -17,7 +17,7 @@ from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2, missing_packages
 from sliplens.files import require_file, require_folder
 
-__all__ = ["absolute_difference", "list_images", "read_image", "write_png"]
+__all__ = ["absolute_difference", "list_images", "read_image", "signed_difference", "write_png"]
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 
@@ -263,6 +263,32 @@ def absolute_difference(
     require_same_size(frames, reference)
     # max - min instead of a subtraction: it stays in uint8 and cannot wrap
     return np.maximum(frames, reference) - np.minimum(frames, reference)
+
+
+def signed_difference(
+    frames: UInt8[np.ndarray, "*batch height width 3"], reference: UInt8[np.ndarray, "_ _ 3"]
+) -> UInt8[np.ndarray, "*batch height width 3"]:
+    """Compute the signed difference T_n - T_0 of frames and the reference frame, halved, plus 128, in 8 bits.
+
+    Values above 128 are brighter, values below darker; a step is two grey levels, less than the noise of a camera.
+
+    Raises
+    ------
+    ImageError
+        If a frame's size differs from the reference's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.images import signed_difference
+    >>> untouched = np.full((1, 3, 3), 100, dtype=np.uint8)
+    >>> frame = np.array([[[100] * 3, [140] * 3, [60] * 3]], dtype=np.uint8)
+    >>> signed_difference(frame, untouched)[..., 0]
+    array([[128, 148, 108]], dtype=uint8)
+    """
+    require_same_size(frames, reference)
+    # T_n / 2 - T_0 / 2 + 128 without leaving uint8: halves of both, rounded alike, so that equal pixels give 128
+    return (frames >> 1) + (np.uint8(128) - (reference >> 1))
 
 
 _CURES = {

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import sliplens as sl
 from sliplens.errors import SliplensError
-from sliplens.images import absolute_difference
+from sliplens.images import absolute_difference, signed_difference
 from sliplens.markers.detect import detect_markers
 from sliplens.markers.tracker import track_markers
 from sliplens.recordings.source import open_source
@@ -51,6 +51,7 @@ CALLS = {
     "track_markers": track_markers,
     "detect_markers": lambda frames, reference: [detect_markers(image) for image in (*frames, reference)],
     "absolute_difference": absolute_difference,
+    "signed_difference": signed_difference,
 }
 KINDS = {
     "floats up to 1": lambda levels: levels / np.float32(255),

@@ -57,3 +57,15 @@ def test_frames_of_another_size_than_the_reference_are_refused(frames: np.ndarra
     for encoding in ENCODINGS.values():
         with pytest.raises(ImageError, match="against a reference of 8 x 16"):
             encoding.encode(frames, frames[0, :8], image_size=8)
+
+
+def test_a_signed_difference_tells_up_from_down_and_leaves_equal_pixels_alone(rng: np.random.Generator):
+    reference = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    frame = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    encoding = ENCODINGS["signed"]
+    untouched = encoding.empty(reference, image_size=8)
+    torch.testing.assert_close(untouched, torch.full_like(untouched, encoding.neutral))
+    told = encoding.encode(frame[None], reference, image_size=8)[0].permute(1, 2, 0).numpy()
+    true = (frame.astype(float) - reference) / 2 / 255 + 128 / 255
+    # each of the two images is halved and rounded down: at most half a step apart
+    np.testing.assert_allclose(told, true, atol=0.5 / 255 + 1e-6)

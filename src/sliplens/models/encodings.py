@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from sliplens.errors import InputError
-from sliplens.images import absolute_difference, require_rgb, require_same_size
+from sliplens.images import absolute_difference, require_rgb, require_same_size, signed_difference
 
 Frames = UInt8[np.ndarray, "batch height width 3"]
 Reference = UInt8[np.ndarray, "_ _ 3"]
@@ -31,6 +31,8 @@ class Encoding:
     """True where an untouched sensor gives a black image, so that an explanation needs no reference frame."""
     own_maximum: bool = True
     """If True, divide each image by its own maximum, as in the thesis; else by 255, which keeps its amplitude."""
+    neutral: float = 0.0
+    """Level of the network's input that means no change."""
     beside: bool = False
     """If True, the input holds the reference beside the frame."""
 
@@ -97,9 +99,13 @@ def _keep(frames: Frames, reference: Reference) -> Frames:
 
 
 ENCODINGS = {
-    # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; |T_n - T_0| with its amplitude; T_n and T_0
+    # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; T_n - T_0; |T_n - T_0| with its amplitude;
+    # T_n and T_0, on one scale
     "difference": Encoding(name="difference", compare=absolute_difference, empty_is_black=True),
     "raw": Encoding(name="raw", compare=_keep, empty_is_black=False),
+    "signed": Encoding(
+        name="signed", compare=signed_difference, empty_is_black=False, own_maximum=False, neutral=128 / 255
+    ),
     "amplitude": Encoding(name="amplitude", compare=absolute_difference, empty_is_black=True, own_maximum=False),
     "pair": Encoding(name="pair", compare=_keep, empty_is_black=False, own_maximum=False, beside=True),
 }

@@ -119,6 +119,7 @@ def _describe(proto: "ModelProto", network: Network) -> None:
             "image_size": manifest.image_size,
             "resize": "bilinear, antialiased, pixel centres at halves, rounded to 8 bits",
             "scale": "the image's own maximum, at least 1" if encoding.own_maximum else "255",
+            "neutral": encoding.neutral,
         },
         "sliplens.output": {
             "margin": "safety margin; 1 full stick, 0 onset of full slip; not clipped",

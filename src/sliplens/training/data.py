@@ -53,6 +53,8 @@ class Augmentation:
     blur_probability: float = 0.25
     blur_sd_px: float = 0.8
     """Share of batches that are blurred, and the largest standard deviation of the blur in pixels."""
+    neutral: float = 0.0
+    """Level of the input that means no change; `colour` scales about it."""
 
     def __call__(
         self, images: Float[Tensor, "batch colours size size"], *, generator: torch.Generator
@@ -79,7 +81,8 @@ class Augmentation:
             images = transforms.gaussian_blur(images, [3, 3], [0.1 + (self.blur_sd_px - 0.1) * float(uniform(1))])
         # one camera saw the reference and the frame
         colour = 1 + self.colour * (2 * uniform(batch, 3, 1, 1) - 1).repeat(1, colours // 3, 1, 1)
-        images.mul_(colour)  # in place: images of a batch are large, and the sampled ones are ours
+        # in place: images of a batch are large, and the sampled ones are ours
+        images.sub_(self.neutral).mul_(colour).add_(self.neutral)
         height, width = images.shape[-2:]
         noise = torch.randn((batch, height, width, colours), generator=generator, device=device).permute(0, 3, 1, 2)
         return images.add_(noise.mul_(uniform(batch, 1, 1, 1) * self.noise_sd)).clamp_(0, 1)
@@ -98,9 +101,10 @@ alone. `all-directions` turns images by any angle, mirrors and magnifies them, f
 direction."""
 
 
-def get_augmentation(name: str) -> Augmentation | None:
-    """Look up an augmentation by name."""
-    return pick(AUGMENTATIONS, name, noun="augmentation")
+def get_augmentation(name: str, *, neutral: float = 0.0) -> Augmentation | None:
+    """Look up an augmentation by name, for inputs with a neutral level."""
+    augmentation = pick(AUGMENTATIONS, name, noun="augmentation")
+    return None if augmentation is None else replace(augmentation, neutral=neutral)
 
 
 UNTOUCHED = -1

@@ -419,7 +419,7 @@ def fit(
     frames, network = (train, validation), model
     if config.learns == "ratio":
         network, frames = _last_layer_alone(model, *frames, batch_size=config.batch_size)
-    augmentation = get_augmentation(config.augmentation)
+    augmentation = get_augmentation(config.augmentation, neutral=train.encoding.neutral)
     module = Regressor(network, config=config, augmentation=augmentation, progress=progress)
     best = ModelCheckpoint(dirpath=folder / "checkpoints", filename="best", monitor="validation_mse")
     # of every epoch: `save_last` writes one only where the best is written too
