@@ -60,11 +60,6 @@ class Shear:
         The distance is measured in pixels from the nearest pull whose direction is within the range or
         `TOLERANCE_DEG` beyond it, so that a small shear is never far outside.
 
-        Parameters
-        ----------
-        range_deg
-            Lowest and highest direction in degrees, the second at least the first; (0, 360) for all.
-
         Examples
         --------
         >>> from sliplens.shear import Shear
@@ -112,10 +107,9 @@ def range_words(range_deg: tuple[float, float]) -> str:
 class ShearEstimator:
     """Estimates the shear of frames of one sensor against its untouched image.
 
-    The displacement of patches of the picture is measured by normalised cross-correlation. A press moves the skin
-    outwards, a press off the centre or tilted also sideways; the shear is a weighted sum over the patches that cancels
-    both. The weights depend on the distance from the centre of the picture alone, so that all directions are equal, and
-    were fitted to simulated presses and pulls in every direction.
+    The displacement of patches of the picture is measured by normalised cross-correlation. The shear is a weighted sum
+    over the patches that cancels a press, off the centre or tilted. The weights depend on the distance from the centre
+    of the picture alone, so that all directions are equal.
 
     Parameters
     ----------
@@ -164,18 +158,15 @@ class ShearEstimator:
 
     def estimate(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> Shear:
         """Estimate the shear of a frame of the reference's size."""
-        moved_px, share = self.measure_displacements(frame)
+        moved_px, share = self._measure_displacements(frame)
         if share < _LEAST_SHARE:
             return Shear(x_px=0.0, y_px=0.0, sigma_px=inf)
-        x_px, y_px = self._weights @ self.moments(moved_px)
-        outward_px = float((moved_px * self._outward).sum(axis=1).mean())
-        sigma_px = hypot(_NOISE_PX * self._factor, self._press_share * outward_px)
-        return Shear(x_px=float(x_px), y_px=float(y_px), sigma_px=sigma_px)
-
-    def moments(self, moved_px: Float[np.ndarray, "patches 2"]) -> Float[np.ndarray, "moments 2"]:
-        """Compute the terms of the shear: mean displacement of the patches near each knot, then of its outward part."""
-        outward = (moved_px * self._outward).sum(axis=1, keepdims=True) * self._outward
-        return np.concatenate([self._near.T @ moved_px, self._near.T @ outward])
+        outward_px = (moved_px * self._outward).sum(axis=1, keepdims=True)
+        # mean displacement of the patches near each knot, then of its outward part
+        moments = np.concatenate([self._near.T @ moved_px, self._near.T @ (outward_px * self._outward)])
+        x_px, y_px = (self._weights @ moments).tolist()
+        sigma_px = hypot(_NOISE_PX * self._factor, self._press_share * float(outward_px.mean()))
+        return Shear(x_px=x_px, y_px=y_px, sigma_px=sigma_px)
 
     def _plane(self, image: UInt8[np.ndarray, "_ _ 3"]) -> Float32[np.ndarray, "rows columns"]:
         """Reduce the green channel and remove structures wider than a marker."""
@@ -185,7 +176,7 @@ class ShearEstimator:
         box = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
         return plane - (box / side**2).astype(np.float32)
 
-    def measure_displacements(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[Float[np.ndarray, "patches 2"], float]:
+    def _measure_displacements(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[Float[np.ndarray, "patches 2"], float]:
         """Measure the displacement (x, y) of each patch in pixels, and the share of the patches that were matched."""
         windows = _cut(np.pad(self._plane(frame), _WINDOW), *self._corners, _WINDOW)
         places = _WINDOW - _PATCH + 1
@@ -244,11 +235,5 @@ def _fill(moved: Float[np.ndarray, "rows columns 2"]) -> Float[np.ndarray, "rows
 
 
 __all__ = [
-    "DIRECTION_LIMIT",
-    "FULL_CIRCLE",
-    "TOLERANCE_DEG",
-    "Shear",
-    "ShearEstimator",
-    "enclosing_range",
-    "range_words",
-]
+    "DIRECTION_LIMIT", "FULL_CIRCLE", "TOLERANCE_DEG", "Shear", "ShearEstimator", "enclosing_range", "range_words",
+]  # fmt: skip

@@ -58,13 +58,6 @@ def few(controller: str | Controller, condition: str = "dry", **options: Any) ->
     return run_episodes("cup", controller, condition=condition, options=chosen, **call)
 
 
-def test_the_same_seed_gives_the_same_episodes_and_another_gives_others(monkeypatch):
-    monkeypatch.setattr(episodes_module, "_TICKS", 50)
-    first, again, other = (few("margin", episodes=8, seed=seed).episodes for seed in (1, 1, 2))
-    assert np.array_equal(first.mean_force_n, again.mean_force_n)
-    assert not np.array_equal(first.mean_force_n, other.mean_force_n)
-
-
 def test_a_fixed_grip_drops_what_weighs_more_than_its_friction_holds_and_no_other():
     scripts = {"kinetic_ratio": 0.99, "friction_gap": 0.0, "pull_n": 0.0, "friction": 0.5}
     force = 1.0
@@ -73,14 +66,6 @@ def test_a_fixed_grip_drops_what_weighs_more_than_its_friction_holds_and_no_othe
     for mass, falls in ((0.9 * limit, False), (1.03 * limit, True)):
         told = few("fixed", episodes=1, settings={"force_n": force}, script=scripts | {"mass_kg": mass})
         assert bool(told.episodes.dropped[0]) is falls
-
-
-def test_the_table_reads_at_its_nodes_what_was_measured(table):
-    tips, place = np.arange(5), (2, 1, 3)
-    state = {"friction": np.full(5, FRICTIONS[2]), "margins": np.full(5, MARGINS[3])}
-    margin, low, high, *_ = table.read(tips, np.full(5, FORCES_N[1]), **state)
-    for values, name in ((margin, "margin"), (low, "low"), (high, "high")):
-        assert values == pytest.approx(getattr(table, name)[(slice(5), *place)], abs=1e-6)
 
 
 def test_what_the_network_reads_of_a_fingertip_is_what_its_table_has(network, table):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lying_gripper import CEILING_N, LIES, WIRE, hold
 
-from sliplens.grip.controllers import CONTROLLERS, FRICTION_CONSTANTS, MarginGrip, MarginLaw, Observation
+from sliplens.grip.controllers import CONTROLLERS, FRICTION_CONSTANTS, MarginLaw, Observation
 from sliplens.grip.holder import Holder
 from sliplens.grip.plant import PERIOD_S
 from sliplens.live.reading import Reading, SlipState
@@ -118,7 +118,7 @@ def test_below_the_margin_aimed_at_no_controller_commands_less_than_before(name,
         time_s = 2.0 + step * PERIOD_S
         holder.update_reading(reading_of(margin), taken_s=time_s)
         after = holder.grip_force(time_s, share * before, load_n=0.0).command_n
-        acted = float(controller.acted[0]) if isinstance(controller, MarginGrip) else margin
+        acted = float(controller.acted[0]) if isinstance(controller, MarginLaw) else margin
         if acted < getattr(controller, "target", MarginLaw.target):
             assert after >= before
         before = after

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sliplens.grip.controllers import Controller, MarginGrip, MarginLaw
+from sliplens.grip.controllers import Controller, MarginLaw
 from sliplens.grip.gripper import GuardedGripper, LineGripper
 from sliplens.grip.holder import Holder
 from sliplens.grip.plant import PERIOD_S
@@ -118,7 +118,7 @@ def hold(lie: str, controller: str | Controller = "margin") -> LyingHold:
                 if words is not None:
                     troubles[words] = None
             law = holder.controller
-            acted = float(law.acted[0]) if isinstance(law, MarginGrip) else read
+            acted = float(law.acted[0]) if isinstance(law, MarginLaw) else read
             rows.append((now_s, answer.command_n, acted, gripper.force_n))
     time_s, command_n, acted, force_n = np.array(rows).T
     return LyingHold(

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError
-from sliplens.markers import interpolate_field, track_markers
+from sliplens.markers import interpolate_field
 
 AFFINE = st.tuples(*[st.floats(-0.2, 0.2) for _ in range(4)])
 
@@ -49,16 +49,3 @@ def test_fields_that_cannot_be_are_refused(grid):
         interpolate_field(places[:2], places[:2], size=(50, 50))
     with pytest.raises(InputError, match="must be positive"):
         interpolate_field(places, places, size=(50, 50), step_px=0.0)
-
-
-def test_a_press_opens_the_field_and_full_slip_drags_it_down(trials):
-    trial = trials["chromatouch"]
-    tracks = track_markers(trial.frames, trial.reference, "chromatouch")
-    pressed = int(np.flatnonzero(trial.safety_margin == 1)[-1])
-    slips = int(np.nanargmin(trial.safety_margin))
-    press, slip = (
-        interpolate_field(tracks.rest_px, tracks.displacement_px[frame], size=(224, 224)) for frame in (pressed, slips)
-    )
-    centre = press.confidence > 0.5
-    assert press.divergence[centre].mean() > 0.02
-    assert (slip.displacement_px - press.displacement_px)[centre][:, 1].mean() > 1.5

@@ -57,11 +57,6 @@ def test_slope_falls_as_that_of_a_point_force_far_away():
         assert slope == pytest.approx(a / R * 4 / (3 * np.pi * s**2), rel=1e-5)
 
 
-def test_negative_force_is_refused():
-    with pytest.raises(ContactError, match="normal force must not be negative, got -1 N; flip its sign on import"):
-        contact_radius(np.array([1.0, -1.0]), sphere_radius_m=R, reduced_modulus_pa=MODULUS)
-
-
 def test_impossible_gel_is_refused():
     with pytest.raises(ContactError, match=r"Poisson's ratio must lie in \[0, 0.5\], got 0.6"):
         reduced_modulus(youngs_modulus_pa=E, poisson_ratio=0.6)

@@ -1,6 +1,5 @@
 """Controllers of the grip force: laws on the safety margin, and grips without one to compare with."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Protocol, runtime_checkable
@@ -11,6 +10,15 @@ from jaxtyping import Bool, Float
 from sliplens.errors import InputError
 from sliplens.extras import Table
 from sliplens.grip.plant import PERIOD_S, Episodes
+
+_SETTLED_S = 1.0  # time until which the object is being lifted and no grip is loosened
+_NOISE, _NOISE_SHARE = 0.06, 0.3
+"""A margin that differs by less from the last one may be noise (two standard deviations), and moves it by this share:
+as a grip tightens fast and loosens slowly, noise would press harder."""
+_NO_MARGIN = -9.0  # before the first margin, which counts in full
+_HIGHEST_ZERO = 0.6  # largest margin at which a slip counts: with more it is a jolt that ended
+_SAME_SLIP_S = 0.15  # time after a slip in which another one is the same
+_HORIZON_S = 0.1  # age of margins at a command, roughly: the law gives the force so long ahead
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,18 +85,15 @@ class AssumedFriction:
         return np.maximum(force_n, self.start_n if observation.time_s < _SETTLED_S else 0.0)
 
 
-_SETTLED_S = 1.0  # time until which the object is being lifted and no grip is loosened
-
-
 @dataclass(kw_only=True)
-class MarginGrip(ABC):
-    """Grip by the margin: caution, dead band, fast up and slow down, reflex, and a safe force without margins.
+class MarginLaw:
+    """F* = F (1 - Gamma) / (1 - Gamma*): the force at which the same load would leave the target margin.
 
-    The controller acts on r = margin - caution (margin - low), the mean over the fingers that have a margin; with a
-    caution of 1 it is the lower end of the interval. A change of r no larger than noise moves it little. A network that
-    cannot see the friction predicts more than 0 for a slippery object that already slides, so the margin is Gamma = (r
-    - r_0) / (1 - r_0): r_0 is a guess until a slip, and then the r at which the fingers began to slide, if that is
-    more. For a while after a slip the grip is never loosened.
+    Around the law: dead band, fast up and slow down, reflex, and a safe force without margins.
+
+    The controller acts on r = margin - caution (margin - low), the mean over the fingers that have a margin. A network
+    that cannot see the friction predicts more than 0 for an object that already slides, so the margin is Gamma = (r -
+    r_0) / (1 - r_0): r_0 is `zero` until a slip, and then the r at which the fingers began to slide, if that is more.
     """
 
     target: float = 0.3
@@ -123,9 +128,9 @@ class MarginGrip(ABC):
     _slipped_s: Episodes = field(init=False, repr=False, default_factory=lambda: np.full(1, -np.inf))
     _margin_s: Episodes = field(init=False, repr=False, default_factory=lambda: np.zeros(1))
 
-    @abstractmethod
     def law(self, force_n: Episodes, margin: Episodes) -> Episodes:
         """Return the grip force in newtons for a margin, a share."""
+        return force_n * (1 - margin) / (1 - self.target)
 
     @property
     def aim(self) -> Episodes:
@@ -164,36 +169,16 @@ class MarginGrip(ABC):
         return np.maximum(force_n, self.start_n if time_s < _SETTLED_S else self.least_n)
 
 
-_NOISE, _NOISE_SHARE = 0.06, 0.3
-"""A margin that differs by less from the last one may be noise (two standard deviations), and moves it by this share:
-as a grip tightens fast and loosens slowly, noise would press harder."""
-_NO_MARGIN = -9.0  # before the first margin, which counts in full
-_HIGHEST_ZERO = 0.6  # largest margin at which a slip counts: with more it is a jolt that ended
-_SAME_SLIP_S = 0.15  # time after a slip in which another one is the same
-
-
 @dataclass(kw_only=True)
-class MarginLaw(MarginGrip):
-    """F* = F (1 - Gamma) / (1 - Gamma*): the force at which the same load would leave the target margin."""
-
-    def law(self, force_n: Episodes, margin: Episodes) -> Episodes:
-        """Return the grip force in newtons for a margin, a share."""
-        return force_n * (1 - margin) / (1 - self.target)
-
-
-@dataclass(kw_only=True)
-class ProportionalLaw(MarginGrip):
+class ProportionalLaw(MarginLaw):
     """dF/dt = K (Gamma* - Gamma): the force grows as long as the margin is below the target."""
 
     gain_n_s: float = 20.0
     """K, in newtons a second for a margin of 1."""
 
     def law(self, force_n: Episodes, margin: Episodes) -> Episodes:
-        """Return the grip force in newtons for a margin, a share."""
+        """Return the grip force in newtons."""
         return force_n + self.gain_n_s * (self.target - margin) * _HORIZON_S
-
-
-_HORIZON_S = 0.1  # age of margins at a command, roughly: the law gives the force so long ahead
 
 
 @dataclass(kw_only=True)
@@ -255,7 +240,7 @@ def make_controller(
     FixedForce(force_n=1.5)
     """
     kind, settings = CONTROLLERS.pick(name), dict(settings or {})
-    if friction_known and issubclass(kind, MarginGrip):
+    if friction_known and issubclass(kind, MarginLaw):
         settings = FRICTION_CONSTANTS | settings
     constants = [field.name for field in fields(kind) if field.init]  # pyright: ignore[reportArgumentType]
     for constant, value in settings.items():

@@ -294,7 +294,7 @@ def run_scripts(
     """Run episodes to their end in a given loop."""
     count = len(scripts)
     force, least, lasted, under = np.zeros((4, count))
-    peak, peak_least, friction = np.zeros(count), np.zeros(count), np.full(count, np.inf)
+    friction = np.full(count, np.inf)
     for _ in range(_TICKS):
         time_s, holds = loop.plant.state.time_s, ~loop.plant.state.dropped
         dark = np.stack([time_s >= scripts.lamp_at_s, np.zeros(count, dtype=bool)], axis=1)
@@ -310,16 +310,14 @@ def run_scripts(
             # the object slips when both fingers do: the margin of both frictions together
             whole = 1 - np.abs(tick.state.load_n) / np.maximum(tick.state.force_n * world.friction.sum(axis=1), 1e-9)
             under += on * (whole < 0.2)
-            peak = np.maximum(peak, np.where(holds, tick.state.force_n, 0))
-            peak_least = np.maximum(peak_least, np.where(holds, needed, 0))
         friction = np.minimum(friction, world.friction.mean(axis=1))
     state = loop.plant.state
     return EpisodeTable(
         condition=np.broadcast_to(np.asarray(condition, dtype=str), count).copy(),
         known_friction=np.full(count, np.nan), mass_kg=scripts.mass_kg + scripts.water_kg, friction=friction,
         dropped=state.dropped, crushed=state.crushed, slip_m=state.slipped_m,
-        mean_force_n=force / lasted, peak_force_n=peak, least_force_n=least / lasted, peak_least_force_n=peak_least,
-        force_excess=force / least - 1, peak_excess=peak / peak_least - 1, under_20_s=under,
+        mean_force_n=force / lasted, least_force_n=least / lasted,
+        force_excess=force / least - 1, under_20_s=under,
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -66,7 +66,7 @@ class Fingertip:
         *,
         friction: Float[np.ndarray, " frames"],
         margins: Float[np.ndarray, " frames"],
-        held_s: Float[np.ndarray, " frames"] | None = None,
+        held_s: Float[np.ndarray, " frames"],
     ) -> tuple[Float[np.ndarray, "markers 2"], Float[np.ndarray, "frames markers 2"]]:
         """Return the markers in pixels (x, y), at rest and in contact states as in `film`."""
         loading = load_at_states(normal_force_n, friction=friction, margins=margins, held_s=held_s)
@@ -288,24 +288,22 @@ def measure_readings(run: Network, *, fingertips: int = 96, seed: int = 0, engin
     mu, force, gamma = np.meshgrid(FRICTIONS, FORCES_N, MARGINS, indexing="ij")
     # a fully stuck contact does not show the friction: one value is enough
     drawn = (gamma < 1) | (mu == FRICTIONS[0])
-    states: dict[str, Any] = {"friction": mu[drawn], "margins": gamma[drawn]}
-    again = np.random.default_rng(seed).choice(drawn.sum(), 12, replace=False)
-    ready = make_engine(engine, run, frames=fingertips * int(drawn.sum()))
+    count = int(drawn.sum())
+    again = np.random.default_rng(seed).choice(count, 12, replace=False)
+    ready = make_engine(engine, run, frames=fingertips * count)
     tables: list[np.ndarray] = []
     repeats: list[np.ndarray] = []
     tip = None
     for number in report_each(range(fingertips)):
         tip = Fingertip(seed=seed + number, day=tip.day if tip is not None and number % 2 else None)
-        film = tip.film(force[drawn], held_s=np.ones(int(drawn.sum())), **states)
-        frames = draw_film(film)
-        twice = draw_film(
-            tip.film(force[drawn][again], held_s=np.ones(12), **{name: part[again] for name, part in states.items()})
-        )
-        estimate = ready.estimate(run, run.encode(np.concatenate([frames, twice]), tip.reference))
+        frames = []
+        for rows in (np.arange(count), again):
+            force_n, friction, margins = (values[drawn][rows] for values in (force, mu, gamma))
+            frames.append(draw_film(tip.film(force_n, friction=friction, margins=margins, held_s=np.ones(len(rows)))))
+        estimate = ready.estimate(run, run.encode(np.concatenate(frames), tip.reference))
         ends = estimate.interval(LEVEL)
         assert ends is not None  # it is calibrated
         ratio = [] if estimate.ratio is None else [estimate.ratio.mean, estimate.ratio.sigma]
-        count = len(frames)
         rows = [estimate.margin[:count], *(end[:count] for end in ends), *(values[:count] for values in ratio)]
         table = np.empty((len(rows), *mu.shape), dtype=np.float32)
         for row, values in zip(table, rows, strict=True):
@@ -327,13 +325,10 @@ def measure_readings(run: Network, *, fingertips: int = 96, seed: int = 0, engin
     )
 
 
-_FOLDER = "readings"  # folder beside a network's weights with its table
-
-
 def load_readings(run: Network) -> ReadingTable | None:
     """Load the table that comes with a network of the package; None for other weights."""
     for name in shipped_names():
-        folder = find_run(Path(name)) / _FOLDER
+        folder = find_run(Path(name)) / "readings"
         if folder.is_dir():
             table = load_result(folder, ReadingTable, command="make weights")
             if table.network == run.manifest.weights_sha256:

@@ -1,8 +1,4 @@
-"""Drivers of real grippers, by lines over serial or TCP or topics of ROS 2, and a guard in front of them.
-
-The guard cuts every force at a ceiling. When no commands come it holds: it repeats the last force, and never opens. A
-dry run records commands and sends nothing.
-"""
+"""Drivers of real grippers, by lines over serial or TCP or topics of ROS 2, and a guard in front of them."""
 
 import math
 import os
@@ -11,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from io import FileIO
 from pathlib import Path
@@ -203,8 +199,7 @@ class RosGripper:
     """A gripper of ROS 2, by topics over Zenoh; its state is `sensor_msgs/msg/JointState` on `joint_states`.
 
     The joint's position is the width in metres and its effort the force in newtons. Topics confirm nothing: a gripper
-    without a state for `timeout_s` is a `GripperError` after each command, though the command was sent, and so is a
-    state that cannot be decoded.
+    without a valid state for `timeout_s` is a `GripperError` after each command, though the command was sent.
 
     Parameters
     ----------
@@ -357,21 +352,21 @@ class DryRun:
 
     def __init__(self) -> None:
         self.sent: list[str] = []
-        self._force_n, self._width_m = 0.0, 0.0
+        self._state = GripperState(force_n=0.0, width_m=0.0)
 
     def set_force(self, force_n: float) -> None:
         """Record a force in newtons."""
         self.sent.append(f"F {force_n:.3f}")
-        self._force_n = force_n
+        self._state = replace(self._state, force_n=force_n)
 
     def set_width(self, width_m: float) -> None:
         """Record a width in metres."""
         self.sent.append(f"W {width_m:.4f}")
-        self._width_m = width_m
+        self._state = replace(self._state, width_m=width_m)
 
     def read_state(self) -> GripperState:
         """Return the last force and width."""
-        return GripperState(force_n=self._force_n, width_m=self._width_m)
+        return self._state
 
     def close(self) -> None:
         """Do nothing."""
@@ -380,9 +375,8 @@ class DryRun:
 class GuardedGripper:
     """A gripper behind a guard: a ceiling that no force exceeds, and a watchdog that holds.
 
-    When no command comes for `watchdog_s`, or the gripper fails at one in whatever way, the guard holds the object: it
-    repeats the last force until commands return, and never opens. A force of NaN holds, too; a width is refused while
-    holding, for opening drops the object.
+    When no command comes for `watchdog_s`, or the gripper fails at one in whatever way, the guard repeats the last
+    force until commands return, and never opens. A force of NaN holds, too; a width is refused while holding.
     """
 
     def __init__(self, gripper: Gripper, *, ceiling_n: float = 4.0, watchdog_s: float = 0.2) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from sliplens.codec import save_result
 from sliplens.errors import InputError
 from sliplens.files import output_folder
-from sliplens.grip.controllers import AssumedFriction, Controller, MarginGrip, Oracle, make_controller
+from sliplens.grip.controllers import AssumedFriction, Controller, MarginLaw, Oracle, make_controller
 from sliplens.grip.gripper import DryRun, Gripper, GripperError, GripperState, GuardedGripper, open_gripper
 from sliplens.grip.holder import STALE_S, GripCommand, Holder
 from sliplens.grip.plant import PERIOD_S
@@ -348,5 +348,5 @@ def _require_fit(controller: Controller, readers: Sequence[LiveReader]) -> None:
         if isinstance(controller, Oracle):
             if not reader.source.simulated:
                 raise InputError(f"this controller needs the true margin, which {name} does not have; choose margin")
-        elif isinstance(controller, MarginGrip) and reader.network is None:
+        elif isinstance(controller, MarginLaw) and reader.network is None:
             raise InputError(f"this controller needs margins, and no network reads {name}; name one with --network")

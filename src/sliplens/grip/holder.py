@@ -4,12 +4,12 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from threading import Lock
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from sliplens.grip.controllers import Controller, MarginGrip, MarginLaw, Observation, make_controller
+from sliplens.grip.controllers import Controller, MarginLaw, Observation, make_controller
 from sliplens.grip.plant import PERIOD_S
 from sliplens.live.reading import Reading, SlipState
 
@@ -65,21 +65,11 @@ class GripCommand:
     """Fault of the measured force; None while it follows the commands."""
 
 
-class _Measured(NamedTuple):
-    """Forces at the time of a command, and the command until then."""
-
-    time_s: float
-    force_n: float
-    load_n: float
-    command_n: float
-
-
 class Holder:
     """Turns the readings of one or two running fingertips into grip forces, command after command.
 
-    A reading counts for half a second, with the grip force at the time of its frame. A slip counts once, and only where
-    the skin does not spring back for another reason (`SlipGate`). The controller's time begins at the first touch.
-    Readings may come from other threads.
+    A reading counts for half a second, with the grip force at the time of its frame; it may come from another thread.
+    A slip counts once (`SlipGate`). The controller's time begins at the first touch.
 
     Three laws hold for every controller. Without a margin, or below the target margin (that of a `MarginLaw` for a
     controller without `target`), the force never falls. Without a measured force, or where it differs from the command
@@ -103,7 +93,8 @@ class Holder:
         self._readings: list[tuple[Reading, float] | None] = [None] * fingers
         """Newest reading of each fingertip, and the time of its frame."""
         self._gates, self._slip = [SlipGate() for _ in range(fingers)], False
-        self._past: deque[_Measured] = deque(maxlen=_MEMORY)
+        self._past: deque[tuple[float, float, float, float]] = deque(maxlen=_MEMORY)
+        """Times of commands, forces and loads measured then, and the command until then."""
         self._touched_s: float | None = None
         self._follows_s, self._trouble = -np.inf, None
         self.choose(controller)
@@ -134,8 +125,8 @@ class Holder:
                 self._gates[finger].update(
                     reading.slip is SlipState.SLIP,
                     since_touch_s=-1.0 if self._touched_s is None else taken_s - self._touched_s,
-                    force_n=self._at(taken_s).command_n,
-                    earlier_n=self._at(taken_s - SPRINGS_BACK_S).command_n,
+                    force_n=self._at(taken_s)[2],
+                    earlier_n=self._at(taken_s - SPRINGS_BACK_S)[2],
                 )
             )
             self._readings[finger] = reading, taken_s
@@ -143,7 +134,7 @@ class Holder:
     def _update_constants(self) -> None:
         """Switch a named margin law to the constants for a known or unknown friction; its state goes on."""
         before = self.controller
-        if isinstance(self._chosen, str) and isinstance(before, MarginGrip):
+        if isinstance(self._chosen, str) and isinstance(before, MarginLaw):
             self.choose(self._chosen)
             for item in fields(before):
                 if not item.init and item.name != "_zero":  # r_0 belongs to the readings before
@@ -152,16 +143,16 @@ class Holder:
     def grip_force(self, time_s: float, force_n: float, *, load_n: float = np.nan) -> GripCommand:
         """Return the grip force to command now, from the force measured now; NaN where none is measured."""
         with self._lock:
-            since_s = min(time_s - self._past[-1].time_s, _LONGEST_S) if self._past else PERIOD_S
+            since_s = min(time_s - self._past[-1][0], _LONGEST_S) if self._past else PERIOD_S
             if self._touched_s is None and force_n > _TOUCH_N:
                 self._touched_s = self._follows_s = time_s
             differs = self._compare(time_s, force_n)
             trouble = None if np.isnan(force_n) else self._trouble
             if differs:
                 force_n = min(force_n, self._command_n)  # no gripper presses harder so soon after a command
-            self._past.append(_Measured(time_s, force_n, load_n, self._command_n))
+            self._past.append((time_s, force_n, load_n, self._command_n))
             fresh = [item if item and time_s - item[1] <= STALE_S else None for item in self._readings]
-            measured = [self._at(item[1])[1:3] for item in fresh if item]
+            measured = [self._at(item[1])[:2] for item in fresh if item]
             then_n, load_n = np.mean(measured, axis=0).tolist() if measured else (force_n, load_n)
             margin, low, true_margin = (
                 np.resize(np.array([getattr(item[0], name) if item else None for item in fresh], dtype=float), (1, 2))
@@ -189,7 +180,7 @@ class Holder:
                 since_s=since_s,
             )
             command_n = float(np.asarray(self.controller.command(observation))[0])
-            acted = float(self.controller.acted[0]) if isinstance(self.controller, MarginGrip) else mean
+            acted = float(self.controller.acted[0]) if isinstance(self.controller, MarginLaw) else mean
             below = acted < getattr(self.controller, "target", MarginLaw.target)
             if np.isnan(command_n) or ((blind or below or differs) and command_n < self._command_n):
                 command_n = self._command_n
@@ -212,12 +203,13 @@ class Holder:
             )
         return differs
 
-    def _at(self, time_s: float) -> _Measured:
+    def _at(self, time_s: float) -> tuple[float, float, float]:
         """Interpolate force, load and command at a time; NaN before the first."""
         if not self._past or np.isnan(time_s):
-            return _Measured(time_s, np.nan, np.nan, np.nan)
+            return np.nan, np.nan, np.nan
         times, *rows = np.array(self._past).T
-        return _Measured(time_s, *(float(np.interp(time_s, times, row)) for row in rows))
+        force_n, load_n, command_n = (float(np.interp(time_s, times, row)) for row in rows)
+        return force_n, load_n, command_n
 
     def _explain(self, command_n: float, *, slip: bool, blind: bool) -> str:
         change_n = command_n - self._command_n
@@ -227,6 +219,6 @@ class Holder:
             return f"the markers show a slip: {action}"
         if blind:
             return f"no margin: {action}"
-        if isinstance(self.controller, MarginGrip):
+        if isinstance(self.controller, MarginLaw):
             return f"aims at a margin of {100 * float(self.controller.aim[0]):.0f} %: {action}"
         return action

@@ -25,6 +25,8 @@ from sliplens.simulation.intervention import NOISE_PX
 
 Markers: TypeAlias = Float[np.ndarray, "_ _ 2"]
 """Positions of a fingertip's markers, in pixels (x, y), by episode and marker."""
+_STILL_FRAMES = 30  # frames of the untouched fingertips before they close, for the noise of the markers
+_GAUSSIAN_90 = 1.645  # standard deviations to either side that hold 90 % of a Gaussian
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -121,9 +123,6 @@ def _margin_of_ratio(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLear
     return margin, margin - reach, margin + reach
 
 
-_GAUSSIAN_90 = 1.645  # standard deviations to either side that hold 90 % of a Gaussian
-
-
 class RenderedSensor:
     """Predictions of a network for drawn images of two fingertips, with their markers followed; for one episode.
 
@@ -158,7 +157,7 @@ class RenderedSensor:
         """Return the markers of both untouched fingertips: at rest, then as followed in some frames."""
         first, second = (
             [tracker.rest.centre_px[None]]
-            + [_follow_frame(tracker, tip.draw(0.0, friction=1.0, margin=1.0)) for _ in range(frames)]
+            + [tracker.update(tip.draw(0.0, friction=1.0, margin=1.0)).position_px[None] for _ in range(frames)]
             for tip, tracker in zip(self.fingertips, self._trackers, strict=True)
         )
         return list(zip(first, second, strict=True))
@@ -175,7 +174,7 @@ class RenderedSensor:
                     encoded = self._network.encode(frame[None], tip.reference)
                 yield encoded
                 with self._threads.limit(limits=1):
-                    markers_px.append(_follow_frame(tracker, frame))
+                    markers_px.append(tracker.update(frame).position_px[None])
                 frames.append(frame)
 
         friction, learner = None, self._learner
@@ -193,40 +192,6 @@ class RenderedSensor:
             markers_px=(markers_px[0], markers_px[1]),
             frames=np.stack(frames),
         )
-
-
-def _follow_frame(tracker: Tracker, frame: UInt8[np.ndarray, "height width 3"]) -> Markers:
-    """Follow a tracker's markers into its next frame."""
-    return tracker.update(frame).position_px[None]
-
-
-class _GripSlip:
-    """Slip of both fingers of each episode, by the detector and the gate of a real hold."""
-
-    def __init__(self, sensor: TableSensor | RenderedSensor) -> None:
-        rest, *still = sensor.still_markers(_STILL_FRAMES)
-        self._fingers = [(SlipBatch(places), SlipGate()) for places in rest]
-        for number, frame in enumerate(still):
-            for (batch, _), places in zip(self._fingers, frame, strict=True):
-                batch.update(places, (number - len(still)) * PERIOD_S)
-        self._forces: deque[Episodes] = deque(maxlen=round(SPRINGS_BACK_S / PERIOD_S) + 1)
-
-    def update(
-        self, markers_px: tuple[Markers, Markers], state: PlantState
-    ) -> tuple[Bool[np.ndarray, " episodes"], Episodes]:
-        """Return True where a slip begins, and the time since a slip that is confirmed now; NaN without one."""
-        self._forces.append(state.force_n)
-        begins, slipped_s = np.zeros(len(state.force_n), dtype=bool), np.full(len(state.force_n), np.nan)
-        for (batch, gate), places in zip(self._fingers, markers_px, strict=True):
-            states = batch.update(places, state.time_s)
-            begins |= gate.update(
-                states.slip, since_touch_s=state.held_s, force_n=state.force_n, earlier_n=self._forces[0]
-            )
-            slipped_s = np.fmax(slipped_s, states.slipped_s)
-        return begins, slipped_s
-
-
-_STILL_FRAMES = 30  # frames of the untouched fingertips before they close, for the noise of the markers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,20 +239,33 @@ class GripLoop:
         self.plant, self.sensor, self.controller = plant, sensor, controller
         delay = math.ceil(latency_s / PERIOD_S - 1e-9)
         self._past: deque[tuple[PlantState, FingertipReading, Bool[np.ndarray, " episodes"]]] = deque(maxlen=delay + 1)
-        self._slip = None if sensor is None else _GripSlip(sensor)
+        self._fingers: list[tuple[SlipBatch, SlipGate]] = []
+        """Detector and gate of each finger, as in a real hold."""
+        self._forces: deque[Episodes] = deque(maxlen=round(SPRINGS_BACK_S / PERIOD_S) + 1)
+        if sensor is not None:
+            rest, *still = sensor.still_markers(_STILL_FRAMES)
+            self._fingers = [(SlipBatch(places), SlipGate()) for places in rest]
+            for number, frame in enumerate(still):
+                for (batch, _), places in zip(self._fingers, frame, strict=True):
+                    batch.update(places, (number - len(still)) * PERIOD_S)
         self._command_n = np.zeros(len(plant.state.force_n))
         self._slipping_s = np.full(len(plant.state.force_n), np.nan)
 
     def tick(self, world: World, *, dark: Bool[np.ndarray, "episodes 2"] | None = None) -> Tick:
         """Measure, command and step; `dark` fingers have no margin and no markers."""
-        now = self.plant.state
-        if self.sensor is None or self._slip is None:
-            nothing, slip = np.full((len(now.force_n), 2), np.nan), np.zeros(len(now.force_n), dtype=bool)
-            reading = FingertipReading(margin=nothing, low=nothing, high=nothing)
-        else:
+        now, count = self.plant.state, len(self._command_n)
+        nothing, slip, slipped_s = np.full((count, 2), np.nan), np.zeros(count, dtype=bool), np.full(count, np.nan)
+        reading = FingertipReading(margin=nothing, low=nothing, high=nothing)
+        if self.sensor is not None:
             reading = _darken(self.sensor.measure(now, self._slipping_s), dark)
             assert reading.markers_px is not None
-            slip, slipped_s = self._slip.update(reading.markers_px, now)
+            self._forces.append(now.force_n)
+            for (batch, gate), places in zip(self._fingers, reading.markers_px, strict=True):
+                states = batch.update(places, now.time_s)
+                slip |= gate.update(
+                    states.slip, since_touch_s=now.held_s, force_n=now.force_n, earlier_n=self._forces[0]
+                )
+                slipped_s = np.fmax(slipped_s, states.slipped_s)
             self._slipping_s = slipped_s + PERIOD_S  # at the next measurement
         self._past.append((now, reading, slip))
         then, earlier, slip = self._past[0]

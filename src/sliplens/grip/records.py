@@ -27,15 +27,10 @@ class EpisodeTable(Columns):
     """Slip of the finger that slid farther."""
     mean_force_n: Annotated[Float64[np.ndarray, " episodes"], AMOUNT, UNKNOWN]
     """Grip force, mean from the lift until the end or the drop."""
-    peak_force_n: Annotated[Float64[np.ndarray, " episodes"], FORCE]
     least_force_n: Annotated[Float64[np.ndarray, " episodes"], AMOUNT, UNKNOWN]
     """Least force that holds, mean over the same time."""
-    peak_least_force_n: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
-    """Largest value of the least force."""
     force_excess: Annotated[Float64[np.ndarray, " episodes"], EXCESS, UNKNOWN]
     """Mean force over the mean least force, less 1: a ratio."""
-    peak_excess: Annotated[Float64[np.ndarray, " episodes"], EXCESS, UNKNOWN]
-    """Peak force over the peak of the least force, less 1."""
     under_20_s: Annotated[Float64[np.ndarray, " episodes"], AMOUNT]
     """Time with a true margin under 20 %."""
 

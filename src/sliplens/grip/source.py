@@ -52,10 +52,9 @@ class GripStatus:
 class GripSource(LiveSource):
     """Simulated gripper that lifts an object and holds it while water is poured in, it is pulled or wetted.
 
-    Its frames are those of one fingertip. `update_reading` takes the reading of each, which `LiveReader` passes on, and
-    the controller acts on it: the loop is closed through pixels, with the network's true latency and withheld margins.
-    Without readings the gripper goes to its safe force. A dropped object is gripped again. With forces from outside
-    (`set_force`), it is a `Gripper` without a controller.
+    Its frames are those of one fingertip. The controller acts on their readings, which `LiveReader` passes on: the loop
+    is closed through pixels. A dropped object is gripped again. With forces from outside (`set_force`), it is a
+    `Gripper` without a controller.
 
     Examples
     --------

@@ -80,7 +80,12 @@ class _Spots(NamedTuple):
 
 def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind) -> Appearance:
     """Estimate colour, size and contrast of a frame's markers: round spots of one size over Otsu's threshold."""
-    _require_exposed(frame)
+    for what, pixels in (("saturated", frame.min(axis=-1) >= _BRIGHT), ("black", frame.max(axis=-1) <= _DARK)):
+        if np.mean(pixels) > _EXPOSED:
+            raise ImageError(
+                f"{100 * np.mean(pixels):.0f} % of the frame is {what}, so that markers do not show; correct the "
+                "exposure or choose another frame"
+            )
     tries: dict[Contrast, _Spots] = {
         contrast: spots for contrast in kind.contrasts if (spots := _find_spots(frame, kind, contrast))
     }
@@ -96,15 +101,6 @@ def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind
     level = float(np.median(signal[inside]) - np.median(signal[spots.labels == 0]))
     # spots end where they pass the threshold, markers where half of their contrast is left: measured when refined
     return Appearance(weights=weights, radius_px=spots.radius_px, contrast=max(level, 1.0))
-
-
-def _require_exposed(frame: UInt8[np.ndarray, "height width 3"]) -> None:
-    for what, pixels in (("saturated", frame.min(axis=-1) >= _BRIGHT), ("black", frame.max(axis=-1) <= _DARK)):
-        if np.mean(pixels) > _EXPOSED:
-            raise ImageError(
-                f"{100 * np.mean(pixels):.0f} % of the frame is {what}, so that markers do not show; correct the "
-                "exposure or choose another frame"
-            )
 
 
 def _find_spots(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind, contrast: Contrast) -> _Spots | None:
@@ -149,11 +145,11 @@ def _find_spots(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind, co
 
 
 def _round(stats: np.ndarray, kind: MarkerKind, size: tuple[int, int]) -> Bool[np.ndarray, " components"]:
+    """Select components that are round, of a possible size and inside the frame."""
     x, y, width, height, area = stats[:, :5].astype(float).T
-    radius = np.sqrt(area / np.pi)
+    radius, fill = np.sqrt(area / np.pi), area / (width * height)
     low, high = kind.radius_px
     inside = (x > 0) & (y > 0) & (x + width < size[1]) & (y + height < size[0])
-    fill = area / (width * height)
     shape = (np.maximum(width, height) < 1.7 * np.minimum(width, height)) & (fill > 0.55) & (fill < 0.95)
     return inside & shape & (radius >= low) & (radius <= min(high, min(size) / 8)) & (np.arange(len(stats)) > 0)
 
@@ -360,11 +356,21 @@ def _detect(frame: UInt8[np.ndarray, "height width 3"], appearance: Appearance) 
     signal = frame.astype(np.float32) @ appearance.weights
     near = _find_places(signal, appearance)
     shapes = measure_spots(signal, near, radius_px=appearance.radius_px)
-    keep = _sound(shapes, near, appearance)
-    keep[keep] = _first_of_each(shapes.centre_px[keep], reach_px=appearance.radius_px)
+    low, high = (share * appearance.radius_px for share in _RADII)
+    keep = (
+        (shapes.contrast > _LEAST_CONTRAST * appearance.contrast)
+        & (shapes.contrast > _LEAST_OVER_NOISE * shapes.noise)
+        & (shapes.radius_px > low)
+        & (shapes.radius_px < high)
+        & (shapes.roundness > _LEAST_ROUNDNESS)
+        & (np.linalg.norm(shapes.centre_px - near, axis=1) < 1.2 * appearance.radius_px)
+    )
+    # spots that came to lie on an earlier, stronger one are the same
+    centre, radius = shapes.centre_px, shapes.radius_px[:, None]
+    apart = np.linalg.norm(centre[keep][:, None] - centre[keep][None], axis=-1)
+    keep[keep] = ~np.any((apart < appearance.radius_px) & np.tri(len(apart), k=-1, dtype=bool), axis=1)
     height, width = signal.shape
     # a pixel beyond the disc: its blurred edge counts too
-    centre, radius = shapes.centre_px, shapes.radius_px[:, None]
     whole = np.all((centre >= radius + 1) & (centre <= np.array([width - 2, height - 2]) - radius), axis=1)
     return Markers(**vars(shapes), whole=whole, appearance=appearance).only(keep)
 
@@ -387,22 +393,3 @@ def _find_places(signal: Float32[np.ndarray, "height width"], appearance: Appear
     order = np.argsort(-response[rows, columns], kind="stable")
     # pixel centres are whole numbers in both frames
     return (np.stack([columns, rows], axis=1)[order] + 0.5) * factor - 0.5
-
-
-def _sound(shapes: Shapes, near: Float[np.ndarray, "places 2"], appearance: Appearance) -> Bool[np.ndarray, " places"]:
-    low, high = (share * appearance.radius_px for share in _RADII)
-    return (
-        (shapes.contrast > _LEAST_CONTRAST * appearance.contrast)
-        & (shapes.contrast > _LEAST_OVER_NOISE * shapes.noise)
-        & (shapes.radius_px > low)
-        & (shapes.radius_px < high)
-        & (shapes.roundness > _LEAST_ROUNDNESS)
-        & (np.linalg.norm(shapes.centre_px - near, axis=1) < 1.2 * appearance.radius_px)
-    )
-
-
-def _first_of_each(centre_px: Float[np.ndarray, "spots 2"], *, reach_px: float) -> Bool[np.ndarray, " spots"]:
-    """Drop spots that came to lie on an earlier, stronger one."""
-    distance = np.linalg.norm(centre_px[:, None] - centre_px[None], axis=-1)
-    earlier = np.tri(len(centre_px), k=-1, dtype=bool)
-    return ~np.any((distance < reach_px) & earlier, axis=1)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeAlias, final
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -57,21 +57,20 @@ class FieldTrial:
     @property
     def inner(self) -> Bool[np.ndarray, " markers"]:
         """Third of the markers nearest to the fixed point of the press."""
-        return _ring(self.rest_px, self.displacement_px[self.hold], 0.0, INNER_SHARE)
+        return _rank(self.rest_px, self.displacement_px[self.hold]) < INNER_SHARE
 
     @property
-    def outer(self) -> Bool[np.ndarray, " markers"]:
-        """Next third: the edge of the contact."""
-        return _ring(self.rest_px, self.displacement_px[self.hold], INNER_SHARE, 2 * INNER_SHARE)
+    def contact(self) -> Bool[np.ndarray, " markers"]:
+        """Two thirds of the markers nearest to that point: those inside and the edge of the contact."""
+        return _rank(self.rest_px, self.displacement_px[self.hold]) < 2 * INNER_SHARE
 
 
-def _ring(
-    rest_px: Float[np.ndarray, "markers 2"], pressed_px: Float[np.ndarray, "markers 2"], low: float, high: float
-) -> Bool[np.ndarray, " markers"]:
-    """Select markers between two shares of all, ranked by their distance from the fixed point of the press."""
+def _rank(
+    rest_px: Float[np.ndarray, "markers 2"], pressed_px: Float[np.ndarray, "markers 2"]
+) -> Float[np.ndarray, " markers"]:
+    """Rank markers by their distance from the fixed point of the press."""
     parts = affine_parts(rest_px, pressed_px[None])
-    [rank] = rank_from_centre(rest_px[None], mean_px=parts[:, :2], divergence=parts[:, 2])
-    return (rank >= low) & (rank < high)
+    return rank_from_centre(rest_px[None], mean_px=parts[:, :2], divergence=parts[:, 2])[0]
 
 
 def rank_from_centre(
@@ -99,9 +98,8 @@ def affine_parts(
 ) -> Float[np.ndarray, "frames 6"]:
     """Compute the least-squares parts of a field: mean x and y, divergence, curl, and the two parts of pure shear.
 
-    The Helmholtz-Hodge decomposition of an affine field: its source-free, its curl-free and its harmonic part (a shift
-    and a deviator), about the middle of the markers. Means are in pixels, the rest in pixels per pixel; NaN where fewer
-    than 3 markers are followed.
+    It is the Helmholtz-Hodge decomposition of an affine field about the middle of the markers. Means are in pixels, the
+    rest in pixels per pixel; NaN where fewer than 3 markers are followed.
 
     References
     ----------
@@ -138,7 +136,7 @@ def find_hold(rest_px: Float[np.ndarray, "markers 2"], displacement_px: Float[np
     if spread.max() <= 0:
         return 0
     first = int(np.argmax(spread >= _PRESSED_SHARE * spread.max()))
-    inner = _ring(rest_px, displacement_px[first], 0.0, INNER_SHARE)
+    inner = _rank(rest_px, displacement_px[first]) < INNER_SHARE
     moved = affine_parts(rest_px[inner], displacement_px[first:, inner] - displacement_px[first, inner])[:, :2]
     pulled = np.flatnonzero(np.linalg.norm(moved, axis=1) > _PULL_PX)
     return max(first + int(pulled[0]) - 1, first) if len(pulled) else first
@@ -155,20 +153,17 @@ _BINS, _BIN_PX = 48, 0.25
 _STILL_PX = 0.05  # added to motions in a denominator: half the noise of a marker
 
 
-def mean_shear(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    """Compute the mean motion of all markers since the hold, in pixels."""
-    return np.linalg.norm(_mean(trial.increment_px), axis=-1)[:, None]
+def mean_shear(trial: FieldTrial, *, inner: bool = False, relative: bool = False) -> Float[np.ndarray, "frames 1"]:
+    """Compute the mean motion of all markers since the hold, or of the inner ones, in pixels.
 
-
-def _over_divergence(shear: Float[np.ndarray, "frames 1"], trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    """Divide a motion by the divergence; at least a tenth of the trial's largest divergence counts."""
+    `relative`: over the divergence, of which at least a tenth of the trial's largest counts.
+    """
+    moved = trial.increment_px[:, trial.inner] if inner else trial.increment_px
+    shear = np.linalg.norm(_mean(moved), axis=-1)[:, None]
+    if not relative:
+        return shear
     spread = trial.spread
     return shear / np.maximum(spread, 0.1 * np.fmax(np.nanmax(spread), 1e-6))[:, None]
-
-
-def shear_over_divergence(trial: FieldTrial) -> Float[np.ndarray, "frames 1"]:
-    """Compute the mean motion over divergence, in pixels."""
-    return _over_divergence(mean_shear(trial), trial)
 
 
 def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
@@ -177,7 +172,7 @@ def rigid_residual(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
     Dong, Ma, Donlon and Rodriguez, *Maintaining Grasps within Slipping Bounds by Monitoring Incipient Slip*, ICRA 2019.
     """
     # the paper uses the largest alone; a bad marker moves the root mean square less
-    distance = _from_rigid(trial, trial.inner | trial.outer)
+    distance = _from_rigid(trial, trial.contact)
     tracked = np.isfinite(distance).any(axis=1)
     largest, rms = np.full(len(trial), np.nan), np.full(len(trial), np.nan)
     largest[tracked] = np.nanmax(distance[tracked], axis=1)
@@ -191,8 +186,7 @@ def stick_area(trial: FieldTrial, *, tolerance_px: float) -> Float[np.ndarray, "
     Sui et al., *Incipient Slip Detection Method for Soft Objects with Vision-Based Tactile Sensor*, Measurement 2022.
     """
     distance = _from_rigid(trial, trial.inner)
-    contact = trial.inner | trial.outer
-    tracked = np.isfinite(distance) & contact
+    tracked = np.isfinite(distance) & trial.contact
     count = tracked.sum(axis=1)
     share = ((distance < tolerance_px) & tracked).sum(axis=1) / np.maximum(count, 1)
     return np.where(count > 0, share, np.nan)[:, None]
@@ -226,20 +220,19 @@ def edge_over_centre(trial: FieldTrial) -> Float[np.ndarray, "frames 2"]:
     way = _mean(moved)
     way = way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), _STILL_PX)
     along = (moved * way[:, None]).sum(axis=-1)
-    middle, edge = (_mean(along[:, zone, None])[:, 0] for zone in (trial.inner, trial.outer))
+    middle, edge = (_mean(along[:, zone, None])[:, 0] for zone in (trial.inner, trial.contact & ~trial.inner))
     return np.stack([(edge + _STILL_PX) / (np.maximum(middle, 0) + _STILL_PX), middle], axis=1)
 
 
 def helmholtz_hodge(trial: FieldTrial) -> Float[np.ndarray, "frames 8"]:
     """Compute divergence and curl since T_0, the parts and the middle of the motion since the hold, and a ratio."""
     whole, since = (affine_parts(trial.rest_px, field) for field in (trial.displacement_px, trial.increment_px))
-    inner = np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=-1)
     scale = float(np.linalg.norm(trial.rest_px - trial.rest_px.mean(axis=0), axis=1).max())
     shift = np.linalg.norm(since[:, :2], axis=1)
     deviator = np.hypot(since[:, 4], since[:, 5])
     shapes = np.stack([whole[:, 2], whole[:, 3], since[:, 2], since[:, 3], deviator], axis=1) * scale
     ratio = shift / np.maximum(shapes[:, 0], 1.0)
-    return np.concatenate([shapes, shift[:, None], inner[:, None], ratio[:, None]], axis=1)
+    return np.concatenate([shapes, shift[:, None], mean_shear(trial, inner=True), ratio[:, None]], axis=1)
 
 
 def _from_rigid(trial: FieldTrial, fitted: Bool[np.ndarray, " markers"]) -> Float[np.ndarray, "frames markers"]:
@@ -275,33 +268,7 @@ _TOLERANCES_PX = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5)
 Margins: TypeAlias = Float[np.ndarray, " frames"]
 Trials: TypeAlias = Sequence[FieldTrial]
 Reader: TypeAlias = Callable[[FieldTrial], Margins]
-"""Estimates the margin of each frame; not finite where the field has no information."""
-
-
-@final
-class MarginEstimator:
-    """Estimator of the safety margin of every frame of a trial, fitted on other trials."""
-
-    def __init__(self, learn: Callable[[Trials, Margins], Reader]) -> None:
-        self._learn = learn
-        self._fitted: tuple[Reader, float] | None = None
-
-    def fit(self, trials: Trials, margins: Sequence[Float[np.ndarray, " _"]]) -> "MarginEstimator":
-        """Fit on training trials and the margin of each of their frames, in [0, 1] or NaN; gives the estimator."""
-        if len(trials) != len(margins) or any(map(lambda trial, labels: len(trial) != len(labels), trials, margins)):
-            raise InputError("trials and margins do not match; give a margin for every frame of every trial")
-        labels = np.concatenate([*margins, np.zeros(0)])
-        if not np.isfinite(labels).any():
-            raise InputError("no frame of the training trials has a label; give trials with safety margins")
-        self._fitted = self._learn(trials, labels), float(np.nanmean(labels))
-        return self
-
-    def estimate(self, trial: FieldTrial) -> Margins:
-        """Estimate the safety margin of each frame, in [0, 1]; the training mean without information."""
-        if self._fitted is None:
-            raise InputError("the estimator was not fitted; call fit with training trials first")
-        read, mean = self._fitted
-        return _bounded(read(trial), mean)
+"""Estimates the margin of each frame."""
 
 
 def _bounded(margin: Margins, mean: float) -> Margins:
@@ -314,11 +281,6 @@ def _usable(labels: Margins, features: Float[np.ndarray, "frames features"]) -> 
     if not usable.any():
         raise InputError("no labelled frame of the training trials has a field; follow more markers")
     return usable
-
-
-def _learn_mean(_: Trials, labels: Margins) -> Reader:
-    """Learn the mean margin of the training frames, as an estimate without touch."""
-    return lambda trial: np.full(len(trial), np.nanmean(labels))
 
 
 def _learn_features(features: Callable[[FieldTrial], np.ndarray], trials: Trials, labels: Margins) -> Reader:
@@ -362,16 +324,12 @@ def _learn_eccentricity(trials: Trials, labels: Margins) -> Reader:
     Slip Feedback*, IROS 2004; Obinata et al., *Vision Based Tactile Sensor Using Transparent Elastic Fingertip for
     Dexterous Handling*, 2007. Johnson, *Contact Mechanics* (1985), section 7.2.
     """
-
-    def eccentricity(trial: FieldTrial) -> Margins:
-        shear = np.linalg.norm(_mean(trial.increment_px[:, trial.inner]), axis=1)
-        return _over_divergence(shear[:, None], trial)[:, 0]
-
-    ratio = np.concatenate([eccentricity(trial) for trial in trials])
+    eccentricity = partial(mean_shear, inner=True, relative=True)
+    ratio = np.concatenate([eccentricity(trial) for trial in trials])[:, 0]
     usable = _usable(labels, ratio[:, None])
     tries = np.geomspace(1e-2, 1e2, 400) * max(float(np.median(ratio[usable])), 1e-3)
     errors = [np.mean((_hertz(ratio[usable], full) - labels[usable]) ** 2) for full in tries]
-    return lambda trial: _hertz(eccentricity(trial), tries[int(np.argmin(errors))])
+    return lambda trial: _hertz(eccentricity(trial)[:, 0], tries[int(np.argmin(errors))])
 
 
 def _hertz(ratio: Margins, full: float) -> Margins:
@@ -379,9 +337,9 @@ def _hertz(ratio: Margins, full: float) -> Margins:
 
 
 ESTIMATORS: dict[str, Callable[[Trials, Margins], Reader]] = {
-    "constant": _learn_mean,
+    "constant": lambda _, labels: lambda trial: np.full(len(trial), np.nanmean(labels)),
     "mean-shear": partial(_learn_features, mean_shear),
-    "shear-over-divergence": partial(_learn_features, shear_over_divergence),
+    "shear-over-divergence": partial(_learn_features, partial(mean_shear, relative=True)),
     "ikeda-eccentricity": _learn_eccentricity,
     "sui-stick-area": _learn_stick_area,
     "dong-rigid-residual": partial(_learn_features, rigid_residual),
@@ -393,6 +351,17 @@ ESTIMATORS: dict[str, Callable[[Trials, Margins], Reader]] = {
 the hold of the whole trial."""
 
 
-def get_estimator(name: str) -> MarginEstimator:
-    """Create an unfitted estimator, a row of `ESTIMATORS`."""
-    return MarginEstimator(pick(ESTIMATORS, name, noun="estimator"))
+def fit_estimator(name: str, trials: Trials, margins: Sequence[Float[np.ndarray, " _"]]) -> Reader:
+    """Fit an estimator, a row of `ESTIMATORS`, on trials and the margin of each of their frames, in [0, 1] or NaN.
+
+    The function that is returned estimates the margin of each frame of a trial, in [0, 1]: the mean of the training
+    trials where the field has no information.
+    """
+    learn = pick(ESTIMATORS, name, noun="estimator")
+    if len(trials) != len(margins) or any(map(lambda trial, labels: len(trial) != len(labels), trials, margins)):
+        raise InputError("trials and margins do not match; give a margin for every frame of every trial")
+    labels = np.concatenate([*margins, np.zeros(0)])
+    if not np.isfinite(labels).any():
+        raise InputError("no frame of the training trials has a label; give trials with safety margins")
+    read, mean = learn(trials, labels), float(np.nanmean(labels))
+    return lambda trial: _bounded(read(trial), mean)

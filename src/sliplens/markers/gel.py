@@ -91,8 +91,10 @@ def propose_profile(
     kind, places, spacing = _find_markers(frame, lit)
     gel = lit
     if len(places):
-        low, high = places.min(axis=0) - _REACH * spacing, places.max(axis=0) + _REACH * spacing
-        gel = _within((low[0], low[1], high[0] + 1, high[1] + 1), lit)
+        left, top = np.maximum(lit[:2], np.floor(places.min(axis=0) - _REACH * spacing)).astype(int).tolist()
+        reach = np.ceil(places.max(axis=0) + _REACH * spacing + 1)
+        right, bottom = np.minimum(np.add(lit[:2], lit[2:]), reach).astype(int).tolist()
+        gel = left, top, right - left, bottom - top
         notes.append(f"{len(places)} markers of kind {kind}, {spacing:.1f} pixels apart")
     else:
         notes.append("no markers were found; set their kind in `markers` if there are any")
@@ -176,14 +178,6 @@ def _kind(part: Frame, centres: Float[np.ndarray, "markers 2"], look: Appearance
     if change.sum() > 0:
         return "tactip" if look.weights.sum() > 0 and np.ptp(change) < _COLOURED else "auto"
     return "chromatouch" if np.ptp(change) > _COLOURED else "gelsight-mini"
-
-
-def _within(box: tuple[float, float, float, float], lit: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """Crop a box (left, top, right, bottom) to the lit one, as left, top, width and height."""
-    x, y = max(lit[0], int(np.floor(box[0]))), max(lit[1], int(np.floor(box[1])))
-    right = min(lit[0] + lit[2], int(np.ceil(box[2])))
-    bottom = min(lit[1] + lit[3], int(np.ceil(box[3])))
-    return x, y, right - x, bottom - y
 
 
 def _shaped(

@@ -142,8 +142,17 @@ def track(
     recipe = {**metadata, "source": trials.recipe}
     outcomes: list[TrialTracking] = []
     with reporting(on_progress):
-        for note in dict.fromkeys(note for kind in trials.kinds for note in (*kind.notes, *_require_movement(kind))):
+        for note in dict.fromkeys(note for kind in trials.kinds for note in kind.notes):
             add_note(note)
+        for trial in trials.kinds:
+            if trial.read_reference is not None:
+                continue
+            if trial.frames == 1:
+                raise InputError(
+                    f"{trial.name} has one frame and no reference to measure displacements from; name the untouched "
+                    "sensor with --reference IMAGE"
+                )
+            add_note(f"{trial.name}: no untouched frame was named, so displacements count from the first frame.")
         _, rows = run_table(
             _Following(trials=trials, markers=markers, schema=schema, on_tracked=on_tracked),
             # a marker is followed from the first frame on: a trial is not cut
@@ -158,18 +167,6 @@ def track(
             on_rows=lambda trial_rows: outcomes.append(_outcome(trial_rows)),
         )
     return Tracking(trials=tuple(outcomes), path=path, rows=rows)
-
-
-def _require_movement(trial: Capture) -> Iterator[str]:
-    """Refuse a trial of one frame without a reference; yields a note on one of several frames."""
-    if trial.read_reference is not None:
-        return
-    if trial.frames == 1:
-        raise InputError(
-            f"{trial.name} has one frame and no reference to measure displacements from; name the untouched sensor "
-            "with --reference IMAGE"
-        )
-    yield f"{trial.name}: no untouched frame was named, so displacements count from the first frame."
 
 
 @dataclass(frozen=True, kw_only=True)
