@@ -36,7 +36,7 @@ def command(name: str, function: str, example: str, *aliases: tuple[str, str]) -
     return register
 
 
-@command("demo", "demo:run_demo", "sliplens demo runs/demo")
+@command("demo", "demo:run_demo", "sliplens demo runs/demo --on processes=2")
 def call_demo(call: Any) -> None:
     """Print where the page is as soon as it exists; its notes are on the page."""
     started = time.perf_counter()
@@ -531,7 +531,7 @@ def call_diagnose(call: Any) -> None:
 @command(
     "study",
     "study.run:run_study",
-    "sliplens study runs/mine/data --network runs/mine/train -o runs/mine/study",
+    "sliplens study runs/mine/data --network runs/mine/train -o runs/mine/study --on processes=2",
     ("networks", "--network"),
     ("methods", "--method"),
 )
