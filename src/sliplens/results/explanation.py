@@ -32,6 +32,8 @@ class ExplainedFrame:
     day: int = 1
     withheld: str | None = None
     """Reason not to trust the prediction as a margin; None if it can be trusted."""
+    baseline_frame: int | None = None
+    """Number of the stick frame in its trial; None where the baseline is no frame of the trial."""
 
 
 @dataclass(frozen=True, kw_only=True)
