@@ -23,8 +23,8 @@ from sliplens.study.run import run_study
 from sliplens.study.scoring import STEPS, score
 from sliplens.training import evaluate, train
 
-NETWORKS = {"difference": DIFFERENCE_NETWORK, "raw": "thesis-raw"}
-"""Networks of the package that the demo reads with, by what they see."""
+NETWORKS = {"difference": "thesis-difference", "raw": "thesis-raw"}
+"""Networks of the package for the sensor of the demo, by input."""
 INPUTS = tuple(NETWORKS)
 METHODS = ("grad-cam-thesis", "integrated-gradients-thesis", "poly-cam-thesis", RECOMMENDED_METHOD)
 """The three methods of the thesis as they were run there, and the one to look at."""
@@ -41,9 +41,17 @@ DEMO_STUDY = StudyConfig(
 )
 """The study of a first look: too few trials to decide anything, as the page says, but there within minutes."""
 DEMO_SEED = 20261122
-"""No seed of the data that the networks of the package were trained on."""
-SHOWN_DATA: dict[str, Any] = {"dry_trials": 8, "wet_trials": 4, "frames_per_trial": 40, "days": 4, "test_days": 3}
-"""Trials that networks of the package predict on."""
+"""Seed of the study, and of the data of networks that are trained here."""
+SHOWN_DATA: dict[str, Any] = {
+    "preset": "thesis",
+    "seed": 0,
+    "days": 12,
+    "test_days": 3,
+    "dry_trials": (2, 1, 1, *[0] * 6, 3, 3, 2),
+    "wet_trials": 4,
+    "frames_per_trial": 40,
+}
+"""Trials of the sensor that the networks of the package were trained for, on three days that none of them met."""
 TRAINING_DATA: dict[str, Any] = {"dry_trials": 96, "wet_trials": 8, "frames_per_trial": 48, "days": 12}
 """Trials to train networks of one's own on."""
 _OTHER_MINUTES = 3.5
@@ -63,10 +71,10 @@ def run_demo(
     on_page: Callable[[Path], None] | None = None,
     on_progress: OnProgress | None = None,
 ) -> Path:
-    """Simulate a few grips, read, explain and judge them, and write a page of it all.
+    """Simulate a few grips, predict, explain and judge them, and write a page of the results.
 
-    The page is written as soon as the first grip is explained, and again whenever more is known; it opens with that
-    grip, from stick to slip. Interrupted, the same call goes on where it stopped.
+    The page is written as soon as the first grip is explained, and again after each further stage; it opens with that
+    grip, from stick to slip. After an interruption the same call continues.
 
     Parameters
     ----------
@@ -103,11 +111,11 @@ def run_demo(
             on_page(page)
         return page
 
-    later = ("how well both networks read", "which explanation can be believed") + (
-        ("what the network reads from real frames",) if real is not None else ()
+    later = ("how well both networks predict", "which explanation can be believed") + (
+        ("what the network predicts from real frames",) if real is not None else ()
     )
     trials = SHOWN_DATA if train_minutes is None else TRAINING_DATA
-    data = simulate(folder / "data", seed=seed, on_progress=on_progress, **trials)
+    data = simulate(folder / "data", on_progress=on_progress, **{"seed": seed, **trials})
     networks = dict(NETWORKS)
     if train_minutes is not None:
         minutes = max(SHORTEST_TRAINING, (train_minutes - _OTHER_MINUTES) / len(INPUTS))
@@ -125,7 +133,8 @@ def run_demo(
     run_study(data, tuple(networks.values()), config, out=folder, on=on, on_progress=on_progress)
     if real is not None:
         maps = folder / "explain-real"
-        network = networks["difference"]
+        # the networks of the thesis are for one simulated sensor
+        network = networks["difference"] if train_minutes is not None else DIFFERENCE_NETWORK
         explain(network, real, labels_in_names=True, out=maps, on_progress=on_progress)
         score(network, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
     return show()

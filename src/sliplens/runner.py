@@ -15,6 +15,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -339,6 +340,8 @@ def _processes(work: Work, number: str, most: int) -> Iterator[_Pool]:
         raise InputError(f"--on processes={number} is no number of processes; write processes or processes=2")
     count = min(int(number or cores()), most)
     threads, packed = max(1, cores() // count), pickle.dumps(work)
+    # loky ends a worker that has grown by 300 MB, such as by loading torch, and starts another
+    warnings.filterwarnings("ignore", "A worker was restarted", UserWarning)
 
     def executor() -> Any:  # a new one after a worker was lost
         return get_reusable_executor(count, timeout=60, initializer=_begin_worker, initargs=(os.getpid(), threads))

@@ -127,7 +127,7 @@ def _diagnosis(diagnosis: Diagnosis, ax: Axes, _: int) -> None:
     if not diagnosis.slices:
         raise InputError("this diagnosis tested no slice of the trials; diagnose a network on more trials")
     rows = [(wrap(part.name, 32), part.excess, BLUE if part.holds else GREY) for part in diagnosis.slices]
-    _plot_gaps(rows, ax, scale=100)
+    _plot_gaps(rows, ax, scale=100.0)
     ax.set(xlabel="Mean |error| less elsewhere (points of Γ, 95 % interval)")
     ax.set_title(f"{input_name(diagnosis.input)}: where the error is")
 

@@ -354,7 +354,7 @@ PRESETS = {
         days=4, sensors=1, series="thesis",
         # one sensor for all days: camera and lamps are built into it
         nuisances=Nuisances(
-            dry_friction=(0.6, 1.1), wet_friction=(0.3, 0.7),
+            dry_friction=(0.6, 1.1), wet_friction=(0.45, 0.7),
             sensor_gain=(0.9, 1.1), sensor_white_balance=(0.95, 1.05), sensor_gradient=(0.0, 0.25),
             sensor_glare=(0.5, 1.1), sensor_shift_px=(-3.0, 3.0), sensor_rotation_deg=(-3.0, 3.0),
             gain=(0.98, 1.02), white_balance=(0.995, 1.005), illumination_gradient=(0.0, 0.02), glare=(0.97, 1.03),
