@@ -110,8 +110,10 @@ def test_markers_are_occluded_where_each_frame_has_them(
         return MARKERS + len(asked)  # elsewhere in every frame
 
     monkeypatch.setattr("sliplens.explainers.frames.markers_in_recording", places)
-    run(difference_run, small_dataset.folder, "-o", tmp_path / "maps", "--method", "occlusion-marker")
+    words = ("--method", "occlusion-marker", "--baseline", "untouched")
+    run(difference_run, small_dataset.folder, "-o", tmp_path / "maps", *words)
     explained = load_explanation(tmp_path / "maps")
+    assert explained.baseline == "untouched"
     assert asked == [frame.id for frame in explained.frames]
     for number, relevance in enumerate(explained.relevance["occlusion-marker"], start=1):
         regions = marker_regions((32, 32), MARKERS + number).numpy()

@@ -124,7 +124,7 @@ def explain_rows(
     # the first of few maps is waited for: each then takes the engine that its passes pay for
     passes = _PASSES_A_MAP * maps if maps > _FEW_MAPS else 0
     with nullcontext() if chosen.together else expecting(passes):
-        # the reference of one call is the same for all its frames
+        # the baseline of one call is the same for all its frames
         attribution = explainer(network.model, inputs, reference=references[0])
     relevance = attribution.relevance.cpu().numpy()
     for row, values in zip(rows, relevance, strict=True):
@@ -162,7 +162,7 @@ def join_maps(
     inputs = network.encoding.normalise(chosen.images).to(network.device)
     references = network.encoding.normalise(chosen.references)
     # predicted once for all methods, on all frames
-    estimate, untouched = network.estimate(inputs), network.predict(references).tolist()
+    estimate, compared = network.estimate(inputs), network.predict(references).tolist()
     withheld = estimate.withheld(np.ones(len(inputs), dtype=bool))  # frames to explain are taken for ones in contact
     return Explanation(
         input=network.encoding.name,
@@ -177,14 +177,16 @@ def join_maps(
                 safety_margin=float(margin) if np.isfinite(margin) else None,
                 prediction=float(estimate.margin[index]),
                 withheld=withheld[index],
-                reference_prediction=untouched[index],
+                reference_prediction=compared[index],
+                baseline_frame=chosen.baseline_frame[index],
             )
             for index, margin in enumerate(chosen.safety_margin)
         ),
-        methods={method: _notes(pieces, chosen.ids, warnings) for method, pieces in maps.items()},
+        methods={method: _notes(pieces, chosen.ids, (*chosen.warnings, *warnings)) for method, pieces in maps.items()},
         images=chosen.images.numpy(),
         references=chosen.references.numpy(),
         pictures=input_pictures(network, chosen),
+        baseline=chosen.baseline,
         relevance={method: np.concatenate([piece.relevance for piece in pieces]) for method, pieces in maps.items()},
     )
 
@@ -231,5 +233,5 @@ def network_inputs(network: Network, explanation: Explanation) -> Float[Tensor, 
 
 
 def network_references(network: Network, explanation: Explanation) -> Float[Tensor, "frames colours size size"]:
-    """Return the network's inputs of the untouched sensor of each explained frame, in [0, 1], on its device."""
+    """Return the network's inputs of the baseline of each explained frame, in [0, 1], on its device."""
     return network.encoding.normalise(torch.from_numpy(explanation.references)).to(network.device)

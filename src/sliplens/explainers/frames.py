@@ -1,30 +1,36 @@
 """Frames to explain: of arrays, of a data set along the safety margin, or of a folder or recording."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import groupby, islice
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from sliplens.errors import ImageError, InputError, RecordingError
+from sliplens.errors import ImageError, InputError, RecordingError, SliplensError
 from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
+from sliplens.markers import track_markers
+from sliplens.markers.estimators import affine_parts, find_hold
 from sliplens.models import Network
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
-from sliplens.results.explanation import MARGIN_LEVELS
+from sliplens.results.explanation import MARGIN_LEVELS, BaselineName
 
+_STICK_SHARE = 0.97  # of the trial's largest margin
+_LEAST_STICK = 0.9
+_LEAST_SPREAD = 1e-3  # divergence of a press, in pixels per pixel
 _LABEL = re.compile(r"_(0|[1-9]\d?|100)$")
 FindMarkers: TypeAlias = Callable[[], Sequence[Float[Tensor, "_markers 2"]]]
 """Function that finds the markers of all frames, x and y in the network's input."""
+Baseline: TypeAlias = Literal["untouched", "stick"] | UInt8[np.ndarray, "_ _ 3"]
+"""Baseline of predictions: the untouched sensor, the last frame before the pull, or a frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,13 +64,19 @@ class ChosenFrames:
     images: UInt8[Tensor, "frames colours size size"]
     """Resized network inputs before normalisation."""
     references: UInt8[Tensor, "frames colours size size"]
-    """Network inputs of the untouched sensor, which each frame is compared with, before normalisation."""
+    """Network inputs of the baseline that each frame is compared with, before normalisation."""
     source: str
     """Either "simulated" or "real": a recorded data set or a folder of images."""
     together: bool = False
     """True if all frames are explained in one batch, not one by one."""
     find_markers: FindMarkers | None = field(default=None, repr=False, compare=False)
     """Function that finds the markers; None where they do not show."""
+    baseline: BaselineName = "untouched"
+    """Kind of the baseline; `stick` if that of any trial is a stick frame."""
+    baseline_frame: tuple[int | None, ...]
+    """Number of the stick frame in the trial of each frame; None where the baseline is no frame of the trial."""
+    warnings: tuple[str, ...] = ()
+    """Trials in which no stick frame was found."""
 
     @property
     def batches(self) -> list[Sequence[int]]:
@@ -73,27 +85,92 @@ class ChosenFrames:
         return [rows] if self.together else [[row] for row in rows]
 
 
+def find_stick_frame(
+    frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+    reference: UInt8[np.ndarray, "height width 3"] | None,
+    margin: Float[np.ndarray, " frames"] | None = None,
+) -> int:
+    """Find the last frame before the pull of a trial, from its labels or else by tracking its markers.
+
+    By labels it is the last frame before the first full slip whose margin is at least 97 % of the trial's largest.
+
+    Raises
+    ------
+    RecordingError
+        If the labels begin below a margin of 0.9, or the markers show no press.
+    ImageError, InputError
+        If the markers cannot be tracked.
+    """
+    if margin is not None and np.isfinite(margin).any():
+        slips = np.flatnonzero(margin <= 0)
+        before = margin[: slips[0]] if len(slips) else margin
+        largest = np.fmax.reduce(before, initial=0.0)
+        if largest < _LEAST_STICK:
+            raise RecordingError(f"no margin before the first full slip reaches {_LEAST_STICK:g}")
+        return int(np.flatnonzero(before >= _STICK_SHARE * largest)[-1])
+    if reference is None:
+        raise RecordingError("it has no labels, and no image of the untouched sensor to track markers from")
+    tracks = track_markers(frames, reference)
+    hold = find_hold(tracks.rest_px, tracks.displacement_px)
+    spread = affine_parts(tracks.rest_px, tracks.displacement_px[hold : hold + 1])[0, 2]
+    if not spread >= _LEAST_SPREAD:
+        raise RecordingError("its markers show no press")
+    return hold
+
+
+def _try_stick_frame(
+    trial: str,
+    frames: Iterable[UInt8[np.ndarray, "height width 3"]],
+    reference: UInt8[np.ndarray, "height width 3"] | None,
+    margin: Float[np.ndarray, " frames"] | None = None,
+) -> tuple[int | None, tuple[str, ...]]:
+    """Find the stick frame, or return None and a warning."""
+    try:
+        return find_stick_frame(frames, reference, margin), ()
+    except SliplensError as error:  # no stick, no markers, or no OpenCV
+        text = (
+            f"{trial}: the last frame before the pull was not found, so frames are compared with the untouched sensor"
+        )
+        return None, (f"{text}: {error}",)
+
+
 def frames_from_arrays(
     network: Network,
     frames: UInt8[np.ndarray, "batch height width 3"],
     reference: UInt8[np.ndarray, "height width 3"] | None,
+    *,
+    baseline: Baseline = "untouched",
 ) -> ChosenFrames:
-    """Choose all of an array of camera frames, or without a reference of difference images."""
+    """Choose all of an array of camera frames, or without a reference of difference images.
+
+    For the baseline `stick` they are the frames of one trial in their order.
+    """
     if not len(frames):
         raise ImageError("there is no frame to explain; give one at least")
     network.require_frame_size(frames.shape[1:3])
     encoding, image_size = network.encoding, network.manifest.image_size
-    if reference is not None:
-        compare = partial(encoding.compare_small, reference=reference, image_size=image_size)
-        images, untouched = compare(frames), compare(reference[None])[0]
-    elif encoding.empty_is_black:
-        images = encoding.resize(frames, image_size=image_size)
-        untouched = torch.zeros_like(images[0])
-    else:
+    if reference is None and not encoding.empty_is_black:
         raise InputError(
             f"a network on {encoding.name} images needs the untouched sensor; give it as reference, on the command "
             "line with --reference IMAGE"
         )
+
+    def small(images: UInt8[np.ndarray, "batch height width 3"]) -> UInt8[Tensor, "batch colours size size"]:
+        if reference is None:
+            return encoding.resize(images, image_size=image_size)
+        return encoding.compare_small(images, reference, image_size=image_size)
+
+    stick, warnings = None, ()
+    if isinstance(baseline, str):
+        if baseline == "stick":
+            stick, warnings = _try_stick_frame("frames", frames, reference)
+        compared = reference if stick is None else frames[stick]
+        name = "untouched" if stick is None else "stick"
+    else:
+        network.require_frame_size(baseline.shape[:2], what="the baseline's frame")
+        compared, name = baseline, "given"
+    images = small(frames)
+    references = torch.zeros_like(images[0]) if compared is None else small(compared[None])[0]
 
     def find_markers() -> list[Float[Tensor, "_markers 2"]]:
         return [markers_in_frame(frame, image_size=image_size) for frame in frames]
@@ -105,14 +182,19 @@ def frames_from_arrays(
         condition=("unknown",) * len(frames),
         safety_margin=np.full(len(frames), np.nan, dtype=np.float32),
         images=images,
-        references=untouched.expand(len(frames), -1, -1, -1),
+        references=references.expand(len(frames), -1, -1, -1),
         source="real",
         together=True,
         find_markers=None if reference is None else find_markers,
+        baseline=name,
+        baseline_frame=(stick,) * len(frames),
+        warnings=warnings,
     )
 
 
-def frames_from_dataset(network: Network, data: Dataset, selection: FrameSelection) -> ChosenFrames:
+def frames_from_dataset(
+    network: Network, data: Dataset, selection: FrameSelection, *, baseline: Baseline = "untouched"
+) -> ChosenFrames:
     """Choose frames of the first trials of a split, in the order of the data set's table, at given safety margins.
 
     For each trial and level the frame whose label is nearest is taken; at a level of 0 the first frame of full slip, at
@@ -128,7 +210,7 @@ def frames_from_dataset(network: Network, data: Dataset, selection: FrameSelecti
         (opened,) = open_source(data, trial=info.trial)
         margin = require_labels(opened.name, opened.safety_margin)
         rows += [(info.trial, nearest_frame(margin, level)) for level in selection.levels]
-    return frames_at(network, data, rows)
+    return frames_at(network, data, rows, baseline=baseline)
 
 
 def require_labels(trial: str, margin: Float[np.ndarray, " frames"] | None) -> Float[np.ndarray, " frames"]:
@@ -138,14 +220,16 @@ def require_labels(trial: str, margin: Float[np.ndarray, " frames"] | None) -> F
     return margin
 
 
-def frames_at(network: Network, data: Dataset, frames: Sequence[tuple[str, int]]) -> ChosenFrames:
+def frames_at(
+    network: Network, data: Dataset, frames: Sequence[tuple[str, int]], *, baseline: Baseline = "untouched"
+) -> ChosenFrames:
     """Choose frames of a data set by trial and number, those of a trial one after another."""
     infos, parts = {info.trial: info for info in data.trials}, []
     for trial, group in groupby(frames, key=lambda frame: frame[0]):
         if trial not in infos:
             raise RecordingError(f"{data.folder} has no trial {trial}; use the data set that the frames came from")
         (opened,), info = open_source(data, trial=trial), infos[trial]
-        part = _take(network, opened, [number for _, number in group], source=data.source)
+        part = _take(network, opened, [number for _, number in group], source=data.source, baseline=baseline)
         ids = len(part.ids)
         parts.append(replace(part, trial=(trial,) * ids, day=(info.day,) * ids, condition=(info.condition,) * ids))
 
@@ -171,11 +255,13 @@ def frames_from_folder(
     reference: Path | None = None,
     labels_in_names: bool = False,
     sensor: SensorProfile | Path | str | None = None,
+    baseline: Baseline | None = "untouched",
 ) -> ChosenFrames:
     """Choose all images of a folder, in natural order, or all frames of another recording that `open_source` opens.
 
     They are camera frames if `reference` is set or the source has one, else absolute difference images |T_n - T_0|. If
-    `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`, hold the safety margin in percent.
+    `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`, hold the safety margin in percent. If
+    `baseline` is None, `stick` for a recording of several frames and `untouched` for a folder of images.
 
     Raises
     ------
@@ -187,7 +273,14 @@ def frames_from_folder(
     """
     parts, captures = [], open_source(folder, reference=reference, sensor=sensor)
     for opened in captures:
-        part = _take(network, opened, range(opened.frames), source="real")
+        ordered = opened.files is None and opened.frames > 1
+        part = _take(
+            network,
+            opened,
+            range(opened.frames),
+            source="real",
+            baseline=("stick" if ordered else "untouched") if baseline is None else baseline,
+        )
         part = replace(part, trial=(folder.name if opened.files else opened.name,) * len(part.ids))
         if labels_in_names:
             margin = np.array([_label(folder / name) for name in opened.files or part.ids], dtype=np.float32)
@@ -203,15 +296,24 @@ def frames_from_folder(
     return replace(_join(parts), find_markers=find_markers if show_markers else None)
 
 
-def _take(network: Network, opened: Capture, numbers: Sequence[int], *, source: str) -> ChosenFrames:
+def _take(
+    network: Network, opened: Capture, numbers: Sequence[int], *, source: str, baseline: Baseline
+) -> ChosenFrames:
     names = opened.files or [f"{opened.name}-f{number:04d}" for number in range(opened.frames)]
     network.require_frame_size(opened.frame_size, what=f"frames such as {names[numbers[0]]}")
     untouched = None if opened.read_reference is None else opened.read_reference()
-    first = islice(opened.read_frames(), max(numbers) + 1)
-    frames = {number: frame for number, frame in enumerate(first) if number in numbers}
+    stick, warnings = None, ()
+    if isinstance(baseline, str) and baseline == "stick":
+        baseline = "untouched"
+        stick, warnings = _try_stick_frame(opened.name, opened.read_frames(), untouched, opened.safety_margin)
+    wanted = {*numbers} if stick is None else {*numbers, stick}
+    frames = {
+        number: frame for number, frame in enumerate(islice(opened.read_frames(), max(wanted) + 1)) if number in wanted
+    }
     if untouched is None and source == "real":
         network.require_kind(frames[numbers[0]], what=names[numbers[0]])
-    chosen = frames_from_arrays(network, np.stack([frames[number] for number in numbers]), untouched)
+    taken = np.stack([frames[number] for number in numbers])
+    chosen = frames_from_arrays(network, taken, untouched, baseline=baseline if stick is None else frames[stick])
     margin = np.full(opened.frames, np.nan) if opened.safety_margin is None else opened.safety_margin
     return replace(
         chosen,
@@ -220,17 +322,21 @@ def _take(network: Network, opened: Capture, numbers: Sequence[int], *, source: 
         source=source,
         together=False,
         find_markers=None,
+        baseline=chosen.baseline if stick is None else "stick",
+        baseline_frame=(stick,) * len(numbers),
+        warnings=warnings,
     )
 
 
 def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
-    names = ("ids", "day", "trial", "condition")
+    names = ("ids", "day", "trial", "condition", "baseline_frame", "warnings")
     return replace(
         parts[0],
         **{name: sum((getattr(part, name) for part in parts), ()) for name in names},
         safety_margin=np.concatenate([part.safety_margin for part in parts]),
         images=torch.cat([part.images for part in parts]),
         references=torch.cat([part.references for part in parts]),
+        baseline=max((part.baseline for part in parts), key=("untouched", "given", "stick").index),
     )
 
 

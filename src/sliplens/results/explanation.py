@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -17,11 +17,19 @@ from sliplens.results.evaluation import ANSWER, MARGIN, TIME, OfNetwork
 
 MARGIN_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 """Safety margins at which the thesis explains frames (section 4)."""
+BaselineName: TypeAlias = Literal["untouched", "stick", "given"]
+"""Kind of a baseline."""
+BASELINES: dict[BaselineName, str] = {
+    "untouched": "the untouched sensor",
+    "stick": "the last frame before the pull",
+    "given": "the given frame",
+}
+"""Baselines in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainedFrame:
-    """An explained frame: label (None if unknown), prediction, and prediction of its reference, in margin units."""
+    """An explained frame: label (None if unknown), prediction, and prediction of its baseline, in margin units."""
 
     id: str
     trial: str
@@ -61,11 +69,13 @@ class Explanation(OfNetwork):
     images: UInt8[np.ndarray, "frames colours size size"]
     """Network inputs before normalisation, 8 bits."""
     references: UInt8[np.ndarray, "frames colours size size"]
-    """Network inputs of the untouched sensor, which each frame is compared with; as `images`."""
+    """Network inputs of the baseline, which each frame is compared with; as `images`."""
     pictures: UInt8[np.ndarray, "frames size size 3"]
     """Normalised inputs, 8 bits, for viewing."""
     relevance: dict[str, Annotated[Float32[np.ndarray, "frames size size"], ANSWER]]
     """Maps by method: signed contribution of each pixel in margin units, above zero where it raises the prediction."""
+    baseline: BaselineName = "untouched"
+    """Kind of the baseline; trials whose stick frame was not found are compared with the untouched sensor."""
 
     def __post_init__(self) -> None:
         """Check that the arrays are of the frames."""

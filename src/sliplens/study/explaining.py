@@ -24,6 +24,7 @@ from sliplens.explainers.explain import (
 )
 from sliplens.explainers.frames import (
     MARGIN_LEVELS,
+    Baseline,
     ChosenFrames,
     FrameSelection,
     frames_from_arrays,
@@ -77,6 +78,7 @@ def explain(
     source: UInt8[np.ndarray, "batch height width 3"] | Dataset | Path | str,
     *,
     reference: UInt8[np.ndarray, "height width 3"] | Path | str | None = None,
+    baseline: Baseline | Path | str | None = None,
     method: Methods | None = None,
     budget: float | None = None,
     select: FrameSelection | None = None,
@@ -86,7 +88,7 @@ def explain(
     colours: Colours = "signed",
     **running: Unpack[Running],
 ) -> Explanation:
-    """Explain why a network predicts these safety margins rather than that of the untouched sensor.
+    """Explain why a network predicts these safety margins rather than that of a baseline.
 
     Parameters
     ----------
@@ -96,6 +98,11 @@ def explain(
         Camera frames T_n, 8-bit RGB, with the frame of the untouched sensor T_0; or a folder of images or a recording
         with the image of the untouched sensor, where it holds none. Without a reference they are absolute difference
         images |T_n - T_0|. Or a data set, of which frames along the safety margin are taken.
+    baseline
+        What predictions are compared with: `untouched`, the untouched sensor; `stick`, the last frame before the pull
+        of the same trial; or a frame of the sensor, or the path of its image. If None, `stick` for data sets and
+        recordings, `untouched` for arrays and folders of images. Where no stick frame is found, the untouched sensor
+        takes its place, with a warning.
     method
         Row of `EXPLAINERS`, an explainer such as `get_explainer("occlusion", tile_px=8)`, or several of them. If None,
         Shapley values of the markers (`RECOMMENDED_METHOD`), or of tiles where no markers are found.
@@ -141,7 +148,16 @@ def explain(
         if isinstance(name, str):
             EXPLAINERS.pick(name)
     network = open_run(run, device=running.get("device", "cpu"))
-    chosen = _choose(network, source, reference, select, sensor=sensor, labels_in_names=labels_in_names)
+    profile = None if sensor is None else load_profile(sensor)
+    chosen = _choose(
+        network,
+        source,
+        reference,
+        select,
+        sensor=profile,
+        labels_in_names=labels_in_names,
+        baseline=_open_baseline(baseline, profile),
+    )
     explainers, warnings = choose_explainers(network, chosen, method, budget=budget)
     frames = number_of(len(chosen.ids), "frame")
     title = f"Explaining {frames} ({network.manifest.input}, {chosen.source})"
@@ -153,7 +169,7 @@ def explain(
         images.update(chosen.references.numpy().tobytes())
         recipe = {"weights_sha256": network.manifest.weights_sha256, "input": network.manifest.input}
         recipe |= {"source": chosen.source, "ids": chosen.ids, "images_sha256": images.hexdigest()}
-        recipe |= {"method": tuple(explainers), "budget": budget, "colours": colours}
+        recipe |= {"method": tuple(explainers), "budget": budget, "colours": colours, "baseline": chosen.baseline}
         maps = "a map" if len(explainers) == 1 else number_of(len(explainers), "map")
         what = f"{maps} of {frames if len(chosen.ids) == 1 else f'each of {frames}'}, panel.png"
         overwrite = running.get("overwrite", False)
@@ -190,18 +206,20 @@ def _choose(
     reference: np.ndarray | Path | str | None,
     select: FrameSelection | None,
     *,
-    sensor: SensorProfile | Path | str | None,
+    sensor: SensorProfile | None,
     labels_in_names: bool,
+    baseline: Baseline | None,
 ) -> ChosenFrames:
     if isinstance(source, str | Path) and (Path(source) / DATASET_FILE).is_file():
         source = load_dataset(source)
     if isinstance(source, Dataset):
         if sensor is not None:
             raise InputError("a data set's frames went through their profile on import; leave out --sensor")
-        return frames_from_dataset(network, source, select or FrameSelection())
+        selection = select or FrameSelection()
+        return frames_from_dataset(network, source, selection, baseline="stick" if baseline is None else baseline)
     if isinstance(source, np.ndarray):
         image = read_image(Path(reference)) if isinstance(reference, str | Path) else reference
-        return frames_from_arrays(network, source, image)
+        return frames_from_arrays(network, source, image, baseline="untouched" if baseline is None else baseline)
     if isinstance(reference, np.ndarray):
         raise InputError("the reference of a folder is an array; give the path of its image")
     return frames_from_folder(
@@ -209,8 +227,20 @@ def _choose(
         Path(source),
         reference=None if reference is None else Path(reference),
         labels_in_names=labels_in_names,
-        sensor=None if sensor is None else load_profile(sensor),
+        sensor=sensor,
+        baseline=baseline,
     )
+
+
+def _open_baseline(baseline: Baseline | Path | str | None, profile: SensorProfile | None) -> Baseline | None:
+    """Read the image of a baseline, and fit it to the network's sensor by its profile."""
+    if baseline is None or (isinstance(baseline, str) and baseline in ("untouched", "stick")):
+        return baseline
+    if not isinstance(baseline, np.ndarray):
+        if not Path(baseline).is_file():
+            raise InputError(f"the baseline {baseline} is no image; give untouched, stick, or the path of an image")
+        baseline = read_image(Path(baseline))
+    return baseline if profile is None else profile.apply(baseline)
 
 
 def _draw_first(folder: Path, network: Network, chosen: ChosenFrames) -> Callable[[tuple[str, int], MethodMaps], None]:
