@@ -7,7 +7,8 @@ more days test, each with 11 dry and 11 wet trials. Each network is trained by
 
 which simulates the data set into WORK/data, trains into WORK/INPUT-SEED, and continues where it was interrupted. The
 recipe: ShuffleNetV2 x1.0 from scratch, 112 px, mean squared error, AdamW with one cosine descent from 1e-3, batches of
-64, noise alone as augmentation. `--optimizer ranger21` trains with the optimizer of the thesis.
+64, noise alone as augmentation. `--optimizer ranger21` trains with the optimizer of the thesis, `--start-from NETWORK
+--epochs 3` continues from a network.
 
 Without `--train` it prints the R2 of the networks in WORK on the test days, dry and wet: the mean over networks and its
 lower and upper end, of 95 % intervals that resample networks, then days, then trials. `train_trials_within_3` counts
