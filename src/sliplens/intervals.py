@@ -31,17 +31,17 @@ class Difference:
 
     @property
     def above_zero(self) -> bool:
-        """Whether the whole interval lies above zero, and rests on enough trials."""
+        """True where the whole interval lies above zero, and rests on enough trials."""
         return self.units >= FEWEST_UNITS and self.low is not None and self.low > 0
 
     @property
     def below_zero(self) -> bool:
-        """Whether the whole interval lies below zero, and rests on enough trials."""
+        """True where the whole interval lies below zero, and rests on enough trials."""
         return self.units >= FEWEST_UNITS and self.high is not None and self.high < 0
 
     @property
     def sure(self) -> bool:
-        """Whether the interval leaves zero out, and rests on enough trials."""
+        """True where the interval leaves zero out, and rests on enough trials."""
         return self.above_zero or self.below_zero
 
     @property
@@ -136,7 +136,7 @@ def mean_interval(
 
 
 def _within(inner: Int[np.ndarray, " images"], outer: Int[np.ndarray, " images"]) -> bool:
-    """Whether each inner cluster lies in a single outer one, so that the spread of these has its own in it."""
+    """Return True if each inner cluster lies in a single outer one, whose spread then includes its own."""
     return len(np.unique(inner * (outer.max() + 1) + outer)) == int(inner.max()) + 1
 
 

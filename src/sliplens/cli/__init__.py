@@ -23,7 +23,7 @@ TASKS = {
     "judge": ("Find out where a network fails, and which explanation can be trusted", ("diagnose", "study")),
     "live": ("Predict from a running camera, and hold a grip", ("live", "grip", "hold")),
 }
-"""What users come for, and the commands that do it, in their order."""
+"""Tasks of users, and the commands of each in their order."""
 _DESCRIPTION = (
     "Predict how close a soft robotic fingertip is to losing its grip, from the images of the camera inside it, and "
     "show why the network says so. Start with `sliplens demo runs/demo`; `sliplens help` lists the commands by task."

@@ -211,7 +211,12 @@ def call_simulate(call: Any, *, preview: Path | None = None, video: Path | None 
     if video is not None:
         require_clip_path(video)
     if preview or video:
-        output.draw_simulation(call.keywords, preview=preview, video=video)
+        from sliplens.simulation import make_recipe
+
+        options = {name: call.keywords[name] for name in call.keywords.keys() - {"out", "overwrite", "on_progress"}}
+        device = options.pop("device", "cpu")
+        recipe = make_recipe(options.pop("preset", "small"), **options)
+        output.draw_simulation(recipe, device=device, preview=preview, video=video)
     if call.keywords.get("out"):
         from sliplens.results.evaluation import describe_simulation
 
@@ -561,7 +566,7 @@ def call_grip(call: Any) -> None:
     if "out" not in call.keywords:
         raise InputError("name the folder to make with -o FOLDER")
     out = Path(call.keywords["out"])
-    output.print_grip(call(out=out / "grip"), call.keywords)
+    output.print_grip(call(out=out / "grip"))
     output.draw_report(out)
 
 

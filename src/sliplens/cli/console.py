@@ -1,4 +1,4 @@
-"""What the command line shows: progress bars, results, errors."""
+"""Output of the command line: progress bars, results, errors."""
 
 import re
 from collections import Counter

@@ -1,12 +1,12 @@
 """Results of the commands on the terminal."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import groupby
 from math import isnan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sliplens.cli.console import Terminal, print_file, print_table, say
 from sliplens.errors import InputError
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sliplens.results.evaluation import Evaluation, RegressionScores
     from sliplens.results.faithfulness import Faithfulness
     from sliplens.runner import Status
+    from sliplens.simulation import SimulationRecipe
 
 _MOST_ROWS = 24
 """Number of frames or trials that are listed one by one."""
@@ -92,16 +93,13 @@ def _sparkline(shares: Sequence[float], *, width: int = 40) -> str:
     )
 
 
-def draw_simulation(arguments: Mapping[str, Any], *, preview: Path | None, video: Path | None) -> None:
+def draw_simulation(recipe: "SimulationRecipe", *, device: str, preview: Path | None, video: Path | None) -> None:
     """Draw the contact sheet and the clip of a simulated data set."""
     from sliplens.plots.clip import write_clip
     from sliplens.plots.contact_sheet import write_contact_sheet
-    from sliplens.simulation import make_recipe, plan_trials, simulate_examples, simulate_trial
+    from sliplens.simulation import plan_trials, simulate_examples, simulate_trial
     from sliplens.simulation.loading import TRIAL_S
 
-    settings = {name: value for name, value in arguments.items() if name not in {"out", "overwrite", "on_progress"}}
-    device = settings.pop("device", "cpu")
-    recipe = make_recipe(settings.pop("preset", "small"), **settings)
     with reporting(Terminal()):
         if preview is not None:
             with open_stage("Simulating trials for the preview"):
@@ -314,7 +312,7 @@ def print_status(path: Path, works: "Sequence[Status]") -> None:
             say(f"  failed, {times}: {failure.name}: {failure.errors[-1]}")
 
 
-def print_grip(result: "Grip", arguments: Mapping[str, Any]) -> None:
+def print_grip(result: "Grip") -> None:
     """Print what became of the episodes."""
     table = result.episodes
     rows = [
@@ -325,8 +323,8 @@ def print_grip(result: "Grip", arguments: Mapping[str, Any]) -> None:
         ("over the least force that holds", f"{100 * table.force_excess.mean():.0f} %"),
         ("time with a margin under 20 %", f"{table.under_20_s.mean():.2f} s"),
     ]
-    names = [arguments.get(name, default) for name, default in (("controller", "margin"), ("object", "cup"))]
-    print_table(f"{names[0]} on a {names[1]}, {arguments.get('condition', 'dry')}", ("", ""), rows)
+    setup = result.setup
+    print_table(f"{setup.controller} on a {setup.object}, {setup.condition}", ("", ""), rows)
 
 
 def print_sources() -> None:
