@@ -12,6 +12,7 @@ from sliplens.simulation import (
     Nuisances,
     Pulls,
     SimulationRecipe,
+    make_recipe,
     plan_trials,
 )
 from sliplens.simulation.nuisances import draw_grasp
@@ -43,6 +44,27 @@ def test_several_days_may_test(dry, wet, days, data):
     assert max(count) - min(count) <= 1
     if dry >= days:
         assert {plan.day for plan in plans if plan.condition == "dry"} == set(range(1, days + 1))
+
+
+@pytest.mark.parametrize("days", [4, 5, 6])
+def test_every_day_between_validates_a_quarter_of_its_trials(days: int):
+    for dry in ((100, *[40] * (days - 2), 11), 24 * days):
+        plans = plan_trials(make_recipe("thesis", days=days, dry_trials=dry))
+        for day in range(2, days):
+            splits = [plan.split for plan in plans if plan.day == day]
+            assert abs(splits.count("validation") - len(splits) / 4) <= 1
+            assert set(splits) == {"train", "validation"}
+
+
+def test_the_camera_of_the_thesis_preset_belongs_to_the_sensor():
+    recipe = make_recipe("thesis", days=6, dry_trials=60)
+    cameras = {plan.day: plan.day_draw for plan in plan_trials(recipe)}.values()
+    shifts = np.array([camera.camera_shift_px for camera in cameras])
+    turns = np.degrees([camera.camera_rotation_rad for camera in cameras])
+    # days differ by twice the largest daily change at most, sensors by pixels and degrees
+    assert np.ptp(shifts, axis=0).max() <= 2 * 0.15
+    assert np.ptp(turns) <= 2 * 0.15
+    assert len({tuple(shift) for shift in shifts}) == 6
 
 
 def test_more_trials_leave_the_others_as_they_were():
