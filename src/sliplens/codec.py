@@ -1,7 +1,7 @@
 """Records on disk, typed as they are declared: JSON for what is short, Parquet for columns, NPZ for arrays.
 
-A record is a frozen dataclass. What it declares is what its file must hold: a field that is missing, of another type or
-not finite is told in one sentence with its place and its cure, by msgspec for JSON and by jaxtyping for arrays.
+A record is a frozen dataclass. Its declaration is what its file must hold: a field that is missing, of another type or
+not finite is reported in one sentence with its place and its cure, by msgspec for JSON and by jaxtyping for arrays.
 """
 
 import tokenize
@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
-from math import prod
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
@@ -22,48 +21,42 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from jaxtyping import AbstractArray, jaxtyped
-from numpy.lib.format import read_array_header_1_0, read_array_header_2_0, read_magic
 
 from sliplens.errors import InputError, SliplensError
 from sliplens.files import read_json, require_file, to_builtins, whole_file, write_json
 
-RESULT_FILE = "result.json"
-"""Record of a folder."""
-ARRAYS_FILE = "arrays.npz"
-"""Arrays beside it."""
+RESULT_FILE = "result.json"  #: Record of a folder.
+ARRAYS_FILE = "arrays.npz"  #: Arrays beside it.
 
 Record = TypeVar("Record")
 _Columns = TypeVar("_Columns", bound="Columns")
 
-
-UNKNOWN = "NaN where it is not known"
-"""Beside the bounds of a column or an array: a number may be missing."""
+UNKNOWN = "NaN where it is not known"  #: Beside the bounds of a column or an array: a number may be missing.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Columns:
     """Base of a table: a record whose fields are arrays of one length, a value a row.
 
-    Text columns are declared as `Shaped[np.ndarray, " rows"]`, numbers with their jaxtyping type
-    (`Float64[np.ndarray, " rows"]`) and, where it is loaded, the bounds of what they can be:
-    `Annotated[Float64[np.ndarray, " rows"], msgspec.Meta(ge=0, le=1), UNKNOWN]`, without `UNKNOWN` where every row must
-    have a number. What such a field declares holds of arrays as well, and without `UNKNOWN` of a number in JSON.
+    Text columns are declared as `Shaped[np.ndarray, " rows"]`, numbers with their jaxtyping type and the bounds that a
+    loaded number must keep: `Annotated[Float64[np.ndarray, " rows"], msgspec.Meta(ge=0, le=1), UNKNOWN]`, without
+    `UNKNOWN` where every row must have a number.
     """
 
     def __len__(self) -> int:
-        """Number of rows."""
+        """Return the number of rows."""
         return len(getattr(self, fields(self)[0].name))
 
     def where(self: _Columns, rows: np.ndarray) -> _Columns:
-        """Rows of a mask, or of these numbers."""
+        """Select rows by a mask or by their numbers."""
         return type(self)(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     def table(self) -> pa.Table:
-        """Arrow table with a column a field; NaN stays NaN. `.to_pandas()` where pandas is installed."""
+        """Convert to an Arrow table with a column a field; NaN stays NaN."""
         return pa.table({field.name: getattr(self, field.name) for field in fields(self)})
 
     def groups(self: _Columns, *names: str) -> dict[tuple[str, ...], _Columns]:
-        """Rows of each combination of values of some text columns, in the order in which these first appear."""
+        """Group rows by the values of some text columns, in the order in which these first appear."""
         codes = np.zeros(len(self), dtype=np.int64)
         for name in names:
             values, place = np.unique(getattr(self, name), return_inverse=True)
@@ -75,7 +68,7 @@ class Columns:
 
     @classmethod
     def joined(cls: type[_Columns], pieces: Sequence[_Columns]) -> _Columns:
-        """One table of the rows of several."""
+        """Join the rows of several tables."""
         names = [field.name for field in fields(cls)]
         return cls(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
 
@@ -86,37 +79,21 @@ def save_record(record: object, path: Path) -> None:
 
 
 def load_record(path: Path, kind: type[Record], *, command: str) -> Record:
-    """Read what `save_record` wrote of a dataclass; a mistake names the command that makes the file again.
+    """Read a dataclass that `save_record` wrote; a mistake names the command that makes the file again.
 
     Raises
     ------
     InputError
         If the file is missing, is not JSON, or holds something else than the record declares.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> from dataclasses import dataclass
-    >>> from pathlib import Path
-    >>> from sliplens.codec import load_record, save_record
-    >>> @dataclass(frozen=True)
-    ... class Grip:
-    ...     normal_force_n: float
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     save_record(Grip(2.5), Path(folder) / "grip.json")
-    ...     load_record(Path(folder) / "grip.json", Grip, command="sliplens grip")
-    Grip(normal_force_n=2.5)
     """
     return from_builtins(_read_json(path, command), kind, where=path, command=command)
 
 
 def from_builtins(values: object, kind: type[Record], *, where: Path | str, command: str) -> Record:
-    """Record from what JSON holds of it (`to_builtins`).
+    """Convert the content of a JSON file to a record; a mistake is one sentence.
 
     Examples
     --------
-    A mistake in a file is one sentence:
-
     >>> from dataclasses import dataclass
     >>> from sliplens.codec import from_builtins
     >>> @dataclass(frozen=True)
@@ -165,7 +142,7 @@ def save_result(result: object, folder: Path) -> None:
 
 
 def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
-    """Read what `save_result` wrote of a dataclass; a mistake names the command that makes the folder again.
+    """Read a dataclass that `save_result` wrote; a mistake names the command that makes the folder again.
 
     Raises
     ------
@@ -173,27 +150,31 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
         If a file is missing or damaged, or holds something else than the record declares.
     """
     path, cure = folder / RESULT_FILE, _cure(command)
-    values = _read_json(path, command)
-    if not isinstance(values, dict):
+    content = _read_json(path, command)
+    if not isinstance(content, dict):
         raise InputError(f"{path} holds no JSON object; {cure}")
     declared = get_type_hints(kind, include_extras=True)
-    arrays = {name: hint for name, hint in declared.items() if _array_type(hint) is not None}
-    columns = {name: _columns_type(hint) for name, hint in declared.items()}
-    # None stands in the JSON where there is no table
-    tables = {
-        name: table
-        for name, table in columns.items()
-        if table and not (NoneType in get_args(declared[name]) and values.get(name, ...) is None)
-    }
+    arrays = {name: field for name, hint in declared.items() if (field := _array_field(hint))}
+    tables = {name: table for name, hint in declared.items() if (table := _columns_type(hint))}
     # one dataclass of what is in the JSON, so that msgspec checks it as declared; defaults are kept
-    beside = {*arrays, *(name for name, table in columns.items() if table)}
-    inside = [field for field in fields(kind) if field.name not in beside]  # pyright: ignore[reportArgumentType]
+    inside = [field for field in fields(kind) if field.name not in {*arrays, *tables}]  # pyright: ignore[reportArgumentType]
     partial = make_dataclass(kind.__name__, [(field.name, declared[field.name], copy(field)) for field in inside])
-    read = from_builtins(values, partial, where=path, command=command)
+    read = from_builtins(content, partial, where=path, command=command)
     values = {field.name: getattr(read, field.name) for field in inside}
-    values |= dict.fromkeys(beside)
-    values |= {name: _load_columns(folder / f"{name}.parquet", table, cure) for name, table in tables.items()}
-    values |= _load_arrays(folder / ARRAYS_FILE, arrays, cure) if arrays else {}
+    for name, table in tables.items():
+        # None stands in the JSON where there is no table
+        absent = NoneType in get_args(declared[name]) and content.get(name, ...) is None
+        values[name] = None if absent else _load_columns(folder / f"{name}.parquet", table, cure)
+    path = folder / ARRAYS_FILE
+    stored = _load_arrays(path, cure) if arrays else {}
+    with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
+        for name, field in arrays.items():
+            keys = [key for key in stored if key.startswith(f"{name}/")] if field.mapping else [name]
+            for key in keys:
+                if key not in stored:
+                    raise InputError(f"{path} lacks {key!r}; {cure}")
+                field.require(stored[key], name=key, path=path, cure=cure)
+            values[name] = {key[len(name) + 1 :]: stored[key] for key in keys} if field.mapping else stored[name]
     try:
         return kind(**values)
     except ValueError as error:  # of a record that checks what its fields have to do with one another
@@ -215,9 +196,7 @@ def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record])
 
 MOST_EXPANDED, MOST_TIMES = 256 * 2**20, 100
 """Bytes that a compressed table may hold, or how many times its size; ours hold some ten times theirs."""
-_MOST_ROWS = 2**25
-_MOST_ARRAYS = 2**31  # bytes that arrays or texts of a small file may expand to, a thousand times what most do
-_MOST_TEXT = 2**27  # characters, were all texts of a column as long as the longest, as NumPy keeps them
+_MOST_ROWS, _MOST_REPEATED = 2**25, 2**31  # rows, and bytes of values that are written once and counted often
 COLUMN_KINDS: dict[str, Callable[[pa.DataType], bool]] = {
     "numbers": lambda kind: pa.types.is_floating(kind) or pa.types.is_integer(kind),
     "whole numbers": pa.types.is_integer,
@@ -232,7 +211,7 @@ COLUMN_KINDS: dict[str, Callable[[pa.DataType], bool]] = {
 
 @contextmanager
 def parquet_errors(path: Path, *, cure: str, error: type[InputError] = InputError) -> Iterator[None]:
-    """Tell in one sentence what Arrow raises of a missing or damaged file, whatever is read of it inside."""
+    """Convert errors of Arrow on a missing or damaged file, whatever is read of it inside, to one sentence."""
     try:
         yield
     except FileNotFoundError:
@@ -242,9 +221,9 @@ def parquet_errors(path: Path, *, cure: str, error: type[InputError] = InputErro
         raise error(f"{path} is not a readable Parquet file ({one_line(raised)}); {cure}") from None
 
 
-def open_table(path: Path, **how: Any) -> pq.ParquetFile:
-    """Open a Parquet file on disk or in a store; `read_table` would import pandas."""
-    return pq.ParquetFile(path, memory_map=True, **how)
+def open_table(path: Path) -> pq.ParquetFile:
+    """Open a Parquet file; `read_table` would import pandas."""
+    return pq.ParquetFile(path, memory_map=True)
 
 
 def open_parquet(
@@ -264,32 +243,23 @@ def open_parquet(
     with parquet_errors(path, cure=cure, error=error):
         file = open_table(path)
         schema, rows = file.schema_arrow, file.metadata.num_rows
-        names = schema.names
         groups = [file.metadata.row_group(group) for group in range(file.num_row_groups)]
         chunks = [group.column(at) for group in groups for at in range(group.num_columns)]
-        expanded = sum(chunk.total_uncompressed_size for chunk in chunks)
-        kinds = {name: schema.field(name).type for name in columns if names.count(name) == 1}
-        # what is written once and counted often grows as it is read; texts are bounded as they are read
-        whole = {name for name, kind in columns.items() if kind in {"bytes", "values"}}
-        repeated = max(
-            (
-                chunk.total_uncompressed_size * chunk.num_values
-                for chunk in chunks
-                if chunk.path_in_schema in whole
-                and chunk.physical_type == "BYTE_ARRAY"
-                and any("DICT" in encoding for encoding in chunk.encodings)
-            ),
-            default=0,
-        )
-    if absent := sorted(name for name in columns if name not in names):
-        raise error(f"{path} lacks the column {', '.join(map(repr, absent))}; {cure}")
+        kinds = {name: [schema.field(at).type for at in schema.get_all_field_indices(name)] for name in columns}
     for name, kind in columns.items():
-        if name not in kinds:
-            raise error(f"{path} has several columns {name!r}; {cure}")
-        if not COLUMN_KINDS[kind](kinds[name]):
-            raise error(f"{path} holds {kinds[name]} as {name!r} where {kind} belong; {cure}")
-    room = max(MOST_EXPANDED, MOST_TIMES * size)
-    if rows > _MOST_ROWS or expanded > room or repeated > _MOST_ARRAYS:
+        if len(kinds[name]) != 1:
+            lacks = f"has several columns {name!r}" if kinds[name] else f"lacks the column {name!r}"
+            raise error(f"{path} {lacks}; {cure}")
+        if not COLUMN_KINDS[kind](kinds[name][0]):
+            raise error(f"{path} holds {kinds[name][0]} as {name!r} where {kind} belong; {cure}")
+    expanded = sum(chunk.total_uncompressed_size for chunk in chunks)
+    dictionaries = [
+        chunk.total_uncompressed_size * chunk.num_values
+        for chunk in chunks
+        if columns.get(chunk.path_in_schema) in {"bytes", "values"} and any("DICT" in each for each in chunk.encodings)
+    ]
+    too_far = expanded > max(MOST_EXPANDED, MOST_TIMES * size) or max(dictionaries, default=0) > _MOST_REPEATED
+    if rows > _MOST_ROWS or too_far:
         raise error(f"{path} has {size:,} bytes and claims {rows:,} rows of {expanded:,} bytes; {cure}")
     return file
 
@@ -297,109 +267,109 @@ def open_parquet(
 def read_parquet(
     path: Path, columns: Mapping[str, str], *, cure: str, error: type[InputError] = InputError
 ) -> pa.Table:
-    """Columns of a Parquet file as `open_parquet` lets it in, with no value missing."""
-    open_parquet(path, columns, cure=cure, error=error).close()
-    texts = [name for name, kind in columns.items() if kind == "texts"]
-    with parquet_errors(path, cure=cure, error=error):
-        # a text that is repeated is held once until its length is known
-        with open_table(path, read_dictionary=texts) as file:
-            table = file.read(columns=list(columns))
-        for name in texts:
-            chunks = table.column(name).chunks
-            longest = max((len(text or "") for chunk in chunks for text in chunk.dictionary.to_pylist()), default=0)
-            if longest * table.num_rows > _MOST_TEXT:
-                raise ValueError(f"{table.num_rows:,} texts of {longest:,} characters in {name!r}")
-            plain = pa.chunked_array([chunk.dictionary_decode() for chunk in chunks], pa.string())
-            table = table.set_column(table.column_names.index(name), name, plain)
+    """Read columns of a Parquet file that `open_parquet` accepts, with no value missing."""
+    with open_parquet(path, columns, cure=cure, error=error) as file, parquet_errors(path, cure=cure, error=error):
+        table = file.read(columns=list(columns))
     if gaps := [name for name in columns if table.column(name).null_count]:
         raise error(f"{path} has gaps in the column {gaps[0]!r}; {cure}")
     return table
-
-
-def _kind_of(hint: Any) -> str:
-    """Kind of a column that a field of `Columns` declares."""
-    name = _shown(hint)
-    if hint is np.ndarray or name.startswith("Shaped"):
-        return "texts"
-    return "true and false" if name.startswith("Bool") else "whole numbers" if "Int" in name else "numbers"
 
 
 _SIDES: dict[str, tuple[str, Callable[..., np.ndarray]]] = {
     "ge": ("at least", np.less), "gt": ("above", np.less_equal), "le": ("at most", np.greater),
     "lt": ("below", np.greater_equal),
 }  # fmt: skip
-"""Bounds of `msgspec.Meta`: their words, and what says that a number is outside."""
+"""Bounds of `msgspec.Meta`: their words, and the comparison that is True for a number outside."""
+_LARGEST = 1e12  # no stage measures more of anything, infinity among them; seconds since 1970 are 2e9
 
 
-def _require_possible(values: np.ndarray, hint: Any, *, name: str, path: Path, cure: str) -> None:
-    """Check numbers against the bounds that their field declares, if it does."""
-    hint = _one_array(hint)
-    facts = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
-    bounds = [fact for fact in facts if isinstance(fact, msgspec.Meta)]
-    sides = {side: limit for bound in bounds for side in _SIDES if (limit := getattr(bound, side)) is not None}
-    wrong = np.isnan(values) if bounds and UNKNOWN not in facts else np.zeros(values.shape, dtype=np.bool_)
-    for side, limit in sides.items():
-        wrong |= _SIDES[side][1](values, limit)
-    if wrong.any():
-        belong = " and ".join(f"{_SIDES[side][0]} {limit:g}" for side, limit in sides.items())
-        raise InputError(f"{path} holds {values[wrong][0]:g} as {name!r}, which must be {belong}; {cure}")
+@dataclass(frozen=True, kw_only=True)
+class _ArrayField:
+    """Declaration of an array."""
+
+    kind: Any
+    bounds: msgspec.Meta | None
+    may_lack: bool  # NaN stands where a number is unknown
+    mapping: bool  # of several arrays by their names
+
+    @property
+    def words(self) -> str:
+        return getattr(self.kind, "__name__", str(self.kind)).replace("ndarray, ", "")
+
+    @property
+    def column(self) -> str:
+        """Kind of a column in a Parquet file."""
+        if self.kind is np.ndarray or self.words.startswith("Shaped"):
+            return "texts"
+        return "true and false" if "Bool" in self.words else "whole numbers" if "Int" in self.words else "numbers"
+
+    def require(self, values: np.ndarray, *, name: str, path: Path, cure: str) -> None:
+        """Check type, shape and bounds."""
+        if not isinstance(values, self.kind):
+            actual = f"{values.dtype} of shape {values.shape}"
+            raise InputError(f"{path} holds {actual} as {name!r} where {self.words} belongs; {cure}")
+        if self.bounds is None:
+            return
+        sides = {side: limit for side in _SIDES if (limit := getattr(self.bounds, side)) is not None}
+        wrong = np.zeros(values.shape, dtype=np.bool_) if self.may_lack else np.isnan(values)
+        for side, limit in sides.items():
+            wrong |= _SIDES[side][1](values, limit)
+        if wrong.any():
+            belong = " and ".join(f"{_SIDES[side][0]} {limit:g}" for side, limit in sides.items())
+            raise InputError(f"{path} holds {values[wrong][0]:g} as {name!r}, which must be {belong}; {cure}")
 
 
-_LARGEST = 1e12
-"""No stage measures more of anything, infinity among them; seconds since 1970 are 2e9."""
+def _array_field(hint: object) -> _ArrayField | None:
+    """Return the declaration of a field of arrays, `X` or `Mapping[str, X]`; None for another field."""
+    mapping = get_origin(hint) in {dict, Mapping}
+    hint = get_args(hint)[1] if mapping else hint
+    kind, *facts = get_args(hint) if get_origin(hint) is Annotated else [hint]
+    if not (isinstance(kind, type) and (issubclass(kind, AbstractArray) or kind is np.ndarray)):
+        return None
+    bounds = next((fact for fact in facts if isinstance(fact, msgspec.Meta)), None)
+    return _ArrayField(kind=kind, bounds=bounds, may_lack=UNKNOWN in facts, mapping=mapping)
+
+
+def _columns_type(hint: object) -> type[Columns] | None:
+    """Return the kind of columns that a field declares, `X` or `X | None`."""
+    kinds = [kind for kind in get_args(hint) or (hint,) if kind is not NoneType]
+    return kinds[0] if len(kinds) == 1 and isinstance(kinds[0], type) and issubclass(kinds[0], Columns) else None
 
 
 def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
-    declared = get_type_hints(kind, include_extras=True)
-    kinds = {name: _kind_of(_array_type(hint)) for name, hint in declared.items()}
-    table = read_parquet(path, kinds, cure=cure)
+    hints = get_type_hints(kind, include_extras=True)
+    declared = {name: field for name, hint in hints.items() if (field := _array_field(hint))}
+    table = read_parquet(path, {name: field.column for name, field in declared.items()}, cure=cure)
     values = {}
-    for name, hint in declared.items():
+    for name, field in declared.items():
         column = table[name]
-        value = np.array(column.to_pylist(), dtype=str) if kinds[name] == "texts" else column.to_numpy()
+        value = np.array(column.to_pylist(), dtype=str) if field.column == "texts" else column.to_numpy()
         # a context of its own: "rows" of one table need not be as many as "rows" of another
         with jaxtyped("context"):
-            if not isinstance(value, plain := _array_type(hint)):
-                raise InputError(f"{path} holds {column.type} as {name!r} where {_shown(plain)} belongs; {cure}")
+            field.require(value, name=name, path=path, cure=cure)
         if value.dtype.kind == "f" and (np.abs(value) > _LARGEST).any():
             raise InputError(f"{path} holds {value[np.nanargmax(np.abs(value))]:g} as {name!r}; {cure}")
-        _require_possible(value, hint, name=name, path=path, cure=cure)
         values[name] = value
     return kind(**values)
 
 
-TABLE_SUFFIXES = (".parquet", ".csv", ".json")
-"""Endings of the tables that can be written: Parquet, CSV, and JSON with one object a row."""
+_DAMAGE = (EOFError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)  # of an archive, and of old headers in it
 
 
-class _JsonWriter:
-    """Rows as a JSON array, one object a line; what is not known is null."""
-
-    def __init__(self, path: Path) -> None:
-        self._stream = path.open("wb")
-        self._first = True
-
-    def __enter__(self) -> "_JsonWriter":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stream.write(b"[]\n" if self._first else b"\n]\n")
-        self._stream.close()
-
-    def write_table(self, table: pa.Table) -> None:
-        for row in table.to_pylist():
-            self._stream.write((b"[\n" if self._first else b",\n") + msgspec.json.encode(row))
-            self._first = False
+def _load_arrays(path: Path, cure: str) -> dict[str, np.ndarray]:
+    require_file(path, missing=cure)
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            return dict(archive)
+    except (*_DAMAGE, OSError, ValueError, LookupError, MemoryError) as error:
+        raise InputError(f"{path} cannot be read as arrays ({one_line(error)}); {cure}") from None
 
 
-def _table_writer(part: Path, schema: pa.Schema, suffix: str) -> Any:
-    if suffix == ".csv":
-        return pa_csv.CSVWriter(part, schema)
-    return _JsonWriter(part) if suffix == ".json" else pq.ParquetWriter(part, schema, compression="zstd")
+TABLE_SUFFIXES = (".parquet", ".csv")  #: Endings of the tables that can be written.
 
 
 def regrouped(tables: Iterable[pa.Table], *, rows: int) -> Iterator[pa.Table]:
-    """The same rows in tables of so many at least, but for the last."""
+    """Join tables to larger ones of so many rows at least, but for the last."""
     waiting: list[pa.Table] = []
     for table in tables:
         waiting.append(table)
@@ -420,15 +390,13 @@ def read_written(path: Path, schema: pa.Schema) -> pa.Table:
         # none of Python's own: Arrow's thread may let go of it when Python has ended, and that aborts the process
         with pa.OSFile(str(path)) as stream:
             return pa_csv.read_csv(stream, convert_options=options)
-    if path.suffix == ".json":
-        return pa.Table.from_pylist(msgspec.json.decode(path.read_bytes()), schema)
     return open_table(path).read()
 
 
 def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schema) -> pa.Table | None:
     """Write tables into one file, each as it comes; whole or not at all.
 
-    The file is Parquet, a row group a table, or by its ending CSV or JSON (`TABLE_SUFFIXES`). A file that is there is
+    The file is CSV by its ending, else Parquet, a row group a table. A file that is there is
     replaced; without a path the tables are joined in memory and given back.
 
     Raises
@@ -439,77 +407,12 @@ def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schem
     if path is None:
         # no empty table before them: each column would begin with an empty chunk
         return pa.concat_tables(list(tables) or [schema.empty_table()]).replace_schema_metadata(schema.metadata)
-    with whole_file(path) as part, _table_writer(part, schema, path.suffix) as writer:
-        for table in tables:
-            writer.write_table(table.replace_schema_metadata(schema.metadata))
+    with whole_file(path) as part:
+        csv = path.suffix == ".csv"
+        with pa_csv.CSVWriter(part, schema) if csv else pq.ParquetWriter(part, schema, compression="zstd") as writer:
+            for table in tables:
+                writer.write_table(table.replace_schema_metadata(schema.metadata))
     return None
-
-
-def _require_claimed(archive: zipfile.ZipFile, info: zipfile.ZipInfo, room: int) -> int:
-    """Bytes of an array, which must be as many as its header claims: that much memory is taken before it is read."""
-    with archive.open(info) as member:
-        read = {(1, 0): read_array_header_1_0, (2, 0): read_array_header_2_0}[read_magic(member)]
-        shape, _, kind = read(member)
-    if prod(shape) * kind.itemsize > min(info.file_size, room):
-        raise ValueError(f"{info.filename} claims {kind} of shape {shape}")
-    return info.file_size
-
-
-_NO_ARRAYS = (
-    OSError, ValueError, LookupError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error, tokenize.TokenError,
-)  # fmt: skip
-"""What NumPy raises of a damaged archive; its headers are read as text of Python where they are old."""
-
-
-def _load_arrays(path: Path, declared: Mapping[str, Any], cure: str) -> dict[str, Any]:
-    """Arrays of the fields of a record, each alone or a mapping of several."""
-    room = max(_MOST_ARRAYS, MOST_TIMES * require_file(path, missing=cure))
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            for info in archive.zip.infolist():
-                room -= _require_claimed(archive.zip, info, room)
-            arrays = {name: archive[name] for name in archive}
-    except _NO_ARRAYS as error:
-        raise InputError(f"{path} cannot be read as arrays ({one_line(error)}); {cure}") from None
-    loaded = {}
-    with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
-        for name, hint in declared.items():
-            kind, alone = _array_type(hint), hint is _one_array(hint)
-            keys = [name] if alone else [key for key in arrays if key.startswith(f"{name}/")]
-            for key in keys:
-                if key not in arrays:
-                    raise InputError(f"{path} lacks {key!r}; {cure}")
-                if not isinstance(arrays[key], kind):
-                    actual = f"{arrays[key].dtype} of shape {arrays[key].shape}"
-                    raise InputError(f"{path} holds {actual} as {key!r} where {_shown(kind)} belongs; {cure}")
-                _require_possible(arrays[key], hint, name=key, path=path, cure=cure)
-            loaded[name] = arrays[name] if alone else {key[len(name) + 1 :]: arrays[key] for key in keys}
-    return loaded
-
-
-def _columns_type(hint: object) -> type[Columns] | None:
-    """Kind of columns that a field declares, `X` or `X | None`."""
-    kinds = [kind for kind in get_args(hint) or (hint,) if kind is not NoneType]
-    return kinds[0] if len(kinds) == 1 and isinstance(kinds[0], type) and issubclass(kinds[0], Columns) else None
-
-
-def _one_array(hint: Any) -> Any:
-    return get_args(hint)[1] if get_origin(hint) in {dict, Mapping} else hint
-
-
-def _array_type(hint: object) -> Any:
-    """Type of the arrays that a field declares, `X` or `Mapping[str, X]`; None where it declares none."""
-    kind = _one_array(hint)
-    kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
-    return kind if isinstance(kind, type) and (issubclass(kind, AbstractArray) or kind is np.ndarray) else None
-
-
-def _is_array_mapping(value: object) -> bool:
-    return isinstance(value, Mapping) and bool(value) and all(isinstance(item, np.ndarray) for item in value.values())
-
-
-def _shown(hint: Any) -> str:
-    return getattr(hint, "__name__", str(hint)).replace("ndarray, ", "")
 
 
 def _decode(kind: Any, value: object) -> object:

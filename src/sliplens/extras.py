@@ -1,7 +1,6 @@
 """What may be installed beside sliplens: packages of its extras, and packages that add rows to its tables."""
 
 import os
-import re
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cached_property
@@ -19,10 +18,8 @@ class Table(Mapping[str, Row]):
     """Rows by name: those of sliplens, then those that installed packages add through an entry point.
 
     A package names its rows in its metadata: `[project.entry-points."sliplens.fills"]`, `my-fill = "package:row"`. They
-    are imported when the table is walked or a name is not one of ours, not before: a package may import sliplens first.
-
-    `noun` says in messages what a row is; the group of entry points is named as `sliplens.fills`. No package replaces a
-    row of sliplens.
+    are imported when the table is walked or a name is not one of ours: a package may import sliplens first. No package
+    replaces a row of sliplens. Messages call a row by the `noun`.
 
     Examples
     --------
@@ -78,14 +75,12 @@ def pick(rows: Mapping[str, Row], name: str, *, noun: str) -> Row:
     return rows[name]
 
 
-ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")
-"""What the extra `onnx` installs."""
-_NAMES = {"cv2": "OpenCV", "rerun": "Rerun"}
-"""Packages that people know by another name than Python does."""
+ONNX_PACKAGES = ("onnx", "onnxscript", "onnxruntime")  #: Packages of the extra `onnx`.
+_NAMES = {"cv2": "OpenCV", "rerun": "Rerun"}  # packages that people know by another name than Python does
 
 
 def missing_packages(*names: str, extra: str) -> str | None:
-    """What to say of packages that are not installed, with the command that installs them; None if all are there.
+    """Describe packages that are not installed, with the command that installs them; None if all are there.
 
     Packages are named as they are imported, extras of sliplens divided by commas. Nothing is imported.
     """
@@ -105,10 +100,7 @@ def require_packages(*names: str, extra: str, purpose: str) -> None:
 
 
 def import_onnxruntime() -> ModuleType:
-    """ONNX Runtime, silenced: from 1.29 on it reports its use to Microsoft unless told not to before it is loaded.
-
-    Privacy.md of the package ("Disabling Telemetry").
-    """
+    """Import ONNX Runtime without its reports to Microsoft: Privacy.md of the package, "Disabling Telemetry"."""
     require_packages("onnxruntime", extra="onnx", purpose="ONNX Runtime")
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime  # noqa: PLC0415 (an extra)
@@ -119,7 +111,7 @@ def import_onnxruntime() -> ModuleType:
 
 
 def import_openvino() -> ModuleType:
-    """OpenVINO, silenced: to import it reports that to Intel, unless its package for that cannot be found."""
+    """Import OpenVINO without its report to Intel, which it makes unless its package for that cannot be found."""
     require_packages("openvino", extra="openvino", purpose="OpenVINO")
     reporter = "openvino_telemetry"
     hide = "openvino" not in sys.modules and reporter not in sys.modules
@@ -133,26 +125,24 @@ def import_openvino() -> ModuleType:
     return openvino
 
 
+def import_cv2() -> ModuleType:
+    """Import OpenCV where it is used: nothing else of sliplens needs it."""
+    require_packages("cv2", extra="markers", purpose="finding markers")
+    import cv2  # noqa: PLC0415 (an extra)
+
+    return cv2
+
+
 def require_device(name: str) -> None:
-    """Refuse a device that is not known or not there."""
-    if not re.fullmatch(r"[a-z]+(:\d+)?", name):
-        raise InputError(f"device {name!r} is not known; use cpu, cuda or cuda:1")
+    """Refuse a device that is unknown or absent."""
     if name == "cpu":
         return  # the usual one, known without torch
     torch = import_module("torch")  # takes seconds, and the floors below the networks do without
     try:
         device = torch.device(name)
-    except RuntimeError:
-        raise InputError(f"device {name!r} is not known; use cpu, cuda or cuda:1") from None
+    except (RuntimeError, ValueError):
+        device = None
+    if device is None or device.type not in {"cpu", "cuda"}:
+        raise InputError(f"device {name!r} is not known; use cpu, cuda or cuda:1")
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise InputError(f"device {name} is not on this machine; use cpu")
-    if device.type not in {"cpu", "cuda"}:
-        raise InputError(f"device {name} cannot be used; use cpu or cuda")
-
-
-def import_cv2() -> ModuleType:
-    """OpenCV, imported where it is used: nothing else of sliplens needs it."""
-    require_packages("cv2", extra="markers", purpose="finding markers")
-    import cv2  # noqa: PLC0415 (an extra)
-
-    return cv2

@@ -8,7 +8,6 @@ import shutil
 import stat
 import sys
 import tempfile
-import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -25,8 +24,8 @@ from filelock import FileLock, Timeout
 from sliplens._version import __version__
 from sliplens.errors import InputError
 
-RUN_FILE = "run.json"
-"""Provenance of a folder."""
+RUN_FILE = "run.json"  #: Provenance of a folder.
+MANIFEST_FILE = "manifest.json"  #: Facts of a network; its folder is one that holds this.
 
 
 def remove(path: Path) -> None:
@@ -40,13 +39,11 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-MANIFEST_FILE = "manifest.json"
-"""What a network is; its folder is one that holds this."""
 _PACKAGES = ("numpy", "torch", "torchvision", "lightning", "captum", "matplotlib", "pyarrow", "pillow")
 
 
 def versions() -> dict[str, str]:
-    """Versions of sliplens, Python and the libraries that shape a result, read without importing them."""
+    """Read the versions of sliplens, Python and the libraries that shape a result, without importing them."""
     versions_by_name = {"sliplens": __version__, "python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(metadata.PackageNotFoundError):
@@ -56,33 +53,30 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """A machine, as far as the standard library can tell."""
+    """System, processor and cores of a machine."""
 
     system: str
     processor: str
     cores: int | None
-    implementation: str
-    """Implementation of Python."""
+    implementation: str  #: Implementation of Python.
 
 
 def machine() -> Machine:
-    """System, processor and cores of this machine."""
+    """Describe this machine."""
     system, processor, implementation = platform.system(), platform.machine(), sys.implementation.name
     return Machine(system=system, processor=processor, cores=os.cpu_count(), implementation=implementation)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Where a folder comes from: what its `run.json` says."""
+    """Origin of a folder: content of its `run.json`."""
 
     stage: str
-    config: object
-    """All that shaped the result, as JSON holds it: to be shown and compared."""
+    config: object  #: All that shaped the result, as JSON holds it: to be shown and compared.
     config_hash: str
     versions: Mapping[str, str]
     machine: Machine
-    finished: str
-    """Date and time in UTC, as ISO 8601."""
+    finished: str  #: Date and time in UTC, as ISO 8601.
 
 
 def to_builtins(value: object) -> Any:
@@ -104,19 +98,19 @@ def _encode(value: object) -> object:
 
 
 def hash_json(value: Any) -> str:
-    """SHA-256 (first 16 hex digits) of a value's canonical JSON: the same recipe gives the same hash."""
+    """Hash a value's canonical JSON (first 16 hex digits of SHA-256): the same recipe gives the same hash."""
     text = json.dumps(to_builtins(value), sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def hash_file(path: Path) -> str:
-    """SHA-256 of a file's bytes, as hex."""
+    """Hash a file's bytes with SHA-256, as hex."""
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def hash_tree(path: Path) -> str:
-    """SHA-256 of a file's bytes, or of the names and bytes of all files below a folder."""
+    """Hash a file's bytes, or the names and bytes of all files below a folder."""
     if path.is_file():
         return hash_file(path)
     return hash_json({str(file.relative_to(path)): hash_file(file) for file in path.rglob("*") if file.is_file()})
@@ -162,13 +156,12 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise
 
 
-MOST_TEXT = 64 * 2**20
-"""Bytes of a JSON or TOML file; the table of a hundred thousand trials has 40 million."""
+MOST_TEXT = 64 * 2**20  #: Bytes of a JSON or TOML file; the table of a hundred thousand trials has 40 million.
 _DEEPEST = 64  # lists and objects in one another; ours are less than ten deep
 
 
 def require_file(path: Path, *, missing: str = "check the path", most: int | None = None) -> int:
-    """Size in bytes of a regular file, no larger than `most`; whoever opens a pipe or a device may wait for ever.
+    """Return the size in bytes of a regular file, at most `most`; to open a pipe or a device may wait for ever.
 
     Raises
     ------
@@ -208,19 +201,9 @@ def parse_json(text: bytes | str, *, where: object, cure: str) -> Any:
 def read_json(
     path: Path, *, missing: str = "name a folder that a sliplens command wrote", damaged: str = "make the folder again"
 ) -> Any:
-    """Read a JSON file; what is missing or damaged is told with its cure."""
+    """Read a JSON file; the cures are for a missing and for a damaged one."""
     require_file(path, missing=missing, most=MOST_TEXT)
     return parse_json(path.read_bytes(), where=path, cure=damaged)
-
-
-def read_toml(path: Path, *, what: str) -> dict[str, Any]:
-    """Read a TOML file; what is missing or damaged is told with its cure. `what` says what it holds."""
-    require_file(path, missing=f"name a TOML file of {what}", most=MOST_TEXT)
-    try:
-        # Windows editors put a mark before the text that TOML does not know
-        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not valid TOML: {error}; mend it there") from None
 
 
 def require_folder(path: Path, *, what: str) -> Path:
@@ -234,19 +217,17 @@ def require_folder(path: Path, *, what: str) -> Path:
 
 # the package is installed as files, never as an archive: its weights are mapped into memory from there
 _WEIGHTS = Path(str(files("sliplens"))) / "weights"
-DEFAULT_NETWORK = "chromatouch-pair"
-"""Network of the package that reads where none is named."""
-DIFFERENCE_NETWORK = "chromatouch-difference"
-"""The same for difference images, which show no frame."""
+DEFAULT_NETWORK = "chromatouch-pair"  #: Network of the package that predicts where none is named.
+DIFFERENCE_NETWORK = "chromatouch-difference"  #: Network of the package for difference images, which show no frame.
 
 
 def shipped_names() -> list[str]:
-    """Names of the networks that come with the package."""
+    """List the networks that come with the package."""
     return sorted(path.parent.name for path in _WEIGHTS.glob(f"*/{MANIFEST_FILE}"))
 
 
 def find_run(run: Path) -> Path:
-    """Folder of a network: the one that is named, else the one of that name that comes with the package."""
+    """Return the folder of a network: the one that is named, else the one of that name that comes with the package."""
     if run.exists():
         return run
     names = shipped_names()
@@ -277,8 +258,7 @@ class Output:
     """Folder being written: `folder` lies beside the target until everything is in it."""
 
     folder: Path
-    complete: bool
-    """True if the target was made before by the same recipe; then nothing is left to do."""
+    complete: bool  #: True if the target was made before by the same recipe; then nothing is left to do.
 
 
 def partial_folder(target: Path) -> Path:
@@ -377,14 +357,9 @@ def output_folder(
         if not recipe_file.exists():
             _drop(partial)
             raise InputError(f"{partial} was removed while {target} was being made; give the command again")
-        finished = datetime.now(UTC).isoformat(timespec="seconds")
+        now, used = datetime.now(UTC).isoformat(timespec="seconds"), versions()
         provenance = Provenance(
-            stage=stage,
-            config=recipe,
-            config_hash=config_hash,
-            finished=finished,
-            versions=versions(),
-            machine=machine(),
+            stage=stage, config=recipe, config_hash=config_hash, finished=now, versions=used, machine=machine()
         )
         write_json(partial / run_file, provenance)
         recipe_file.unlink()

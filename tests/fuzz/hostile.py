@@ -475,10 +475,9 @@ def _lerobot(folder: Path) -> None:
 
 
 def _robot(folder: Path) -> None:
-    """A data set of LeRobot as others write it: frames in videos, and none of what sliplens keeps beside."""
+    """A data set of LeRobot with frames in videos."""
     _lerobot(folder)
     robot = folder / "robot"
-    shutil.rmtree(robot / "meta" / "sliplens")
     info = json.loads((robot / "meta" / "info.json").read_text())
     info["features"]["observation.images.tactile"]["dtype"] = "video"
     info["video_path"] = "{video_key}-{file_index}.mkv"

@@ -9,8 +9,7 @@ from there import there
 
 from sliplens.errors import ImageError, InputError
 from sliplens.images import decode_png, encode_png, list_images, read_image, write_png
-from sliplens.recordings.formats.images import frame_size
-from sliplens.recordings.formats.lerobot import decode_image
+from sliplens.recordings.formats.images import decode_image, frame_size
 from sliplens.recordings.source import open_source
 
 

@@ -17,7 +17,6 @@ from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.dataset import Dataset, begin_recording, finish_recording, load_dataset
 from sliplens.recordings.formats.tables import (
     UNITS,
-    TextTable,
     guess_force_columns,
     guess_time_column,
     require_trial_name,
@@ -254,14 +253,13 @@ def _line_parser(path: Path, header: str) -> Callable[[str], tuple[float, tuple[
     """Return the function that reads a line of a table of forces, by the names of its columns."""
     separator = next((mark for mark in ("\t", ";", ",") if mark in header), ",")
     names = tuple(name.strip() for name in header.split(separator))
-    table = TextTable(path=path, encoding="utf-8", separator=separator, header=names, first_line=2)
 
     def column(name: str, quantity: str, unit: str) -> tuple[int, float]:
-        return names.index(name), UNITS[quantity][unit_of(name, quantity=quantity, path=str(path)) or unit][0]
+        return names.index(name), UNITS[quantity][unit_of(name, quantity=quantity, path=path) or unit][0]
 
-    forces = [column(name, "force", "N") for name in guess_force_columns(table)]
+    forces = [column(name, "force", "N") for name in guess_force_columns(names, path=path)]
     try:
-        stamp = column(guess_time_column(table), "time", "s")
+        stamp = column(guess_time_column(names, path=path), "time", "s")
     except RecordingError:
         stamp = None
 

@@ -23,7 +23,7 @@ from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
-from sliplens.recordings.formats.video import display_turn
+from sliplens.recordings.formats.video import upright
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.source import open_source
 from sliplens.simulation.filming import prepare_film
@@ -217,11 +217,11 @@ class StreamSource(LiveSource):
             except StopIteration:
                 raise SourceError(f"{self.name} has ended; start the camera again") from None
             for frame in frames:
-                turn = display_turn(frame, where=self.name)
-                height, width = turn.size(*(self._size or turn.size(frame.height, frame.width)))
-                image = turn.apply(to_rgb.reformat(frame, width=width, height=height, format="rgb24").to_ndarray())
+                size = self._size or (frame.height, frame.width)
+                height, width = size[::-1] if self._size and frame.rotation % 180 else size
+                pixels = to_rgb.reformat(frame, width=width, height=height, format="rgb24").to_ndarray()
                 yield LiveFrame(
-                    image=image,
+                    image=upright(frame, pixels, where=self.name),
                     number=number,
                     time_s=arrived_s if frame.time is None else float(frame.time),
                     captured_s=arrived_s,

@@ -29,7 +29,7 @@ def export_lerobot(
     """Write trials as a LeRobot v3.0 data set, one episode a trial, without loss.
 
     `observation.force` is (F_t, 0, F_n) in newtons, `observation.time_s` has the measured times: LeRobot counts time in
-    frames of one rate. `meta/sliplens` has the rest of each trial, of which `import_recordings` restores the data set.
+    frames of one rate.
 
     Parameters
     ----------
@@ -63,7 +63,6 @@ def export_mcap(
 
     Frames are PNG images in `/tactile/image`, labels are in `/tactile/labels` and forces in `/tactile/wrench`. Stamps
     are the times of the trial, later by the whole seconds `stamp_offset_s` in the metadata where it begins before 1 s.
-    Attachments have the rest of the trial, from which `import_recordings` restores it.
 
     Parameters
     ----------

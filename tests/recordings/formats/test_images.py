@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 from readers import read_image_folder, refused
 
-from sliplens.errors import ImageError, InputError, RecordingError
+from sliplens.errors import ImageError, RecordingError
 from sliplens.images import write_png
 
 
@@ -82,7 +82,7 @@ def test_times_must_be_given_in_one_way(folder: Path):
         ("file,time_s\nimage_1.png,0\n", "has no time for image_2.tiff; add a row"),
         ("file,time_s\nimage_1.png,0\nimage_1.png,1\n", "line 3 names 'image_1.png' again"),
         ("file,time_s\n" + "".join(f"image_{number},0\n" for number in range(1, 13)), "'time_s' repeats"),
-        ("file,time_s\nimage_1.png,soon\n", "line 2, 'time_s' is 'soon', not a number"),
+        ("file,time_s\nimage_1.png,soon\n", "line 2, 'time_s' is 'soon', not a finite number"),
         ("who,time_s\nimage_1.png,0\n", "no column with the names of images among 'who', 'time_s'; call it file"),
     ],
 )
@@ -97,40 +97,18 @@ def test_frames_of_two_sizes_are_refused(folder: Path, frames: np.ndarray):
     refused(read_image_folder, folder, r"image_5\.png is 30 x 10 pixels but image_1\.png is 30 x 20", frame_rate=30.0)
 
 
-@pytest.mark.parametrize(
-    ("pixels", "mode", "cure"),
-    [
-        (np.zeros((20, 30), dtype=np.uint16), "I;16", "16 bits a channel; divide its levels by 256"),
-        (np.zeros((20, 30, 4), dtype=np.uint8), "RGBA", "4 channels .alpha.; drop the alpha channel"),
-    ],
-)
-def test_frames_of_another_depth_are_refused(folder: Path, pixels: np.ndarray, mode: str, cure: str):
-    image = Image.fromarray(pixels)
-    assert image.mode == mode
-    image.save(folder / "image_13.png")
-    capture = read_image_folder(folder, frame_rate=30.0)
-    with pytest.raises(ImageError, match=cure):
-        list(capture.read_frames())
-
-
 def test_damaged_images_are_refused(folder: Path):
     first = folder / "image_1.png"
-    first.write_bytes(first.read_bytes()[:200])
+    whole = first.read_bytes()
+    first.write_bytes(whole[:200])
     capture = read_image_folder(folder, frame_rate=30.0)
     with pytest.raises(ImageError, match=r"image_1\.png cannot be read as an image"):
         list(capture.read_frames())
-    first.write_text("no image")
-    with pytest.raises(ImageError, match=r"image_1\.png cannot be read as an image"):
-        read_image_folder(folder, frame_rate=30.0)
-
-
-def test_an_absurd_size_is_refused(folder: Path):
-    first = folder / "image_1.png"
-    data = bytearray(first.read_bytes())
-    data[16:24] = (30_000).to_bytes(4, "big") * 2  # the header's width and height
-    first.write_bytes(data)
-    with pytest.raises(ImageError, match=r"image_1\.png cannot be read as an image"):
-        read_image_folder(folder, frame_rate=30.0)
+    absurd = whole[:16] + (30_000).to_bytes(4, "big") * 2 + whole[24:]  # width and height of the header
+    for data in (b"no image", absurd):
+        first.write_bytes(data)
+        with pytest.raises(ImageError, match=r"image_1\.png cannot be read as an image"):
+            read_image_folder(folder, frame_rate=30.0)
 
 
 def test_several_images_in_a_file_are_refused(folder: Path, frames: np.ndarray):
@@ -138,10 +116,3 @@ def test_several_images_in_a_file_are_refused(folder: Path, frames: np.ndarray):
     pages[0].save(folder / "image_2.tiff", save_all=True, append_images=pages[1:])
     with pytest.raises(ImageError, match=r"image_2\.tiff holds 3 images; save one image a file"):
         read_image_folder(folder, frame_rate=30.0)
-
-
-def test_a_folder_without_images_is_refused(tmp_path: Path):
-    with pytest.raises(InputError, match="holds no image"):
-        read_image_folder(tmp_path, frame_rate=30.0)
-    with pytest.raises(InputError, match="does not exist"):
-        read_image_folder(tmp_path / "nothing", frame_rate=30.0)

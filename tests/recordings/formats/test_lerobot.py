@@ -199,26 +199,23 @@ def test_a_damaged_image_in_parquet_is_refused(tmp_path, frames, wrenches):
 def test_a_camera_is_found_by_its_name_or_named(dataset, frames):
     capture = read_lerobot(dataset, camera_key=SCENE)[0]
     np.testing.assert_array_equal(list(capture.read_frames()), 255 - split(frames)[0])
-    refused(read_lerobot, dataset, rf"has no camera wrist; it has {CAMERA}, {SCENE}", camera_key="wrist")
+    refused(read_lerobot, dataset, rf"has no camera wrist among {CAMERA}, {SCENE}; name one with", camera_key="wrist")
     write_info(dataset, lambda info: info["features"].pop(CAMERA))
-    capture = read_lerobot(dataset)[0]
-    assert capture.notes[0] == f"{SCENE} was taken for the tactile camera, for there is no other."
+    assert SCENE in read_lerobot(dataset)[0].source  # there is no other
     write_info(dataset, lambda info: info["features"].update(gelsight=info["features"][CAMERA]))
-    refused(read_lerobot, dataset, rf"of which {CAMERA}, gelsight could be tactile; name one with")
+    refused(read_lerobot, dataset, rf"has 2 tactile cameras among {CAMERA}, {SCENE}, gelsight; name one with")
     write_info(dataset, lambda info: info["features"][CAMERA].update(info={"is_depth_map": True}))
     assert SCENE in read_lerobot(dataset)[0].source
     write_info(dataset, lambda info: [info["features"].pop(key) for key in (CAMERA, SCENE)])
-    refused(read_lerobot, dataset, "press v3 has no camera; record one")
+    refused(read_lerobot, dataset, "press v3 has no tactile cameras among none")
 
 
 def test_a_force_is_found_by_its_name_or_named(dataset):
     write_info(dataset, lambda info: info["features"].update(ft=info["features"][FORCE]))
-    refused(read_lerobot, dataset, rf"has forces {FORCE}, ft; name one with --force-key")
+    refused(read_lerobot, dataset, rf"has 2 forces among {FORCE}, action.wrench, ft; name one with --force-key")
     assert read_lerobot(dataset, force_key=FORCE)[0].forces is not None
-    with pytest.raises(RecordingError, match=rf"has no feature load; 3 or 6 numbers have {FORCE}, action.wrench, ft"):
-        read_lerobot(dataset, force_key="load")
-    with pytest.raises(RecordingError, match=r"observation\.state of .* is float32 of shape \[2\]; a force has 3 or 6"):
-        read_lerobot(dataset, force_key="observation.state")
+    for name in ("load", "observation.state"):
+        refused(read_lerobot, dataset, rf"has no feature {name} of 3 or 6 floating-point", force_key=name)
     write_info(dataset, lambda info: info["features"].pop(FORCE))
     capture = read_lerobot(dataset)[0]
     assert capture.forces is None
@@ -235,15 +232,6 @@ def test_torques_are_not_taken_for_forces(dataset, names):
     refused(read_lerobot, dataset, r"observation\.wrench of .* begins with t.*; forces must come first")
 
 
-@pytest.mark.parametrize("version", ["v2.0", "v2.1", "v1.6", "v4.0"])
-def test_another_version_is_refused_by_name_with_the_cure(dataset, version):
-    write_info(dataset, lambda info: info.update(codebase_version=version))
-    with pytest.raises(
-        RecordingError, match=rf"LeRobot data set of version {version}, v3\.0 is needed; convert it wit"
-    ):
-        read_lerobot(dataset)
-
-
 def test_a_folder_of_something_else_is_refused(tmp_path):
     (tmp_path / "meta").mkdir()
     info = tmp_path / "meta" / "info.json"
@@ -251,8 +239,9 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
     for text, message in {
         "{": "is not valid JSON",
         "[" * 100_000: "is not valid JSON",
-        "[]": "has no codebase_version",
-        '{"codebase_version": "v3.0", "fps": 0}': r"is not .*`float` > 0.* at `\$.fps`\); copy it",
+        "[]": r"has codebase_version '', v3\.0 is needed",
+        '{"codebase_version": "v2.1"}': r"has codebase_version 'v2\.1', v3\.0 is needed; convert it wit",
+        '{"codebase_version": "v3.0", "fps": 0}': r"is not .*`float` > 0.* at `\$.fps`\); copy",
         '{"codebase_version": "v3.0", "fps": "30"}': r"is not .*Expected `float`, got `str`",
         '{"codebase_version": "v3.0", "fps": 30, "features": {"a": 1}}': "is not .*, got `int`.*features",
     }.items():
@@ -266,8 +255,6 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
         "../{video_key}.mp4",
         "videos/../../secret.mp4",
         "/etc/{video_key}.mp4",
-        "C:\\videos\\{video_key}.mp4",
-        "..\\secret.mp4",
         "{video_key.__class__}.mp4",
         "{chunk_index:999999999d}.mp4",
         "{0}.mp4",
@@ -297,7 +284,7 @@ def test_a_missing_or_damaged_video_is_refused(dataset):
     video.write_bytes(whole[: len(whole) // 2])
     refused(read_lerobot, dataset, r"file-000\.mp4 cannot be read as a video \(.*\); copy or")
     video.unlink()
-    refused(read_lerobot, dataset, r"file-000\.mp4 does not exist; copy the data set again, with its videos")
+    refused(read_lerobot, dataset, r"file-000\.mp4 does not exist; name a video, or copy it")
 
 
 def test_a_video_that_ends_too_early_is_refused_when_it_is_read(dataset, frames):

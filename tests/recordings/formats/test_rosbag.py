@@ -197,57 +197,47 @@ def test_compressed_images_are_what_pillow_makes_of_their_bytes(tmp_path, pixels
             np.testing.assert_array_equal(frames, pixels)
 
 
-@pytest.mark.parametrize(("encoding", "channels"), [("16UC1", 2), ("rgba8", 4), ("bayer_rggb8", 1), ("", 3)])
-def test_another_encoding_is_refused_by_name(tmp_path, rng, encoding, channels):
-    pixels = rng.integers(0, 256, (HEIGHT, WIDTH, channels), dtype=np.uint8)
-    path = write_bag(tmp_path / "trial", [(CAMERA, raw_image(pixels, frame_ns(0), encoding=encoding), 0)])
-    with pytest.raises(
-        RecordingError, match=rf"frame 0 of .* has encoding '{encoding}'; record it as rgb8, bgr8, mono8"
-    ):
-        read_rosbag(path)
+@pytest.mark.parametrize(
+    ("shape", "claims", "message"),
+    [
+        ((HEIGHT, WIDTH, 2), {"encoding": "16UC1"}, "has encoding '16UC1'; record it as rgb8, bgr8, mono8"),
+        ((HEIGHT, WIDTH, 4), {"encoding": "rgba8"}, "has encoding 'rgba8'"),
+        ((HEIGHT, WIDTH, 3), {"height": 200_000, "width": 170_000, "step": 510_000}, "but holds 576 bytes"),  # 100 GB
+        ((HEIGHT, WIDTH, 3), {"height": 2**32 - 1, "width": 1, "step": 2**32 - 1}, "but holds"),  # over 64 bits
+        ((HEIGHT, WIDTH, 3), {"height": HEIGHT + 1}, "but holds"),
+        ((HEIGHT, WIDTH, 3), {"height": 0}, "claims 0 rows"),
+        ((HEIGHT, WIDTH, 3), {"width": 0}, "claims"),
+        ((HEIGHT, WIDTH, 3), {"step": 0}, "rows of 0 bytes"),
+        ((HEIGHT, WIDTH, 3), {"width": WIDTH + 1}, "claims"),
+    ],
+)
+def test_a_frame_that_is_no_8_bit_image_or_contradicts_itself_is_refused(tmp_path, rng, shape, claims, message):
+    pixels = rng.integers(0, 256, shape, dtype=np.uint8)
+    path = write_bag(tmp_path / "trial", [(CAMERA, raw_image(pixels, frame_ns(0), **claims), 0)])
+    with held_below(64e6):
+        refused(read_rosbag, path, f"frame 0 of .* {message}")
 
 
-def test_another_kind_of_compressed_image_is_refused(tmp_path, pixels):
-    depth = compressed_image(b"\0" * 12 + encode(pixels[0], "PNG"), frame_ns(0), form="16UC1; compressedDepth png")
-    with pytest.raises(RecordingError, match=r"of format '16UC1; compressedDepth png', cannot be read as JPEG or PNG"):
-        read_rosbag(write_bag(tmp_path / "depth", [(CAMERA, depth, 0)]))
-    alpha = compressed_image(encode(np.zeros((4, 4, 4), np.uint8), "PNG"), frame_ns(0))
-    with pytest.raises(RecordingError, match=r"has pixels of mode RGBA; record it as 8-bit RGB or grey"):
-        read_rosbag(write_bag(tmp_path / "alpha", [(CAMERA, alpha, 0)]))
+def test_another_kind_of_compressed_image_is_refused(tmp_path, pixels, monkeypatch):
+    png = encode(pixels[0], "PNG")
+    events = {
+        "of format '16UC1; compressedDepth png', cannot be read as PNG or JPEG": compressed_image(
+            b"\0" * 12 + png, frame_ns(0), form="16UC1; compressedDepth png"
+        ),
+        "has pixels of mode RGBA; record it as 8-bit": compressed_image(
+            encode(np.zeros((4, 4, 4), np.uint8), "PNG"), frame_ns(0)
+        ),
+        "cannot be read as PNG or JPEG .*decompression bomb": compressed_image(png, frame_ns(0)),
+    }
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 50)
+    for number, (message, image) in enumerate(events.items()):
+        refused(read_rosbag, write_bag(tmp_path / f"{number}", [(CAMERA, image, 0)]), message)
 
 
 def test_frames_of_changing_size_are_refused(tmp_path, pixels, frames_of):
     small = (CAMERA, raw_image(pixels[0, :-2], frame_ns(FRAMES)), frame_ns(FRAMES) + 2_000_000)
-    with pytest.raises(RecordingError, match=r"frame 5 of .* is of another size than those before it; cut"):
-        read_rosbag(write_bag(tmp_path / "trial", [*frames_of(), small]))
-
-
-@pytest.mark.parametrize(
-    "claims",
-    [
-        {"height": 200_000, "width": 170_000, "step": 510_000},  # 100 GB
-        {"height": 2**32 - 1, "width": 1, "step": 2**32 - 1},  # more than 64 bits can count
-        {"height": HEIGHT + 1},
-    ],
-)
-def test_a_header_that_claims_more_than_there_is_is_refused_without_allocating(tmp_path, frames_of, claims):
-    path = write_bag(tmp_path / "trial", frames_of(**claims))
-    told = r"claims \d+ rows of \d+ bytes but holds fewer; mend it"
-    with held_below(64e6), pytest.raises(RecordingError, match=told):
-        read_rosbag(path)
-
-
-@pytest.mark.parametrize("claims", [{"height": 0}, {"width": 0}, {"step": 0}, {"width": WIDTH + 1}])
-def test_a_header_that_contradicts_itself_is_refused(tmp_path, frames_of, claims):
-    with pytest.raises(RecordingError, match=r"claims rows of \d+ bytes, no rgb8"):
-        read_rosbag(write_bag(tmp_path / "trial", frames_of(**claims)))
-
-
-def test_a_decompression_bomb_is_refused(tmp_path, monkeypatch, pixels):
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 50)
-    event = (CAMERA, compressed_image(encode(pixels[0], "PNG"), frame_ns(0)), 0)
-    with pytest.raises(RecordingError, match=r"frame 0 of .* cannot be read as JPEG or PNG \(.*decompression bomb"):
-        read_rosbag(write_bag(tmp_path / "trial", [event]))
+    path = write_bag(tmp_path / "trial", [*frames_of(), small])
+    refused(read_rosbag, path, r"frame 5 of .* is of another size than those before it; cut")
 
 
 def test_a_compressed_frame_that_is_cut_short_is_refused_when_it_is_read(tmp_path, rng):
@@ -256,7 +246,7 @@ def test_a_compressed_frame_that_is_cut_short_is_refused_when_it_is_read(tmp_pat
     events = [(CAMERA, compressed_image(data, frame_ns(i)), i) for i, data in enumerate((whole, cut))]
     frames = read_rosbag(write_bag(tmp_path / "trial", events)).read_frames()
     np.testing.assert_array_equal(next(frames), noise)
-    with pytest.raises(RecordingError, match=r"frame 1 of .* is damaged \(.*; cut the bag before it"):
+    with pytest.raises(RecordingError, match=r"frame 1 of .* cannot be read as PNG or JPEG"):
         next(frames)
 
 
@@ -281,25 +271,23 @@ def test_clocks_that_never_meet_are_replaced_by_the_time_of_the_bag(tmp_path, pi
 def test_a_bag_without_wrenches_has_no_forces(tmp_path, frames_of):
     capture = read_rosbag(write_bag(tmp_path / "a", frames_of()))
     assert capture.forces is None
-    assert capture.notes == ("There are no forces: the bag has no topic of geometry_msgs/msg/WrenchStamped.",)
+    assert capture.notes == ("There are no forces: the bag has no message of geometry_msgs/msg/WrenchStamped.",)
     silent = write_bag(tmp_path / "b", frames_of(), topics=[(FORCE, "geometry_msgs/msg/WrenchStamped")])
-    assert read_rosbag(silent).notes == ("There are no forces: /wrench has no message.",)
+    assert "There are no forces: /wrench has no message" in read_rosbag(silent).notes[0]
     refused(read_rosbag, silent, r"/wrench of .* has no force sample; record the force sensor too", wrench_topic=FORCE)
 
 
 def test_of_several_topics_one_must_be_named(tmp_path, pixels, frames_of, wrenches):
-    other = [("/scene", raw_image(255 - image, frame_ns(i)), frame_ns(i)) for i, image in enumerate(pixels)]
-    path = write_bag(tmp_path / "trial", in_order(frames_of(), other, wrenches))
-    with pytest.raises(
-        RecordingError,
-        match=r"has 2 topics with images, /scene \(sensor_msgs/msg/Image\), /tactile/image \(.*\); name one of them",
-    ):
-        read_rosbag(path)
-    frames = read_rosbag(path, image_topic="/scene", wrench_topic=FORCE).read_frames()
+    shown = [(raw_image(255 - image, frame_ns(i)), frame_ns(i)) for i, image in enumerate(pixels)]
+    scenes = [(name, *frame) for frame in shown for name in ("/a", "/b")]
+    path = write_bag(tmp_path / "trial", in_order(scenes, wrenches))
+    refused(read_rosbag, path, r"has 2 image topics, /a \(sensor_msgs/msg/Image\), /b \(.*\); name one of them with")
+    refused(read_rosbag, path, r"has no image topic /wrench", image_topic=FORCE)
+    frames = read_rosbag(path, image_topic="/b", wrench_topic=FORCE).read_frames()
     np.testing.assert_array_equal(list(frames), 255 - pixels)
     left = [("/left", message, time_ns) for _, message, time_ns in wrenches]
     path = write_bag(tmp_path / "two", in_order(frames_of(), left, wrenches))
-    refused(read_rosbag, path, r"has 2 topics with wrenches, /left .*, /wrench .*; name one of them")
+    refused(read_rosbag, path, r"has 2 wrench topics, /left .*, /wrench .*; name one of them")
 
 
 @pytest.mark.parametrize("storage", ["MCAP", "SQLITE3"])
@@ -337,18 +325,10 @@ def test_a_bag_with_any_byte_changed_raises_no_foreign_error(tmp_path, rng, reco
 def test_a_path_that_is_no_bag_is_refused(tmp_path, frames_of):
     bag = write_bag(tmp_path / "bag", frames_of())
     (bag / "metadata.yaml").unlink()
-    (tmp_path / "notes.txt").write_text("no bag")
     (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
-    (tmp_path / "folder").mkdir()
-    refusals = {
-        "nothing": "does not exist; check the path",
-        "bag": r"has no metadata\.yaml; write it with `ros2 bag reindex`, or name bag\.mcap itself",
-        "folder": r"has no metadata\.yaml; .* or name the folder of one bag",
-        "notes.txt": r"is no ROS 2 bag; name its folder, or its \.mcap or \.db3 file",
-        "old.bag": "is a ROS 1 bag; convert it with `rosbags-convert",
-    }
-    for name, message in refusals.items():
-        refused(read_rosbag, tmp_path / name, message)
+    refused(read_rosbag, bag, r"has no metadata\.yaml; write it with `ros2 bag reindex`, or name bag\.mcap")
+    refused(read_rosbag, tmp_path, r"has no metadata\.yaml; .* or name the folder of a bag")
+    refused(read_rosbag, tmp_path / "old.bag", "is a ROS 1 bag; convert it with `rosbags-convert")
 
 
 def test_files_of_something_else_are_refused(tmp_path, frames_of):

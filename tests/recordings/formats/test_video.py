@@ -130,8 +130,8 @@ def test_skipped_frames_keep_the_times_of_the_rest(tmp_path: Path):
     np.testing.assert_array_equal(list(capture.read_frames()), brightening(6)[2:])
     np.testing.assert_allclose(capture.frame_time_s, np.arange(2, 6) / 25, atol=1e-3)
     assert capture.notes == ("a.mkv: the first 2 of 6 frames were left out.",)
-    refused(read_video, path, r"a\.mkv has 6 frames, 6 were to be skipped; skip fewer", skip_frames=6)
-    refused(read_video, path, "-1 frames cannot be skipped", skip_frames=-1)
+    for count in (6, -1):
+        refused(read_video, path, rf"{count} of 6 frames of .*a\.mkv cannot be skipped", skip_frames=count)
 
 
 def test_forces_lie_beside_the_video(tmp_path: Path):
@@ -204,8 +204,8 @@ def test_a_file_that_is_no_video_is_refused(tmp_path: Path, rng: np.random.Gener
     for name in cases:
         refused(read_video, tmp_path / name, rf"{name} cannot be read as a video \(.*\); copy or export it again")
     refused(read_video, tmp_path / "frame.png", r"frame\.png is an image and no video; name the folder that it lies in")
-    refused(read_video, tmp_path / "nothing.mp4", r"nothing\.mp4 does not exist; name a video file")
-    refused(read_video, tmp_path, "is no file; name a video file")
+    refused(read_video, tmp_path / "nothing.mp4", r"nothing\.mp4 does not exist; name a video, or copy it")
+    refused(read_video, tmp_path, "is no file; name a video")
 
 
 def test_an_absurd_frame_size_is_refused(tmp_path: Path):

@@ -1,6 +1,5 @@
 """The published GelSight Mini clips of grasps that slip or hold, with their pitfalls handled."""
 
-import csv
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,9 +22,7 @@ def is_gelsight(path: Path) -> bool:
     """Return True for a clip of the data set, the folder of a grasp, or the data set, by the header of `labels.csv`."""
     for folder in (path, *path.absolute().parents[1:3]):
         with suppress(RecordingError):
-            if (folder / LABELS_FILE).is_file() and {"file", "slip_label"} <= set(
-                open_text_table(folder / LABELS_FILE).header
-            ):
+            if {"file", "slip_label"} <= set(open_text_table(folder / LABELS_FILE).header):
                 return True
     return False
 
@@ -50,26 +47,19 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
     key = "/".join(path.absolute().parts[-3:])
     if key not in rows:
         raise RecordingError(f"{table} does not list {key}; name a clip of the data set it belongs to")
-    row, whole = rows[key], read_video(path, ReadOptions())
-    if len(whole) != int(row["n_frames"]):
-        raise RecordingError(f"{path} has {len(whole)} frames but {table.name} says {row['n_frames']}; copy it again")
-    copies = small_copies(whole.read_frames())
-    stale = count_stale(copies)
-    slipped = row["slip_label"].strip() == "1"
+    row, copies = rows[key], small_copies(read_video(path, ReadOptions()).read_frames())
+    stale, slipped = count_stale(copies), row["slip_label"] == "1"
     capture = read_video(path, ReadOptions(frame_rate=frame_rate, skip_frames=stale))
     reference = least_contact(copies[stale:])
-    label = "slips" if slipped else "does not slip"
     notes = (
-        f"{path.name}: times are nominal; the true frame rate is unknown, roughly {FRAME_RATE_HZ:g} frames/s, and not "
-        "the 25 of the file.",
-        f"{path.name}: one label for the whole clip ({label}); it is not known when slip begins.",
-        f"{path.name}: no reference frame was recorded; frame {reference} of the rest shows the least contact, "
-        "check it before use.",
+        f"times are nominal; the true frame rate is unknown, roughly {FRAME_RATE_HZ:g} frames/s, not that of the file.",
+        f"one label for the whole clip ({'slips' if slipped else 'does not slip'}); the beginning of slip is unknown.",
+        f"no reference frame was recorded; frame {reference} shows the least contact, check it before use.",
     )
     return replace(
         capture,
         trial=trial_name(f"{path.parent.name}-{path.stem}"),
-        notes=capture.notes + notes,
+        notes=(*capture.notes, *(f"{path.name}: {note}" for note in notes)),
         labels=labels_of_margins(np.full(len(capture), np.nan)),
         reference_index=reference,
         clip=Clip(slips=slipped, grasp=path.parent.name, stale_frames=stale),
@@ -87,12 +77,8 @@ def list_gelsight_clips(folder: Path) -> list[Path]:
 
 
 def _read_labels(path: Path) -> dict[str, dict[str, str]]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = list(csv.DictReader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f"{path}, the labels of the clips, cannot be read ({error}); copy it again") from None
-    needed = {"file", "slip_label", "object", "n_frames"}
-    if not rows or needed - set(rows[0]):
-        raise RecordingError(f"{path} is no table of GelSight clips; it needs columns {', '.join(sorted(needed))}")
+    table = open_text_table(path)
+    if needed := {"file", "slip_label", "object"} - set(table.header):
+        raise RecordingError(f"{path} is no table of GelSight clips; it lacks {', '.join(sorted(needed))}")
+    rows = (dict(zip(table.header, cells, strict=True)) for _, cells in table.rows)
     return {row["file"]: row for row in rows}

@@ -3,8 +3,8 @@
 import io
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from pathlib import Path
+from contextlib import contextmanager
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -27,38 +27,48 @@ from sliplens.recordings.formats.tables import (
     UNITS,
     evenly_spaced,
     guess_time_column,
-    guess_time_unit,
     open_text_table,
     place_on_clock,
-    require_rising,
     require_unit,
+    scale_times,
     to_number,
     trial_name,
-    unit_of,
 )
 from sliplens.recordings.options import ReadOptions
 
 
 @contextmanager
 def open_encoded(data: Any, *, where: str) -> Iterator[Image.Image]:
-    """Open a PNG or JPEG in memory, recognised by its bytes, and read its header."""
-    with open_image(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+    """Open a PNG or JPEG in memory, recognised by its bytes; damage of its header or pixels is a `RecordingError`."""
+    damage = telling_damage(f"{where} cannot be read as PNG or JPEG", "copy or record it again", kind=RecordingError)
+    with damage, open_image(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
         if image.mode not in {"RGB", "L"}:
             raise RecordingError(f"{where} has pixels of mode {image.mode}; record it as 8-bit RGB or grey")
         require_eight_bits(image, where=where)
         yield image
 
 
-def rgb_pixels(image: Image.Image) -> Frame:
-    """Return the pixels of an RGB or grey image, upright; a grey one gets three equal channels."""
+def decode_image(data: Any, *, where: str) -> Frame:
+    """Decode a PNG or JPEG in memory, upright; grey is repeated in all three channels."""
+    with open_encoded(data, where=where) as image:
+        return _rgb_pixels(image)
+
+
+def _rgb_pixels(image: Image.Image) -> Frame:
     pixels = upright_pixels(image)
     return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
 
 
+@contextmanager
+def _open_file(path: Path) -> Iterator[Image.Image]:
+    require_image(path)
+    with telling_damage(f"{path} cannot be read as an image", "copy or export it again"), open_image(path) as image:
+        yield image
+
+
 def frame_size(path: Path) -> tuple[int, int]:
     """Read height and width of an image, in pixels, from its header."""
-    require_image(path)
-    with _image_errors(path), open_image(path) as image:
+    with _open_file(path) as image:
         pages = getattr(image, "n_frames", 1)
         if pages > 1:
             raise ImageError(f"{path} holds {pages} images; save one image a file")
@@ -67,23 +77,17 @@ def frame_size(path: Path) -> tuple[int, int]:
 
 def read_frame(path: Path, *, size: tuple[int, int]) -> Frame:
     """Read an image as a frame."""
-    require_image(path)
-    with _image_errors(path), open_image(path) as image:
-        if image.mode != "L" or upright_size(image) != size:
-            return read_image(path, size=size)  # and refuse what no frame is
-        return rgb_pixels(image)
-
-
-def _image_errors(path: Path) -> AbstractContextManager[None]:
-    return telling_damage(f"{path} cannot be read as an image", "copy or export it again")
+    with _open_file(path) as image:
+        if image.mode == "L" and upright_size(image) == size:
+            return _rgb_pixels(image)
+    return read_image(path, size=size)
 
 
 def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
     """Return the height and width that all images share."""
     first = frame_size(paths[0])
     for path in paths[1:]:
-        size = frame_size(path)
-        if size != first:
+        if (size := frame_size(path)) != first:
             sizes = f"{path} is {size[1]} x {size[0]} pixels but {paths[0].name} is {first[1]} x {first[0]}"
             raise RecordingError(f"{sizes}; record all frames of a trial with the same camera settings")
     return first
@@ -93,44 +97,36 @@ _NAME_COLUMNS = ("file", "filename", "file_name", "image", "image_name", "frame"
 
 
 def read_frame_times(
-    table: Path, images: Sequence[Path]
+    path: Path, images: Sequence[Path]
 ) -> tuple[tuple[Path, ...], Float[np.ndarray, " frames"], list[str]]:
     """Sort images by a table with names of files and times; return them, their times, and notes."""
-    text = open_text_table(table)
-    name_column = next((name for name in text.header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
+    table = open_text_table(path)
+    name_column = next((name for name in table.header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
     if name_column is None:
-        raise RecordingError(f"{table} has no column with the names of images among {text.names}; call it file")
-    time_column = guess_time_column(text)
-    name_at, time_at = text.header.index(name_column), text.header.index(time_column)
+        columns = ", ".join(map(repr, table.header))
+        raise RecordingError(f"{path} has no column with the names of images among {columns}; call it file")
+    time_column = guess_time_column(table.header, path=path)
+    name_at, time_at = table.header.index(name_column), table.header.index(time_column)
     stamps: dict[str, tuple[float, int]] = {}
-    for line, fields in text.rows():
-        name = fields[name_at].replace("\\", "/").rsplit("/", maxsplit=1)[-1]
+    for line, cells in table.rows:
+        name = PureWindowsPath(cells[name_at]).name  # divides at slashes and backslashes
         if name in stamps:
-            raise RecordingError(f"{table}, line {line} names {name!r} again; give each image one time")
-        stamps[name] = to_number(fields[time_at], where=f"{table}, line {line}, {time_column!r}"), line
+            raise RecordingError(f"{path}, line {line} names {name!r} again; give each image one time")
+        stamps[name] = to_number(cells[time_at], path=path, line=line, column=time_column), line
     rows = len(stamps)
     # "frame_1.5" has no ending: a full name is looked up before one without it
     for name in list(stamps):
         stamps.setdefault(Path(name).stem, stamps[name])
-    taken = []
-    for image in images:
-        row = stamps.get(image.name, stamps.get(image.stem))
-        if row is None:
-            raise RecordingError(f"{table} has no time for {image.name}; add a row for every image of the folder")
-        taken.append((*row, image))
-    stamp, lines, ordered = zip(*sorted(taken, key=lambda row: row[0]), strict=True)
-    time = np.array(stamp)
-    require_rising(time, lines, path=table, column=time_column)
-    unit, how = unit_of(time_column, quantity="time", path=str(table)), "by its name"
-    if unit is None:
-        unit, how = guess_time_unit(time), "guessed from its steps"
-    notes = [
-        f"{table.name}: times of images are those of column {time_column!r}, in {unit} ({how}), "
-        f"their names those of {name_column!r}.",
-    ]
+    if absent := [image.name for image in images if not {image.name, image.stem} & stamps.keys()]:
+        raise RecordingError(f"{path} has no time for {absent[0]}; add a row for every image of the folder")
+    timed = sorted((*(stamps.get(image.name) or stamps[image.stem]), image) for image in images)
+    stamp, lines, ordered = zip(*timed, strict=True)
+    time_s, unit = scale_times(np.array(stamp), lines, path=path, column=time_column)
+    times = f"{path.name}: times of images are those of column {time_column!r}, in {unit}"
+    notes = [f"{times}, their names those of {name_column!r}."]
     if rows > len(images):
-        notes.append(f"{table.name}: {rows - len(images)} of {rows} rows name no image of the folder.")
-    return ordered, time * UNITS["time"][unit][0], notes
+        notes.append(f"{path.name}: {rows - len(images)} of {rows} rows name no image of the folder.")
+    return ordered, time_s, notes
 
 
 def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
@@ -149,12 +145,16 @@ def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
         notes.append(f"{folder.name}: frames were declared to be taken {frame_rate:g} times a second.")
     else:
         unit = require_unit(str(name_unit), quantity="time")
-        time = _numbers_in_names(paths) * UNITS["time"][unit][0]
+        numbers = [re.findall(r"\d+(?:\.\d+)?", path.stem) for path in paths]
+        if [] in numbers:
+            path = paths[numbers.index([])]
+            raise RecordingError(f"{path} has no number in its name; give its time in a table (--times) instead")
+        time = np.array([float(each[-1]) for each in numbers]) * UNITS["time"][unit][0]
         notes.append(f"{folder.name}: the last number in a file's name was declared to be its time in {unit}.")
     lossy = sum(path.suffix.lower() in {".jpg", ".jpeg"} for path in paths)
     if lossy:
-        jpeg = f"{folder.name}: {lossy} of {len(paths)} frames are JPEG, which moves markers a little"
-        notes.append(f"{jpeg}; record PNG or TIFF where you can.")
+        jpeg = f"{lossy} of {len(paths)} frames are JPEG, which moves markers; record PNG or TIFF where you can."
+        notes.append(f"{folder.name}: {jpeg}")
     size = common_size(paths)
     time, samples, more = place_on_clock(time, options, source=folder.name)
     return Capture(
@@ -166,11 +166,3 @@ def read_image_folder(folder: Path, options: ReadOptions) -> Capture:
         forces=samples,
         notes=(*notes, *more),
     )
-
-
-def _numbers_in_names(paths: Sequence[Path]) -> Float[np.ndarray, " frames"]:
-    numbers = [re.findall(r"\d+(?:\.\d+)?", path.stem) for path in paths]
-    if [] in numbers:
-        path = paths[numbers.index([])]
-        raise RecordingError(f"{path} has no number in its name; give its time in a table (--times) instead")
-    return np.array([float(each[-1]) for each in numbers])

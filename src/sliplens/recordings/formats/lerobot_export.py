@@ -13,13 +13,12 @@ from jaxtyping import Int64, Shaped
 from sliplens.errors import RecordingError
 from sliplens.files import write_json
 from sliplens.progress import report_each, report_progress
-from sliplens.recordings.capture import Capture, Frame
+from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import Dataset, TrialInfo
-from sliplens.recordings.formats.lerobot import CAMERA, COMPANION
-from sliplens.recordings.formats.stored import encode_batches, fill_labels, read_stored_trial, save_without_images
+from sliplens.recordings.formats.stored import encode_batches, fill_labels, read_stored_trial
 from sliplens.recordings.trial import ContactState
 
-TIME, FORCE = "observation.time_s", "observation.force"
+CAMERA, TIME, FORCE = "observation.images.tactile", "observation.time_s", "observation.force"
 NUMBERS = {
     name: f"observation.{name}"
     for name in ("friction_coefficient", "safety_margin", "safety_margin_sigma", "stick_ratio")
@@ -43,47 +42,51 @@ def write_lerobot(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> N
     trials = sorted(trials, key=lambda info: splits.index(info.split))
     splits = [info.split for info in trials]
     fps, features, reasons = _frame_rate(data, trials), _features(trials), {"": 0}
-    schema = _data_schema(features)
-    tasks: dict[str, int] = {}
-    rows, stats, paths = [], [], []
-    levels, first = np.zeros((3, 256), dtype=np.int64), 0
+    schema, tasks, rows = _data_schema(features), dict[str, int](), []
+    numbers: list[dict[str, np.ndarray]] = []
+    levels: list[Int64[np.ndarray, "3 256"]] = []
+    first = 0
     for episode, info in enumerate(report_each(trials, sizes=[info.frames for info in trials])):
         capture = read_stored_trial(data, info)
         task = f"touch {info.object or 'an object'} ({info.condition})"
         number = tasks.setdefault(task, len(tasks))
-        columns = _frame_columns(capture, fps=fps, reasons=reasons) | {
-            "episode_index": np.full(len(capture), episode),
-            "index": first + np.arange(len(capture)),
-            "task_index": np.full(len(capture), number),
-        }
+        numbers.append(
+            _frame_columns(capture, fps=fps, reasons=reasons)
+            | {
+                "episode_index": np.full(len(capture), episode),
+                "index": first + np.arange(len(capture)),
+                "task_index": np.full(len(capture), number),
+            }
+        )
         chunk, file = divmod(episode, _CHUNK_FILES)
-        paths.append(folder / DATA_PATH.format(chunk_index=chunk, file_index=file))
-        counts = _write_episode(paths[-1], schema, columns, capture)
-        numbers = {name: number_stats(values.reshape(len(capture), -1)) for name, values in columns.items()}
-        stats.append({CAMERA: pixel_stats(counts, len(capture)), **numbers})
+        path = folder / DATA_PATH.format(chunk_index=chunk, file_index=file)
+        levels.append(_write_episode(path, schema, numbers[-1], capture))
         places = {"data/chunk_index": chunk, "data/file_index": file}
         ends = {"dataset_from_index": first, "dataset_to_index": first + len(capture)}
         rows.append({"episode_index": episode, "tasks": [task], "length": len(capture), **places, **ends})
-        levels += counts
         first += len(capture)
-    total = {name: number_stats(_read_feature(paths, name)) for name in features if name != CAMERA}
-    total = {CAMERA: pixel_stats(levels, first), **total}
-    for episode_stats in stats:
-        for name, feature in episode_stats.items():
+    total = {CAMERA: pixel_stats(np.sum(levels, axis=0), first)}
+    total |= {name: number_stats(np.concatenate([each[name] for each in numbers])) for name in numbers[0]}
+    for row, columns, counts in zip(rows, numbers, levels, strict=True):
+        stats = {CAMERA: pixel_stats(counts, row["length"])}
+        stats |= {name: number_stats(values) for name, values in columns.items()}
+        for name, feature in stats.items():
             if feature["count"] == [0]:  # the statistics of all, which spoil no minimum and weigh nothing
                 feature.update({**total[name], "count": [0]})
+            row |= {f"stats/{name}/{statistic}": value for statistic, value in feature.items()}
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
     features[REASON]["info"] = {"values": list(reasons)}
     meta = folder / "meta"
-    save_without_images(data, trials, folder / COMPANION)
+    (meta / "episodes" / "chunk-000").mkdir(parents=True)
+    pq.write_table(pa.Table.from_pylist(rows), meta / "episodes" / "chunk-000" / "file-000.parquet")
     _write_tasks(meta / "tasks.parquet", list(tasks))
-    _write_episodes(meta / "episodes" / "chunk-000" / "file-000.parquet", rows, stats)
     write_json(meta / "stats.json", total)
     ranges = {split: f"{splits.index(split)}:{splits.index(split) + splits.count(split)}" for split in splits}
     totals = {"total_episodes": len(rows), "total_frames": first, "total_tasks": len(tasks)}
     sizes = {"chunks_size": _CHUNK_FILES, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
-    paths_of = {"data_path": DATA_PATH, "video_path": None}
+    paths = {"data_path": DATA_PATH, "video_path": None}
     info = {"codebase_version": "v3.0", "robot_type": None, **totals, **sizes, "fps": fps, "splits": ranges}
-    write_json(meta / "info.json", {**info, **paths_of, "features": features})
+    write_json(meta / "info.json", {**info, **paths, "features": features})
 
 
 def _frame_rate(data: Dataset, trials: Sequence[TrialInfo]) -> int | float:
@@ -146,7 +149,8 @@ def _write_episode(
     counts, done = np.zeros((3, 256), dtype=np.int64), 0
     with pq.ParquetWriter(path, schema, compression="snappy", use_dictionary=False) as writer:
         for frames, pngs in encode_batches(capture.read_frames()):
-            counts += sum(map(count_levels, frames))
+            for frame in frames:
+                counts += [np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)]
             names = pa.array([f"frame-{done + index:06d}.png" for index in range(len(pngs))])
             batch = {name: array.slice(done, len(pngs)) for name, array in arrays.items()}
             batch[CAMERA] = pa.StructArray.from_arrays([pa.array(pngs, pa.binary()), names], ["bytes", "path"])
@@ -156,32 +160,24 @@ def _write_episode(
     return counts
 
 
-def count_levels(frame: Frame) -> Int64[np.ndarray, "3 256"]:
-    """Count how often each channel of a frame has each of the 256 levels; statistics of pixels follow from the sums."""
-    return np.array([np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)], dtype=np.int64)
-
-
 def pixel_stats(counts: Int64[np.ndarray, "3 256"], frames: int) -> Stats:
     """Compute the statistics of each channel in [0, 1]; a quantile is the lowest level that so many do not exceed."""
     level = np.arange(256) / 255
     share = counts / counts.sum(axis=1, keepdims=True)
-    mean = share @ level
-    below = counts.cumsum(axis=1)
+    mean, below = share @ level, counts.cumsum(axis=1)
     stats = {
         "min": [level[channel > 0].min() for channel in counts],
         "max": [level[channel > 0].max() for channel in counts],
         "mean": mean,
         "std": np.sqrt((share * (level - mean[:, None]) ** 2).sum(axis=1)),
-        **{
-            name: [level[np.searchsorted(channel, quantile * channel[-1])] for channel in below]
-            for name, quantile in _QUANTILES.items()
-        },
+        **{name: level[(below < each * below[:, -1:]).sum(axis=1)] for name, each in _QUANTILES.items()},
     }
     return {**{name: np.reshape(values, (3, 1, 1)).tolist() for name, values in stats.items()}, "count": [frames]}
 
 
-def number_stats(values: Shaped[np.ndarray, "frames numbers"]) -> Stats:
+def number_stats(values: Shaped[np.ndarray, "frames *numbers"]) -> Stats:
     """Compute the statistics over frames in which all numbers are finite; zeros with a count of 0 if none is."""
+    values = values.reshape(len(values), -1)
     finite = values[np.isfinite(values).all(axis=1)]
     counted = finite if len(finite) else np.zeros_like(values[:1])
     exact = counted.astype(np.float64)
@@ -195,13 +191,6 @@ def number_stats(values: Shaped[np.ndarray, "frames numbers"]) -> Stats:
     return {**{name: value.tolist() for name, value in stats.items()}, "count": [len(finite)]}
 
 
-def _read_feature(paths: Sequence[Path], name: str) -> Shaped[np.ndarray, "frames numbers"]:
-    columns = [pq.ParquetFile(path).read(columns=[name]).column(name).combine_chunks() for path in paths]
-    flat = [column.flatten() if pa.types.is_fixed_size_list(column.type) else column for column in columns]
-    values = np.concatenate([column.to_numpy(zero_copy_only=False) for column in flat])
-    return values.reshape(sum(map(len, columns)), -1)
-
-
 def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
     """Write the tasks as a data frame of pandas, whose index is their text."""
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
@@ -211,16 +200,6 @@ def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
     ]
     index = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(index)}), path)
-
-
-def _write_episodes(path: Path, rows: Sequence[Mapping], stats: Sequence[dict[str, Stats]]) -> None:
-    """Write where each episode is stored, and its statistics."""
-    table = []
-    for row, features in zip(rows, stats, strict=True):
-        flat = {f"stats/{feature}/{name}": value for feature, each in features.items() for name, value in each.items()}
-        table.append({**row, **flat, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0})
-    path.parent.mkdir(parents=True)
-    pq.write_table(pa.Table.from_pylist(table), path)
 
 
 def _data_schema(features: Features) -> pa.Schema:

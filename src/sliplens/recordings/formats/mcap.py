@@ -1,27 +1,27 @@
 """Trials as MCAP files of ROS 2 messages, which Foxglove, Rerun and ROS play with images, forces and labels."""
 
 import math
-from collections.abc import Iterable, Sequence
-from contextlib import closing
+from collections.abc import Sequence
+from heapq import merge
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 
 from sliplens._version import __version__
 from sliplens.errors import RecordingError
 from sliplens.extras import require_packages
-from sliplens.files import scratch_folder
 from sliplens.images import encode_png
 from sliplens.progress import report_each, report_progress
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.dataset import DATASET_FILE, Dataset, TrialInfo, load_dataset, trial_path
-from sliplens.recordings.formats.stored import encode_batches, fill_labels, read_stored_trial, save_without_images
-from sliplens.recordings.store import forces_path
+from sliplens.recordings.dataset import Dataset, TrialInfo
+from sliplens.recordings.formats.stored import encode_batches, fill_labels, read_stored_trial
 from sliplens.recordings.trial import LABEL_SIGNALS
 
 if TYPE_CHECKING:
+    from mcap.writer import Writer
     from rosbags.typesys.store import Typestore
 
 REFERENCE, IMAGE, WRENCH = "/tactile/reference", "/tactile/image", "/tactile/wrench"
@@ -47,8 +47,6 @@ bool valid
 string contact_state
 string invalid_reason
 """
-_TRIAL_FILE, _FORCES_FILE = "trial.parquet", "forces.parquet"
-_ATTACHMENTS = frozenset({DATASET_FILE, _TRIAL_FILE, _FORCES_FILE})
 _LAST_S = 2**31  # a stamp of ROS counts seconds in 32 bits
 
 
@@ -63,128 +61,85 @@ def trial_types() -> "Typestore":
 
 def write_mcap(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> None:
     """Write trials into an empty folder; see `export_mcap`."""
+    require_packages("mcap", "rosbags", extra="ros", purpose="an MCAP file")
+    from mcap.writer import Writer  # noqa: PLC0415 (an extra)
+
     for info in report_each(trials, sizes=[info.frames for info in trials]):
-        with (
-            (folder / f"{info.trial}.mcap").open("wb") as stream,
-            closing(_Bag(stream)) as bag,
-            scratch_folder() as copy,
-        ):
-            _write_trial(bag, read_stored_trial(data, info))
-            save_without_images(data, [info], copy)
-            bag.attach(copy / DATASET_FILE, DATASET_FILE)
-            bag.attach(trial_path(copy, info.trial), _TRIAL_FILE)
-            if info.forces_sha256:
-                bag.attach(forces_path(copy, info.trial), _FORCES_FILE)
-
-
-def extract_attachments(bag: Path, folder: Path) -> bool:
-    """Copy the trial without images that `write_mcap` attached into a folder; return False if there is none."""
-    from mcap.reader import SeekingReader  # noqa: PLC0415 (an extra)
-
-    with bag.open("rb") as stream:
-        reader = SeekingReader(stream, validate_crcs=True, record_size_limit=bag.stat().st_size)
-        summary = reader.get_summary()
-        if summary is None or DATASET_FILE not in {index.name for index in summary.attachment_indexes}:
-            return False
-        data = {item.name: item.data for item in reader.iter_attachments() if item.name in _ATTACHMENTS}
-    (folder / DATASET_FILE).write_bytes(data[DATASET_FILE])
-    trial = load_dataset(folder).trials[0].trial
-    for name, path in ((_TRIAL_FILE, trial_path(folder, trial)), (_FORCES_FILE, forces_path(folder, trial))):
-        if name in data:
-            path.parent.mkdir()
-            path.write_bytes(data[name])
-    return True
+        with (folder / f"{info.trial}.mcap").open("wb") as stream:
+            writer = Writer(stream)  # chunks under Zstandard, with indexes and checksums
+            writer.start(profile="ros2", library=f"sliplens {__version__}")
+            _write_trial(_Bag(writer), read_stored_trial(data, info))
+            writer.finish()
 
 
 class _Bag:
     """MCAP file that takes messages by topic and fields."""
 
-    def __init__(self, stream: BinaryIO) -> None:
-        require_packages("mcap", "rosbags", extra="ros", purpose="an MCAP file")
-        from mcap.writer import Writer  # noqa: PLC0415 (an extra)
-
-        self.types = trial_types()
-        # chunks under Zstandard, with indexes and checksums
-        self.writer = Writer(stream)
-        self.writer.start(profile="ros2", library=f"sliplens {__version__}")
-        self.channels: dict[str, int] = {}
+    def __init__(self, writer: "Writer") -> None:
+        self.writer, self._types = writer, trial_types()
+        self._channels: dict[str, int] = {}
 
     def make(self, kind: str, **fields: Any) -> Any:
         """Make a message, or part of one."""
-        return self.types.types[kind](**fields)
+        return self._types.types[kind](**fields)
 
     def write(self, topic: str, stamp_ns: int, **fields: Any) -> None:
         """Write a message that was recorded when it was stamped; all but a bare number have a header."""
         kind = TOPICS[topic]
-        if kind != "std_msgs/msg/Float64":
+        if topic != MARGIN:
             stamp = self.make("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
             fields["header"] = self.make("std_msgs/msg/Header", stamp=stamp, frame_id="tactile")
-        if topic not in self.channels:
-            definition, _ = self.types.generate_msgdef(kind, ros_version=2)
+        if topic not in self._channels:
+            definition, _ = self._types.generate_msgdef(kind, ros_version=2)
             schema = self.writer.register_schema(kind, "ros2msg", definition.encode())
-            self.channels[topic] = self.writer.register_channel(topic, "cdr", schema)
-        data = self.types.serialize_cdr(self.make(kind, **fields), kind)
-        self.writer.add_message(self.channels[topic], log_time=stamp_ns, data=bytes(data), publish_time=stamp_ns)
+            self._channels[topic] = self.writer.register_channel(topic, "cdr", schema)
+        data = bytes(self._types.serialize_cdr(self.make(kind, **fields), kind))
+        self.writer.add_message(self._channels[topic], log_time=stamp_ns, data=data, publish_time=stamp_ns)
 
     def write_image(self, topic: str, stamp_ns: int, png: bytes) -> None:
         """Write an image."""
         self.write(topic, stamp_ns, format="png", data=np.frombuffer(png, dtype=np.uint8))
 
-    def attach(self, path: Path, name: str) -> None:
-        """Attach a file."""
-        self.writer.add_attachment(0, 0, name, "application/octet-stream", path.read_bytes())
-
-    def close(self) -> None:
-        """Write the index."""
-        self.writer.finish()
+    def write_wrench(self, stamp_ns: int, force_n: Sequence[float]) -> None:
+        """Write a force without a torque."""
+        force, torque = (
+            self.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", vector, strict=True)))
+            for vector in (force_n, (0.0, 0.0, 0.0))
+        )
+        self.write(WRENCH, stamp_ns, wrench=self.make("geometry_msgs/msg/Wrench", force=force, torque=torque))
 
 
 def _write_trial(bag: _Bag, capture: Capture) -> None:
     """Write the messages of a trial in the order of time."""
     assert capture.labels is not None
     assert capture.reference is not None
-    forces, offset_s = capture.forces, _stamp_offset_s(capture)
+    forces, labels = capture.forces, fill_labels(capture.labels)
+    series = [capture.frame_time_s, *([forces.time_s] if forces else [])]
+    first_s, last_s = min(times[0].item() for times in series), max(times[-1].item() for times in series)
+    offset_s = 0 if first_s >= 1 else 1 - math.floor(first_s)  # to ROS a stamp of zero is none
+    if last_s + offset_s >= _LAST_S:
+        raise RecordingError(f"trial {capture.trial} goes to {last_s:.6g} s, beyond ROS; import it with other times")
     bag.writer.add_metadata("sliplens", {"trial": capture.trial, "stamp_offset_s": str(offset_s)})
-    frame_ns = _stamps_ns(capture.frame_time_s, offset_s)
-    force_ns = _stamps_ns(forces.time_s, offset_s) if forces else np.zeros(0, dtype=np.int64)
-    wrenches = iter(zip(force_ns.tolist(), forces.force_n.tolist() if forces else (), strict=True))
-    labels = fill_labels(capture.labels)
     rows = {name: getattr(labels, name).tolist() for name in (*LABEL_SIGNALS, "safety_margin_sigma", "valid")}
     rows |= {"time_s": capture.frame_time_s.tolist(), "invalid_reason": labels.reason or ()}
     rows["contact_state"] = [str(state) for state in labels.contact_state]
-    first_ns = min(series[0].item() for series in (frame_ns, force_ns) if len(series))
+    (first_ns,) = _stamps_ns([first_s], offset_s)
     bag.write_image(REFERENCE, first_ns, encode_png(capture.reference))
+    wrenches = zip(_stamps_ns(forces.time_s, offset_s), forces.force_n.tolist(), strict=True) if forces else ()
     pngs = (png for _, batch in encode_batches(capture.read_frames()) for png in batch)
-    written = 0
-    for index, (stamp_ns, png) in enumerate(zip(frame_ns.tolist(), pngs, strict=True)):
-        until = int(np.searchsorted(force_ns, stamp_ns, side="right"))
-        _write_wrenches(bag, wrenches, until - written)
-        written = until
+    frames = zip(_stamps_ns(capture.frame_time_s, offset_s), enumerate(pngs), strict=True)
+    for stamp_ns, content in merge(wrenches, frames, key=itemgetter(0)):
+        if isinstance(content, list):
+            bag.write_wrench(stamp_ns, content)
+            continue
+        index, png = content
         bag.write_image(IMAGE, stamp_ns, png)
         bag.write(LABELS, stamp_ns, **{name: values[index] for name, values in rows.items()})
         bag.write(MARGIN, stamp_ns, data=rows["safety_margin"][index])
         report_progress(index + 1, len(capture))
-    _write_wrenches(bag, wrenches, len(force_ns) - written)
 
 
-def _write_wrenches(bag: _Bag, wrenches: Iterable[tuple[int, list[float]]], count: int) -> None:
-    zero = bag.make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    for _, (stamp_ns, (x, y, z)) in zip(range(count), wrenches, strict=False):
-        force = bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-        bag.write(WRENCH, stamp_ns, wrench=bag.make("geometry_msgs/msg/Wrench", force=force, torque=zero))
-
-
-def _stamp_offset_s(capture: Capture) -> int:
-    """Return the whole seconds by which stamps are later than the times of the trial."""
-    series = [capture.frame_time_s, *([capture.forces.time_s] if capture.forces else [])]
-    first, last = min(times[0].item() for times in series), max(times[-1].item() for times in series)
-    offset_s = 0 if first >= 1 else 1 - math.floor(first)
-    if last + offset_s >= _LAST_S:
-        raise RecordingError(f"trial {capture.trial} goes to {last:.6g} s, beyond ROS; import it with times in seconds")
-    return offset_s
-
-
-def _stamps_ns(time_s: Float[np.ndarray, " samples"], offset_s: int) -> Int64[np.ndarray, " samples"]:
+def _stamps_ns(time_s: Sequence[float] | Float[np.ndarray, " samples"], offset_s: int) -> list[int]:
     """Round to nanoseconds; whole seconds apart, since doubles of times since 1970 are 256 ns apart."""
     whole = np.floor(time_s)
-    return (whole.astype(np.int64) + offset_s) * 10**9 + np.rint((time_s - whole) * 1e9).astype(np.int64)
+    return ((whole.astype(np.int64) + offset_s) * 10**9 + np.rint((time_s - whole) * 1e9).astype(np.int64)).tolist()

@@ -1,7 +1,6 @@
-"""Data sets of sliplens as recordings, and the copy without images that exports carry along."""
+"""Data sets of sliplens as recordings."""
 
-import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from functools import partial
@@ -10,15 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sliplens.errors import InputError, RecordingError
-from sliplens.files import hash_file, require_file
 from sliplens.images import encode_png
 from sliplens.recordings.capture import Capture, Forces, Frame
-from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_info, trial_path, write_dataset_table
-from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames, write_trial
+from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
+from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames
 from sliplens.recordings.trial import Labels, Recording, TrialFacts
 
-_AGAIN = "export the data set again, or remove that folder to import without labels"
 _BATCH = 16  # frames that are encoded side by side
 
 
@@ -74,46 +70,3 @@ def fill_labels(labels: Labels) -> Labels:
         valid=has_margin if valid is None else valid,
         reason=("",) * count if reason is None else reason,
     )
-
-
-def save_without_images(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> None:
-    """Write a copy of a data set that has everything but the images and the ground truth of simulated trials."""
-    rows = []
-    for info in trials:
-        stored = load_recording(trial_path(data.folder, info.trial), pixels=False)
-        path, samples = trial_path(folder, info.trial), forces_path(folder, info.trial)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if info.forces_sha256:
-            samples.parent.mkdir(exist_ok=True)
-            shutil.copyfile(forces_path(data.folder, info.trial), samples)
-        no_images = [[b""] * len(stored)]
-        write_trial(path, no_images, facts=stored, time_s=stored.time_s, labels=stored, reference=stored.reference)
-        rows.append(trial_info(path, split=info.split))
-    write_dataset_table(folder, rows, simulated=data.simulated)
-
-
-def restore_trials(
-    folder: Path, images: Sequence[tuple[str, int, tuple[int, int], Callable[[], Iterator[Frame]]]]
-) -> list[Capture]:
-    """Join the trials of `save_without_images` with their images."""
-    try:
-        data = load_dataset(folder)
-        for info in data.trials:
-            hashes = {trial_path(folder, info.trial): info.sha256}
-            if info.forces_sha256:
-                hashes[forces_path(folder, info.trial)] = info.forces_sha256
-            for path, sha256 in hashes.items():
-                require_file(path, missing="export the data set again")
-                if hash_file(path) != sha256:
-                    raise RecordingError(f"{path} was changed since it was exported; export the data set again")
-        stored = [read_stored_trial(data, info) for info in data.trials]
-    except InputError as error:
-        raise RecordingError(str(error)) from None
-    if len(stored) != len(images):
-        raise RecordingError(f"{folder} describes {len(stored)} trials beside the images of {len(images)}; {_AGAIN}")
-    captures = []
-    for capture, (source, frames, size, read_frames) in zip(stored, images, strict=True):
-        if (len(capture), capture.frame_size) != (frames, size):
-            raise RecordingError(f"{source} has not the frames of trial {capture.trial} in {folder}; {_AGAIN}")
-        captures.append(replace(capture, source=f"{capture.trial}, {source}", read_frames=read_frames))
-    return captures

@@ -33,15 +33,11 @@ def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
     rate = _FRAME_RATE_HZ if options.frame_rate is None else options.frame_rate
     how = "assumed" if options.frame_rate is None else "declared"
     times = f"The lists give no times: {rate:g} frames/s were {how}; how fast the margin falls rests on it."
-    frames_list = path
-    if path.is_dir():
-        lists = sorted(path.glob(f"*{FRAMES}"))
-        if len(lists) != 1:
-            names = ", ".join(file.name for file in lists) or "none"
-            raise RecordingError(f"{path} must hold one list *{FRAMES}, it holds {names}; name the list itself")
-        frames_list = lists[0]
-    elif not path.name.endswith(FRAMES):
-        raise RecordingError(f"{path} is not a list of the thesis; name the file that ends in {FRAMES}")
+    lists = sorted(path.glob(f"*{FRAMES}")) if path.is_dir() else [path] * path.name.endswith(FRAMES)
+    if len(lists) != 1:
+        names = ", ".join(file.name for file in lists) or "no list"
+        raise RecordingError(f"{path} has {names} of the thesis; name the file that ends in {FRAMES}")
+    frames_list = lists[0]
     stem = frames_list.name.removesuffix(FRAMES)
     references_list, margins_list = (frames_list.with_name(stem + ending) for ending in (REFERENCES, MARGINS))
     frames, references = _read_lines(frames_list), _read_lines(references_list)
@@ -88,18 +84,17 @@ def _read_lines(path: Path) -> list[tuple[int, str]]:
 
 
 def _find_image(listed: str, where: str, *, folder: Path, root: Path) -> Path:
-    """Find the file of a list at its path in the root, else under the root by the last parts of its path."""
+    """Find the file of a list at its path, which must stay in the root, or under the root by its last parts."""
     if Path(listed).is_absolute() and _is_file(Path(listed)):
         return Path(listed)
     foreign = PureWindowsPath(listed)  # reads slashes and backslashes
     parts = foreign.parts[1:] if foreign.anchor else foreign.parts
-    if not foreign.anchor:
-        inside = Path(os.path.normpath(folder.absolute().joinpath(*parts)))
-        within = inside.is_relative_to(os.path.normpath(root.absolute()))
-        if within and _is_file(inside):
-            return inside
-        if not within and ".." in parts:
-            raise RecordingError(f"{where}: {listed!r} leads out of {root}; give the folder of all with --image-root")
+    inside = Path(os.path.normpath(folder.absolute().joinpath(*parts)))
+    within = inside.is_relative_to(os.path.normpath(root.absolute()))
+    if ".." in parts and not within:
+        raise RecordingError(f"{where}: {listed!r} leads out of {root}; give the folder of all with --image-root")
+    if within and _is_file(inside):
+        return inside
     parts = tuple(part for part in parts if part != "..")
     moved = (root.joinpath(*parts[dropped:]) for dropped in range(len(parts)))
     if image := next(filter(_is_file, moved), None):

@@ -85,13 +85,75 @@ _OPTIONS = {
 }
 # titles that are no UTF-8 must not keep a recording from being read; from PyAV 19 on they never do
 _LENIENT: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
-_NO_DECODER = "is coded in a way that FFmpeg cannot read; export it as FFV1 or H.264"
-_ANY_ZERO = frozenset({"mpegts", "mpeg"})
+
+
+@contextmanager
+def open_video(path: Path) -> Iterator[tuple[InputContainer, VideoStream]]:
+    """Open the container of a video, never a play list, and its first video stream; FFmpeg's errors are reported."""
+    if not path.is_file():
+        raise RecordingError(f"{path} {'is no file' if path.exists() else 'does not exist'}; name a video, or copy it")
+    if is_image(path):
+        raise RecordingError(f"{path} is an image and no video; name the folder that it lies in")
+    try:
+        # an absolute path cannot be taken for an address or a pattern of file names
+        with av.open(str(path.absolute()), options=_OPTIONS, **_LENIENT) as container:
+            streams = _moving(container)
+            if not streams:
+                raise RecordingError(f"{path} has no video stream; name the file that the camera wrote")
+            codec = streams[0].codec_context
+            if codec is not None and not 0 < codec.height * codec.width <= MOST_PIXELS:
+                size = f"{codec.width} x {codec.height}"
+                raise RecordingError(f"{path} claims frames of {size} pixels; the file is damaged, copy it")
+            if codec is None or codec.format is None:
+                raise RecordingError(f"{path} is coded in a way that FFmpeg cannot read; export it as FFV1 or H.264")
+            if max(part.bits for part in codec.format.components) >= 16:
+                # a decoder keeps the upper 8, and of a camera with 12 bits those hold four
+                raise RecordingError(f"{path} has 16 bits a channel ({codec.format.name}); export it with 8")
+            streams[0].thread_type = "AUTO"
+            yield container, streams[0]
+    except (FFmpegError, OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RecordingError(f"{path} cannot be read as a video ({reason}); copy or export it again") from None
+
+
+def _moving(container: InputContainer) -> list[VideoStream]:
+    # the cover picture of a sound file is a stream too
+    return [stream for stream in container.streams.video if not stream.disposition & Disposition.attached_pic]
+
+
+def upright(
+    frame: av.VideoFrame, pixels: UInt8[np.ndarray, "rows columns 3"], *, where: object
+) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Turn and mirror a frame by its display matrix, in which a telephone keeps how it was held."""
+    side_data = frame.side_data.get("DISPLAYMATRIX")
+    if side_data is None:
+        return pixels
+    fixed = np.frombuffer(bytes(side_data), dtype=np.int32)  # pyright: ignore[reportArgumentType]
+    a, b, _, c, d = (fixed[:5] / 65536).tolist()
+    if (abs(a), abs(b), abs(c), abs(d)) not in {(1, 0, 0, 1), (0, 1, 1, 0)}:
+        raise RecordingError(f"{where} is turned by {frame.rotation} degrees, or stretched; export it upright")
+    pixels = pixels.transpose(1, 0, 2) if a == 0 else pixels
+    return np.ascontiguousarray(pixels[:: -1 if b + d < 0 else 1, :: -1 if a + c < 0 else 1])
+
+
+def first_frame_size(path: Path) -> tuple[int, int]:
+    """Return height and width of the upright frames of a video, from the first."""
+    with open_video(path) as (container, video):
+        for frame in container.decode(video):
+            return upright(frame, frame.to_ndarray(format="rgb24"), where=path).shape[:2]
+    raise RecordingError(f"{path} holds no frame; record it again")
+
+
+def loss_note(video: VideoStream, *, name: str) -> tuple[str, ...]:
+    """Return a note if frames are coded with loss."""
+    codec = video.codec_context.codec
+    loss = f"{name}: frames are coded with loss ({codec.canonical_name}), which moves markers a little"
+    return (f"{loss}; record losslessly (FFV1, PNG) where you can.",) if codec.lossy else ()
 
 
 @dataclass(frozen=True, kw_only=True)
-class VideoFile:
-    """Facts about the frames of a video from its container, without decoding any."""
+class _VideoFile:
+    """Facts about the frames of a video from its container."""
 
     frames: int
     stamps: Int64[np.ndarray, " frames"] | None
@@ -102,14 +164,13 @@ class VideoFile:
     notes: tuple[str, ...]
 
 
-def inspect_video(path: Path) -> VideoFile:
-    """Read the stamps of all frames."""
+def _inspect(path: Path) -> _VideoFile:
+    """Read the stamps of all frames, and decode the first for its size."""
+    packets: list[int | None] = []
+    cut, stamps, time_s = False, None, None
     with open_video(path) as (container, video):
-        size = require_size(path, video)
         # AVI counts frames; the presentation stamps made up from that are late where frames are reordered
         counted = container.format.name == "avi"
-        packets: list[int | None] = []
-        cut = False
         try:
             for packet in container.demux(video):
                 # packets to be discarded are decoded for those that need them, but never shown
@@ -118,114 +179,27 @@ def inspect_video(path: Path) -> VideoFile:
                     cut = packet.is_corrupt
         except FFmpegError as error:
             raise RecordingError(_damaged(path, len(packets), error.strerror)) from None
-        if not packets:
-            raise RecordingError(f"{path} holds no frame; record it again")
-        stamps = time = None
-        if None not in packets and video.time_base is not None:
+        if packets and None not in packets and video.time_base is not None:
             stamps = np.sort(np.array(packets, dtype=np.int64))
             # the clock of a transport stream starts anywhere
-            zero = stamps[0] if container.format.name in _ANY_ZERO else 0
-            time = (stamps - zero) * float(video.time_base)
-        if cut or _ends_early(container, video, len(packets), time):
+            zero = stamps[0] if container.format.name in {"mpegts", "mpeg"} else 0
+            time_s = (stamps - zero) * float(video.time_base)
+        if cut or _ends_early(container, video, len(packets), time_s):
             raise RecordingError(f"{path} is truncated or damaged: it ends before frame {len(packets)}; copy it again")
-        notes = _notes(container, video, path)
-        turn = read_display_turn(path)
-    return VideoFile(
-        frames=len(packets), stamps=stamps, time_s=time, counted=counted, frame_size=turn.size(*size), notes=notes
+        notes = list(loss_note(video, name=path.name))
+        if (streams := len(_moving(container))) > 1:
+            notes.append(f"{path.name}: the first of {streams} video streams was read.")
+        pixels = video.codec_context.format
+        if pixels is not None and max(part.bits for part in pixels.components) > 8:
+            notes.append(f"{path.name}: frames have more than 8 bits a channel and were reduced to 8.")
+    return _VideoFile(
+        frames=len(packets),
+        stamps=stamps,
+        time_s=time_s,
+        counted=counted,
+        frame_size=first_frame_size(path),
+        notes=tuple(notes),
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class DisplayTurn:
-    """Turn by right angles, and mirror image, by which a player shows the frames of a video."""
-
-    transpose: bool = False  #: Rows become columns, before anything is reversed.
-    reverse_columns: bool = False
-    reverse_rows: bool = False
-
-    def apply(self, pixels: UInt8[np.ndarray, "rows columns 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
-        """Turn the pixels of a frame upright."""
-        pixels = pixels.transpose(1, 0, 2) if self.transpose else pixels
-        return np.ascontiguousarray(pixels[:: -1 if self.reverse_rows else 1, :: -1 if self.reverse_columns else 1])
-
-    def size(self, height: int, width: int) -> tuple[int, int]:
-        """Height and width of an upright frame, in pixels."""
-        return (width, height) if self.transpose else (height, width)
-
-
-def display_turn(frame: av.VideoFrame, *, where: object) -> DisplayTurn:
-    """Return how a frame is turned by its display matrix, in which a telephone keeps how it was held."""
-    side_data = frame.side_data.get("DISPLAYMATRIX")
-    if side_data is None:
-        return DisplayTurn()
-    fixed = np.frombuffer(bytes(side_data), dtype=np.int32)  # pyright: ignore[reportArgumentType]
-    a, b, _, c, d = (fixed[:5] / 65536).tolist()
-    if (abs(a), abs(b), abs(c), abs(d)) not in {(1, 0, 0, 1), (0, 1, 1, 0)}:
-        raise RecordingError(f"{where} is turned by {frame.rotation} degrees, or stretched; export it upright")
-    return DisplayTurn(transpose=a == 0, reverse_columns=a + c < 0, reverse_rows=b + d < 0)
-
-
-def read_display_turn(path: Path, *, missing: str = "name a video file") -> DisplayTurn:
-    """Return how the frames of a video are turned, from the first; a damaged one is left to whoever decodes it."""
-    with open_video(path, missing=missing) as (container, video):
-        try:
-            first = next(container.decode(video), None)
-        except FFmpegError:
-            first = None
-        return DisplayTurn() if first is None else display_turn(first, where=path)
-
-
-@contextmanager
-def open_video(path: Path, *, missing: str = "name a video file") -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Open the container of a video, never a play list, and its first video stream; FFmpeg's errors are reported."""
-    if not path.is_file():
-        raise RecordingError(f"{path} {'is no file' if path.exists() else 'does not exist'}; {missing}")
-    if is_image(path):
-        raise RecordingError(f"{path} is an image and no video; name the folder that it lies in")
-    try:
-        # an absolute path cannot be taken for an address or a pattern of file names
-        with av.open(str(path.absolute()), options=_OPTIONS, **_LENIENT) as container:
-            streams = _moving(container)
-            if not streams:
-                raise RecordingError(f"{path} has no video stream; name the file that the camera wrote")
-            if streams[0].codec_context is None:
-                raise RecordingError(f"{path} {_NO_DECODER}")
-            if (pixels := streams[0].codec_context.format) and max(part.bits for part in pixels.components) >= 16:
-                # a decoder keeps the upper 8, and of a camera with 12 bits those hold four
-                raise RecordingError(f"{path} has 16 bits a channel ({pixels.name}); export it with 8")
-            yield container, streams[0]
-    except (FFmpegError, OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise RecordingError(f"{path} cannot be read as a video ({reason}); copy or export it again") from None
-
-
-def require_size(path: Path, video: VideoStream) -> tuple[int, int]:
-    """Return height and width of the frames in the header, where they are possible."""
-    size = video.codec_context.height, video.codec_context.width
-    if min(size) <= 0 or size[0] * size[1] > MOST_PIXELS:
-        raise RecordingError(f"{path} claims frames of {size[1]} x {size[0]} pixels; the file is damaged, copy it")
-    return size
-
-
-def _moving(container: InputContainer) -> list[VideoStream]:
-    # the cover picture of a sound file is a stream too
-    return [stream for stream in container.streams.video if not stream.disposition & Disposition.attached_pic]
-
-
-def _notes(container: InputContainer, video: VideoStream, path: Path) -> tuple[str, ...]:
-    codec, pixels = video.codec_context.codec, video.codec_context.format
-    if pixels is None:
-        raise RecordingError(f"{path} {_NO_DECODER}")
-    notes = []
-    streams = len(_moving(container))
-    if streams > 1:
-        notes.append(f"{path.name}: the first of {streams} video streams was read.")
-    if codec.lossy:
-        loss = f"{path.name}: frames are coded with loss ({codec.canonical_name}), which moves markers a little"
-        notes.append(f"{loss}; record losslessly (FFV1, PNG) where you can.")
-    if max(part.bits for part in pixels.components) > 8:
-        notes.append(f"{path.name}: frames have more than 8 bits a channel and were reduced to 8.")
-    return tuple(notes)
 
 
 def _ends_early(
@@ -244,12 +218,11 @@ def _ends_early(
     return float(time_s[-1]) + 1.5 * max(steps) < container.duration / av.time_base
 
 
-def decode_video(path: Path, file: VideoFile) -> Iterator[Frame]:
+def _decode(path: Path, file: _VideoFile) -> Iterator[Frame]:
     """Decode the frames in the order they are shown, upright."""
     count = 0
     to_rgb = VideoReformatter()  # one for all: preparing it costs as much as a frame
     with open_video(path) as (container, video):
-        video.thread_type = "AUTO"
         try:
             for frame in container.decode(video):
                 if frame.is_corrupt:
@@ -258,12 +231,11 @@ def decode_video(path: Path, file: VideoFile) -> Iterator[Frame]:
                     file.stamps is None or file.counted or frame.pts in {None, file.stamps[count]}
                 ):
                     raise RecordingError(_damaged(path, count, "its stamp is not among those of the file"))
-                turn = display_turn(frame, where=path)
-                height, width = turn.size(frame.height, frame.width)
-                if (height, width) != file.frame_size:
-                    raise RecordingError(_damaged(path, count, "it is of another size than the file says"))
+                pixels = upright(frame, to_rgb.reformat(frame, format="rgb24").to_ndarray(), where=path)
+                if pixels.shape[:2] != file.frame_size:
+                    raise RecordingError(_damaged(path, count, "it is of another size than the first"))
                 count += 1
-                yield turn.apply(to_rgb.reformat(frame, format="rgb24").to_ndarray())
+                yield pixels
         except FFmpegError as error:
             raise RecordingError(_damaged(path, count, error.strerror)) from None
     if count < file.frames:
@@ -276,34 +248,26 @@ def _damaged(path: Path, frame: int, reason: str | None) -> str:
 
 def read_video(path: Path, options: ReadOptions) -> Capture:
     """Open a video at its presentation stamps, which keep a variable rate, and a table of forces recorded beside it."""
-    file, frame_rate = inspect_video(path), options.frame_rate
-    notes = list(file.notes)
+    file, frame_rate, skipped = _inspect(path), options.frame_rate, options.skip_frames or 0
+    notes, time_s = list(file.notes), file.time_s
     if frame_rate is not None:
-        time = evenly_spaced(file.frames, frame_rate=frame_rate)
-        notes.append(
-            f"{path.name}: frames were declared to be taken {frame_rate:g} times a second, whatever its stamps say."
-        )
-    elif file.time_s is None:
+        time_s = evenly_spaced(file.frames, frame_rate=frame_rate)
+        notes.append(f"{path.name}: frames were declared to be taken {frame_rate:g} times a second.")
+    if time_s is None:
         raise RecordingError(f"{path} has no presentation stamps; declare its rate with --frame-rate")
-    else:
-        time = file.time_s
-    time, samples, more = place_on_clock(time, options, source=path.name)
-    notes.extend(more)
-    skipped = options.skip_frames or 0
-    if skipped < 0:
-        raise RecordingError(f"{skipped} frames cannot be skipped; give 0 or more")
+    time_s, samples, more = place_on_clock(time_s, options, source=path.name)
     if options.skip_stale:
-        skipped = max(skipped, count_stale(small_copies(decode_video(path, file))))
-    if skipped >= file.frames:
-        raise RecordingError(f"{path} has {number_of(file.frames, 'frame')}, {skipped} were to be skipped; skip fewer")
+        skipped = max(skipped, count_stale(small_copies(_decode(path, file))))
+    if not 0 <= skipped < file.frames:
+        raise RecordingError(f"{skipped} of {number_of(file.frames, 'frame')} of {path} cannot be skipped; skip fewer")
     if skipped:
-        notes.append(f"{path.name}: the first {skipped} of {file.frames} frames were left out.")
+        more = (*more, f"{path.name}: the first {skipped} of {file.frames} frames were left out.")
     return Capture(
         trial=trial_name(path.stem),
         source=str(path),
-        frame_time_s=time[skipped:],
+        frame_time_s=time_s[skipped:],
         frame_size=file.frame_size,
-        read_frames=lambda: islice(decode_video(path, file), skipped, None),
+        read_frames=lambda: islice(_decode(path, file), skipped, None),
         forces=samples,
-        notes=tuple(notes),
+        notes=(*notes, *more),
     )
