@@ -131,7 +131,7 @@ def save_result(result: object, folder: Path) -> None:
             write_tables([value.table()], folder / f"{field.name}.parquet", value.table().schema)
         elif isinstance(value, np.ndarray):
             arrays[field.name] = value
-        elif _is_array_mapping(value):
+        elif isinstance(value, Mapping) and value and all(isinstance(each, np.ndarray) for each in value.values()):
             arrays |= {f"{field.name}/{name}": array for name, array in value.items()}
         else:
             short[field.name] = value
