@@ -197,6 +197,7 @@ def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record])
 MOST_EXPANDED, MOST_TIMES = 256 * 2**20, 100
 """Bytes that a compressed table may hold, or how many times its size; ours hold some ten times theirs."""
 _MOST_ROWS, _MOST_REPEATED = 2**25, 2**31  # rows, and bytes of values that are written once and counted often
+_MOST_TEXT = 2**27  # characters, were all texts of a column as long as the longest, as NumPy keeps them
 COLUMN_KINDS: dict[str, Callable[[pa.DataType], bool]] = {
     "numbers": lambda kind: pa.types.is_floating(kind) or pa.types.is_integer(kind),
     "whole numbers": pa.types.is_integer,
@@ -268,8 +269,19 @@ def read_parquet(
     path: Path, columns: Mapping[str, str], *, cure: str, error: type[InputError] = InputError
 ) -> pa.Table:
     """Read columns of a Parquet file that `open_parquet` accepts, with no value missing."""
-    with open_parquet(path, columns, cure=cure, error=error) as file, parquet_errors(path, cure=cure, error=error):
-        table = file.read(columns=list(columns))
+    open_parquet(path, columns, cure=cure, error=error).close()
+    texts = [name for name, kind in columns.items() if kind == "texts"]
+    with parquet_errors(path, cure=cure, error=error):
+        # repeated texts stay in memory once until their length is known
+        with pq.ParquetFile(path, memory_map=True, read_dictionary=texts) as file:
+            table = file.read(columns=list(columns))
+        for name in texts:
+            column = table.column(name)
+            lengths = [len(text or "") for part in column.chunks for text in part.dictionary.to_pylist()]
+            longest = max(lengths, default=0)
+            if longest * len(table) > _MOST_TEXT:
+                raise ValueError(f"{len(table):,} texts of {longest:,} characters in {name!r}")
+            table = table.set_column(table.column_names.index(name), name, column.cast(pa.string()))
     if gaps := [name for name in columns if table.column(name).null_count]:
         raise error(f"{path} has gaps in the column {gaps[0]!r}; {cure}")
     return table
@@ -357,15 +369,19 @@ _DAMAGE = (EOFError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)  # of 
 
 
 def _load_arrays(path: Path, cure: str) -> dict[str, np.ndarray]:
-    require_file(path, missing=cure)
+    room = max(_MOST_REPEATED, MOST_TIMES * require_file(path, missing=cure))
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return dict(archive)
+            expanded = sum(info.file_size for info in archive.zip.infolist())
+            arrays = dict(archive) if expanded <= room else {}
     except (*_DAMAGE, OSError, ValueError, LookupError, MemoryError) as error:
         raise InputError(f"{path} cannot be read as arrays ({one_line(error)}); {cure}") from None
+    if expanded > room:
+        raise InputError(f"{path} claims arrays of {expanded:,} bytes; {cure}")
+    return arrays
 
 
-TABLE_SUFFIXES = (".parquet", ".csv")  #: Endings of the tables that can be written.
+TABLE_SUFFIXES = (".parquet", ".csv", ".json")  #: Endings of the tables that can be written.
 
 
 def regrouped(tables: Iterable[pa.Table], *, rows: int) -> Iterator[pa.Table]:
@@ -390,14 +406,16 @@ def read_written(path: Path, schema: pa.Schema) -> pa.Table:
         # none of Python's own: Arrow's thread may let go of it when Python has ended, and that aborts the process
         with pa.OSFile(str(path)) as stream:
             return pa_csv.read_csv(stream, convert_options=options)
+    if path.suffix == ".json":
+        return pa.Table.from_pylist(msgspec.json.decode(path.read_bytes()), schema)
     return open_table(path).read()
 
 
 def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schema) -> pa.Table | None:
     """Write tables into one file, each as it comes; whole or not at all.
 
-    The file is CSV by its ending, else Parquet, a row group a table. A file that is there is
-    replaced; without a path the tables are joined in memory and given back.
+    The file is CSV or JSON (a list, one object a row) by its ending, else Parquet, a row group a table. A file that is
+    there is replaced; without a path the tables are joined in memory and returned.
 
     Raises
     ------
@@ -408,6 +426,13 @@ def write_tables(tables: Iterable[pa.Table], path: Path | None, schema: pa.Schem
         # no empty table before them: each column would begin with an empty chunk
         return pa.concat_tables(list(tables) or [schema.empty_table()]).replace_schema_metadata(schema.metadata)
     with whole_file(path) as part:
+        if path.suffix == ".json":
+            rows = (msgspec.json.encode(row) for table in tables for row in table.to_pylist())
+            with part.open("wb") as stream:
+                stream.write(b"[\n" + next(rows, b""))
+                stream.writelines(b",\n" + row for row in rows)
+                stream.write(b"\n]\n")
+            return None
         csv = path.suffix == ".csv"
         with pa_csv.CSVWriter(part, schema) if csv else pq.ParquetWriter(part, schema, compression="zstd") as writer:
             for table in tables:

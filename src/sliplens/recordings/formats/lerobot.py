@@ -130,7 +130,9 @@ def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
             raise RecordingError(f"{folder} begins episode {index} at {start_s:g} s of a video; {_COPY}")
         data_file = layout.file(layout.data_path, {"chunk_index": chunk, "file_index": file})
         episodes.append(
-            Episode(index=index, length=length, data_file=data_file, video_file=video_file, video_start_s=start_s)
+            Episode(
+                index=index, length=length, data_file=data_file, video_file=video_file, video_start_s=float(start_s)
+            )
         )
     return episodes
 
