@@ -31,6 +31,7 @@ from sliplens.results.study import (
     MarkerTable,
     MetaTest,
     MethodTime,
+    NeutralScores,
     Randomisation,
     RandomisedMethod,
     States,
@@ -379,6 +380,7 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                 y_px=y,
                 shapley=network,
                 shapley_error=0.1 * network,
+                stick=network,
                 network=network,
                 margin=-margin,
                 state=np.ones(len(x), dtype=np.int64),
@@ -408,6 +410,8 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
             methods={
                 method: Localisation(
                     mass=mass,
+                    neutral=interval(value, made.trials),
+                    stick=interval(value, made.trials),
                     shapley=interval(value, made.trials),
                     network=interval(value, made.trials),
                     margin=interval(value / 2, made.trials),
@@ -423,6 +427,7 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                 )
                 for method, value in spearman.items()
             },
+            neutral_reliability=0.9,
             pairs=400,
             reliability=interval(0.9, made.trials),
             sums={"shapley": 1.0, "network": -1.2},
@@ -430,6 +435,13 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
             meta=(MetaTest(fill="true", **held),),
             summary="Each marker was put back where it rested.",
             effects=MarkerEffects.joined(tables),
+            neutral=NeutralScores(
+                frame_id=np.tile([row.id for row in rows], len(spearman)),
+                day=np.ones(len(rows) * len(spearman), dtype=np.int64),
+                trial=np.tile([row.trial for row in rows], len(spearman)),
+                method=np.repeat(list(spearman), len(rows)),
+                correlation=np.repeat(list(spearman.values()), len(rows)),
+            ),
             shapley_maps=np.stack(maps["shapley"]),
             network_maps=np.stack(maps["network"]),
             margin_maps=np.stack(maps["margin"]),

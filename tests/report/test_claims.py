@@ -237,13 +237,6 @@ def test_recommended_is_what_leads_every_control_and_every_method(judged, tmp_pa
     assert numbers == sorted(numbers, reverse=True)
 
 
-@pytest.mark.parametrize(("name", "kin"), [("Integrated Gradients", True), ("Poly-CAM", False)])
-def test_a_method_that_is_kin_to_the_truth_is_called_so(judged, tmp_path, rng, name, kin):
-    judged(Made(inputs=("raw",)))
-    row = believed(load_results(tmp_path), rng)[name, RAW]
-    assert ("Kin to this truth by construction" in row.sentence) is kin
-
-
 def test_a_fill_votes_once_and_not_where_it_cannot_tell_the_truth(judged, tmp_path):
     judged(Made())
     study = load_results(tmp_path).study

@@ -73,6 +73,18 @@ def test_with_no_marker_put_back_a_frame_has_the_stored_bytes(trials, recordings
             np.testing.assert_array_equal(drawn, np.broadcast_to(recording.frames[frame], drawn.shape))
 
 
+def test_markers_moved_to_where_they_are_change_no_byte(trials, recordings):
+    for trial, recording in zip(trials, recordings, strict=True):
+        frame, all_markers = in_pull(trial), ~nobody(trial)
+        stored = recording.frames[frame]
+        for back, to in ((all_markers, frame), (nobody(trial), 0)):
+            np.testing.assert_array_equal(draw_with_markers_back(trial.film, frame, back, to=to).numpy()[0], stored)
+        # moved elsewhere, they have the places and sizes of the other frame
+        moved = put_markers_back(trial.film, frame, all_markers, to=0)
+        np.testing.assert_array_equal(moved.marker_px[0], trial.film.marker_px[0])
+        np.testing.assert_array_equal(moved.motion.scale[0], trial.film.motion.scale[0])
+
+
 @pytest.mark.parametrize("sensor", [CHROMATOUCH, FLAT_GEL])
 def test_all_markers_back_and_no_touch_is_the_untouched_sensor(sensor):
     grasp = Grasp()

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from scipy.stats import pearsonr
 from torch import Tensor, nn
 
 from sliplens.codec import load_result, save_result
@@ -205,6 +206,54 @@ def test_markers_of_the_frame_are_put_back_and_the_reference_beside_it_stays(dat
     assert without[:3, markers].abs().mean() < 0.5 * as_it_was[:3, markers].abs().mean()
 
 
+def test_neutral_effects_and_correlations_follow_from_frames_drawn_one_by_one(trained, explained, data, maps):
+    judging = judge(trained, explained, data, maps=maps, fills=(), pairs=PAIRS)
+    make = judging.prepare()
+    records = [make(index) for index in range(len(LEVELS))]
+    rows = {(row["frame_id"], row["method"]): row for row in judging.join(records).neutral.table().to_pylist()}
+    for index, (frame, record) in enumerate(zip(stage_frames(trained, explained, data), records, strict=True)):
+        film, place = frame.scene.film, find_places(frame, image_size=SIZE)
+        stored = data.load(next(info for info in data.trials if info.trial == frame.trial)).frames[frame.number]
+        whole = trained.predict(trained.encode(stored[None], frame.reference))[0]
+        effects, sums = [], []
+        for members in record.groups.tolist():
+            back = np.zeros((1, len(film.marker_rest_px)), dtype=bool)
+            back[0, frame.markers[members]] = True
+            drawn = draw_with_markers_back(film, frame.number, back, to=frame.neutral_frame).numpy()
+            effects.append(float(whole - trained.predict(trained.encode(drawn, frame.reference))[0]))
+            sums.append(sum(maps["attribution"][index][place.regions == member].sum() for member in members))
+        np.testing.assert_allclose(record.moved, effects, atol=1e-6)
+        expected = pearsonr(sums, explained.towards[index] * np.array(effects))[0]
+        assert rows[frame.id, "attribution"]["correlation"] == pytest.approx(expected, abs=1e-3)
+
+
+def test_an_additive_network_agrees_with_the_stick_game_from_the_neutral_frame(two_signed, data):
+    trained, explained, _ = two_signed
+    frames = stage_frames(trained, explained, data)
+    stuck = replace(
+        explained,
+        frames=tuple(
+            replace(row, baseline_frame=frame.neutral_frame)
+            for row, frame in zip(explained.frames, frames, strict=True)
+        ),
+    )
+    judging = judge(trained, stuck, data, maps={}, fills=(), pairs=PAIRS)
+    make = judging.prepare()
+    records = [make(index) for index in range(len(LEVELS))]
+    points = np.zeros((len(LEVELS), SIZE, SIZE))
+    for values, record, frame, towards in zip(points, records, frames, stuck.towards, strict=True):
+        x, y = np.round(find_places(frame, image_size=SIZE).now_px).astype(int).T
+        values[y, x] = towards * record.stick
+    truth = judge(trained, stuck, data, maps={"points": points, "flat": 0 * points}, fills=(), pairs=PAIRS).join(
+        records
+    )
+    assert truth.methods["points"].neutral.estimate > 0.99
+    assert truth.methods["flat"].neutral.estimate == 0
+    assert truth.methods["points"].lead_over_methods["flat"].estimate > 0.99
+    np.testing.assert_array_equal(truth.effects.stick, np.concatenate([record.stick for record in records]))
+    assert truth.neutral_reliability > 0.9
+
+
 def test_maps_show_the_effects_on_the_markers(judged, explained):
     painted = {"shapley": judged.shapley_maps, "network": judged.network_maps, "margin": judged.margin_maps}
     for index, frame in enumerate(explained.frames):
@@ -270,9 +319,8 @@ def test_a_map_without_signs_never_outranks_the_attribution_of_a_network_with_tw
             assert getattr(methods[control], truth).estimate < 0.5
     # of two trials nothing is sure, and only a method can lead
     lead = methods["attribution"].lead_over_controls
-    best = max(methods[control].shapley.estimate for control in CONTROLS if control != "random")
-    assert lead.control != "random"
-    assert lead.gap.estimate == pytest.approx(methods["attribution"].shapley.estimate - best)
+    best = max(0.0, *(methods[control].neutral.estimate for control in CONTROLS if control != "random"))
+    assert lead.gap.estimate == pytest.approx(methods["attribution"].neutral.estimate - best)
     assert {name for name, own in methods.items() if own.lead_over_controls is not None} == {"attribution"}
 
 
@@ -318,7 +366,8 @@ def test_a_gain_is_put_to_the_test_by_several_trials_or_not_at_all(trials, holds
     gains = np.array([0.5, 0.3, 0.1])
     none = np.zeros(2)
     effects = [
-        FrameEffects(shapley=none, shapley_error=none, network=none, margin=none, shuffled=none,
+        FrameEffects(shapley=none, shapley_error=none, network=none, margin=none, shuffled=none, stick=none,
+                     groups=np.zeros((2, 1), dtype=np.int64), moved=none,
                      gains={"true": gains + 0.01 * rng.normal(size=3)})
         for _ in range(3 * trials)
     ]  # fmt: skip

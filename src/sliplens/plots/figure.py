@@ -117,9 +117,9 @@ def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int) -> None:
 
 
 def _truth(truth: Truth, ax: Axes, _: int) -> None:
-    scores = {name: method.shapley for name, method in truth.methods.items() if method.shapley is not None}
+    scores = {name: method.neutral for name, method in truth.methods.items() if method.neutral is not None}
     _plot_methods(scores, ax)
-    ax.set(xlabel="Signed rank correlation with the markers' Shapley values (95 % interval)")
+    ax.set(xlabel="Correlation with the effects of moved groups of markers (95 % interval)")
     ax.set_title(input_name(truth.input))
 
 

@@ -164,9 +164,9 @@ def plate_truth(results: Results, name: str) -> Plate | None:
     if not rows:
         return None
     likeness = {
-        method: record.shapley.estimate
+        method: record.neutral.estimate
         for method, record in truth.methods.items()
-        if method in explained.relevance and not is_control(method) and record.shapley is not None
+        if method in explained.relevance and not is_control(method) and record.neutral is not None
     }
     methods = sorted(methods_in_order(likeness), key=lambda method: -likeness[method])[:_TRUTH_METHODS]
     pictures, title = bright_pictures(explained, rows)
@@ -186,7 +186,7 @@ def plate_truth(results: Results, name: str) -> Plate | None:
                 words=["", *(f"up to {100 * np.abs(values).max():.1f} points" for values in effects)],
             )
         )
-    columns = ("frame_id", "marker", "x_px", "y_px", "shapley", "shapley_error", "network", "margin", "state")
+    columns = ("frame_id", "marker", "x_px", "y_px", "shapley", "shapley_error", "stick", "network", "margin", "state")
     titles = [method_name(method) for method in methods]
     heads = [title, "Shapley values", "Put back alone:\nprediction", "Put back alone:\nmargin", *titles]
     return Plate(
@@ -196,8 +196,8 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         f"the best estimate of the margin, beside the maps of {listed(titles or ['no method'])}",
         caption=f"{input_name(name)}: what each marker does to the network's prediction, in whatever company of "
         "markers (Shapley value) and alone, and to the best estimate of the margin, in percentage points (value less "
-        "value with that marker put back where it rested), beside the maps nearest to the first. Orange lowers, blue "
-        "raises; full colour at the largest effect of each picture.",
+        "value with that marker put back where it rested), beside the maps that the neutral judge ranks first. Orange "
+        "lowers, blue raises; full colour at the largest effect of each picture.",
         columns=columns,
         rows=rows_of(*(getattr(truth.effects, column) for column in columns)),
         pixels=True,

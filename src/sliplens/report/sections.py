@@ -285,10 +285,11 @@ SECTIONS: tuple[Section, ...] = (
         id="truth",
         title="What the network should have looked at",
         short_title="Truth",
-        intro="The simulator draws each frame again with markers put back to rest. A Shapley value is the mean "
-        "of its effect on the prediction in the company of all others; a map should show these values, signs included. "
-        "Integrated Gradients is close to them by construction. The best estimate of the margin is linear in the "
-        "markers' displacements and shows where the network should look.",
+        intro="The simulator draws each frame again with groups of markers moved to where they lie at another margin "
+        "of the same trial: a map should predict, signs included, how that changes the prediction. No map is made to. "
+        "Beside this neutral judge: Shapley values, the mean effect of putting a marker back to the stick frame, or to "
+        "rest, in the company of all others. Integrated Gradients is close to those by construction. The best "
+        "estimate of the margin is linear in the markers' displacements and shows where the network should look.",
         build=_truth,
         step="truth",
         of_sample=True,

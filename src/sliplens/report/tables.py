@@ -243,18 +243,23 @@ def table_localisation(truth: Truth) -> CellTable:
 
     return make_table(
         f"{input_name(truth.input)}, {number_of(truth.frames, 'simulated frame')}: share of the relevance in three "
-        f"regions (share of the image: {areas}); signed rank correlation of the map's means over the markers with "
-        "their Shapley values, single effects, and effects on the best estimate of the margin (95 % interval over "
-        f"{write_over(method.shapley for method in truth.methods.values())}). Lead: the first less that of the "
-        "strongest control; a method whose interval includes zero has shown nothing about this network.",
+        f"regions (share of the image: {areas}). Neutral: correlation of the map's sums over random groups of "
+        "markers with the change of the prediction as a group is moved to another margin of the trial. Lead: that "
+        "less that of the strongest control; a method whose interval includes zero has shown nothing about this "
+        "network on these days. Beside it the signed rank correlation of the map's means over the markers with their "
+        "Shapley values, put back to the stick frame or to the untouched sensor, single effects, and effects on the "
+        f"best estimate of the margin (95 % interval over {write_over(row.neutral for row in truth.methods.values())}"
+        ").",
         {
             # here chance is a map, not an order
             "Method": lambda name: "Random map (control)" if name == CHANCE else method_name(name),
-            **masses,
-            "With Shapley values": lambda name: write(truth.methods[name].shapley),
+            "Neutral": lambda name: write(truth.methods[name].neutral),
             "Lead over controls": lambda name: write((lead := truth.methods[name].lead_over_controls) and lead.gap),
+            "Shapley values, stick": lambda name: write(truth.methods[name].stick),
+            "Shapley values, untouched": lambda name: write(truth.methods[name].shapley),
             "With markers put back alone": lambda name: write(truth.methods[name].network),
             "With the best estimate": lambda name: write(truth.methods[name].margin),
+            **masses,
         },
         [*methods_in_order(set(truth.methods) - set(perfect)), *perfect],
     )

@@ -87,9 +87,10 @@ def judge_results(results: Results, *, claims: Sequence[Verdict] = (), rng: np.r
         (
             "believe",
             "Which explanation to believe",
-            "Number, where the scene can be drawn anew: signed rank correlation of a map's means over the markers "
-            "with their Shapley values in this network's prediction; else the mean symmetric gain of removal, in "
-            "margin units. A method holds where it beats every map that knows nothing of what the network learned, "
+            "Number, where the scene can be drawn anew: correlation of a map's sums over groups of markers with the "
+            "change of this network's prediction as the group is moved to another margin of the trial; else the mean "
+            "symmetric gain of removal, in margin units. A method holds where it beats every map that knows nothing of "
+            "what the network learned, "
             f"beyond the 95 % interval over days and trials, of which {FEWEST_UNITS} trials or more are needed.",
             _judge_methods(results) if results.study else (),
         ),
@@ -165,7 +166,7 @@ def most_of(outcomes: Sequence[Outcome]) -> Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Recommended:
-    """Method whose map ranks the markers most like their Shapley values, and whether it may be recommended."""
+    """Method whose map agrees best with the neutral judge, and whether it may be recommended."""
 
     method: str
     lead: Lead
@@ -181,7 +182,7 @@ class Recommended:
 
 
 def recommend(truth: Truth) -> Recommended | None:
-    """Return the method with the best correlation with the Shapley values; None where there is none."""
+    """Return the method with the best correlation under the neutral judge; None where there is none."""
     compared = _compared(truth)
     if not compared:
         return None
@@ -194,9 +195,9 @@ def recommend(truth: Truth) -> Recommended | None:
 def _compared(truth: Truth) -> list[tuple[str, Difference, Lead]]:
     """Methods with their correlation and lead, the best first."""
     compared = [
-        (name, method.shapley, method.lead_over_controls)
+        (name, method.neutral, method.lead_over_controls)
         for name, method in truth.methods.items()
-        if method.shapley is not None and method.lead_over_controls is not None
+        if method.neutral is not None and method.lead_over_controls is not None
     ]
     return sorted(compared, key=lambda item: -item[1].estimate)
 
@@ -213,10 +214,6 @@ def _judge_methods(results: Results) -> Iterator[Row]:
             yield Row(claim="Any method", subject=input_name(name), outcome="undecided", sentence=sentence)
 
 
-_KIN = ("shapley-marker", "shapley", "integrated-gradients", "integrated-gradients-thesis", "expected-gradients")
-"""Methods that share out the prediction by the rule of Shapley, as the truth does."""
-
-
 def _judge_by_truth(name: str, truth: Truth) -> Iterator[Row]:
     best = recommend(truth)
     assert best is not None
@@ -228,10 +225,16 @@ def _judge_by_truth(name: str, truth: Truth) -> Iterator[Row]:
             claim=method_name(method),
             subject=input_name(name),
             outcome=outcome,
-            sentence=sentence + (" Kin to this truth by construction." if method in _KIN else ""),
+            sentence=sentence + _scope(correlation),
             number=signed(correlation.estimate, 2),
             interval=write_ends(correlation, digits=2),
         )
+
+
+def _scope(correlation: Difference) -> str:
+    """Say what an interval of one network leaves out."""
+    days = "this day" if correlation.days == 1 else "these days"
+    return f" For this network on {days}." if correlation.networks == 1 else ""
 
 
 def _compare_by_truth(method: str, lead: Lead, best: Recommended) -> tuple[Outcome, str]:

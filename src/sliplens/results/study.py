@@ -199,18 +199,22 @@ class Timing(OfNetwork):
 
 @dataclass(frozen=True, kw_only=True)
 class Localisation:
-    """Where a method's relevance lies, and how well it ranks the markers as the network and the true margin do."""
+    """Where a method's relevance lies, and how far it agrees with what markers do to the prediction and the margin."""
 
     mass: dict[str, float | None]
     """Share of the relevance by `REGIONS`."""
+    neutral: Difference | None
+    """Mean correlation (Pearson, signed) of the map's sums over groups of markers with the change of the prediction as
+    the group is moved to another margin of the trial: the main judge. The fields beside it are other truths."""
+    stick: Difference | None
     shapley: Difference | None
     network: Difference | None
     margin: Difference | None
     """Mean rank correlation, signed, of the map's means over the markers with the columns of `MarkerEffects`."""
     lead_over_controls: Lead | None
-    """Of the correlation with the Shapley values; None for what is no method."""
+    """Of `neutral`; None for what is no method, or where it is undefined."""
     lead_over_methods: dict[str, Difference]
-    """Correlation with the Shapley values less that of each other method."""
+    """`neutral` less that of each other method."""
     edges: Difference | None
     """Mass on the edges of markers less the share of the image that they cover."""
 
@@ -247,13 +251,28 @@ class MarkerEffects(Columns):
     """Place in pixels of the network's input."""
     shapley: Annotated[Float64[np.ndarray, " rows"], ANSWER]
     shapley_error: Annotated[Float64[np.ndarray, " rows"], AMOUNT, UNKNOWN]
-    """Shapley value in the answer, over scenes with other markers put back, and its standard error."""
+    """Shapley value in the prediction, over scenes with other markers put back to rest, and its standard error."""
+    stick: Annotated[Float64[np.ndarray, " rows"], ANSWER, UNKNOWN]
+    """Shapley value with markers put back to their places in the stick frame that is the baseline of the explanation;
+    NaN where that is the untouched sensor."""
     network: Annotated[Float64[np.ndarray, " rows"], ANSWER]
     margin: Annotated[Float64[np.ndarray, " rows"], ANSWER]
     """Answer and best reading as they are less those with the marker put back, in margin units. The reading is linear:
     these are its Shapley values too."""
     state: Int64[np.ndarray, " rows"]
     """Slips (1), sticks (2), or lies outside of the contact (0)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NeutralScores(Columns):
+    """Correlation of each map with the effects of moved groups of markers, a row a frame and method."""
+
+    frame_id: Shaped[np.ndarray, " rows"]
+    day: Int64[np.ndarray, " rows"]
+    trial: Shaped[np.ndarray, " rows"]
+    method: Shaped[np.ndarray, " rows"]
+    correlation: Annotated[Float64[np.ndarray, " rows"], UNKNOWN]
+    """NaN where the effects do not vary."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,18 +283,22 @@ class Truth(OfNetwork):
     areas: dict[str, float | None]
     """Share of the image that each of `REGIONS` covers, None where no frame has it."""
     methods: dict[str, Localisation]
+    neutral_reliability: float | None
+    """Expected correlation of `Localisation.neutral` by map and frame with that by as many other groups (split half,
+    Spearman-Brown)."""
     pairs: int
     """Pairs of scenes drawn for the Shapley values of each frame."""
     reliability: Difference | None
     """Expected correlation of the Shapley values with a second estimate, by their standard errors; its root is the most
     that a map can reach."""
     sums: dict[str, float | None]
-    """How many times the answer's change the effects add up to, over all frames: `shapley` and `network`."""
+    """Multiple of the prediction's change from the untouched sensor to which `shapley` and `network` add up."""
     shapley_against_margin: Difference | None
     """Rank correlation of the Shapley values with the effects on the best reading of the margin."""
     meta: tuple[MetaTest, ...]
     summary: str
     effects: MarkerEffects
+    neutral: NeutralScores
     shapley_maps: Annotated[Float32[np.ndarray, "frames size size"], ANSWER]
     network_maps: Annotated[Float32[np.ndarray, "frames size size"], ANSWER]
     margin_maps: Annotated[Float32[np.ndarray, "frames size size"], ANSWER]
@@ -333,9 +356,12 @@ STUDY_METHODS = (
     "integrated-gradients",
     "poly-cam",
     "occlusion",
+    "occlusion-marker",
     "shapley-marker",
 )
-"""The thesis's three as published, the same against the untouched sensor, occlusion, Shapley values of the markers."""
+"""The thesis's three as published, the same against the baseline, occlusion, Shapley values of the markers."""
+RIVALS = ("integrated-gradients", "occlusion-marker")
+"""Methods beside which the recommended one is always judged."""
 STUDY_BUDGET = 0.15
 """Share of the channels that Poly-CAM measures at first: more where the map asks for it."""
 

@@ -273,42 +273,45 @@ def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecip
     return FilmedTrial(plan=plans[name], loading=loading, film=film)
 
 
-def put_markers_back(film: Film, frame: int, back: Bool[np.ndarray, "variants markers"]) -> Film:
+def put_markers_back(
+    film: Film, frame: int, back: Bool[np.ndarray, "variants markers"], *, to: int | None = None
+) -> Film:
     """Film one moment several times, each time with other markers put back; all else stays, the noise too.
 
-    A marker put back has its place, size and pressure of the untouched sensor. Focus and paleness, which the touch
-    gives to all markers, stay.
+    A marker put back has its place, size and pressure of the frame `to`, of the untouched sensor if None. Focus and
+    paleness, which the touch gives to all markers, stay.
     """
     count, motion = len(back), film.motion
     at, taken = np.full(count, frame), np.full(count, frame + 1)  # the untouched sensor's picks come first
 
-    def where_back(rest: np.ndarray | float, now: np.ndarray) -> np.ndarray:
+    def where_back(rest: np.ndarray | float, path: np.ndarray) -> np.ndarray:
+        now, then = path[frame], rest if to is None else path[to]
         chosen = back[..., None] if now.ndim == 2 else back
-        return np.where(chosen, rest, now[None])
+        return np.where(chosen, then, now[None])
 
     return replace(
         film,
         motion=replace(
             motion,
-            centres_px=where_back(motion.rest_px, motion.centres_px[frame]),
-            scale=where_back(1.0, motion.scale[frame]),
-            pressure=where_back(0.0, motion.pressure[frame]),
+            centres_px=where_back(motion.rest_px, motion.centres_px),
+            scale=where_back(1.0, motion.scale),
+            pressure=where_back(0.0, motion.pressure),
             touch=motion.touch[at],
             indentation_m=motion.indentation_m[at],
             contact_radius_m=motion.contact_radius_m[at],
             stick_radius_m=motion.stick_radius_m[at],
         ),
-        marker_px=where_back(film.marker_rest_px, film.marker_px[frame]),
+        marker_px=where_back(film.marker_rest_px, film.marker_px),
         blur_px=film.blur_px[np.append(0, taken)],
         noise_picks=film.noise_picks[np.append(0, taken)],
     )
 
 
 def draw_with_markers_back(
-    film: Film, frame: int, back: Bool[np.ndarray, "variants markers"]
+    film: Film, frame: int, back: Bool[np.ndarray, "variants markers"], *, to: int | None = None
 ) -> UInt8[Tensor, "variants height width 3"]:
     """Draw a frame with markers put back (`put_markers_back`), once for each choice; the stored frame for none."""
-    changed = put_markers_back(film, frame, back)
+    changed = put_markers_back(film, frame, back, to=to)
     return torch.cat([changed.draw(part) for part in batches(len(back), device="cpu")])
 
 

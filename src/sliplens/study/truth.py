@@ -1,11 +1,12 @@
-"""Explanations held against the truth that only a simulator knows: what each marker does to the answer."""
+"""Explanations compared with the effects of markers on the prediction, which only a simulator knows."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64, Int, Shaped, UInt8
+import torch
+from jaxtyping import Bool, Float, Float64, Int, Int64, Shaped, UInt8
 from scipy.stats import spearmanr
 from torch import Tensor
 
@@ -37,7 +38,7 @@ from sliplens.recordings import Dataset
 from sliplens.recordings.trial import SLIPS
 from sliplens.results.explanation import Explanation
 from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
-from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, Truth
+from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, NeutralScores, Truth
 from sliplens.runner import Part, part
 from sliplens.simulation.intervention import (
     FilmedTrial,
@@ -46,6 +47,15 @@ from sliplens.simulation.intervention import (
     marker_readings,
     rebuild_trial,
     visible_markers,
+)
+from sliplens.study.neutral import (
+    GROUPS,
+    correlate_groups,
+    draw_groups,
+    marker_sums,
+    neutral_frame,
+    place_regions,
+    split_half_reliability,
 )
 from sliplens.study.stages import MakeRecord, Stage, mean_of_known
 
@@ -65,6 +75,10 @@ class StagedFrame:
     number: int
     """In its trial."""
     safety_margin: float
+    baseline_frame: int | None
+    """Frame of the trial that is the baseline of the explanation; None if that is the untouched sensor."""
+    neutral_frame: int
+    """Frame to whose places groups of markers are moved."""
     scene: FilmedTrial
     reference: UInt8[np.ndarray, "height width 3"]
     contact_map: UInt8[np.ndarray, "height width"]
@@ -82,6 +96,8 @@ class Places:
     markers: Bool[np.ndarray, "size size"]
     edges: Bool[np.ndarray, "size size"]
     """All markers in the image, those at its border too: their areas, and their rims alone."""
+    regions: Int[np.ndarray, "size size"]
+    """Marker whose relevance each pixel holds (`place_regions`)."""
     slip_annulus: Bool[np.ndarray, "size size"]
     """Where the skin slips over the object."""
     now_px: Float[np.ndarray, "markers 2"]
@@ -123,6 +139,8 @@ def stage_frames(trained: Network, explained: Explanation, data: Dataset) -> tup
                 trial=trial,
                 number=number,
                 safety_margin=float(recording.safety_margin[number]),
+                baseline_frame=explained.frames[row].baseline_frame,
+                neutral_frame=neutral_frame(recording.safety_margin, number),
                 contact_map=recording.truth.contact_map[number],
                 scene=scene,
                 reference=recording.reference,
@@ -131,15 +149,18 @@ def stage_frames(trained: Network, explained: Explanation, data: Dataset) -> tup
     return tuple(staged[row] for row in range(len(explained.frames)))
 
 
-def redrawing(trained: Network, frames: Sequence[StagedFrame]) -> Redraw:
-    """Draw frames with some of their `markers` put back, as the network gets them, on its device."""
+def redrawing(trained: Network, frames: Sequence[StagedFrame], *, to: Sequence[int | None] | None = None) -> Redraw:
+    """Draw frames with some of their `markers` put back, as the network gets them, on its device.
+
+    `to` are the frames of the trials whose places the markers take; the untouched sensor's where it is None.
+    """
 
     def redraw(image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants colours size size"]:
         frame = frames[image]
         film = frame.scene.film
         every = np.zeros((len(back), len(film.marker_rest_px)), dtype=bool)
         every[:, frame.markers] = back
-        drawn = draw_with_markers_back(film, frame.number, every).numpy()
+        drawn = draw_with_markers_back(film, frame.number, every, to=to[image] if to else None).numpy()
         return trained.encode(drawn, frame.reference).to(trained.device)
 
     return redraw
@@ -169,7 +190,13 @@ def find_places(frame: StagedFrame, *, image_size: int) -> Places:
     column, row = ((2 * steps + 1) * side // (2 * image_size) for side in (width, height))
     now_px = outlines.now_px[frame.markers]
     x, y = np.clip(np.round(now_px).astype(np.int64), 0, [width - 1, height - 1]).T
+    at = frame.baseline_frame
+    baseline_px = outlines.rest_px if at is None else frame.scene.film.marker_px[at]
     return Places(
+        regions=place_regions(
+            image_size,
+            *((px + 0.5) * scale - 0.5 for px in (now_px, baseline_px[frame.markers])),
+        ),
         units=np.where(covered, place[nearest], len(frame.markers)),
         markers=covered,
         edges=np.minimum(np.abs(rest), np.abs(now)).min(axis=0) <= _RIM_PX,
@@ -183,10 +210,10 @@ TRUE_FILL = "true"
 ORACLE, DEGRADED = "oracle", "degraded-oracle"
 TRUTH_FILLS = ("reference", "grey", "background", "blur")
 """Fills that the oracle is tried under; the true one always is. The noisy-linear one takes longer than all of them."""
-TRUTH_PAIRS = 400
-"""Pairs of scenes for the Shapley values of a frame: their standard error is then about a quarter of their spread."""
+TRUTH_PAIRS = 200
+"""Pairs of scenes for the Shapley values of a frame: their standard error is then about a third of their spread."""
 
-_EFFECTS = ("shapley", "network", "margin")
+_EFFECTS = ("stick", "shapley", "network", "margin")
 """Effects that a map is compared with, as `MarkerEffects` and `Localisation` name it."""
 
 Maps = Float[np.ndarray, "frames size size"]
@@ -200,6 +227,11 @@ class FrameEffects:
     shapley_error: Float64[np.ndarray, " markers"]
     network: Float64[np.ndarray, " markers"]
     margin: Float64[np.ndarray, " markers"]
+    stick: Float64[np.ndarray, " markers"]
+    groups: Int64[np.ndarray, "groups members"]
+    """Places of the members among the frame's markers."""
+    moved: Float64[np.ndarray, " groups"]
+    """Prediction less that with the group moved to where it lies in the neutral frame."""
     shuffled: Float64[np.ndarray, " markers"]
     """`shapley`, the values of half of the markers shuffled: an oracle that is half wrong."""
     gains: dict[str, Float64[np.ndarray, " 3"]]
@@ -284,7 +316,14 @@ def _summarise(truth: Truth) -> str:
     """Write what the effects add up to, how sure they are, and how far they follow the margin."""
     text = {name: "unknown" if times is None else f"{times:.2f} times" for name, times in truth.sums.items()}
     summary = (
-        "Put back one at a time, all markers together change the answer by "
+        f"Neutral judge: {GROUPS} random groups of markers of each frame are moved to their places at another margin "
+        "of the trial; a map is judged by the correlation of its sums over the groups with the changes of the "
+        "prediction."
+    )
+    if truth.neutral_reliability is not None:
+        summary += f" As many other groups would give scores that correlate by {truth.neutral_reliability:.2f}."
+    summary += (
+        " Put back to rest one at a time, all markers together change the prediction by "
         f"{text['network']} its whole change; their Shapley values, from {truth.pairs} pairs of scenes a frame, add up "
         f"to {text['shapley']}."
     )
@@ -296,16 +335,18 @@ def _summarise(truth: Truth) -> str:
             f" Marker by marker the Shapley values of the answer agree with those of the best reading of the margin by "
             f"{agreement.estimate:.2f} (Spearman, {tell_ends(agreement, '{:.2f}'.format, title='95 % interval ')})."
         )
-    return summary
+    return f"{summary} This holds for this network on these days."
 
 
 @dataclass(frozen=True, kw_only=True)
 class JudgingByTruth(Stage[Truth]):
     """Markers of every frame, a part, put back alone and in company, and maps compared with what that does.
 
-    There are two truths: the change by putting a marker back alone, and its Shapley value, which add up to the change
-    of the answer. Marker by marker the mean of a map is compared with both, signed, along the answer's change; a map's
-    mass is that of its positive part.
+    The main judge is neutral: no map is made to predict how groups of markers, moved to another margin of the trial,
+    change the prediction. Beside it, marker by marker, the mean of a map is compared with Shapley values of the stick
+    game, those of the untouched game, and the change by putting a marker back alone. All are signed, along the change
+    of the prediction, which leaves correlations of methods as they are and gives controls its sign. A map's mass is
+    that of its positive part.
     """
 
     record = FrameEffects
@@ -319,7 +360,7 @@ class JudgingByTruth(Stage[Truth]):
     fills: Sequence[str] = TRUTH_FILLS
     """Those under which a map that knows the effects is compared with one that knows half of them."""
     pairs: int = TRUTH_PAIRS
-    """Number of pairs of scenes behind the Shapley values of a frame; at least two a marker are taken."""
+    """Number of pairs of scenes behind the Shapley values of a frame and game; at least two a marker are taken."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -343,19 +384,29 @@ class JudgingByTruth(Stage[Truth]):
         trained, explained, fills, seed = self.trained, self.explained, self.fills, self.seed
         frames, places, pairs = self._staged
         inputs, redraw = network_inputs(trained, explained), redrawing(trained, frames)
-        # each marker alone, pairs of scenes, and under each fill three maps both ways
-        passes = len(frames) * (len(frames[0].markers) + 2 * pairs + 6 * len(SHARES) * (len(fills) + 1))
+        to_stick = redrawing(trained, frames, to=[frame.baseline_frame for frame in frames])
+        move = redrawing(trained, frames, to=[frame.neutral_frame for frame in frames])
+        # groups, each marker alone, pairs of scenes of two games, and under each fill three maps both ways
+        passes = len(frames) * (GROUPS + len(frames[0].markers) + 4 * pairs + 6 * len(SHARES) * (len(fills) + 1))
         predict = prepare_passes(trained, inputs, passes)
 
         def put_back(index: int) -> FrameEffects:
             frame, place, towards = frames[index], places[index], float(explained.towards[index])
             count, answer = len(frame.markers), answer_scenes(predict, partial(redraw, index))
+            groups = draw_groups(count, rng=np.random.default_rng((seed, index, GROUPS)))
             # the whole image first
+            members = np.zeros((len(groups) + 1, count), dtype=bool)
+            np.put_along_axis(members[1:], groups, values=True, axis=1)
+            moved = answer_scenes(predict, partial(move, index))(members)
             answers = answer(np.eye(count + 1, count, k=-1, dtype=bool))
             # a run that goes on draws the same; a first guess would lean the truth towards the map that gave it
             rng = np.random.default_rng((seed, index))
             estimate = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
             shuffled = shuffle_half(estimate.values, rng=rng)
+            stick = np.full(count, np.nan)
+            if frame.baseline_frame is not None:
+                of_stick = answer_scenes(predict, partial(to_stick, index))
+                stick = shapley_values(lambda stay: of_stick(~stay), count, pairs=pairs, rng=rng).values
             empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
             change = unit_means(change_of(inputs[index].cpu(), empty).double().numpy(), place.units)[:count]
             maps = [towards * estimate.values, towards * shuffled, change]
@@ -387,6 +438,9 @@ class JudgingByTruth(Stage[Truth]):
                 shapley_error=estimate.standard_errors,
                 network=answers[0] - answers[1:],
                 margin=marker_readings(frame.scene, frame.number)[1],
+                stick=stick,
+                groups=groups,
+                moved=moved[0] - moved[1:],
                 shuffled=shuffled,
                 gains={name: areas[::2] - areas[1::2] for name, areas in lost.items()},
             )
@@ -400,7 +454,7 @@ class JudgingByTruth(Stage[Truth]):
         size = trained.manifest.image_size
         # along the answer's change, as the maps are
         along = [
-            {name: sign * getattr(effect, name) for name in (*_EFFECTS, "shuffled")}
+            {name: sign * getattr(effect, name) for name in (*_EFFECTS, "moved", "shuffled")}
             for sign, effect in zip(explained.towards, effects, strict=True)
         ]
         judged = dict(self.maps) | {
@@ -408,8 +462,24 @@ class JudgingByTruth(Stage[Truth]):
             ORACLE: _paint(places, [rows["shapley"] for rows in along]),
             DEGRADED: _paint(places, [rows["shuffled"] for rows in along]),
         }
-        change = np.array([frame.prediction - frame.reference_prediction for frame in explained.frames])
-        painted = {name: _paint(places, [getattr(effect, name) for effect in effects]) for name in _EFFECTS}
+        values = {
+            name: [
+                marker_sums(rows, place.regions, markers=len(place.now_px))
+                for rows, place in zip(rows_of_map, places, strict=True)
+            ]
+            for name, rows_of_map in judged.items()
+        }
+        # by the values themselves: the area on which they are painted is no part of them
+        values |= {ORACLE: [rows["shapley"] for rows in along], DEGRADED: [rows["shuffled"] for rows in along]}
+        groups, moved = [effect.groups for effect in effects], [rows["moved"] for rows in along]
+        neutral = {
+            name: np.array([correlate_groups(*of_frame) for of_frame in zip(rows, groups, moved, strict=True)])
+            for name, rows in values.items()
+        }
+        empty = torch.stack([trained.encoding.empty(frame.reference, image_size=size) for frame in frames])
+        untouched = trained.predict(empty).cpu().numpy()
+        change = np.array([frame.prediction for frame in explained.frames]) - untouched
+        painted = {name: _paint(places, [getattr(effect, name) for effect in effects]) for name in _EFFECTS[1:]}
         interval = partial(mean_of_defined, clusters=explained.clusters, seed=seed)
         alike = partial(interval, limits=(-1.0, 1.0))
         truth = Truth(
@@ -418,7 +488,8 @@ class JudgingByTruth(Stage[Truth]):
             frames=len(frames),
             # the mass of a map of chance
             areas=_by_region(places, lambda _, region: float(region.mean())),
-            methods=_judge(judged, places, along, explained.clusters, seed=seed),
+            methods=_judge(judged, places, along, neutral, explained.clusters, seed=seed),
+            neutral_reliability=split_half_reliability(values, groups, moved),
             pairs=pairs,
             reliability=interval(
                 (reliability_of(effect.shapley, effect.shapley_error) for effect in effects), limits=(0.0, 1.0)
@@ -428,6 +499,18 @@ class JudgingByTruth(Stage[Truth]):
             meta=meta_test(effects, interval),
             summary="",
             effects=_table(frames, places, effects),
+            neutral=NeutralScores.joined(
+                [
+                    NeutralScores(
+                        frame_id=np.array([frame.id for frame in frames]),
+                        day=np.array([frame.day for frame in frames]),
+                        trial=np.array([frame.trial for frame in frames]),
+                        method=np.repeat(name, len(frames)),
+                        correlation=correlations,
+                    )
+                    for name, correlations in neutral.items()
+                ]
+            ),
             **{f"{name}_maps": values.astype(np.float32) for name, values in painted.items()},
         )
         return replace(truth, summary=_summarise(truth))
@@ -436,7 +519,8 @@ class JudgingByTruth(Stage[Truth]):
 def _judge(
     maps: Mapping[str, Maps],
     places: Sequence[Places],
-    effects: Sequence[Mapping[str, Float[np.ndarray, " markers"]]],
+    effects: Sequence[Mapping[str, Float[np.ndarray, " values"]]],
+    neutral: Mapping[str, Float[np.ndarray, " frames"]],
     clusters: Shaped[np.ndarray, "2 frames"],
     *,
     seed: int,
@@ -451,25 +535,27 @@ def _judge(
         }
         for name, of_map in means.items()
     }
-    # a map that tells no marker from another ranks them as chance does
-    ranks = {name: np.nan_to_num(rows["shapley"]) for name, rows in alike.items()}
+    # frames in which nothing changes judge nobody; the others judge all maps
+    valid = np.isfinite(neutral[CHANCE])
+    ranks, of_valid = {name: rows[valid] for name, rows in neutral.items()}, clusters[:, valid]
     controls = {name: rank for name, rank in ranks.items() if is_control(name) and name != CHANCE}
     rng, records = np.random.default_rng(seed), {}
     interval = partial(mean_of_defined, clusters=clusters, seed=seed, limits=(-1.0, 1.0))
     methods = [name for name in maps if not is_control(name) and name not in (ORACLE, DEGRADED)]
     for name, values in maps.items():
-        others = [method for method in methods if method != name] if name in methods else []
+        others = [method for method in methods if method != name] if name in methods and valid.any() else []
         positive = np.clip(values.astype(np.float64), 0, None)
         on_edges = (
             relevance_mass(rows, place.edges) - place.edges.mean() for rows, place in zip(positive, places, strict=True)
         )
         records[name] = Localisation(
             mass=_by_region(places, lambda frame, region, maps=positive: relevance_mass(maps[frame], region)),
-            lead_over_controls=lead_over_controls(ranks[name], controls, clusters=clusters, rng=rng)
-            if name in methods
+            neutral=interval(neutral[name]),
+            lead_over_controls=lead_over_controls(ranks[name], controls, clusters=of_valid, rng=rng)
+            if name in methods and valid.any()
             else None,
             lead_over_methods={
-                other: paired_difference(ranks[name], ranks[other], clusters=clusters, rng=rng) for other in others
+                other: paired_difference(ranks[name], ranks[other], clusters=of_valid, rng=rng) for other in others
             },
             edges=interval(on_edges),
             **{truth: interval(values) for truth, values in alike[name].items()},
@@ -491,6 +577,7 @@ def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Seq
             y_px=place.now_px[:, 1],
             shapley=effect.shapley,
             shapley_error=effect.shapley_error,
+            stick=effect.stick,
             network=effect.network,
             margin=effect.margin,
             state=place.state,

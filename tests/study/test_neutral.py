@@ -1,0 +1,68 @@
+"""Neutral judge on additive games, whose answers are known."""
+
+import numpy as np
+import pytest
+
+from sliplens.study.neutral import (
+    correlate_groups,
+    draw_groups,
+    marker_sums,
+    neutral_frame,
+    place_regions,
+    split_half_reliability,
+)
+
+MARKERS = 40
+
+
+def test_an_additive_game_agrees_with_its_own_values_and_not_with_chance(rng):
+    values, groups = rng.normal(size=MARKERS), draw_groups(MARKERS, rng=rng)
+    assert all(len(set(members)) == 5 for members in groups.tolist())
+    effects = 0.1 * values[groups].sum(axis=1)
+    assert correlate_groups(values, groups, effects) == pytest.approx(1)
+    assert correlate_groups(-values, groups, effects) == pytest.approx(-1)
+    # the standard deviation of one is about 0.2
+    chance = [correlate_groups(rng.normal(size=MARKERS), groups, effects) for _ in range(400)]
+    assert np.mean(chance) == pytest.approx(0, abs=0.05)
+
+
+def test_effects_that_do_not_vary_judge_nothing_and_maps_that_do_not_vary_score_zero(rng):
+    values, groups = rng.normal(size=MARKERS), draw_groups(MARKERS, rng=rng)
+    assert np.isnan(correlate_groups(values, groups, np.zeros(len(groups))))
+    assert correlate_groups(np.zeros(MARKERS), groups, rng.normal(size=len(groups))) == 0
+
+
+def test_markers_move_to_a_frame_before_the_first_slip():
+    margins = np.array([np.nan, 1.0, 0.84, 0.5, 0.31, 0.0, 0.85, 0.3, 0.0])
+    assert neutral_frame(margins, 4) == 2
+    assert neutral_frame(margins, 7) == 2
+    assert neutral_frame(margins, 1) == 4  # too near to .85 itself
+    assert neutral_frame(margins, 2) == 4
+
+
+def test_a_pixel_is_that_of_the_marker_now_before_that_of_the_baseline():
+    now, baseline = np.array([[5.0, 5.0], [15.0, 5.0]]), np.array([[5.0, 15.0], [5.0, 6.0]])
+    regions = place_regions(24, now, baseline)
+    assert (regions[5, 5], regions[5, 15], regions[15, 5], regions[23, 23]) == (0, 1, 0, 2)
+    relevance = np.zeros((24, 24))
+    relevance[5, 5], relevance[15, 5], relevance[5, 15], relevance[23, 23] = 1.0, 2.0, 4.0, 8.0
+    np.testing.assert_array_equal(marker_sums(relevance, regions, markers=2), [3.0, 4.0])
+
+
+def test_the_reliability_is_the_correlation_with_scores_by_other_groups(rng):
+    frames, maps = 60, 6
+    truth = rng.normal(size=(frames, MARKERS))
+    noise = np.linspace(0, 3, maps)
+    values = {f"{level:.1f}": list(truth + level * rng.normal(size=truth.shape)) for level in noise}
+
+    def scores(seed: int):
+        drawn = [draw_groups(MARKERS, rng=np.random.default_rng((seed, frame))) for frame in range(frames)]
+        effects = [one[members].sum(axis=1) for one, members in zip(truth, drawn, strict=True)]
+        score = [
+            correlate_groups(*row) for of_map in values.values() for row in zip(of_map, drawn, effects, strict=True)
+        ]
+        return np.array(score), split_half_reliability(values, drawn, effects)
+
+    (first, reliability), (second, _) = scores(1), scores(2)
+    assert reliability == pytest.approx(np.corrcoef(first, second)[0, 1], abs=0.08)
+    assert split_half_reliability({}, [], []) is None
