@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import change_of
-from sliplens.explainers.explain import network_inputs
+from sliplens.explainers.explain import network_inputs, network_references
 from sliplens.explainers.shapley import shapley_values
 from sliplens.faithfulness.controls import lead_over_controls, relevance_mass
 from sliplens.faithfulness.fills import get_fill
@@ -91,8 +91,8 @@ class Places:
     """Where the network sees what moves, in pixels of its input."""
 
     units: Units
-    """For each pixel which of the frame's `markers` covers it, where it is or where it was, its rim included: its place
-    among them, or their number where there is none."""
+    """For each pixel which of the frame's `markers` covers it, where it is or where the baseline has it, its rim
+    included: its place among them, or their number where there is none."""
     markers: Bool[np.ndarray, "size size"]
     edges: Bool[np.ndarray, "size size"]
     """All markers in the image, those at its border too: their areas, and their rims alone."""
@@ -179,7 +179,12 @@ def find_places(frame: StagedFrame, *, image_size: int) -> Places:
         away = np.hypot(steps[None, None, :] - centres[:, :1, None], steps[None, :, None] - centres[:, 1:, None])
         return away - radius_px[:, None, None] * scale
 
-    rest = from_outline(outlines.rest_px, outlines.rest_radius_px)
+    if frame.baseline_frame is None:
+        rest_px, rest_radius_px = outlines.rest_px, outlines.rest_radius_px
+    else:
+        baseline = marker_outlines(frame.scene.film, frame.baseline_frame)
+        rest_px, rest_radius_px = baseline.now_px, baseline.now_radius_px
+    rest = from_outline(rest_px, rest_radius_px)
     now = from_outline(outlines.now_px, outlines.now_radius_px)
     beyond = np.minimum(rest, now)
     nearest = beyond.argmin(axis=0)
@@ -190,12 +195,10 @@ def find_places(frame: StagedFrame, *, image_size: int) -> Places:
     column, row = ((2 * steps + 1) * side // (2 * image_size) for side in (width, height))
     now_px = outlines.now_px[frame.markers]
     x, y = np.clip(np.round(now_px).astype(np.int64), 0, [width - 1, height - 1]).T
-    at = frame.baseline_frame
-    baseline_px = outlines.rest_px if at is None else frame.scene.film.marker_px[at]
     return Places(
         regions=place_regions(
             image_size,
-            *((px + 0.5) * scale - 0.5 for px in (now_px, baseline_px[frame.markers])),
+            *((px + 0.5) * scale - 0.5 for px in (now_px, rest_px[frame.markers])),
         ),
         units=np.where(covered, place[nearest], len(frame.markers)),
         markers=covered,
@@ -233,9 +236,14 @@ class FrameEffects:
     moved: Float64[np.ndarray, " groups"]
     """Prediction less that with the group moved to where it lies in the neutral frame."""
     shuffled: Float64[np.ndarray, " markers"]
-    """`shapley`, the values of half of the markers shuffled: an oracle that is half wrong."""
+    """`oracle`, the values of half of the markers shuffled: an oracle that is half wrong."""
     gains: dict[str, Float64[np.ndarray, " 3"]]
-    """Symmetric gain, under each fill, of the maps that have `shapley`, `shuffled` and |x - b|."""
+    """Symmetric gain, under each fill, of the maps that have `oracle`, `shuffled` and |x - b|."""
+
+    @property
+    def oracle(self) -> Float64[np.ndarray, " markers"]:
+        """Shapley values of the game of the explanation's baseline."""
+        return self.shapley if np.isnan(self.stick).all() else self.stick
 
 
 def shuffle_half(values: Float[np.ndarray, " markers"], *, rng: np.random.Generator) -> Float[np.ndarray, " markers"]:
@@ -345,8 +353,8 @@ class JudgingByTruth(Stage[Truth]):
     The main judge is neutral: no map is made to predict how groups of markers, moved to another margin of the trial,
     change the prediction. Beside it, marker by marker, the mean of a map is compared with Shapley values of the stick
     game, those of the untouched game, and the change by putting a marker back alone. All are signed, along the change
-    of the prediction, which leaves correlations of methods as they are and gives controls its sign. A map's mass is
-    that of its positive part.
+    of the prediction, which leaves correlations of methods as they are. A control knows no sign: it has the one that
+    suits it where leads are taken. A map's mass is that of its positive part.
     """
 
     record = FrameEffects
@@ -384,8 +392,9 @@ class JudgingByTruth(Stage[Truth]):
         trained, explained, fills, seed = self.trained, self.explained, self.fills, self.seed
         frames, places, pairs = self._staged
         inputs, redraw = network_inputs(trained, explained), redrawing(trained, frames)
-        to_stick = redrawing(trained, frames, to=[frame.baseline_frame for frame in frames])
+        put_to_baseline = redrawing(trained, frames, to=[frame.baseline_frame for frame in frames])
         move = redrawing(trained, frames, to=[frame.neutral_frame for frame in frames])
+        references = network_references(trained, explained).to(trained.device)
         # groups, each marker alone, pairs of scenes of two games, and under each fill three maps both ways
         passes = len(frames) * (GROUPS + len(frames[0].markers) + 4 * pairs + 6 * len(SHARES) * (len(fills) + 1))
         predict = prepare_passes(trained, inputs, passes)
@@ -402,14 +411,13 @@ class JudgingByTruth(Stage[Truth]):
             # a run that goes on draws the same; a first guess would lean the truth towards the map that gave it
             rng = np.random.default_rng((seed, index))
             estimate = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
-            shuffled = shuffle_half(estimate.values, rng=rng)
-            stick = np.full(count, np.nan)
+            stick, values = np.full(count, np.nan), estimate.values
             if frame.baseline_frame is not None:
-                of_stick = answer_scenes(predict, partial(to_stick, index))
-                stick = shapley_values(lambda stay: of_stick(~stay), count, pairs=pairs, rng=rng).values
-            empty = trained.encoding.empty(frame.reference, image_size=trained.manifest.image_size)
-            change = unit_means(change_of(inputs[index].cpu(), empty).double().numpy(), place.units)[:count]
-            maps = [towards * estimate.values, towards * shuffled, change]
+                of_stick = answer_scenes(predict, partial(put_to_baseline, index))
+                stick = values = shapley_values(lambda stay: of_stick(~stay), count, pairs=pairs, rng=rng).values
+            shuffled = shuffle_half(values, rng=rng)
+            change = unit_means(change_of(inputs[index], references[index]).cpu().double().numpy(), place.units)[:count]
+            maps = [towards * values, towards * shuffled, change]
             orders = [
                 unit_order(place.paint(values), place.units, least_first=least)
                 for values in maps
@@ -422,13 +430,13 @@ class JudgingByTruth(Stage[Truth]):
                         inputs[index : index + 1],
                         np.stack(orders)[:, None],
                         fill=get_fill(name),
-                        references=empty[None].to(trained.device),
+                        references=references[index : index + 1],
                         areas=SHARES,
                     )
                     for name in fills
                 }
                 by_marker = np.concatenate([influence_orders(values[None]) for values in maps])
-                curves[TRUE_FILL] = marker_curves(predict, lambda _, back: redraw(index, back), by_marker)
+                curves[TRUE_FILL] = marker_curves(predict, lambda _, back: put_to_baseline(index, back), by_marker)
             lost = {
                 name: np.trapezoid(curve.lost(np.array([towards]))[:, 0], curve.areas, axis=-1)
                 for name, curve in curves.items()
@@ -454,12 +462,12 @@ class JudgingByTruth(Stage[Truth]):
         size = trained.manifest.image_size
         # along the answer's change, as the maps are
         along = [
-            {name: sign * getattr(effect, name) for name in (*_EFFECTS, "moved", "shuffled")}
+            {name: sign * getattr(effect, name) for name in (*_EFFECTS, "moved", "oracle", "shuffled")}
             for sign, effect in zip(explained.towards, effects, strict=True)
         ]
         judged = dict(self.maps) | {
             CHANCE: np.random.default_rng(seed).random((len(frames), size, size)),
-            ORACLE: _paint(places, [rows["shapley"] for rows in along]),
+            ORACLE: _paint(places, [rows["oracle"] for rows in along]),
             DEGRADED: _paint(places, [rows["shuffled"] for rows in along]),
         }
         values = {
@@ -470,7 +478,7 @@ class JudgingByTruth(Stage[Truth]):
             for name, rows_of_map in judged.items()
         }
         # by the values themselves: the area on which they are painted is no part of them
-        values |= {ORACLE: [rows["shapley"] for rows in along], DEGRADED: [rows["shuffled"] for rows in along]}
+        values |= {ORACLE: [rows["oracle"] for rows in along], DEGRADED: [rows["shuffled"] for rows in along]}
         groups, moved = [effect.groups for effect in effects], [rows["moved"] for rows in along]
         neutral = {
             name: np.array([correlate_groups(*of_frame) for of_frame in zip(rows, groups, moved, strict=True)])
@@ -538,7 +546,12 @@ def _judge(
     # frames in which nothing changes judge nobody; the others judge all maps
     valid = np.isfinite(neutral[CHANCE])
     ranks, of_valid = {name: rows[valid] for name, rows in neutral.items()}, clusters[:, valid]
-    controls = {name: rank for name, rank in ranks.items() if is_control(name) and name != CHANCE}
+    # a control knows no sign: it has the one that suits it
+    controls = {
+        name: np.copysign(1.0, rows.mean()) * rows
+        for name, rows in ranks.items()
+        if is_control(name) and name != CHANCE and valid.any()
+    }
     rng, records = np.random.default_rng(seed), {}
     interval = partial(mean_of_defined, clusters=clusters, seed=seed, limits=(-1.0, 1.0))
     methods = [name for name in maps if not is_control(name) and name not in (ORACLE, DEGRADED)]
@@ -602,7 +615,7 @@ def true_curves(
     passes = len(frames) * (2 * len(maps) + random_orders) * (len(SHARES) - 2)
     return score_maps_by_marker(
         prepare_passes(trained, inputs, passes),
-        redrawing(trained, frames),
+        redrawing(trained, frames, to=[frame.baseline_frame for frame in frames]),
         {name: np.stack(marker_means(values, places)) for name, values in maps.items()},
         rng=np.random.default_rng(seed),
         towards=explained.towards,
