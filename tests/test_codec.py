@@ -67,26 +67,17 @@ def found() -> Found:
     )
 
 
-def same(first: object, second: object) -> bool:
-    return np.array_equal(np.asarray(first), np.asarray(second), equal_nan=np.asarray(first).dtype.kind == "f")
-
-
 def test_a_result_comes_back_as_it_was(tmp_path):
     save_result(found(), tmp_path)
     back = load_result(tmp_path, Found, command="sliplens x")
     wanted = found()
     assert (back.input, back.by_name, back.notes) == (wanted.input, wanted.by_name, ())
     assert back.parts == wanted.parts
-    assert all(same(getattr(back.rows, name), getattr(wanted.rows, name)) for name in ("trial", "frame", "margin"))
-    assert same(back.maps["grad-cam"], wanted.maps["grad-cam"])
-    assert same(back.one, wanted.one)
+    for name in ("trial", "frame", "margin"):
+        np.testing.assert_array_equal(getattr(back.rows, name), getattr(wanted.rows, name))
+    np.testing.assert_array_equal(back.maps["grad-cam"], wanted.maps["grad-cam"])
+    np.testing.assert_array_equal(back.one, wanted.one)
     assert back.rows.frame.dtype == np.int64
-
-
-def test_columns_are_a_table_with_a_row_for_each_value():
-    table = found().rows.table()
-    assert table.column_names == ["trial", "frame", "margin"]
-    assert table.num_rows == len(found().rows) == 2
 
 
 @pytest.mark.parametrize(
@@ -242,19 +233,11 @@ def test_a_record_alone_comes_back(tmp_path: Path):
     class Place:
         folder: Path
         share: float
+        config: object  # as JSON holds it
 
-    place = Place(folder=tmp_path, share=0.5)
+    place = Place(folder=tmp_path, share=0.5, config={"a": [1, 2]})
     save_record(place, tmp_path / "place.json")
     assert load_record(tmp_path / "place.json", Place, command="sliplens x") == place
-
-
-def test_what_is_declared_as_any_object_comes_back_as_json_holds_it(tmp_path: Path):
-    @dataclass(frozen=True, kw_only=True)
-    class Loose:
-        config: object
-
-    save_record(Loose(config={"a": (1, 2)}), tmp_path / "loose.json")
-    assert load_record(tmp_path / "loose.json", Loose, command="sliplens x").config == {"a": [1, 2]}
 
 
 @pytest.mark.parametrize("suffix", TABLE_SUFFIXES)

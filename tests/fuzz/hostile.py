@@ -6,11 +6,13 @@ from the file, so that what is accepted can be held against the original.
 
 import json
 import os
+import pickle
 import shutil
 import socket
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import chdir
 from dataclasses import dataclass, replace
 from functools import cache
 from io import BytesIO
@@ -29,7 +31,7 @@ from sliplens.errors import SliplensError
 from sliplens.files import hash_file, scratch_folder
 from sliplens.images import write_png
 from sliplens.models import predict
-from sliplens.recordings import import_recordings, label_dataset, load_dataset
+from sliplens.recordings import Dataset, import_recordings, label_dataset, load_dataset
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.check import check_dataset
 from sliplens.recordings.corrections import read_corrections
@@ -46,7 +48,7 @@ from sliplens.recordings.trial import Labels, TrialFacts
 from sliplens.report.results import load_results
 
 Rng = np.random.Generator
-Change = Callable[[Path, Rng], None]
+Change = Callable[[Path, Rng], object]
 """Spoils a file in place."""
 
 
@@ -54,7 +56,7 @@ Change = Callable[[Path, Rng], None]
 class Format:
     """A kind of input: how a valid one is made, which of its files are spoilt and how, and what reads it."""
 
-    make: Callable[[Path], None]
+    make: Callable[[Path], object]
     files: tuple[str, ...]
     """Patterns of the files to spoil."""
     changes: dict[str, Change]
@@ -65,11 +67,15 @@ class Format:
 
 @dataclass(frozen=True, kw_only=True)
 class Input:
-    """One hostile input."""
+    """Hostile input."""
 
     format: str
     change: str
     seed: int
+
+
+def _draw(values: Sequence[str], rng: Rng) -> str:
+    return values[int(rng.integers(len(values)))]
 
 
 def _keep(path: Path, change: Callable[[bytearray, Rng], bytes | bytearray], rng: Rng) -> None:
@@ -88,35 +94,14 @@ def _zero(data: bytearray, rng: Rng) -> bytearray:
     return data
 
 
-def _fifo(path: Path, _: Rng) -> None:
-    path.unlink()
-    os.mkfifo(path)
+def _instead(make: Callable[[Path], object]) -> Change:
+    """Put something else in the place of a file."""
+    return lambda path, _: (path.unlink(), make(path))
 
 
-def _device(path: Path, _: Rng) -> None:
-    path.unlink()
-    path.symlink_to("/dev/zero")
-
-
-def _folder(path: Path, _: Rng) -> None:
-    path.unlink()
-    path.mkdir()
-
-
-def _socket(path: Path, _: Rng) -> None:
-    path.unlink()
-    here = Path.cwd()
-    os.chdir(path.parent)  # the name of a socket is short
-    try:
-        with socket.socket(socket.AF_UNIX) as one:
-            one.bind(path.name)
-    finally:
-        os.chdir(here)
-
-
-def _loop(path: Path, _: Rng) -> None:
-    path.unlink()
-    path.symlink_to(path.name)
+def _socket(path: Path) -> None:
+    with chdir(path.parent), socket.socket(socket.AF_UNIX) as server:  # the name of a socket is short
+        server.bind(path.name)
 
 
 ANY: dict[str, Change] = {
@@ -126,11 +111,11 @@ ANY: dict[str, Change] = {
     "bytes added": lambda path, rng: _keep(path, lambda data, rng: data + rng.bytes(100), rng),
     "empty": lambda path, rng: _keep(path, lambda *_: b"", rng),
     "noise": lambda path, rng: _keep(path, lambda data, rng: rng.bytes(len(data)), rng),
-    "pipe": _fifo,
-    "device": _device,
-    "folder": _folder,
-    "socket": _socket,
-    "link to itself": _loop,
+    "pipe": _instead(os.mkfifo),
+    "device": _instead(lambda path: path.symlink_to("/dev/zero")),
+    "folder": _instead(Path.mkdir),
+    "socket": _instead(_socket),
+    "link to itself": _instead(lambda path: path.symlink_to(path.name)),
 }
 """What can happen to any file."""
 
@@ -165,7 +150,7 @@ def spoil_json(text: bytes, rng: Rng, how: str) -> bytes:
         inside[key] = inside[key] * 10**40 if isinstance(inside[key], int | float) else [inside[key]]
     else:
         inside[key] = "@here@"
-        return json.dumps(value).replace('"@here@"', str(rng.choice(np.array(_HOSTILE, dtype=object)))).encode()
+        return json.dumps(value).replace('"@here@"', _draw(_HOSTILE, rng)).encode()
     return json.dumps(value).encode()
 
 
@@ -174,17 +159,19 @@ def _json(how: str) -> Change:
 
 
 JSON: dict[str, Change] = {f"value {how}": _json(how) for how in ("replaced", "dropped", "added", "larger")}
-JSON["whole value"] = lambda path, rng: _keep(
-    path, lambda *_: str(rng.choice(np.array(_HOSTILE, dtype=object))).encode(), rng
-)
+JSON["whole value"] = lambda path, rng: _keep(path, lambda *_: _draw(_HOSTILE, rng).encode(), rng)
 
 
-def _columns(change: Callable[[pa.Table, str, Rng], pa.Table]) -> Change:
+def _columns(
+    change: Callable[[pa.Table, str, Rng], pa.Table], fits: Callable[[pa.DataType], bool] = lambda _: True
+) -> Change:
+    """Change a column whose type fits; a table without any loses its rows but the first."""
+
     def spoil(path: Path, rng: Rng) -> None:
         table = pq.read_table(path)
-        name = str(rng.choice(np.array(table.column_names, dtype=object)))
+        names = [field.name for field in table.schema if fits(field.type)]
         part = path.with_name("part")
-        pq.write_table(change(table, name, rng), part)
+        pq.write_table(change(table, _draw(names, rng), rng) if names else table.slice(0, 1), part)
         part.replace(path)
 
     return spoil
@@ -194,54 +181,45 @@ def _set(table: pa.Table, name: str, values: Any) -> pa.Table:
     return table.set_column(table.column_names.index(name), name, values)
 
 
-def _numbers(table: pa.Table, name: str, rng: Rng) -> np.ndarray:
-    """A column of numbers, that of the name or another."""
-    return table.column(name).to_numpy().astype(np.float64).copy()
+def _filled(value: object) -> Change:
+    """Put one value into all rows of a column of another type."""
+    kind = pa.scalar(value).type
+    return _columns(lambda table, name, _: _set(table, name, pa.array([value] * len(table))), lambda one: one != kind)
 
 
-def _texts(table: pa.Table, name: str, rng: Rng) -> pa.Table:
-    others = [one for one in table.column_names if not pa.types.is_string(table.schema.field(one).type)]
-    name = name if name in others else str(rng.choice(np.array(others, dtype=object)))
-    return _set(table, name, pa.array(["x"] * len(table)))
-
-
-def _moved(value: float) -> Callable[[pa.Table, str, Rng], pa.Table]:
+def _moved(value: float) -> Change:
     def change(table: pa.Table, name: str, rng: Rng) -> pa.Table:
-        names = [one for one in table.column_names if pa.types.is_floating(table.schema.field(one).type)]
-        if not names:
-            return table.slice(0, 1)
-        name = name if name in names else str(rng.choice(np.array(names, dtype=object)))
-        numbers = _numbers(table, name, rng)
+        numbers = table.column(name).to_numpy().copy()
         numbers[int(rng.integers(len(numbers)))] = value
         return _set(table, name, pa.array(numbers))
 
-    return change
+    return _columns(change, pa.types.is_floating)
 
 
 def _far(table: pa.Table, _: str, rng: Rng) -> pa.Table:
-    time = _numbers(table, "time_s", rng)
+    time = table.column("time_s").to_numpy().copy()
     time[int(rng.integers(1, len(time))) :] += float(rng.choice([1e6, 1e12, 1e300]))
     return _set(table, "time_s", pa.array(time))
 
 
 COLUMNS: dict[str, Change] = {
     "column dropped": _columns(lambda table, name, _: table.drop_columns([name])),
-    "column of texts": _columns(_texts),
-    "column of whole numbers": _columns(lambda table, name, _: _set(table, name, pa.array([1] * len(table)))),
-    "column of lists": _columns(lambda table, name, _: _set(table, name, pa.array([[1.0, 2.0]] * len(table)))),
+    "column of texts": _filled("x"),
+    "column of whole numbers": _filled(1),
+    "column of lists": _filled([1.0, 2.0]),
+    "column of bytes": _filled(b"\xff"),
     "column of nothing": _columns(lambda table, name, _: _set(table, name, pa.nulls(len(table)))),
     "column of gaps": _columns(
         lambda table, name, _: _set(table, name, pa.array([None] * len(table), table.schema.field(name).type))
     ),
-    "column of bytes": _columns(lambda table, name, _: _set(table, name, pa.array([b"\xff"] * len(table)))),
     "column twice": _columns(lambda table, name, _: table.append_column(name, table.column(name))),
     "no row": _columns(lambda table, _name, _: table.slice(0, 0)),
     "rows turned": _columns(lambda table, _name, _: table.take(np.arange(len(table))[::-1])),
     "rows doubled": _columns(lambda table, _name, _: pa.concat_tables([table, table])),
     "no metadata": _columns(lambda table, _name, _: table.replace_schema_metadata(None)),
-    "infinity": _columns(_moved(np.inf)),
-    "1e56": _columns(_moved(1e56)),
-    "-1e9": _columns(_moved(-1e9)),
+    "infinity": _moved(np.inf),
+    "1e56": _moved(1e56),
+    "-1e9": _moved(-1e9),
     "times far apart": _columns(_far),
 }
 """What can happen to a table of Parquet."""
@@ -252,7 +230,7 @@ def _header(path: Path, rng: Rng) -> None:
     metadata = dict(table.schema.metadata or {})
     key = list(metadata)[int(rng.integers(len(metadata)))]
     if key == b"sliplens":
-        metadata[key] = spoil_json(metadata[key], rng, str(rng.choice(["replaced", "dropped", "larger"])))
+        metadata[key] = spoil_json(metadata[key], rng, _draw(["replaced", "dropped", "larger"], rng))
     else:
         metadata[key] = bytes(_flip(bytearray(metadata[key]), rng))
     pq.write_table(table.replace_schema_metadata(metadata), path)
@@ -267,8 +245,7 @@ def _blobs(path: Path, rng: Rng) -> None:
     pq.write_table(_set(table, "image", pa.array(blobs, pa.binary())), path)
 
 
-TABLES = {**ANY, **COLUMNS}
-del TABLES["times far apart"]
+TABLES = {name: change for name, change in {**ANY, **COLUMNS}.items() if "times" not in name}
 TRIAL = {**ANY, **COLUMNS, "header": _header, "images": _blobs}
 
 
@@ -367,27 +344,14 @@ def _lines(change: Callable[[list[str], int, Rng], Any]) -> Change:
 
 def _cell(lines: list[str], at: int, rng: Rng) -> None:
     cells = lines[at].split(",")
-    cells[int(rng.integers(len(cells)))] = str(rng.choice(np.array(_CELLS, dtype=object)))
+    cells[int(rng.integers(len(cells)))] = _draw(_CELLS, rng)
     lines[at] = ",".join(cells)
 
 
 _CELLS = (
-    "",
-    "nan",
-    "inf",
-    "x",
-    "1e400",
-    "1e56",
-    "-1e300",
-    "9" * 5000,
-    "1_000",
-    "\x00",
-    "\x1b[2J",
-    '"',
-    "../../x",
-    "=1+1",
+    "", "nan", "inf", "x", "1e400", "1e56", "-1e300", "9" * 5000, "1_000", "\x00", "\x1b[2J", '"', "../../x", "=1+1",
     "0x10",
-)
+)  # fmt: skip
 
 
 def _put(at: int | None, text: Callable[[str, int], str]) -> Callable[[list[str], int, Rng], None]:
@@ -425,10 +389,6 @@ def bomb() -> bytes:
     return packed.getvalue()
 
 
-def _bomb(path: Path, _: Rng) -> None:
-    path.write_bytes(bomb())
-
-
 def _as(form: str, mode: str) -> Change:
     def spoil(path: Path, rng: Rng) -> None:
         with Image.open(path) as image:
@@ -446,13 +406,12 @@ def claim_size(path: Path, size: tuple[int, int]) -> None:
 
 
 def _claim(path: Path, rng: Rng) -> None:
-    width, height = rng.integers(1, 2**15, 2).tolist()
-    claim_size(path, (width, height))
+    claim_size(path, tuple(rng.integers(1, 2**15, 2).tolist()))
 
 
 PICTURE: dict[str, Change] = {
-    **ANY, "bomb": _bomb, "claims a size": _claim, "jpeg": _as("JPEG", "RGB"), "palette": _as("PNG", "P"),
-    "alpha": _as("PNG", "RGBA"), "gif": _as("GIF", "P"),
+    **ANY, "bomb": lambda path, _: path.write_bytes(bomb()), "claims a size": _claim, "jpeg": _as("JPEG", "RGB"),
+    "palette": _as("PNG", "P"), "alpha": _as("PNG", "RGBA"), "gif": _as("GIF", "P"),
 }  # fmt: skip
 
 
@@ -464,14 +423,17 @@ def _video(folder: Path) -> None:
     write_video(make_recording("cup", frames=20), folder / "cup.mkv")
 
 
-def _bag(folder: Path) -> None:
-    _data_set(folder / "data")
-    export_mcap(load_dataset(folder / "data"), folder / "bags")
+def _exported(export: Callable[[Dataset, Path], object], name: str) -> Callable[[Path], object]:
+    """Maker of an exported data set."""
+
+    def make(folder: Path) -> None:
+        _data_set(folder / "data")
+        export(load_dataset(folder / "data"), folder / name)
+
+    return make
 
 
-def _lerobot(folder: Path) -> None:
-    _data_set(folder / "data")
-    export_lerobot(load_dataset(folder / "data"), folder / "robot")
+_lerobot = _exported(export_lerobot, "robot")
 
 
 def _robot(folder: Path) -> None:
@@ -494,10 +456,6 @@ def _robot(folder: Path) -> None:
         write_video(trial, robot / f"observation.images.tactile-{index}.mkv")
 
 
-def _workspace(folder: Path) -> None:
-    write_workspace(folder / "work", trials=2)
-
-
 def _read_workspace(folder: Path) -> object:
     found = load_results(folder / "work")
     return repr(replace(found, workspace=Path("work")))
@@ -507,7 +465,7 @@ def _arrays(change: Callable[[dict[str, np.ndarray], str, Rng], Any]) -> Change:
     def spoil(path: Path, rng: Rng) -> None:
         with np.load(path) as archive:
             arrays = dict(archive)
-        change(arrays, str(rng.choice(np.array(list(arrays), dtype=object))), rng)
+        change(arrays, _draw(list(arrays), rng), rng)
         with path.open("wb") as stream:
             np.savez_compressed(stream, **arrays)
 
@@ -556,7 +514,7 @@ def _tensors(path: Path, rng: Rng) -> None:
     """Another header over the same numbers."""
     data = path.read_bytes()
     size = int.from_bytes(data[:8], "little")
-    head = spoil_json(data[8 : 8 + size].strip(), rng, str(rng.choice(["replaced", "dropped", "larger"])))
+    head = spoil_json(data[8 : 8 + size].strip(), rng, _draw(["replaced", "dropped", "larger"], rng))
     path.write_bytes(len(head).to_bytes(8, "little") + head + data[8 + size :])
 
 
@@ -567,17 +525,10 @@ def _not_finite(path: Path, rng: Rng) -> None:
     path.write_bytes(data)
 
 
-def _toml(folder: Path) -> None:
-    (folder / "tip.toml").write_text(
-        'name = "tip"\ncamera_size_px = [640, 480]\ncrop_px = [80, 0, 480, 480]\nresize_px = [224, 224]\n'
-        "frame_rate_hz = 30.0\n"
-    )
-
-
 def _value(path: Path, rng: Rng) -> None:
     lines = path.read_text().splitlines()
     at = int(rng.choice([row for row, line in enumerate(lines) if "=" in line]))
-    value = str(rng.choice(np.array((*_HOSTILE, "nan", "inf", "1979-05-27", "'x", "{ a = 1 }"), dtype=object)))
+    value = _draw((*_HOSTILE, "nan", "inf", "1979-05-27", "'x", "{ a = 1 }"), rng)
     lines[at] = lines[at].split("=")[0] + "= " + value
     path.write_text("\n".join(lines))
 
@@ -590,20 +541,27 @@ def _read_toml(folder: Path) -> object:
     return profile, profile.output_size((480, 640))
 
 
-def _splits(folder: Path) -> None:
-    (folder / "splits.csv").write_text("trial,split\nmug-1,test\nc*,validation\n*,train\n")
-
-
 def _read_splits(folder: Path) -> object:
     trials = [TrialFacts(trial=f"{name}-{day}", day=day) for name in ("mug", "cup", "jar") for day in (1, 2)]
     return assign_splits(trials, read_split_table(folder / "splits.csv")).splits
 
 
-def _corrections(folder: Path) -> None:
-    (folder / "corrections.csv").write_text(
-        "trial,exclude,reference_frame,slip_s,tare,normal_sign,mu,bad_frames\n"
-        "trial-0,,5,1.25,0.1 0 -0.2,-1,0.7,2..3 9\ntrial-1,yes,,,,,,\n"
-    )
+TEXTS = {
+    "splits.csv": "trial,split\nmug-1,test\nc*,validation\n*,train\n",
+    "corrections.csv": "trial,exclude,reference_frame,slip_s,tare,normal_sign,mu,bad_frames\n"
+    "trial-0,,5,1.25,0.1 0 -0.2,-1,0.7,2..3 9\ntrial-1,yes,,,,,,\n",
+    "tip.toml": 'name = "tip"\ncamera_size_px = [640, 480]\ncrop_px = [80, 0, 480, 480]\nresize_px = [224, 224]\n'
+    "frame_rate_hz = 30.0\n",
+}
+
+
+def _text(name: str) -> Callable[[Path], object]:
+    """Maker of a folder with one of `TEXTS`."""
+    return lambda folder: (folder / name).write_text(TEXTS[name])
+
+
+def _read_corrections(folder: Path) -> object:
+    return read_corrections(folder / "corrections.csv")
 
 
 def _frames_of(name: str, **options: Any) -> Callable[[Path], object]:
@@ -616,25 +574,28 @@ FORMATS = {
     "data set": Format(_data_set, ("dataset.json",), {**ANY, **JSON}, _read_data_set),
     "trial": Format(_data_set, ("trials/trial-0.parquet",), TRIAL, _read_data_set, _hashes),
     "samples": Format(_data_set, ("forces/trial-0.parquet",), {**ANY, **COLUMNS}, _labels, _hashes),
-    "corrections": Format(
-        _corrections, ("corrections.csv",), MANY, lambda folder: read_corrections(folder / "corrections.csv")
-    ),
-    "stages": Format(_workspace, ("work/*/*.json",), {**ANY, **JSON}, _read_workspace),
-    "tables": Format(_workspace, ("work/*/*.parquet",), TABLES, _read_workspace),
-    "arrays": Format(_workspace, ("work/*/arrays.npz",), ARRAYS, _read_workspace),
+    "corrections": Format(_text("corrections.csv"), ("corrections.csv",), MANY, _read_corrections),
+    **{
+        name: Format(lambda folder: write_workspace(folder / "work", trials=2), (files,), changes, _read_workspace)
+        for name, files, changes in (
+            ("stages", "work/*/*.json", {**ANY, **JSON}),
+            ("tables", "work/*/*.parquet", TABLES),
+            ("arrays", "work/*/arrays.npz", ARRAYS),
+        )
+    },
     "network": Format(_network, ("run/manifest.json",), {**ANY, **JSON}, _read_network),
     "weights": Format(_network, ("run/model.safetensors",), _WEIGHTS, _read_network, _weights_hash),
     "forces": Format(
         _own, ("forces.csv",), {**ANY, **TABLE}, lambda folder: _import(folder, forces=folder / "forces.csv")
     ),
-    "splits": Format(_splits, ("splits.csv",), MANY, _read_splits),
+    "splits": Format(_text("splits.csv"), ("splits.csv",), MANY, _read_splits),
     "manifest": Format(_own, ("many.csv",), MANY, lambda folder: _import(folder, "many.csv")),
     "images": Format(_own, ("cup/0*.png",), PICTURE, _frames_of("cup", frame_rate=30.0)),
     "video": Format(_video, ("cup.mkv",), ANY, _frames_of("cup.mkv")),
-    "bag": Format(_bag, ("bags/trial-0.mcap",), ANY, _frames_of("bags/trial-0.mcap")),
+    "bag": Format(_exported(export_mcap, "bags"), ("bags/trial-0.mcap",), ANY, _frames_of("bags/trial-0.mcap")),
     "lerobot": Format(_lerobot, ("robot/meta/info.json",), {**ANY, **JSON}, _frames_of("robot")),
     "lerobot tables": Format(_lerobot, _ROBOT, TABLES, _frames_of("robot")),
-    "toml": Format(_toml, ("*.toml",), TOML, _read_toml),
+    "toml": Format(_text("tip.toml"), ("*.toml",), TOML, _read_toml),
     "robot": Format(_robot, _ROBOT, TABLES, _frames_of("robot")),
 }
 """Every kind of input."""
@@ -715,9 +676,11 @@ def outcome(one: Input, originals: Path, folder: Path) -> tuple[str, str]:
     return ("wrong" if one.change in IMPOSSIBLE else "accepted"), ""
 
 
-@cache
 def whole_reading(name: str, originals: Path) -> object:
-    """What is read of a valid input."""
-    with scratch_folder() as folder:
-        shutil.copytree(original(name, originals), folder / "input")
-        return FORMATS[name].read(folder / "input")
+    """Reading of a valid input, stored beside it."""
+    stored = originals / f"{name}.pickle"
+    if not stored.is_file():
+        with scratch_folder() as folder:
+            shutil.copytree(original(name, originals), folder / "input")
+            stored.write_bytes(pickle.dumps(FORMATS[name].read(folder / "input")))
+    return pickle.loads(stored.read_bytes())  # noqa: S301 (written by this function)

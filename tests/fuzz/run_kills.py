@@ -12,7 +12,6 @@ of `UNLIKE`. Each run is a fork of this process, which has imported everything. 
 and goes on after those that are there; `--json` ends with one line of JSON.
 """
 
-import argparse
 import hashlib
 import json
 import os
@@ -24,10 +23,9 @@ import sys
 import tempfile
 import time
 import traceback
-from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from fnmatch import fnmatch
 from functools import partial
@@ -44,6 +42,7 @@ import pyarrow as pa  # noqa: E402
 import torch  # noqa: E402
 from changes import count_changes  # noqa: E402
 from hostile import FORMATS  # noqa: E402
+from outcomes import in_a_child, parser, resume, tabulate  # noqa: E402
 from small import make_recording, save_untrained  # noqa: E402
 
 import sliplens.cli.output  # noqa: E402
@@ -94,9 +93,9 @@ CASES = {
     "score": Case(("score", "@/run", "@/explained", "-o", "out", "--steps", "8")),
     "study": Case(("study", "@/drawn", "-o", "out", "--network", "@/of-drawn", *_QUICK)),
     "track": Case(("track", "@/drawn", "-o", "out.parquet")),
-    "export --onnx": Case(("export", "@/run", "-o", "out.onnx", "--onnx")),
-    "export --lerobot": Case(("export", "@/data", "-o", "out", "--lerobot")),
-    "export --mcap": Case(("export", "@/data", "-o", "out", "--mcap")),
+    "export onnx": Case(("export", "onnx", "@/run", "-o", "out.onnx")),
+    "export lerobot": Case(("export", "lerobot", "@/data", "-o", "out")),
+    "export mcap": Case(("export", "mcap", "@/data", "-o", "out")),
     "live": Case(("live", "@/data", "--speed", "2", "--no-page", "--record", "out"), grows=True),
     "grip": Case(("grip", "-o", "out", "--controller", "margin", "--episodes", "12")),
 }  # fmt: skip
@@ -305,33 +304,14 @@ class Bench:
 
     def __init__(self, base: Path) -> None:
         self.material, self.work = base / "material", base / "work"
-        self._in_a_child(lambda: make_material(self.material))
+        in_a_child(lambda: make_material(self.material))
         self.work.mkdir()
-        self.own_disk = os.geteuid() == 0 and self._mount("size=1g") == 0
+        self.own_disk = os.geteuid() == 0 and self.mount("size=1g", new=True)
 
-    @staticmethod
-    def _in_a_child(work: Callable[[], None]) -> None:
-        """Do something in a process of its own, whose threads stay there."""
-        child = os.fork()
-        if not child:
-            code = 1
-            try:
-                work()
-                code = 0
-            finally:
-                os._exit(code)
-        if os.waitpid(child, 0)[1]:
-            raise SystemExit("the material could not be made")
-
-    def _mount(self, options: str) -> int:
-        return subprocess.run(
-            ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(self.work)], capture_output=True, check=False
-        ).returncode
-
-    def remount(self, options: str) -> bool:
-        """Change the disk; whether that was let."""
-        words = ["mount", "-o", f"remount,{options}", str(self.work)]
-        return subprocess.run(words, capture_output=True, check=False).returncode == 0
+    def mount(self, options: str, *, new: bool = False) -> bool:
+        """Make or change the disk; True if the system lets it."""
+        words = ["-t", "tmpfs", "-o", options, "tmpfs"] if new else ["-o", f"remount,{options}"]
+        return subprocess.run(["mount", *words, str(self.work)], capture_output=True, check=False).returncode == 0
 
     def close(self) -> None:
         """Give the disk back."""
@@ -346,16 +326,16 @@ class Bench:
         for name in case.copies:
             shutil.copytree(self.material / name, self.work / name)
 
-    def words(self, case: Case) -> tuple[str, ...]:
-        """Words of a command with the material's place."""
-        return tuple(word.replace("@", str(self.material)) for word in case.words)
+    def run(self, case: Case, **limits: Any) -> Run:
+        """Begin a command with the material's place in its words."""
+        return Run(tuple(word.replace("@", str(self.material)) for word in case.words), self.work, **limits)
 
     def undisturbed(self, name: str) -> tuple[Ended, dict[str, str]]:
         """How a command ends that nothing disturbs, and what it makes."""
         case = CASES[name]
         self.prepare(case)
         used = shutil.disk_usage(self.work).used
-        ended = Run(self.words(case), self.work).end()
+        ended = self.run(case).end()
         if ended.code:
             raise SystemExit(f"{name} fails undisturbed ({ended.code}): {ended.said[-2000:]}")
         ended.facts["bytes"] = shutil.disk_usage(self.work).used - used
@@ -363,29 +343,29 @@ class Bench:
 
     def disturbed(self, fault: Fault, whole: Ended) -> tuple[Ended, ...]:
         """Run a command with a fault; how it ended, and the other one of two."""
-        words, moment, facts = self.words(CASES[fault.case]), fault.at * whole.seconds, whole.facts
+        case, moment, facts = CASES[fault.case], fault.at * whole.seconds, whole.facts
         if fault.kind == "disk" and self.own_disk:
             room = shutil.disk_usage(self.work).used + int(fault.at * facts["bytes"]) // 4096 * 4096
-            self.remount(f"size={max(room, 4096)}")
+            self.mount(f"size={max(room, 4096)}")
         limits: dict[str, Any] = {
             "kill at a change": {"kill_before": 1 + int(fault.at * facts["changes"])},
             "memory": {"room": int(fault.at * facts["room"])},
             "disk": {} if self.own_disk else {"most_file": int(4096 * 4 ** (6 * fault.at))},
             "clock": {"clock": fault.much < 0.5},
         }
-        run = Run(words, self.work, **limits.get(fault.kind, {}))
+        run = self.run(case, **limits.get(fault.kind, {}))
         if fault.kind not in {"kill at a change", "memory", "disk"}:  # these have their moments
             run.ended(0.0 if fault.kind == "read-only" and fault.much < 0.3 else moment)
-        second = Run(words, self.work) if fault.kind == "twice" else None
-        while fault.kind == "read-only" and not self.remount("ro") and not run.ended(0):
+        second = self.run(case) if fault.kind == "twice" else None
+        while fault.kind == "read-only" and not self.mount("ro") and not run.ended(0):
             time.sleep(0.01)  # refused while a file is open to be written
         if fault.kind == "removed":
-            for path in [one for one in self.work.iterdir() if one.name not in {"tmp", *CASES[fault.case].copies}]:
+            for path in [one for one in self.work.iterdir() if one.name not in {"tmp", *case.copies}]:
                 shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
         signals = {"kill": signal.SIGKILL, "clock": signal.SIGKILL, "interrupt": signal.SIGINT}
         ended = [run.end(signals.get(fault.kind)), *([second.end()] if second else [])]
         if self.own_disk:
-            self.remount("rw,size=1g")
+            self.mount("rw,size=1g")
         if fault.kind == "clock":  # all that is there is of tomorrow
             tomorrow = time.time() + 86_400
             for path in self.work.rglob("*"):
@@ -400,7 +380,7 @@ class Bench:
         runs = self.disturbed(fault, whole)
         how = " and ".join("killed" if one.code < 0 else f"code {one.code}" for one in runs)
         recorded = journalled(self.work / "out") if case.grows else 0
-        again = Run(self.words(case), self.work).end()
+        again = self.run(case).end()
         if unfair := next((one for one in (*runs, again) if not one.fair), None):
             return "hang" if unfair.code == -signal.SIGALRM else "traceback", f"{how}: {unfair.said[-3000:]}"
         if case.grows:
@@ -422,11 +402,8 @@ class Bench:
         frames = [info.frames for info in data.trials]
         if sum(frames[:-1]) < recorded:
             return "lost", f"{how}: {recorded} frames were recorded, {frames} are there"
-        named = {
-            "dataset.json",
-            *(f"{kind}/{info.trial}.parquet" for info in data.trials for kind in ("trials", "forces")),
-        }
-        others = sorted(set(snapshot(data.folder)) - named) + sorted(set(snapshot(self.work / "tmp")))
+        named = {f"{kind}/{info.trial}.parquet" for info in data.trials for kind in ("trials", "forces")}
+        others = sorted({*snapshot(data.folder)} - {*named, "dataset.json"}) + sorted(snapshot(self.work / "tmp"))
         return ("orphan", f"{how}: {others[:5]}") if others else ("same", f"{how}, trials of {frames} frames")
 
 
@@ -442,60 +419,33 @@ def journalled(folder: Path) -> int:
     return count
 
 
-def run(count: int, seed: int, only: list[str], keep: Path | None, bench: Bench) -> Iterator[tuple[Fault, str, str]]:
-    """Outcomes of so many faults, those that are kept first."""
-    known: dict[Fault, tuple[str, str]] = {}
-    if keep is not None and keep.is_file():
-        for line in keep.read_text().splitlines():
-            row = json.loads(line)
-            known[Fault(**row["fault"])] = row["outcome"], row["said"]
+def judge(rest: list[Fault], bench: Bench) -> Iterator[tuple[Fault, str, str]]:
+    """Outcomes of faults, beside undisturbed runs of their commands."""
     wholes: dict[str, tuple[Ended, dict[str, str]]] = {}
-    drawn = [one for one in faults(count, seed=seed) if not only or one.case in only or one.kind in only]
-    for number, fault in enumerate(drawn, start=1):
-        if fault not in known:
-            # no bar: its thread may hold a lock at the moment of a fork, which the child would wait for in vain
-            say(f"{number} of {len(drawn)}: {fault.case}, {fault.kind}", aside=True)
-            if fault.case not in wholes:
-                wholes[fault.case] = bench.undisturbed(fault.case)
-            known[fault] = bench.outcome(fault, *wholes[fault.case])
-            if keep is not None:
-                keep.parent.mkdir(parents=True, exist_ok=True)
-                with keep.open("a") as stream:
-                    outcome, said = known[fault]
-                    stream.write(json.dumps({"fault": asdict(fault), "outcome": outcome, "said": said}) + "\n")
-        yield fault, *known[fault]
+    for number, fault in enumerate(rest, start=1):
+        # no bar: its thread may hold a lock at the moment of a fork, which the child would wait for in vain
+        say(f"{number} of {len(rest)}: {fault.case}, {fault.kind}", aside=True)
+        if fault.case not in wholes:
+            wholes[fault.case] = bench.undisturbed(fault.case)
+        yield fault, *bench.outcome(fault, *wholes[fault.case])
 
 
 def main() -> None:
     """Disturb commands, and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--faults", type=int, default=20)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", nargs="*", default=[], metavar="NAME", help="commands or kinds of faults, of those")
-    parser.add_argument("--keep", type=Path)
-    parser.add_argument("--json", action="store_true")
-    given = parser.parse_args()
+    options = parser(__doc__, cases="faults", count=20)
+    options.add_argument("--only", nargs="*", default=[], metavar="NAME", help="commands or kinds of faults, of those")
+    given = options.parse_args()
     torch.set_num_threads(1)
     shorten_study()
-    table: dict[str, Counter[str]] = {name: Counter() for name in CASES}
-    began, failures = time.perf_counter(), []
+    drawn = faults(given.count, seed=given.seed)
+    wanted = [one for one in drawn if not given.only or one.case in given.only or one.kind in given.only]
     with tempfile.TemporaryDirectory(prefix="kills-") as base, closing(Bench(Path(base))) as bench:
-        for fault, outcome, said in run(given.faults, given.seed, given.only, given.keep, bench):
-            table[fault.case][outcome] += 1
-            if outcome not in SURVIVED:
-                failures.append(f"  {outcome}: {fault}  {said}")
-        own_disk = bench.own_disk
-    print(f"{'':18}" + "".join(f"{kind:>10}" for kind in OUTCOMES))
-    for name, counts in table.items():
-        print(f"{name:18}" + "".join(f"{counts[kind] or '':>10}" for kind in OUTCOMES))
-    total = sum(table.values(), Counter())
-    print(f"{'all':18}" + "".join(f"{total[kind] or '':>10}" for kind in OUTCOMES), *failures, sep="\n")
-    if not own_disk:
-        print("this machine mounts no disk for it: a full disk was a limit on the size of a file, none was read-only")
-    if given.json:
-        survived = sum(total[kind] for kind in SURVIVED)
-        figures = {"faults": total.total(), "survived": survived, "orphans": total["orphan"]}
-        print(json.dumps({**figures, "minutes": round((time.perf_counter() - began) / 60, 2)}))
+        if not bench.own_disk:
+            print("this machine mounts no disk: a full disk is a limit on the size of a file, none is read-only")
+        print(tabulate(
+            resume(given.keep, wanted, Fault, lambda rest: judge(rest, bench)), lambda fault: fault.case,
+            rows=CASES, columns=OUTCOMES, passed=SURVIVED, as_json=given.json,
+        ))  # fmt: skip
 
 
 if __name__ == "__main__":

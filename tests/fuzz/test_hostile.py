@@ -13,7 +13,7 @@ from hostile import FORMATS, IMPOSSIBLE, Input, claim_size, inputs, outcome
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sliplens.codec import COLUMN_KINDS, from_builtins, open_parquet
+from sliplens.codec import from_builtins, open_parquet
 from sliplens.errors import ImageError, InputError, RecordingError, SliplensError
 from sliplens.files import parse_json, require_file
 from sliplens.friction import MOST_FRICTION, Friction
@@ -134,13 +134,6 @@ def test_whatever_is_no_file_is_not_opened(tmp_path: Path):
     assert require_file(tmp_path / "file") == 3
     with pytest.raises(InputError, match="has 3 bytes, and no such file has more than 2"):
         require_file(tmp_path / "file", most=2)
-
-
-def test_a_kind_of_column_is_what_its_words_say():
-    kinds = {"numbers": pa.float32(), "whole numbers": pa.int8(), "texts": pa.string(), "bytes": pa.binary()}
-    for words, kind in kinds.items():
-        fitting = {name for name, fits in COLUMN_KINDS.items() if fits(kind)} - {"values"}
-        assert fitting == {words} | ({"numbers"} if words == "whole numbers" else set())
 
 
 def test_a_small_table_that_claims_to_be_large_is_not_read(tmp_path: Path):

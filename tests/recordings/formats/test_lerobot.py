@@ -252,16 +252,10 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
 @pytest.mark.parametrize(
     "template",
     [
-        "../{video_key}.mp4",
-        "videos/../../secret.mp4",
-        "/etc/{video_key}.mp4",
-        "{video_key.__class__}.mp4",
-        "{chunk_index:999999999d}.mp4",
-        "{0}.mp4",
-        "a\0b.mp4",
-        "",
+        "../{video_key}.mp4", "videos/../../secret.mp4", "/etc/{video_key}.mp4", "{video_key.__class__}.mp4",
+        "{chunk_index:999999999d}.mp4", "{0}.mp4", "a\0b.mp4", "",
     ],
-)
+)  # fmt: skip
 def test_a_template_that_leads_out_of_the_data_set_is_refused(dataset, template):
     write_info(dataset, lambda info: info.update(video_path=template))
     refused(read_lerobot, dataset, "which leads out of the data set or cannot be filled in")
@@ -299,18 +293,17 @@ def test_a_video_that_ends_too_early_is_refused_when_it_is_read(dataset, frames)
 
 def test_tables_that_contradict_the_metadata_are_refused(dataset):
     starts = np.cumsum([0, *LENGTHS])
-    write_episodes(dataset, starts, length=[7, 4, 6])
-    refused(read_lerobot, dataset, r"has 5 frames of episode 1, its metadata say 4; leave the episode out")
-    write_episodes(dataset, starts, episode_index=[0, 1, 1])
-    refused(read_lerobot, dataset, "lists episode 1 twice")
-    write_episodes(dataset, starts, **{f"videos/{CAMERA}/from_timestamp": [0.0, None, 0.0]})
-    refused(read_lerobot, dataset, r"has gaps in the column 'videos/.*/from_timestamp'; copy the data set")
-    write_episodes(dataset, starts, **{f"videos/{CAMERA}/from_timestamp": [0.0, np.inf, 0.0]})
-    refused(read_lerobot, dataset, "begins episode 1 at inf s of a video")
-    write_episodes(dataset, starts, episode_index=["0", "1", "2"])
-    refused(read_lerobot, dataset, r"holds string as .episode_index. where whole numbers belong")
-    write_episodes(dataset, starts, **{"data/file_index": ["0", "0", "1"]})
-    refused(read_lerobot, dataset, r"holds string as .data/file_index. where whole numbers belong")
+    from_timestamp = f"videos/{CAMERA}/from_timestamp"
+    for name, values, message in (
+        ("length", [7, 4, 6], r"has 5 frames of episode 1, its metadata say 4; leave the episode out"),
+        ("episode_index", [0, 1, 1], "lists episode 1 twice"),
+        (from_timestamp, [0.0, None, 0.0], r"has gaps in the column 'videos/.*/from_timestamp'; copy the data set"),
+        (from_timestamp, [0.0, np.inf, 0.0], "begins episode 1 at inf s of a video"),
+        ("episode_index", ["0", "1", "2"], r"holds string as .episode_index. where whole numbers belong"),
+        ("data/file_index", ["0", "0", "1"], r"holds string as .data/file_index. where whole numbers belong"),
+    ):
+        write_episodes(dataset, starts, **{name: values})
+        refused(read_lerobot, dataset, message)
     write_episodes(dataset, starts)
     write_info(dataset, lambda info: info["features"][FORCE].update(shape=[3]))
     refused(read_lerobot, dataset, r"does not hold 3 numbers a frame, as meta/info\.json says")

@@ -46,9 +46,7 @@ def test_it_is_laid_out_as_the_library_lays_it_out(exported):
     info = read_info(exported)
     assert list(info) == list(library["info"])
     ours = {"total_episodes", "total_frames", "total_tasks", "splits", "features"}
-    assert {key: value for key, value in info.items() if key not in ours} == {
-        key: value for key, value in library["info"].items() if key not in ours
-    }
+    assert {**info, **dict.fromkeys(ours)} == {**library["info"], **dict.fromkeys(ours)}
     # of the same features it says the same; size of the image and names are ours
     for name, feature in library["info"]["features"].items():
         assert info["features"][name]["dtype"] == feature["dtype"]
@@ -92,11 +90,8 @@ def test_counts_and_places_agree(exported):
 
 
 def test_features_hold_the_labels_and_images_of_the_frames(data, exported):
-    rows, features, first = (
-        read_rows(exported).slice(0, 40),
-        read_info(exported)["features"],
-        read_stored(data.folder)[0],
-    )
+    rows, features = read_rows(exported).slice(0, 40), read_info(exported)["features"]
+    first = read_stored(data.folder)[0]
     labels = there(first.labels)
     expected = np.stack([labels.tangential_force_n, np.zeros(40), labels.normal_force_n], axis=1)
     np.testing.assert_array_equal(np.array(rows["observation.force"].to_pylist()), expected)
@@ -106,9 +101,7 @@ def test_features_hold_the_labels_and_images_of_the_frames(data, exported):
     np.testing.assert_array_equal(rows["observation.time_s"].to_numpy(), first.frame_time_s)
     for name, words in (("contact_state", labels.contact_state), ("invalid_reason", labels.reason)):
         values = features[f"observation.{name}"]["info"]["values"]
-        assert [values[code] for code in rows[f"observation.{name}"].to_pylist()] == [
-            str(word) for word in there(words)
-        ]
+        assert [values[code] for code in rows[f"observation.{name}"].to_pylist()] == [*map(str, there(words))]
     cells = rows["observation.images.tactile"].to_pylist()
     for index, frame in enumerate(first.read_frames()):
         assert cells[index]["path"] == f"frame-{index:06d}.png"

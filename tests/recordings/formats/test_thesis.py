@@ -95,15 +95,10 @@ def test_shuffled_frames_are_put_in_order_with_their_margins(data: Path, images:
 
 @pytest.mark.parametrize(
     ("lines", "unit"),
-    [
-        (["100", "60", "20"], None),
-        (["gamma", "1.0", "0.6", "0.2"], None),
-        (["100", "60", "20"], "percent"),
-        (["1.0", "0.6", "0.2"], "fraction"),
-    ],
+    [("100 60 20", None), ("gamma 1.0 0.6 0.2", None), ("100 60 20", "percent"), ("1.0 0.6 0.2", "fraction")],
 )
-def test_margins_are_read_in_percent_or_as_fractions(data: Path, lines: list[str], unit: str | None):
-    (trial,) = read_thesis(write_lists(data, FRAMES, REFERENCE, lines), margin_unit=unit)
+def test_margins_are_read_in_percent_or_as_fractions(data: Path, lines: str, unit: str | None):
+    (trial,) = read_thesis(write_lists(data, FRAMES, REFERENCE, lines.split()), margin_unit=unit)
     np.testing.assert_allclose(margins_of(trial), [1, 0.6, 0.2])
 
 
@@ -124,12 +119,7 @@ def test_the_folder_of_one_list_is_enough(data: Path):
         (FRAMES, REFERENCE, ["1.2", "0.6", "0.2"], r"gamma\.csv: safety_margin of frame 0 is 1\.2, outside \[0, 1\]"),
         (FRAMES, REFERENCE, ["150", "0.6", "0.2"], r"safety_margin of frame 0 is 1\.5, outside"),
         (FRAMES, REFERENCE, ["nan", "nan", "nan"], "holds no safety margin"),
-        (
-            [*FRAMES[:2], "trial77/L/image_7.tiff"],
-            REFERENCE,
-            MARGINS,
-            "images_L.txt, line 3: .* is not there, nor under",
-        ),
+        ([*FRAMES[:2], "trial77/L/image_7.tiff"], REFERENCE, MARGINS, "L.txt, line 3: .* is not there, nor under"),
         ([*FRAMES[:2], FRAMES[0]], REFERENCE, MARGINS, "twice with one reference"),
         ([*FRAMES[:2], "../../etc/passwd"], REFERENCE, MARGINS, "line 3: .* leads out of"),
         ([*FRAMES[:2], "x" * 5000], REFERENCE, MARGINS, "line 3: .* is not there"),
