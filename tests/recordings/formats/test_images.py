@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 from readers import read_image_folder, refused
 
-from sliplens.errors import ImageError, RecordingError
+from sliplens.errors import ImageError
 from sliplens.images import write_png
 
 
@@ -59,21 +59,11 @@ def test_names_hold_times_where_that_is_declared(tmp_path: Path, frames: np.ndar
     np.testing.assert_allclose(read_image_folder(tmp_path, name_unit="ms").frame_time_s, [0.0125, 0.01325, 0.101])
 
 
-def test_forces_lie_beside_the_frames(folder: Path, tmp_path: Path):
-    table = tmp_path / "forces.csv"
-    table.write_text("t,fx,fy,fz\n100,1,2,3\n100.1,1,2,3\n")
-    capture = read_image_folder(folder, frame_rate=30.0, forces=table, start_s=100.0, time_unit="s")
-    assert capture.forces is not None
-    np.testing.assert_allclose(capture.forces.time_s, [100, 100.1])
-    np.testing.assert_allclose(capture.frame_time_s, 100 + np.arange(12) / 30)
-    with pytest.raises(RecordingError, match=r"have no moment in common; give --start-s"):
-        read_image_folder(folder, frame_rate=30.0, forces=table, time_unit="s")
-
-
 def test_times_must_be_given_in_one_way(folder: Path):
     refused(read_image_folder, folder, "trial 7 have no times; give one of --times, --frame-rate,")
     refused(read_image_folder, folder, "more than one source of times", frame_rate=30.0, name_unit="s")
-    refused(read_image_folder, folder, r"a frame rate of 0\.0 frames/s cannot be", frame_rate=0.0)
+    for rate in (0.0, -8.0, float("nan"), float("inf")):
+        refused(read_image_folder, folder, f"a frame rate of {rate} frames/s cannot be", frame_rate=rate)
 
 
 @pytest.mark.parametrize(

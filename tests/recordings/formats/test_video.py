@@ -111,12 +111,6 @@ def test_a_stream_without_stamps_needs_a_declared_rate(tmp_path: Path):
     np.testing.assert_allclose([frame.mean() for frame in capture.read_frames()], 20 + 6 * np.arange(6), atol=2.5)
 
 
-@pytest.mark.parametrize("rate", [0.0, -8.0, float("nan"), float("inf")])
-def test_a_rate_that_cannot_be_is_refused(tmp_path: Path, rate: float):
-    with pytest.raises(RecordingError, match="cannot be; declare a positive one"):
-        read_video(write_video(tmp_path / "a.mkv", brightening(2)), frame_rate=rate)
-
-
 def test_skipped_frames_keep_the_times_of_the_rest(tmp_path: Path):
     path = write_video(tmp_path / "a.mkv", brightening(6))
     capture = read_video(path, skip_frames=2)
