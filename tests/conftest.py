@@ -20,7 +20,7 @@ from hypothesis import settings
 from small import make_recording, save_untrained
 
 from sliplens.images import absolute_difference, write_png
-from sliplens.models import load_checkpoint, save_checkpoint
+from sliplens.models import load, save_checkpoint
 from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.sequence import SequenceHead, SequenceManifest
 from sliplens.recordings import Dataset, Recording
@@ -130,7 +130,7 @@ def sequence_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sure = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
     traction = Traction(calibration=sure, told=sure, friction=(0.2, 0.7, 1.2))
     folder = save_untrained(tmp_path_factory.mktemp("sequence") / "run", traction=traction)
-    alone = load_checkpoint(folder)
+    alone = load(folder)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(3)
         head = SequenceHead(alone.model.get_buffer("edges"), alone.model.get_buffer("ratio_edges"))

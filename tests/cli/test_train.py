@@ -18,7 +18,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sliplens.cli import main
-from sliplens.models import load_checkpoint
+from sliplens.models import load
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import trial_path, write_dataset_table
 from sliplens.recordings.store import save_recording
@@ -161,7 +161,7 @@ def test_a_loss_that_diverges_leaves_the_best_network_to_use(
     line = refused(capsys, small_dataset.folder, tmp_path / "run")
     assert "the training loss is inf in epoch 2, at step 5; lower the learning rate" in line
     assert "lower the learning rate" in line
-    kept = load_checkpoint(tmp_path / ".run.partial")
+    kept = load(tmp_path / ".run.partial")
     assert f"the best network so far, of validation MSE {kept.manifest.metrics['validation_mse']:.4g}, is in" in line
 
 
@@ -203,7 +203,7 @@ def test_no_label(small_dataset: Dataset, tmp_path: Path, capsys):
 
 def test_it_goes_on_from_a_network_at_another_size(finished: Path, small_dataset: Dataset, tmp_path: Path):
     assert train(small_dataset.folder, tmp_path / "more", "--start-from", str(finished), "--image-size", "48") == 0
-    start, more = load_checkpoint(finished).manifest, load_checkpoint(tmp_path / "more").manifest
+    start, more = load(finished).manifest, load(tmp_path / "more").manifest
     assert more.started_from == start.weights_sha256
     assert more.image_size == 48
     recipe = json.loads((tmp_path / "more" / "run.json").read_text())["config"]

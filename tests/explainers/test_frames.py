@@ -8,18 +8,18 @@ from PIL import Image
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.explainers.frames import FrameSelection, frames_from_dataset, frames_from_folder
 from sliplens.images import write_png
-from sliplens.models import Network, load_checkpoint
+from sliplens.models import Network, load
 from sliplens.recordings import Dataset
 
 
 @pytest.fixture
 def difference(difference_run: Path) -> Network:
-    return load_checkpoint(difference_run)
+    return load(difference_run)
 
 
 @pytest.fixture
 def raw(raw_run: Path) -> Network:
-    return load_checkpoint(raw_run)
+    return load(raw_run)
 
 
 def test_frames_are_those_nearest_to_the_levels(difference: Network, small_dataset: Dataset):

@@ -8,7 +8,7 @@ from small import IMAGE_SIZE, save_untrained
 from torch import Tensor, nn
 from torch.nn import functional
 
-from sliplens.models import Network, load_checkpoint
+from sliplens.models import Network, load
 from sliplens.models.backbones import HistogramRegressor
 from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.onnx import export_onnx
@@ -56,7 +56,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="session")
 def networks(runs: dict[str, Path]) -> dict[str, Network]:
-    return {head: load_checkpoint(folder) for head, folder in runs.items()}
+    return {head: load(folder) for head, folder in runs.items()}
 
 
 @pytest.fixture(scope="session")

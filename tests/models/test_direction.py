@@ -12,7 +12,7 @@ from sliplens.live.frame_reader import FrameReader
 from sliplens.live.health import HealthMonitor
 from sliplens.live.reading import Reading
 from sliplens.live.sources import open_live
-from sliplens.models import Network
+from sliplens.models import Network, make_engine
 from sliplens.shear import FULL_CIRCLE
 
 TURNS = {
@@ -43,7 +43,7 @@ def read_live(network: Network, reference: np.ndarray, frames: np.ndarray) -> li
         open_live(frames), network, friction=None, same_object=False, sequence=False, smoothing_s=0.0,
         health=HealthMonitor, slip=None,
     )  # fmt: skip
-    reader.begin(sl.models.make_engine("torch", network, batch_size=1), reference)
+    reader.begin(make_engine("torch", network, batch_size=1), reference)
     return [
         reader.read(LiveFrame(image=image, number=at, time_s=at / 30, captured_s=0.0))
         for at, image in enumerate(frames)

@@ -9,14 +9,14 @@ import torch
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.models import Network, build_model, load_checkpoint, save_checkpoint
+from sliplens.models import Network, build_model, load, save_checkpoint
 from sliplens.models.backbones import REFERENCE_SIGNS, with_reference
 from sliplens.recordings import Dataset, Recording
 
 
 def begun(folder: Path) -> Network:
     """A pair network that begins with the weights of another."""
-    other = load_checkpoint(folder)
+    other = load(folder)
     model = build_model(head=other.manifest.head, colours=6)
     model.load_state_dict(with_reference(other.model.state_dict(), sign=REFERENCE_SIGNS[other.manifest.input]))
     return Network(model=model.eval(), manifest=replace(other.manifest, input="pair"))
@@ -33,10 +33,7 @@ def touch(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
 def test_without_weight_on_the_reference_it_answers_as_a_raw_network(raw_run: Path, touch: tuple[np.ndarray, ...]):
     frames, reference = touch
     # at full size, where a white pixel stays white
-    raw, pair = (
-        replace(run, manifest=replace(run.manifest, image_size=48))
-        for run in (load_checkpoint(raw_run), begun(raw_run))
-    )
+    raw, pair = (replace(run, manifest=replace(run.manifest, image_size=48)) for run in (load(raw_run), begun(raw_run)))
     torch.testing.assert_close(
         pair.predict(pair.encode(frames, reference)), raw.predict(raw.encode(frames, reference)), atol=1e-5, rtol=0
     )
@@ -54,7 +51,7 @@ def test_it_does_without_no_reference(raw_run: Path, recording: Recording):
 def test_from_training_to_an_explanation(small_dataset: Dataset, raw_run: Path, tmp_path: Path):
     run = sl.train(small_dataset, input="pair", start_from=raw_run, image_size=32, epochs=1, batch_size=11)
     save_checkpoint(tmp_path, run.model, run.manifest)
-    again = load_checkpoint(tmp_path)
+    again = load(tmp_path)
     assert (again.manifest.input, again.encoding.colours) == ("pair", 6)
     found = sl.evaluate(again, small_dataset)
     recording = small_dataset.load(small_dataset.select(split="test")[0])
@@ -63,13 +60,9 @@ def test_from_training_to_an_explanation(small_dataset: Dataset, raw_run: Path, 
     tested = found.predictions
     own = tested.prediction[tested.trial == recording.trial][:2]
     np.testing.assert_allclose(rows, own, atol=1e-5)
-    for method in ("integrated-gradients", "occlusion"):
-        explanation = sl.explain(again, frames, reference=reference, method=method)
-        np.testing.assert_allclose([frame.prediction for frame in explanation.frames], own, atol=1e-5)
-        # the untouched sensor, twice
-        empty = again.predict(again.encode(reference[None], reference))
-        untouched = [frame.reference_prediction for frame in explanation.frames]
-        np.testing.assert_allclose(untouched, empty.expand(2).numpy(), atol=1e-5)
-    with sl.LiveReader(frames, again, reference=reference, engine="torch", health=None, slip=None) as reader:
-        *_, last = reader.readings()
-    assert last.margin == pytest.approx(np.clip(own[-1], 0, 1), abs=1e-4)
+    explanation = sl.explain(again, frames, reference=reference, method="occlusion")
+    np.testing.assert_allclose([frame.prediction for frame in explanation.frames], own, atol=1e-5)
+    # the untouched sensor, twice
+    empty = again.predict(again.encode(reference[None], reference))
+    untouched = [frame.reference_prediction for frame in explanation.frames]
+    np.testing.assert_allclose(untouched, empty.expand(2).numpy(), atol=1e-5)

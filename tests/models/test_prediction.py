@@ -1,6 +1,5 @@
 """Predictions: those of the network, one frame at a time, from every kind of source."""
 
-import shutil
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -15,7 +14,7 @@ import pytest
 
 import sliplens as sl
 from sliplens.codec import TABLE_SUFFIXES
-from sliplens.errors import ImageError, InputError, PartError, RecordingError
+from sliplens.errors import ImageError, InputError
 from sliplens.images import absolute_difference, write_png
 from sliplens.markers.camera import CAMERA_REASON
 from sliplens.models import Network
@@ -24,10 +23,7 @@ from sliplens.models.predictions import Predictions
 from sliplens.models.predictions import predict as predict_source
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.dataset import trial_path
-from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import ContactState
-from sliplens.runner import read_status
 
 TRIAL = "test-wet-7"
 
@@ -104,16 +100,6 @@ def test_where_a_frame_is_withheld_the_table_holds_no_answer_of_the_network(
     assert None not in rows["known"].to_pylist()  # it is what the reason was found by
 
 
-@pytest.mark.parametrize("batch_size", [1, 64])
-def test_predictions_do_not_depend_on_the_batch(
-    batch_size: int, trained: Network, small_dataset: Dataset, tmp_path: Path
-):
-    first = predict(small_dataset.folder, trained, tmp_path / "a.parquet", batch_size=5)
-    second = predict(small_dataset.folder, trained, tmp_path / "b.parquet", batch_size=batch_size)
-    np.testing.assert_allclose(first["prediction"], second["prediction"], atol=1e-5)  # as above
-    assert first["frame"] == second["frame"]
-
-
 def test_the_lowest_margin_is_of_a_frame_that_touches(trained: Network, wet: Recording):
     noise = np.random.default_rng(0).integers(-3, 4, (6, *wet.reference.shape))
     untouched = np.clip(wet.reference.astype(int) + noise, 0, 255).astype(np.uint8)
@@ -156,13 +142,7 @@ def test_what_is_missing_or_too_much_is_refused(
     write_png(image, wet.reference)
     small = write_frames(tmp_path / "small", np.ascontiguousarray(wet.frames[:, :40]))
     refused(folder, trained, InputError, "named twice", reference=image, reference_frame=0)
-    refused(folder, trained, InputError, "no splits; leave out --split", split="test", reference=image)
-    refused(folder, trained, ImageError, "gone.png does not exist", reference=tmp_path / "gone.png")
-    refused(folder, trained, InputError, "no frame 12; name one from 0 to 11", reference_frame=12)
-    refused(tmp_path / "nothing", trained, InputError, "nothing does not exist")
     refused(data, trained, InputError, "bring their reference frames", reference=image)
-    refused(data, trained, InputError, "does not take --frame-rate", options=ReadOptions(frame_rate=30.0))
-    refused(data, trained, RecordingError, "no trial with split exam", split="exam")
     refused(small, trained, ImageError, "40 x 48 pixels", reference_frame=0, out=tmp_path / "a.parquet")
     assert not (tmp_path / "a.parquet").exists()
 
@@ -177,20 +157,6 @@ def frames_of(recording: Recording, read_frames: Callable[[], Iterator[np.ndarra
         read_frames=read_frames,
         reference=recording.reference,
     )
-
-
-def test_a_source_that_fails_leaves_what_was_there(trained: Network, wet: Recording, tmp_path: Path):
-    def broken() -> Iterator[np.ndarray]:
-        yield from wet.frames[:6]
-        raise RecordingError("the disk is gone")
-
-    trial = frames_of(wet, broken, frames=12)
-    path = tmp_path / "a.parquet"
-    path.write_text("the last good one")
-    with pytest.raises(RecordingError, match="the disk is gone"):
-        predict_source(trained, [trial], out=path, overwrite=True, engine="torch", batch_size=4)
-    assert path.read_text() == "the last good one"
-    assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_only_one_batch_of_frames_is_held(trained: Network, wet: Recording, tmp_path: Path):
@@ -229,15 +195,9 @@ def test_rows_in_memory_are_those_of_the_file(trained: Network, small_dataset: D
     kept = predict_source(trained, small_dataset, split="test")
     assert kept.frame().equals(written.frame(), check_metadata=True)
     assert kept.frames == kept.frame().num_rows == 24
-    margins = zip(kept.frame()["trial"].to_pylist(), kept.frame()["prediction"].to_pylist(), strict=True)
-    by_trial: dict[str, list[float]] = {}
-    for trial, margin in margins:
-        by_trial.setdefault(trial, []).append(margin)
-    assert {told.trial: told.margin.tolist() for told in kept.trials()} == by_trial
-    assert len(by_trial) == 2
-    assert "prediction: double" in repr(kept)
-    (tmp_path / "a.parquet").unlink()  # to name it nobody has to read it
-    assert repr(written) == f"Predictions of 24 frames by {written.engine}, in {tmp_path / 'a.parquet'}"
+    margins = np.concatenate([trial.margin for trial in kept.trials()])
+    assert margins.tolist() == kept.frame()["prediction"].to_pylist()
+    assert [trial.trial for trial in kept.trials()] == list(dict.fromkeys(kept.frame()["trial"].to_pylist()))
 
 
 def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_them(
@@ -263,22 +223,6 @@ def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_the
     frames = np.zeros((2, 48, 48, 3), dtype=np.uint8)
     with pytest.raises(InputError, match="frames in memory are worked on in this process"):
         predict_source(trained, frames, on="processes")
-
-
-def test_a_damaged_trial_does_not_lose_the_others(trained: Network, small_dataset: Dataset, tmp_path: Path):
-    data = tmp_path / "data"
-    shutil.copytree(small_dataset.folder, data)
-    good = trial_path(data, TRIAL).read_bytes()
-    trial_path(data, TRIAL).write_bytes(good[:-100])
-    own: dict[str, Any] = {"split": "test", "engine": "torch", "out": tmp_path / "set"}
-    with pytest.raises(PartError, match=f"1 of 2 could not be done.*--retry-failed:\n  {TRIAL}: .*{TRIAL}"):
-        predict_source(trained, data, **own)
-    assert not (tmp_path / "set").exists()
-    (status,) = read_status(tmp_path / "set")
-    assert (status.done, [one.name for one in status.failed]) == (1, [TRIAL])
-    trial_path(data, TRIAL).write_bytes(good)
-    assert predict_source(trained, data, **own, retry_failed=True).frames == 24
-    assert read_status(tmp_path / "set") == []
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1.5, -3.0])

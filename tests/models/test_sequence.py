@@ -4,22 +4,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 import torch
 from there import there
 
 import sliplens as sl
-from sliplens.errors import CheckpointError, InputError
-from sliplens.live.contract import LiveOptions
-from sliplens.models import Network, load_checkpoint, save_checkpoint
+from sliplens.errors import InputError
+from sliplens.models import Network, Ratio, load
 from sliplens.models.calibration import Calibration
 from sliplens.models.checkpoint import Estimate
 from sliplens.recordings import Dataset
 from sliplens.recordings.source import open_source
 from sliplens.recordings.trial import ContactState
-from sliplens.training.data import load_frames
-from sliplens.training.evaluation import evaluate_frames
 
 EDGES, RATIO_EDGES = torch.linspace(-0.1, 1.1, 61), torch.linspace(-0.1, 1.5, 81)
 SURE = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
@@ -27,7 +23,7 @@ SURE = Calibration(temperature=1.0, offsets={"0.9": 0.02}, frames=100, mse=0.01)
 
 @pytest.fixture(scope="module")
 def run(sequence_run: Path) -> Network:
-    return load_checkpoint(sequence_run)
+    return load(sequence_run)
 
 
 def answers(frames: int, *, seed: int = 0) -> Estimate:
@@ -35,7 +31,7 @@ def answers(frames: int, *, seed: int = 0) -> Estimate:
     rng = np.random.default_rng(seed)
     edges, ratio_edges = EDGES.double().numpy(), RATIO_EDGES.double().numpy()
     margin = rng.dirichlet(np.full(60, 0.3), frames)
-    ratio = sl.models.Ratio(probabilities=rng.dirichlet(np.full(80, 0.3), frames), edges=ratio_edges)
+    ratio = Ratio(probabilities=rng.dirichlet(np.full(80, 0.3), frames), edges=ratio_edges)
     mean = margin @ ((edges[1:] + edges[:-1]) / 2)
     return Estimate(margin=mean, calibration=SURE, probabilities=margin, edges=edges, ratio=ratio)
 
@@ -142,18 +138,6 @@ def test_a_recording_is_read_as_the_follower_reads_it(run: Network, small_datase
     assert written["prediction"].equals(table["prediction"])
 
 
-def test_the_rows_of_a_long_trial_are_written_as_they_come(
-    run: Network, small_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    whole = sl.predict(run, small_dataset, split="test", sequence=True, batch_size=4)
-    monkeypatch.setattr("sliplens.models.predictions.LONGEST", 4)
-    for name in ("margins", "margins.parquet"):
-        table = sl.predict(run, small_dataset, split="test", sequence=True, batch_size=4, out=tmp_path / name).frame()
-        assert table.equals(whole.frame())
-    parts = list((tmp_path / "margins").glob("*/*.parquet"))
-    assert [pq.ParquetFile(part).num_row_groups for part in parts] == [3, 3]
-
-
 def test_what_cannot_be_followed_is_refused(run: Network, small_dataset: Dataset):
     with pytest.raises(InputError, match="--recipe sequence"):
         sl.predict("thesis-raw", small_dataset, sequence=True)
@@ -170,22 +154,3 @@ def test_frames_that_come_too_seldom_are_refused(run: Network, small_dataset: Da
     with pytest.raises(InputError, match=r"has a frame each 1 s, .* leave out --sequence, or record 2 frames a second"):
         sl.predict(run, [seldom], sequence=True)
     assert len(sl.predict(run, [seldom])) == len(capture)
-    frames = load_frames(small_dataset, trials, encoding=run.encoding, image_size=32)
-    with pytest.raises(InputError, match=r"the trial test-\S+ has a frame each 1 s"):
-        evaluate_frames(run, replace(frames, time_s=30 * frames.time_s), sequence=True)
-    slow, reference = LiveOptions(rate_hz=1.0), small_dataset.load(trials[0]).reference
-    reader = sl.LiveReader(seldom, run, options=slow, reference=reference, sequence=True, engine="torch")
-    with pytest.raises(InputError, match="has a frame each 1 s"), reader:
-        pass
-
-
-def test_a_damaged_head_is_refused(run: Network, tmp_path: Path):
-    save_checkpoint(tmp_path, run.model, run.manifest, sequence=run.sequence)
-    weights = tmp_path / "sequence.safetensors"
-    kept = weights.read_bytes()
-    weights.write_bytes(kept[:-1] + bytes([kept[-1] ^ 1]))
-    with pytest.raises(CheckpointError, match="not the file its manifest describes"):
-        load_checkpoint(tmp_path)
-    weights.unlink()
-    with pytest.raises(CheckpointError, match=r"sequence\.safetensors is missing"):
-        load_checkpoint(tmp_path)

@@ -9,7 +9,6 @@ import pytest
 from scipy.stats import spearmanr
 
 import sliplens
-from sliplens.errors import InputError
 from sliplens.explainers.frames import frames_from_folder
 from sliplens.faithfulness.controls import cascade
 from sliplens.files import find_run, shipped_names
@@ -94,13 +93,6 @@ def test_it_reads_real_touch_it_was_never_trained_on(chromatouch_folder: Path):
     low, high = estimate.interval(0.9) or (labels, labels)
     # five intervals of 90 %: three or fewer hold with a chance below 0.09
     assert np.count_nonzero((low <= labels) & (labels <= high)) >= 4
-
-
-def test_a_network_that_is_not_there_is_refused():
-    with pytest.raises(InputError, match="the run gelsight does not exist; check the path, or name chromatouch-diff"):
-        sliplens.load("gelsight")
-    with pytest.raises(InputError, match="the run nowhere does not exist; check the path"):
-        find_run(Path("nowhere"))
 
 
 def test_networks_are_loaded_without_the_compiler_and_pandas():

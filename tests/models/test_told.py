@@ -104,7 +104,6 @@ def test_friction_that_is_mostly_beyond_the_training_is_doubted(
     kept = networks["margin-and-ratio"].manifest
     assert kept.traction is not None
     manifest = replace(kept, traction=replace(kept.traction, friction=tuple(TRAINED)))
-    words = replace(networks["margin-and-ratio"], manifest=manifest).doubt_friction(friction)
-    assert (words is not None) == doubted
-    assert words is None or "0.15 to 1.2" in words
-    assert networks["histogram"].doubt_friction(friction) is None
+    doubts = replace(networks["margin-and-ratio"], manifest=manifest).doubts(friction=friction)
+    assert ["0.15 to 1.2" in words for words in doubts] == [True] * doubted
+    assert networks["histogram"].doubts(friction=friction) == ()

@@ -7,7 +7,7 @@ import pytest
 
 from sliplens.explainers.explain import explain_frames
 from sliplens.explainers.frames import frames_at
-from sliplens.models import Network, load_checkpoint
+from sliplens.models import Network, load
 from sliplens.recordings import Dataset
 from sliplens.results.study import Choice, MarkerPlaces
 from sliplens.study.choice import Material, choose_frames, gather, study_explainers
@@ -17,7 +17,7 @@ METHODS = ("grad-cam", "integrated-gradients")
 
 @pytest.fixture(scope="session")
 def network(difference_run: Path) -> Network:
-    return load_checkpoint(difference_run)
+    return load(difference_run)
 
 
 @pytest.fixture(scope="session")

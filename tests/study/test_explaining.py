@@ -10,7 +10,7 @@ from sliplens.errors import InputError
 from sliplens.explainers.explain import network_inputs
 from sliplens.explainers.frames import FrameSelection
 from sliplens.files import output_folder
-from sliplens.models import Network, load_checkpoint
+from sliplens.models import Network, load
 from sliplens.recordings import Dataset
 from sliplens.results.explanation import Explanation, load_explanation
 from sliplens.study.explaining import explain
@@ -21,7 +21,7 @@ SELECT = FrameSelection(levels=(1.0, 0.0))
 
 @pytest.fixture(scope="module")
 def trained(difference_run: Path) -> Network:
-    return load_checkpoint(difference_run)
+    return load(difference_run)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.explainers.table import RECOMMENDED_METHOD
-from sliplens.models import load_checkpoint
+from sliplens.models import load
 from sliplens.results.explanation import Strip
 from sliplens.study.explaining import make_strip
 
@@ -12,7 +12,7 @@ from ..conftest import make_recording
 
 @pytest.fixture(scope="module")
 def run(difference_run):
-    return load_checkpoint(difference_run)
+    return load(difference_run)
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,3 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,11 +5,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sliplens.errors import RecordingError
-from sliplens.models import load_checkpoint
-from sliplens.models.encodings import ENCODINGS
-from sliplens.recordings import Dataset
-from sliplens.training import evaluate_frames, regression_scores
-from sliplens.training.data import load_frames
+from sliplens.training import lead_times, regression_scores
+from sliplens.training.evaluation import risk_coverage
 
 MARGINS = arrays(np.float64, 30, elements=st.floats(0, 1))
 
@@ -41,15 +36,63 @@ def test_labels_in_percent_are_refused():
         regression_scores(np.array([80.0]), np.array([0.8]))
 
 
-def test_every_condition_is_scored_on_its_own_frames(small_dataset: Dataset, difference_run: Path):
-    trained = load_checkpoint(difference_run)
-    frames = load_frames(
-        small_dataset, small_dataset.select(split="test"), encoding=ENCODINGS["difference"], image_size=32
-    )
-    evaluation = evaluate_frames(trained, frames, batch_size=5)
-    table = evaluation.frame().to_pydict()
-    for condition in ("dry", "wet"):
-        rows = [index for index, name in enumerate(table["condition"]) if name == condition]
-        squares = [(table["prediction"][row] - table["safety_margin"][row]) ** 2 for row in rows]
-        assert evaluation.conditions[condition].mse == pytest.approx(np.mean(squares))
-        assert evaluation.conditions[condition].trials == 1
+def trial(seconds: float = 10.0) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """A margin that falls evenly to 0 at `seconds` and stays there for a second, 10 frames a second."""
+    time = np.arange(0, seconds + 1.05, 0.1)
+    # rounded: 1 - 0.8 is not 0.2 in binary, and a threshold would tell them apart
+    return ["one"] * len(time), time, np.clip(1 - time / seconds, 0, 1).round(6)
+
+
+def test_a_perfect_network_warns_as_early_as_the_margin_itself():
+    name, time, labels = trial()
+    found = lead_times(name, time, labels, labels)
+    # below 0.2 from the first frame after 8 s on, at 10 s it slips
+    assert found.median_ms == pytest.approx(1900)
+    assert found.median_ms == found.ideal_ms
+    assert (found.trials, found.warned, found.false_per_minute) == (1, 1, 0)
+
+
+def test_a_network_that_reads_too_much_warns_late_and_one_that_always_does_never():
+    name, time, labels = trial()
+    late = lead_times(name, time, labels, (labels + 0.1).round(6))
+    # below 0.2 where the label is below 0.1: the last second
+    assert late.median_ms == pytest.approx(900)
+    never = lead_times(name, time, labels, labels + 0.3)
+    assert (never.median_ms, never.warned, never.trials) == (None, 0, 1)
+
+
+def test_alarms_far_from_slip_are_false_and_counted_by_the_minute():
+    name, time, labels = trial()
+    predictions = labels.copy()
+    predictions[[5, 20, 21]] = 0.1  # two stretches, at margins of 0.95 and 0.8
+    found = lead_times(name, time, labels, predictions)
+    # 9.9 s lie between the first frame and the last before the slip
+    assert found.false_per_minute == pytest.approx(2 / (9.9 / 60))
+    assert found.median_ms == pytest.approx(1900)
+
+
+def test_what_comes_after_the_slip_and_trials_that_never_slip_count_no_lead():
+    name, time, labels = trial()
+    held = labels >= 0.5
+    found = lead_times(["one"] * int(held.sum()), time[held], labels[held], labels[held])
+    assert (found.trials, found.median_ms, found.ideal_ms) == (0, None, None)
+    after = labels.copy()
+    after[labels <= 0] = 0.9
+    # an answer after the slip changes nothing
+    assert lead_times(name, time, labels, after) == lead_times(name, time, labels, labels)
+
+
+def test_withholding_by_the_errors_themselves_is_best_and_by_chance_gains_nothing(rng: np.random.Generator):
+    errors = rng.exponential(0.1, 2000)
+    spread = errors + rng.normal(0, 0.05, 2000)
+    found = risk_coverage(errors, {"known": rng.uniform(size=2000), "spread": -spread, "none": None})
+    assert set(found.error) == {"known", "spread", "perfect"}
+    assert [values[0] for values in found.error.values()] == pytest.approx([errors.mean()] * 3)
+    best = np.array(found.error["perfect"])
+    assert np.all(np.diff(best) <= 0)
+    for values in found.error.values():
+        assert np.all(np.array(values) >= best - 1e-12)
+    # of an exponential with mean m, what lies below its quantile q has the mean m (1 + (1 - q) ln(1 - q) / q)
+    assert found.error_at("perfect", 0.8) == pytest.approx(0.1 * (1 + 0.2 * np.log(0.2) / 0.8), rel=0.1)
+    assert found.error_at("known", 0.5) == pytest.approx(errors.mean(), rel=0.1)
+    assert str(found).startswith(f"mean error {100 * errors.mean():.1f} points; with a fifth of the frames withheld ")

@@ -2,12 +2,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from data_sets import save_dataset
 
 from sliplens.models.encodings import ENCODINGS
 from sliplens.recordings import Dataset, Recording
-from sliplens.training.data import UNTOUCHED, load_frames
+from sliplens.training.data import UNTOUCHED, EpochShuffle, load_frames
 
 
 def test_a_batch_is_what_encoding_the_frames_one_by_one_gives(small_dataset: Dataset):
@@ -43,3 +44,18 @@ def test_frames_whose_label_cannot_be_trusted_are_left_out(tmp_path: Path, recor
     frames = load_frames(data, data.trials, encoding=ENCODINGS["difference"], image_size=32)
     # frame 0 has no contact, frames 7 to 11 are not trusted
     assert frames.frame == (1, 2, 3, 4, 5, 6)
+
+
+def order(epoch: int, count: int, **options: int) -> list[int]:
+    shuffle = EpochShuffle(count, seed=1, **options)
+    shuffle.set_epoch(epoch)
+    assert len(list(shuffle)) == len(shuffle)
+    return list(shuffle)
+
+
+@pytest.mark.parametrize(("count", "drawn"), [(20, 20), (20, 7), (7, 20), (5, 15)])
+def test_each_epoch_has_an_order_that_repeats_and_draws_all_frames_alike(count: int, drawn: int):
+    assert order(2, count, drawn=drawn) == order(2, count, drawn=drawn) != order(3, count, drawn=drawn)
+    times = np.bincount(order(2, count, drawn=drawn), minlength=count)
+    assert times.sum() == drawn
+    assert np.ptp(times) <= 1

@@ -10,7 +10,7 @@ from small import save_untrained
 from there import there
 
 from sliplens.errors import InputError, ModelError
-from sliplens.models import load_checkpoint
+from sliplens.models import load
 from sliplens.models.calibration import Calibration, Traction
 from sliplens.models.sequence import GAP_S
 from sliplens.recordings import Dataset
@@ -32,7 +32,7 @@ def teach(data: Dataset, start: Path, out: Path | None = None, **changes):
 def test_several_frames_tell_what_one_does_not(small_dataset: Dataset, start: Path, tmp_path: Path):
     """The margin of these trials falls with time: a network of random weights does not see it, its head counts."""
     run = teach(small_dataset, start, tmp_path / "run")
-    kept, before, training = run.manifest.sequence, load_checkpoint(start), run.training
+    kept, before, training = run.manifest.sequence, load(start), run.training
     assert kept is not None
     assert training is not None
     assert kept.calibration.mse < 0.7 * kept.mse_one
@@ -114,12 +114,8 @@ def test_what_cannot_be_taught_is_refused(small_dataset: Dataset, start: Path, d
         train(small_dataset, recipe="sequence")
     with pytest.raises((InputError, ModelError), match="ratio"):
         teach(small_dataset, difference_run)
-    with pytest.raises(InputError, match="--max-minutes"):
-        teach(small_dataset, start, max_minutes=1.0)
     with pytest.raises(InputError, match="whose image_size is 32; leave out --image-size"):
         teach(small_dataset, start, image_size=96)
-    with pytest.raises(InputError, match="takes no such option; leave out --untouched-share"):
-        teach(small_dataset, start, untouched_share=0.2)
     with pytest.raises(InputError, match="--logger"):
         teach(small_dataset, start, logger="tensorboard")
     with pytest.raises(ModelError, match="has the input difference, and pair is to be trained"):

@@ -218,10 +218,10 @@ def call_simulate(call: Any, *, preview: Path | None = None, video: Path | None 
         recipe = make_recipe(options.pop("preset", "small"), **options)
         output.draw_simulation(recipe, device=device, preview=preview, video=video)
     if call.keywords.get("out"):
-        from sliplens.results.evaluation import describe_simulation
-
-        splits = describe_simulation(call()).by_split.items()
-        rows = [(name, str(row.trials), f"{row.frames:,}") for name, row in splits]
+        frames: dict[str, list[int]] = {}
+        for trial in call().trials:
+            frames.setdefault(trial.split, []).append(trial.frames)
+        rows = [(split, str(len(counts)), f"{sum(counts):,}") for split, counts in frames.items()]
         print_table("Simulated", ("split", "trials", "frames"), rows)
 
 

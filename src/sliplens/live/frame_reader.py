@@ -133,7 +133,7 @@ class FrameReader:
         """Engine of the network; set by `begin`."""
         self.reference: Frame | None = None
         """The sensor untouched, as the next frame is compared with it."""
-        self.doubt: str | None = None
+        self.doubts: tuple[str, ...] = ()
         """Doubt about the colours of the reference for this network; None without."""
         self.new_reference = Event()
         """Set to take a new reference as soon as the picture is still."""
@@ -323,7 +323,7 @@ class FrameReader:
 
     def _set_reference(self, image: Frame) -> None:
         self.reference = image
-        self.doubt = None if self.network is None else self.network.doubt_colour(image)
+        self.doubts = () if self.network is None else self.network.doubts(frame=image)
         self._health = None if self._make_health is None else self._make_health(image)
         network = None if self._health is None else self.network
         self._shear = None if network is None else network.shear_estimator(image)

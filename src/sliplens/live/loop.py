@@ -247,11 +247,11 @@ class LiveReader:
 
         Another sensor or direction of the pull, other friction, and grey frames once a reference was taken.
         """
-        network, profile, doubts = self.network, self._profile, [self._reader.doubt]
-        if network is not None:
-            doubts += [] if profile is None else [network.doubt(profile.name), network.doubt_direction(profile)]
-            doubts.append(network.doubt_friction(self._reader.learner.friction))
-        return tuple(doubt for doubt in doubts if doubt is not None)
+        if self.network is None:
+            return ()
+        profile, friction = self._profile, self._reader.learner.friction
+        sensor = "" if profile is None else profile.name
+        return self._reader.doubts + self.network.doubts(sensor=sensor, profile=profile, friction=friction)
 
     @property
     def troubles(self) -> tuple[str, ...]:

@@ -1,7 +1,7 @@
 """Networks that read the safety margin, their checkpoints, and the engines that run them."""
 
 from sliplens.models.backbones import build_model
-from sliplens.models.checkpoint import Estimate, Manifest, Network, Ratio, load, load_checkpoint, save_checkpoint
+from sliplens.models.checkpoint import Estimate, Manifest, Network, Ratio, load, save_checkpoint
 from sliplens.models.engines import ENGINES, Engine, make_engine, prepare
 from sliplens.models.onnx import export_onnx
 from sliplens.models.predictions import Predictions, predict
@@ -9,5 +9,5 @@ from sliplens.models.sequence import Follower
 
 __all__ = [
     "ENGINES", "Engine", "Estimate", "Follower", "Manifest", "Network", "Predictions", "Ratio", "build_model",
-    "export_onnx", "load", "load_checkpoint", "make_engine", "predict", "prepare", "save_checkpoint",
+    "export_onnx", "load", "make_engine", "predict", "prepare", "save_checkpoint",
 ]  # fmt: skip

@@ -171,52 +171,48 @@ class Network:
                 "--reference-frame N"
             )
 
-    def doubt(self, sensor: str) -> str | None:
-        """Warn of frames of another kind of sensor than those it was trained on; None if they are of its kind."""
-        trained = self.manifest.sensor
-        if not sensor or not trained or sensor_kind(sensor) == sensor_kind(trained):
-            return None
-        return (
-            f"the network was trained on {trained} and reads frames of {sensor}: its intervals were not measured on "
-            "that sensor, so take the margins for a trend until `sliplens evaluate` on trials with forces measures them"
-        )
+    def doubts(
+        self,
+        *,
+        sensor: str = "",
+        frame: UInt8[np.ndarray, "height width 3"] | None = None,
+        friction: Friction | None = None,
+        profile: SensorProfile | None = None,
+    ) -> tuple[str, ...]:
+        """Warn of whatever differs from the training: kind of sensor, colours, friction, direction of the pull.
 
-    def doubt_colour(self, frame: UInt8[np.ndarray, "height width 3"]) -> str | None:
-        """Warn of a grey frame if the network was trained on colours; None otherwise, or if unknown."""
-        if not self.manifest.colour or has_colour(frame):
-            return None
-        return (
-            "the frames are grey, and the network was trained on colours: its intervals were not measured on such "
-            "frames, so read those of a colour camera, or train it on frames of this one (`sliplens train`)"
-        )
-
-    def doubt_friction(self, friction: Friction | None) -> str | None:
-        """Warn of a friction outside that of its training; None where most of it lies inside."""
-        if friction is None or self.manifest.traction is None:
-            return None
-        low, high = self.manifest.traction.friction[0], self.manifest.traction.friction[-1]
-        values, weights = friction.nodes
-        if weights[(low <= values) & (values <= high)].sum() >= 0.5:
-            return None
-        cure = "begin a new object" if friction.note == LEARNT else "check --friction"
-        return (
-            f"the friction {friction.mean:.3g} lies outside that of the network's training, {low:.2g} to {high:.2g}: "
-            f"its intervals were not measured there, so {cure}, or take the margins for a trend"
-        )
-
-    def doubt_direction(self, profile: SensorProfile) -> str | None:
-        """Warn of a sensor that is pulled in another direction than the training trials; None if it is not."""
-        trained = self.manifest.pull_direction_deg
-        if profile.pull_direction_deg is None or trained is None:
-            return None
-        pull = radians(profile.pull_direction_deg)
-        if not Shear(x_px=cos(pull), y_px=sin(pull), sigma_px=1.0).excess(trained):
-            return None
-        return (
-            f"the profile {profile.name} says that the sensor is pulled at {profile.pull_direction_deg:g} degrees in "
-            f"the image, and the network was trained on {range_words(trained)} (90 is down): its margins will "
-            f"be withheld, so {_TURN_CURE}"
-        )
+        `friction`: doubted if most of it lies outside that of the training.
+        """
+        trained, directions, doubts = self.manifest, self.manifest.pull_direction_deg, []
+        if sensor and trained.sensor and sensor_kind(sensor) != sensor_kind(trained.sensor):
+            doubts.append(
+                f"the network was trained on {trained.sensor} and reads frames of {sensor}: its intervals were not "
+                "measured on that sensor, so take the margins for a trend until `sliplens evaluate` on trials with "
+                "forces measures them"
+            )
+        if frame is not None and trained.colour and not has_colour(frame):
+            doubts.append(
+                "the frames are grey, and the network was trained on colours: its intervals were not measured on such "
+                "frames, so read those of a colour camera, or train it on frames of this one (`sliplens train`)"
+            )
+        if friction is not None and trained.traction is not None:
+            low, high = trained.traction.friction[0], trained.traction.friction[-1]
+            values, weights = friction.nodes
+            if weights[(low <= values) & (values <= high)].sum() < 0.5:
+                cure = "begin a new object" if friction.note == LEARNT else "check --friction"
+                doubts.append(
+                    f"the friction {friction.mean:.3g} lies outside that of the network's training, {low:.2g} to "
+                    f"{high:.2g}: its intervals were not measured there, so {cure}, or take the margins for a trend"
+                )
+        if profile is not None and profile.pull_direction_deg is not None and directions is not None:
+            pull = radians(profile.pull_direction_deg)
+            if Shear(x_px=cos(pull), y_px=sin(pull), sigma_px=1.0).excess(directions):
+                doubts.append(
+                    f"the profile {profile.name} says that the sensor is pulled at {profile.pull_direction_deg:g} "
+                    f"degrees in the image, and the network was trained on {range_words(directions)} (90 is down): "
+                    f"its margins will be withheld, so {_TURN_CURE}"
+                )
+        return tuple(doubts)
 
     def shear_estimator(self, reference: UInt8[np.ndarray, "height width 3"]) -> ShearEstimator | None:
         """Make the estimator of the shear of frames; None for a network of all directions, or of unknown ones."""
@@ -476,33 +472,6 @@ def _save_weights(path: Path, model: nn.Module) -> str:
     return hash_file(path)
 
 
-def load_checkpoint(folder: Path, *, device: str = "cpu") -> Network:
-    """Load a checkpoint written by `save_checkpoint`; `CheckpointError` for damaged files and unknown schemas."""
-    require_folder(folder, what="the run")
-    manifest = read_manifest(folder)
-    model = build_model(
-        manifest.backbone, head=manifest.head, colours=pick(ENCODINGS, manifest.input, noun="input").colours
-    )
-    what = f"a {manifest.backbone} with a {manifest.head} head"
-    _load_weights(folder / WEIGHTS_FILE, model, what=what, sha256=manifest.weights_sha256)
-    if manifest.novelty is not None and manifest.novelty.layer not in dict(model.named_modules()):
-        raise CheckpointError(f"{folder / MANIFEST_FILE} names a layer that the network has not; copy the folder again")
-    sequence = None
-    if manifest.sequence is not None:
-        if not isinstance(model, HistogramRegressor) or model.ratio_edges is None:
-            raise CheckpointError(f"{folder / MANIFEST_FILE} tells of several frames, whose head reads F_t / F_n too")
-        sequence = SequenceHead(model.edges, model.ratio_edges)
-        hashed = manifest.sequence.weights_sha256
-        _load_weights(folder / SEQUENCE_FILE, sequence, what="a head of several frames", sha256=hashed)
-        sequence.eval()
-    # channels last: depthwise convolutions run up to half as fast again on a CPU
-    model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
-    # the networks of the package come without their learning curve
-    has_curve = (folder / "curve.parquet").is_file()
-    training = load_result(folder, Training, command="sliplens train") if has_curve else None
-    return Network(model=model, manifest=manifest, training=training, sequence=sequence)
-
-
 def _load_weights(path: Path, model: nn.Module, *, what: str, sha256: str) -> None:
     """Fill a network with finite weights of the file that its manifest describes."""
     if not path.is_file():
@@ -539,6 +508,11 @@ def load(run: str | Path, *, device: str = "cpu") -> Network:
     device
         Where to put it: cpu, cuda or cuda:1.
 
+    Raises
+    ------
+    CheckpointError
+        If a file is missing, damaged, or of an unknown schema.
+
     Examples
     --------
     >>> import sliplens as sl
@@ -547,7 +521,30 @@ def load(run: str | Path, *, device: str = "cpu") -> Network:
     ('pair', 112)
     """
     require_device(device)
-    return load_checkpoint(find_run(Path(run)), device=device)
+    folder = find_run(Path(run))
+    require_folder(folder, what="the run")
+    manifest = read_manifest(folder)
+    model = build_model(
+        manifest.backbone, head=manifest.head, colours=pick(ENCODINGS, manifest.input, noun="input").colours
+    )
+    what = f"a {manifest.backbone} with a {manifest.head} head"
+    _load_weights(folder / WEIGHTS_FILE, model, what=what, sha256=manifest.weights_sha256)
+    if manifest.novelty is not None and manifest.novelty.layer not in dict(model.named_modules()):
+        raise CheckpointError(f"{folder / MANIFEST_FILE} names a layer that the network has not; copy the folder again")
+    sequence = None
+    if manifest.sequence is not None:
+        if not isinstance(model, HistogramRegressor) or model.ratio_edges is None:
+            raise CheckpointError(f"{folder / MANIFEST_FILE} tells of several frames, whose head reads F_t / F_n too")
+        sequence = SequenceHead(model.edges, model.ratio_edges)
+        hashed = manifest.sequence.weights_sha256
+        _load_weights(folder / SEQUENCE_FILE, sequence, what="a head of several frames", sha256=hashed)
+        sequence.eval()
+    # channels last: depthwise convolutions run up to half as fast again on a CPU
+    model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
+    # the networks of the package come without their learning curve
+    has_curve = (folder / "curve.parquet").is_file()
+    training = load_result(folder, Training, command="sliplens train") if has_curve else None
+    return Network(model=model, manifest=manifest, training=training, sequence=sequence)
 
 
 def open_run(run: object, *, device: str = "cpu") -> Network:

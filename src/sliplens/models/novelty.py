@@ -137,8 +137,8 @@ def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[
     unit = (features - mean) / scale
     _, singular, directions = np.linalg.svd(unit, full_matrices=False)
     variances = singular**2 / len(unit)
-    count = min(_MOST_DIRECTIONS, len(variances) - 1)
-    begun = Novelty(
+    count, usual = min(_MOST_DIRECTIONS, len(variances) - 1), 1 - _SHARES[-1]
+    novelty = Novelty(
         layer=layer,
         mean=_rounded(mean),
         scale=_rounded(scale),
@@ -147,15 +147,11 @@ def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[
         rest=float(variances[count:].sum() / max(1, unit.shape[1] - count)) + 1e-6,
         limit=np.inf,
         frames=len(validation_features),
-    )
-    usual = 1 - _SHARES[-1]
-    limited = replace(
-        begun,
-        limit=float(np.quantile(begun.distance(validation_features), usual)),
         spread_limit=None if sigma is None else float(np.quantile(sigma, usual)),
     )
-    reached = np.quantile(limited.measure_strangeness(validation_features, sigma), 1 - np.array(_SHARES))
-    return replace(limited, strangeness=_rounded(reached))
+    novelty = replace(novelty, limit=float(np.quantile(novelty.distance(validation_features), usual)))
+    reached = np.quantile(novelty.measure_strangeness(validation_features, sigma), 1 - np.array(_SHARES))
+    return replace(novelty, strangeness=_rounded(reached))
 
 
 def _rounded(values: np.ndarray) -> tuple[float, ...]:

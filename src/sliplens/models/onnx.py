@@ -36,6 +36,7 @@ _COMPARED = {
     "amplitude": "|T_n - T_0|",
     "raw": "T_n",
     "pair": "T_n, then T_0",
+    "signed": "(T_n - T_0) / 2 + 128",
 }
 
 

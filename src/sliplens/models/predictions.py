@@ -321,18 +321,26 @@ def _list_notes(
     sequence: bool,
 ) -> tuple[str, ...]:
     """Refuse recordings and options that do not fit the network; return the assumptions about those that do."""
+    notes: list[str] = []
     if friction is not None:
         network.require_ratio()
     if sequence:
-        _require_order(network, captures, friction=friction)
-    notes = [words for capture in captures for words in (*capture.notes, *_require_comparable(network, capture))]
-    if profile is not None:
-        notes.append(network.doubt_direction(profile) or "")
+        network.follow(friction=friction)
+    for capture in captures:
+        if sequence and capture.time_s is None:
+            raise InputError(
+                f"--sequence needs the times of the frames, and those of {capture.name} are unknown; leave it out, or "
+                "name a recording with times"
+            )
+        if sequence and capture.time_s is not None:
+            require_frequent(capture.time_s, what=capture.name)
+        notes += [*capture.notes, *_require_comparable(network, capture)]
+    notes += network.doubts(profile=profile)
     if friction is not None:
-        notes += [f"The coefficient of friction is taken for {friction}.", network.doubt_friction(friction) or ""]
+        notes += [f"The coefficient of friction is taken for {friction}.", *network.doubts(friction=friction)]
     if sequence:
         notes.append("Frames were read in order: each answer counts those of its contact before it.")
-    return tuple(dict.fromkeys(filter(None, notes)))
+    return tuple(dict.fromkeys(notes))
 
 
 def _find_profile(trials: Trials, sensor: SensorProfile | Path | str | None) -> SensorProfile | None:
@@ -354,18 +362,6 @@ def _choose_network(trials: Trials, profile: SensorProfile | None) -> tuple[str,
     return DEFAULT_NETWORK, "which comes with sliplens"
 
 
-def _require_order(network: Network, captures: Sequence[Capture], *, friction: Friction | None) -> None:
-    """Refuse `sequence` for a network without a sequence head, and for frames of unknown times."""
-    network.follow(friction=friction)
-    for capture in captures:
-        if capture.time_s is None:
-            raise InputError(
-                f"--sequence needs the times of the frames, and those of {capture.name} are unknown; leave it out, or "
-                "name a recording with times"
-            )
-        require_frequent(capture.time_s, what=capture.name)
-
-
 def _assume_reference(network: Network, trial: Capture) -> Capture:
     """Assume that the first frame of a recording shows the untouched sensor, if a network needs a reference."""
     if trial.read_reference is not None or not _is_recorded(trial) or network.encoding.name == "raw":
@@ -384,10 +380,10 @@ def _is_recorded(trial: Capture) -> bool:
 def _require_comparable(network: Network, trial: Capture) -> Iterator[str]:
     """Refuse a trial that does not fit the network; yield the assumptions about a trial that does."""
     network.require_frame_size(trial.frame_size)
-    yield network.doubt(trial.sensor) or ""
+    yield from network.doubts(sensor=trial.sensor)
     untouched, encoding = trial.read_reference, network.encoding
     if untouched is not None or encoding.name == "raw":  # difference images are black where nothing moved
-        yield network.doubt_colour(next(trial.read_frames()) if untouched is None else untouched()) or ""
+        yield from network.doubts(frame=next(trial.read_frames()) if untouched is None else untouched())
     if untouched is not None:
         return
     if not _is_recorded(trial):
@@ -453,7 +449,6 @@ class _Prediction(Work):
         """Return the columns, and the function that predicts a part."""
         engine, read = self.make(), self.trials.reader()
         schema = self.schema.with_metadata({"sliplens.engine": engine.name, **(self.schema.metadata or {})})
-
         return schema, partial(self._tables, engine, read, schema)
 
     def _tables(self, engine: Engine, read: _Read, schema: pa.Schema, part: tuple[str, int, int]) -> Iterator[pa.Table]:
@@ -462,7 +457,7 @@ class _Prediction(Work):
         capture = _assume_reference(self.network, capture)
         network, follower = self.network, self.network.follow() if self.sequence else None
         if self.sequence and capture.time_s is not None:
-            require_frequent(capture.time_s, what=capture.name)  # `_require_order` saw one trial of each sensor
+            require_frequent(capture.time_s, what=capture.name)  # `_list_notes` saw one trial of each sensor
         reference = None if capture.read_reference is None else capture.read_reference()
         check, size = _make_check(network, capture, reference), tuple(network.manifest.frame_size)
         encode = partial(network.encoding.encode, reference=reference, image_size=network.manifest.image_size)
@@ -492,7 +487,7 @@ class _Prediction(Work):
             believed = np.array([reason is None for reason in withheld])
             here = slice(begin, begin + len(checks))
             if follower is not None:
-                assert capture.time_s is not None  # `_require_order`
+                assert capture.time_s is not None  # `_list_notes`
                 estimate = follower.update(estimate, capture.time_s[here], touches, believed=believed)
             columns = _columns(estimate, capture, here, believed=believed) | {
                 "touches": pa.array(touches),

@@ -215,19 +215,17 @@ def load_frames(
     for info in report_each(trials):
         recording = data.load(info, truth=False)
         labelled = np.flatnonzero(recording.labelled)
+        copies, end = copies_of(len(labelled)), len(rows) + len(labelled)
         compare = partial(encoding.compare_small, reference=recording.reference, image_size=image_size)
-        images[len(rows) : len(rows) + len(labelled)] = compare(recording.frames[labelled])
-        labels.append(recording.safety_margin[labelled])
-        ratios.append(_ratios(recording)[labelled])
-        times.append(recording.time_s[labelled])
-        rows += [(recording.trial, int(frame), recording.condition, recording.day) for frame in labelled]
-        if copies := copies_of(len(labelled)):
-            images[len(rows) : len(rows) + copies] = compare(recording.reference[None])
-            labels.append(np.ones(copies))
-            ratios.append(np.zeros(copies))
-            times.append(np.full(copies, recording.time_s[0]))
-            rows += [(recording.trial, UNTOUCHED, recording.condition, recording.day)] * copies
-        frictions.append(np.full(len(rows) - sum(map(len, frictions)), trial_friction(recording)))
+        images[len(rows) : end] = compare(recording.frames[labelled])
+        if copies:
+            images[end : end + copies] = compare(recording.reference[None])
+        labels += recording.safety_margin[labelled], np.ones(copies)
+        ratios += _ratios(recording)[labelled], np.zeros(copies)
+        times += recording.time_s[labelled], np.full(copies, recording.time_s[0])
+        frictions.append(np.full(len(labelled) + copies, trial_friction(recording)))
+        numbers = [*labelled.tolist(), *[UNTOUCHED] * copies]
+        rows += [(recording.trial, number, recording.condition, recording.day) for number in numbers]
     trial, frame, condition, day = zip(*rows, strict=True)
     return FrameSet(
         encoding=encoding,

@@ -84,10 +84,10 @@ def evaluate(
         return replace(evaluation, known_trials=len(find_training_trials(trials, network)))
 
     with reporting(on_progress):
-        doubts = [network.doubt_friction(prior)] if isinstance(prior, Friction) else []
+        doubts = network.doubts(friction=prior if isinstance(prior, Friction) else None)
         for first in map(data.read_labels, {trial.sensor: trial for trial in reversed(trials)}.values()):
-            doubts += network.doubt(first.sensor), network.doubt_colour(first.reference)
-        for words in dict.fromkeys(filter(None, doubts)):
+            doubts += network.doubts(sensor=first.sensor, frame=first.reference)
+        for words in dict.fromkeys(doubts):
             add_note(words)
         if out is None:
             return compute()

@@ -22,7 +22,7 @@ from sliplens.errors import InputError, ModelError, RecordingError
 from sliplens.extras import pick
 from sliplens.files import output_folder, scratch_folder, versions
 from sliplens.images import has_colour
-from sliplens.models import Manifest, Network, build_model, load_checkpoint, save_checkpoint
+from sliplens.models import Manifest, Network, build_model, load, save_checkpoint
 from sliplens.models.backbones import (
     REFERENCE_SIGNS,
     HistogramRegressor,
@@ -32,7 +32,7 @@ from sliplens.models.backbones import (
     with_reference,
 )
 from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
-from sliplens.models.checkpoint import Estimate, Ratio, condition_each, load, sensor_kind
+from sliplens.models.checkpoint import Estimate, Ratio, condition_each, sensor_kind
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import fit_novelty
 from sliplens.progress import OnProgress, add_note, open_stage, report_each, report_file, reporting
@@ -174,8 +174,22 @@ def train(
         if start is not None and config.learns == "sequence":
             training = fit_sequence(config, start, data, trials, folder)
         else:
-            training = _fit_trials(
-                config, data, trials, folder, encoding=encoding, start=start, trainer=trainer, logger=opened
+            load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=folder)
+            with open_stage(f"Reading training trials ({encoding.name})"):
+                train_frames = load_some(trials[0], untouched_share=config.untouched_share)
+            with open_stage(f"Reading validation trials ({encoding.name})"):
+                validation = load_some(trials[1])
+            info = trials[0][0]
+            facts = DataOrigin(
+                frame_size=(info.height, info.width),
+                sensor=info.sensor,
+                data_hash=data.hash,
+                colour=has_colour(data.read_labels(info).reference),
+                pull_direction_deg=trained_directions(config, data, trials[0], start),
+                trained_on=tuple(trial.sha256[:12] for some in trials for trial in some),
+            )
+            training = fit(
+                config, train_frames, validation, folder, origin=facts, start=start, trainer=trainer, logger=opened
             )
         return replace(training, condition=condition)
 
@@ -185,7 +199,7 @@ def train(
         if out is None:
             with scratch_folder() as folder:
                 training = run(folder)
-                return replace(load_checkpoint(folder), training=training)
+                return replace(load(folder), training=training)
         out = Path(out)
         with output_folder(out, stage="train", config={**origin, "training": config}, overwrite=overwrite) as output:
             if not output.complete:
@@ -194,40 +208,12 @@ def train(
                 ) as opened:
                     training = run(output.folder, opened)
                 save_result(training, output.folder)
-        network = load_checkpoint(out)
+        network = load(out)
         training = network.training
         assert training is not None
         best = f"validation MSE {training.best_validation_mse:.4f}"
         report_file(out, f"{training.epochs:.1f} epochs in {training.minutes:.1f} min, {best}", kept=output.complete)
         return network
-
-
-def _fit_trials(
-    config: TrainingConfig,
-    data: Dataset,
-    trials: tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]],
-    folder: Path,
-    *,
-    encoding: Encoding,
-    start: Network | None,
-    trainer: lightning.Trainer,
-    logger: Logger | None,
-) -> Training:
-    load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=folder)
-    with open_stage(f"Reading training trials ({encoding.name})"):
-        train_frames = load_some(trials[0], untouched_share=config.untouched_share)
-    with open_stage(f"Reading validation trials ({encoding.name})"):
-        validation = load_some(trials[1])
-    info = trials[0][0]
-    origin = DataOrigin(
-        frame_size=(info.height, info.width),
-        sensor=info.sensor,
-        data_hash=data.hash,
-        colour=has_colour(data.read_labels(info).reference),
-        pull_direction_deg=trained_directions(config, data, trials[0], start),
-        trained_on=tuple(trial.sha256[:12] for some in trials for trial in some),
-    )
-    return fit(config, train_frames, validation, folder, origin=origin, start=start, trainer=trainer, logger=logger)
 
 
 def _configure(recipe: str, changes: TrainingChanges, start: Network | None) -> TrainingConfig:
@@ -302,11 +288,9 @@ def pull_direction(trial: Recording) -> float | None:
     shears = [estimator.estimate(trial.frames[frame]) for frame in lowest]
     if not shears:
         return None
-    x_px, y_px, sigma_px = (
-        float(np.mean([getattr(shear, name) for shear in shears])) for name in ("x_px", "y_px", "sigma_px")
-    )
-    mean = Shear(x_px=x_px, y_px=y_px, sigma_px=sigma_px)
-    return mean.direction_deg if np.hypot(x_px, y_px) > _SURE * sigma_px else None
+    means = {name: float(np.mean([getattr(shear, name) for shear in shears])) for name in ("x_px", "y_px", "sigma_px")}
+    mean = Shear(**means)
+    return mean.direction_deg if np.hypot(mean.x_px, mean.y_px) > _SURE * mean.sigma_px else None
 
 
 def _advise(
@@ -416,9 +400,14 @@ def fit(
         max_minutes=config.max_minutes,
         metrics_file=folder / "metrics.csv",
     )
-    frames, network = (train, validation), model
+    frames, network = [train, validation], model
     if config.learns == "ratio":
-        network, frames = _last_layer_alone(model, *frames, batch_size=config.batch_size)
+        network = HistogramRegressor(last_layer(model), ratio=True)
+        network.load_state_dict(  # edges of a network of the package are rounded
+            {name: model.get_buffer(name) for name in ("temperature", "edges", "ratio_edges")}, strict=False
+        )
+        with open_stage("Passing frames through the network"):
+            frames = [extract_features(model, some, batch_size=config.batch_size) for some in report_each(frames)]
     augmentation = get_augmentation(config.augmentation, neutral=train.encoding.neutral)
     module = Regressor(network, config=config, augmentation=augmentation, progress=progress)
     best = ModelCheckpoint(dirpath=folder / "checkpoints", filename="best", monitor="validation_mse")
@@ -451,8 +440,10 @@ def fit(
             last_layer(model).load_state_dict(last_layer(network).state_dict())
         model.eval()
         if learnt is None:
-            few = (some.sample(_NOVELTY_FRAMES, batch_size=config.batch_size) for some in (train, validation))
-            novelty = fit_novelty(model, *few)
+            novelty = fit_novelty(
+                model,
+                *(some.sample(_NOVELTY_FRAMES, batch_size=config.batch_size) for some in (train, validation)),
+            )
         else:  # the last layer alone was trained: the early layers stay as they were
             novelty = learnt.novelty
         manifest = Manifest(
@@ -517,17 +508,6 @@ def _begin(config: TrainingConfig, encoding: Encoding, start: Network | None) ->
         fill = model.load_state_dict if start.manifest.head == config.head else partial(fill_head, model)
         fill(weights)
     return model
-
-
-def _last_layer_alone(
-    model: nn.Module, *frames: FrameSet, batch_size: int
-) -> tuple[HistogramRegressor, tuple[FrameSet, ...]]:
-    """Make a network of the last layer alone, and training and validation frames of its inputs."""
-    alone = HistogramRegressor(last_layer(model), ratio=True)
-    for name in ("temperature", "edges", "ratio_edges"):  # edges of a network of the package are rounded
-        alone.get_buffer(name).copy_(model.get_buffer(name))
-    with open_stage("Passing frames through the network"):
-        return alone, tuple(extract_features(model, some, batch_size=batch_size) for some in report_each(frames))
 
 
 def _check_frames(config: TrainingConfig, train: FrameSet, validation: FrameSet) -> None:
