@@ -28,6 +28,14 @@ def test_a_strip_shows_the_frames_nearest_to_its_levels(strip):
     assert np.array_equal(strip.pictures, make_recording("t").frames[list(strip.shown)])
 
 
+def test_a_strip_compares_with_the_last_frame_before_the_pull(strip, run):
+    assert strip.baseline == "stick"
+    assert strip.shown[0] == 1  # the stick frame itself
+    np.testing.assert_allclose(strip.relevance[0], 0, atol=1e-9)
+    untouched = make_strip(run, make_recording("t"), source="simulated", levels=(0.0,), baseline="untouched")
+    assert untouched.baseline == "untouched"
+
+
 def test_a_strip_is_explanation_by_the_recommended_method_of_tiles_where_no_markers_show(strip):
     assert strip.method == RECOMMENDED_METHOD.removesuffix("-marker")
 

@@ -118,7 +118,7 @@ def find_stick_frame(
     return hold
 
 
-def _try_stick_frame(
+def try_stick_frame(
     trial: str,
     frames: Iterable[UInt8[np.ndarray, "height width 3"]],
     reference: UInt8[np.ndarray, "height width 3"] | None,
@@ -163,7 +163,7 @@ def frames_from_arrays(
     stick, warnings = None, ()
     if isinstance(baseline, str):
         if baseline == "stick":
-            stick, warnings = _try_stick_frame("frames", frames, reference)
+            stick, warnings = try_stick_frame("frames", frames, reference)
         compared = reference if stick is None else frames[stick]
         name = "untouched" if stick is None else "stick"
     else:
@@ -305,7 +305,7 @@ def _take(
     stick, warnings = None, ()
     if isinstance(baseline, str) and baseline == "stick":
         baseline = "untouched"
-        stick, warnings = _try_stick_frame(opened.name, opened.read_frames(), untouched, opened.safety_margin)
+        stick, warnings = try_stick_frame(opened.name, opened.read_frames(), untouched, opened.safety_margin)
     wanted = {*numbers} if stick is None else {*numbers, stick}
     frames = {
         number: frame for number, frame in enumerate(islice(opened.read_frames(), max(wanted) + 1)) if number in wanted

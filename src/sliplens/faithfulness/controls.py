@@ -127,7 +127,7 @@ def centre(images: Images) -> ControlMaps:
 
 
 def control_maps(model: nn.Module, images: Images, references: Images) -> dict[str, Maps]:
-    """Compute maps that use nothing the network learned, by name, of images and their untouched sensors.
+    """Compute maps that use nothing the network learned, by name, of images and their baselines.
 
     Beside these stand random orders, and each explainer on networks whose weights were drawn anew. A network without
     layers that have a map has no `weights-1`.

@@ -110,7 +110,7 @@ Painter = Callable[
 ]
 """From numbers of images, and the pixels that are gone of each, to the images without them."""
 Fill = Callable[[Images, Images | None, int], Painter]
-"""From inputs in [0, 1], their references (the untouched sensor) if they are known, and a seed, to a painter."""
+"""From inputs in [0, 1], their references (the baseline) if they are known, and a seed, to a painter."""
 
 
 def _static(fill: Callable[[Images], Images]) -> Fill:
@@ -168,7 +168,7 @@ _ROWS: dict[str, Fill] = {
 FILLS = Table("fill", "sliplens.fills", _ROWS)
 """Fills by name; an installed package adds its own by the entry point `sliplens.fills`.
 
-`background` is the median colour of the image, `reference` the untouched sensor; `noisy-linear` (ROAD) blends the
+`background` is the median colour of the image, `reference` the baseline; `noisy-linear` (ROAD) blends the
 pixels around, with a little noise.
 """
 

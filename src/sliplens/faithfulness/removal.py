@@ -85,7 +85,7 @@ class RemovalCurves:
     """Answers in margin units; at step 0 those on the whole images."""
 
     def lost(self, towards: Float[np.ndarray, " images"]) -> Float64[np.ndarray, "orders images steps"]:
-        """Changes along the sign of f(x) - f(untouched sensor): how much of the supporting evidence is removed."""
+        """Changes along the sign of f(x) - f(baseline): how much of the supporting evidence is removed."""
         return towards[:, None] * (self.answers[..., :1] - self.answers)
 
     def by_method(self, names: Iterable[str], *, towards: Float[np.ndarray, " images"]) -> dict[str, RemovalCurve]:
@@ -148,7 +148,7 @@ def removal_curves(
 ) -> RemovalCurves:
     """Predict inputs while parts of them are removed, in several orders each.
 
-    Inputs are in [0, 1], as the references, those of the untouched sensor, where the fill needs them. Orders are flat
+    Inputs are in [0, 1], as the references, those of the baseline, where the fill needs them. Orders are flat
     pixel indices, first to be removed first (`unit_order`); areas are shares of the image, rising from 0 to 1.
     `batch_size` images are made and answered at a time, which bounds the memory.
 
@@ -205,7 +205,7 @@ def score_maps(
     """Score the maps of several methods on the same images, against the same random orders.
 
     Of signed relevance give the part that works towards the target; changes count along `towards`, the sign of
-    f(x) - f(untouched sensor) of each image.
+    f(x) - f(baseline) of each image.
 
     Samek et al., *Evaluating the Visualization of What a Deep Neural Network Has Learned* (2017), most and least
     relevant first.

@@ -19,7 +19,7 @@ from sliplens.faithfulness.removal import Predict, removal_curves
 from sliplens.intervals import mean_interval, paired_difference
 from sliplens.models import Network
 from sliplens.models.engines import Engine, prepare
-from sliplens.results.explanation import Explanation, MethodNotes, require_saliency
+from sliplens.results.explanation import BASELINES, Explanation, MethodNotes, require_saliency
 from sliplens.results.faithfulness import (
     CHANCE,
     DeletionScores,
@@ -166,7 +166,7 @@ def score_curves(
         scores=tuple(scores),
         comparisons=tuple(comparisons),
         alarms=(
-            *little_to_explain(change),
+            *little_to_explain(change, baseline=BASELINES[explanation.baseline]),
             *saturated(whole),
             *flat_maps({name: explanation.influence(name) for name in explanation.relevance}),
             *(alarm for fill, gone in blank.items() for alarm in fill_decides(whole, gone, fill=fill)),
@@ -346,12 +346,12 @@ def follows_last_step(
     return [f"{name} correlates with its last step by {tied:.2f}: it measures the fill rather than the map"]
 
 
-def little_to_explain(change: Float[np.ndarray, " images"]) -> list[str]:
-    """Warn of frames predicted nearly like the untouched sensor, whose direction is chance."""
+def little_to_explain(change: Float[np.ndarray, " images"], *, baseline: str) -> list[str]:
+    """Warn of frames predicted nearly like the baseline, whose direction is chance."""
     few = int(np.sum(np.abs(change) < CLOSE))
     sentence = (
-        f"next to nothing to explain in {few} of {len(change)} frames: the answer lies within {CLOSE} of that on the "
-        "untouched sensor, less than networks err by, and the direction that a gain counts along is chance; leave them "
+        f"next to nothing to explain in {few} of {len(change)} frames: the answer lies within {CLOSE} of that on "
+        f"{baseline}, less than networks err by, and the direction that a gain counts along is chance; leave them "
         "out"
     )
     return [sentence] if few else []

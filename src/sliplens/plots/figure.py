@@ -96,7 +96,8 @@ def _explanation(explanation: Explanation, ax: Axes, index: int) -> None:
     ax.set_axis_off()
     predicted = "withheld" if frame.withheld else percent(frame.prediction)
     why = f"why {predicted} rather than {percent(frame.reference_prediction)}"
-    ax.set_title(f"{method_name(explanation.method)}: {why}\norange lowers, blue raises")
+    baseline = explanation.baseline_words(row)
+    ax.set_title(f"{method_name(explanation.method)}: {why},\nthat of {baseline}\norange lowers, blue raises")
 
 
 def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int) -> None:

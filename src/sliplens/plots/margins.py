@@ -30,7 +30,7 @@ from sliplens.plots.style import (
     shade_withheld,
     source_name,
 )
-from sliplens.results.explanation import Strip
+from sliplens.results.explanation import BASELINES, Strip
 
 MARGIN_LABEL = "Safety margin Γ (%)"
 MOST_TRIALS = 6
@@ -102,7 +102,8 @@ def draw_strip(strip: Strip) -> Figure:
         network = input_name(strip.input).lower()
         figure.suptitle(
             f"A {strip.condition} grip from stick to slip ({source_name(strip.source)})\nFrames under the map of "
-            f"{method_name(strip.method)}, network on {network}: orange lowers its margin, blue raises it",
+            f"{method_name(strip.method)}, network on {network}: orange lowers its margin, blue raises it,\nagainst "
+            f"{BASELINES[strip.baseline]}",
             x=0.01, ha="left", fontsize=11,
         )  # fmt: skip
         grid = figure.add_gridspec(2, count, height_ratios=(8.2 / count, 2.6))

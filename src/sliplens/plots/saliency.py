@@ -16,7 +16,7 @@ from matplotlib.ticker import PercentFormatter
 
 from sliplens.images import write_png
 from sliplens.plots.style import ORANGE, SKY, drawing_style, method_name, percent, place_axes, place_text, reading_words
-from sliplens.results.explanation import Explanation
+from sliplens.results.explanation import BASELINES, Explanation
 
 FrameU8: TypeAlias = UInt8[np.ndarray, "height width 3"]
 """A picture, RGB."""
@@ -111,6 +111,7 @@ def draw_explanation(explanation: Explanation, folder: Path, *, colours: Colours
     words = _BAR_WORDS
     if colours == "jet":
         words = "supports the prediction (share of its own picture's strongest)"
+    words += f"\nagainst {BASELINES[explanation.baseline]}"
     if len(columns) < count:
         words += f"\n{len(columns)} of {count} frames, evenly spread; overlays/ has them all"
     bar = ScalarMappable(Normalize(0, 1), "jet") if colours == "jet" else SIGN_BAR

@@ -51,7 +51,7 @@ CONTROL_NAMES = {
 }
 """Names of maps that no explainer makes; those of explainers are in their rows of `EXPLAINERS`."""
 FILL_NAMES = {
-    "reference": "untouched frame",
+    "reference": "baseline frame",
     "grey": "grey",
     "background": "background",
     "blur": "blur",

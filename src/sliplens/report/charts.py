@@ -188,7 +188,7 @@ def plate_removal_curves(faithful: Faithfulness) -> Plate | None:
         figure=figure,
         alt=f"Evidence lost against the area removed, {style.input_name(faithful.input).lower()}, for "
         f"{style.listed([style.method_name(method) for method in methods])}",
-        caption=f"{style.input_name(faithful.input)}: how much of the prediction's change from the untouched sensor is "
+        caption=f"{style.input_name(faithful.input)}: how much of the prediction's change from the baseline is "
         f"lost while parts go, most supporting first, least supporting first, and in {faithful.random_orders} random "
         f"orders; the band holds the middle half of {number_of(faithful.frames, 'frame')}. The area between the first "
         "two is the symmetric gain.",

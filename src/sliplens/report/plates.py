@@ -38,7 +38,7 @@ from sliplens.plots.style import (
     written_whole,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import Explanation, Strip
+from sliplens.results.explanation import BASELINES, Explanation, Strip
 from sliplens.results.faithfulness import is_control
 
 FOLDER = "figures"
@@ -114,8 +114,8 @@ def plate_strip(strip: Strip) -> Plate:
         f"the true and the predicted safety margin over time: {ends[0]} at first and {ends[-1]} at last.",
         caption=f"One grip of {source_name(strip.source)} from stick to slip: the first {strip.condition} trial that "
         f"tests, chosen by its place alone. Above: the camera's frames under the map of {method_name(strip.method)}, "
-        "one scale for all. Below: the true margin, the predicted margin, and the interval that should hold 90 % of "
-        "the labels.",
+        f"against {BASELINES[strip.baseline]}, one scale for all. Below: the true margin, the predicted margin, and "
+        "the interval that should hold 90 % of the labels.",
         columns=list(vars(readings)),
         rows=rows_of(*vars(readings).values()),
         pixels=True,
@@ -142,8 +142,9 @@ def plate_states(results: Results, explained: Explanation) -> Plate:
         name=f"real-{explained.input}" if explained.source == "real" else name,
         figure=draw_pictures(lines, heads=heads, bar=SIGN_BAR),
         alt=f"{what}: {listed([method_name(method) for method in methods])} from stick to slip",
-        caption=f"{what}, from full stick to full slip.{errors} Orange lowers the margin against the untouched sensor, "
-        "blue raises it; one scale a method, so that its frames compare and methods do not.",
+        caption=f"{what}, from full stick to full slip.{errors} Orange lowers the margin against that of "
+        f"{BASELINES[explained.baseline]}, blue raises it; one scale a method, so that its frames compare and methods "
+        "do not.",
         columns=("input", "method", "frame_id", "safety_margin", "prediction", "relevance"),
         rows=[
             (explained.input, method, frame.id, frame.safety_margin, frame.prediction, float(relevance.sum()))

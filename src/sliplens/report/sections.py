@@ -13,6 +13,7 @@ from sliplens.report.claims import judge_claims
 from sliplens.report.comparisons import write_sample
 from sliplens.report.results import Results
 from sliplens.report.verdict import Verdict
+from sliplens.results.explanation import BASELINES
 from sliplens.results.study import TESTS
 
 
@@ -53,11 +54,13 @@ class Section:
 def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Section, ...]:
     """Build the sections whose results are there, in the order they are read; the last says what was not run."""
     built, absent, study = [], [], results.study
+    baseline = next((BASELINES[each.baseline] for each in results.explanations.values()), BASELINES["untouched"])
     for section in SECTIONS:
         blocks = tuple(block for block in section.build(results, rng) if block is not None)
         if blocks:
             sample = f" {write_sample(study.choice)}" if study.choice is not None and section.of_sample else ""
-            built.append(replace(section, intro=f"{section.intro}{sample}", blocks=blocks))
+            intro = f"{section.intro}{sample}".replace("{baseline}", baseline)
+            built.append(replace(section, intro=intro, blocks=blocks))
         elif study and section.step and not (section.step == "truth" and study.source == "real"):
             left_out = study.config is not None and section.step in set(TESTS) - set(study.config.tests)
             absent += [] if left_out else [section.short_title]
@@ -222,7 +225,7 @@ SECTIONS: tuple[Section, ...] = (
         title="How far the explanations can be believed",
         short_title="Faithfulness",
         intro="Parts of a frame are removed: the most supporting first, the least supporting first, and at random. "
-        "With a faithful map the prediction returns to that of the untouched sensor at once in the first case, and not "
+        "With a faithful map the prediction returns to that of {baseline} at once in the first case, and not "
         "in the second. Controls are maps that use nothing the network learned.",
         build=_faithfulness,
         step="faithfulness",
@@ -253,7 +256,7 @@ SECTIONS: tuple[Section, ...] = (
         title="Where each network looks, and what the maps look like",
         short_title="Saliency maps",
         intro="From full stick (Γ 100 %) to the onset of full slip (Γ 0 %): why each network predicts its margin "
-        "rather than that of the untouched sensor. The thesis judged the maps by eye; a study measures the same.",
+        "rather than that of {baseline}. The thesis judged the maps by eye; a study measures the same.",
         build=_study_maps,
         step="explain",
         of_sample=True,

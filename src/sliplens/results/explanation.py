@@ -60,7 +60,7 @@ class MethodNotes:
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation(OfNetwork):
-    """Explanations of some frames by one or several methods: why the network predicts f(x) rather than f(reference)."""
+    """Explanations of some frames by one or several methods: why the network predicts f(x) rather than f(baseline)."""
 
     weights_sha256: str
     """Hash of the network that was explained."""
@@ -120,6 +120,11 @@ class Explanation(OfNetwork):
                 "completeness_gap": np.concatenate([*gaps, []]),
             }
         )
+
+    def baseline_words(self, row: int) -> str:
+        """Return the baseline of a frame in words."""
+        lacks_stick = self.baseline == "stick" and self.frames[row].baseline_frame is None
+        return BASELINES["untouched" if lacks_stick else self.baseline]
 
     @property
     def method(self) -> str:
@@ -251,4 +256,5 @@ class Strip:
     """Numbers of the frames that have pictures and maps."""
     pictures: UInt8[np.ndarray, "shown height width 3"]
     relevance: Annotated[Float32[np.ndarray, "shown rows columns"], ANSWER]
-    """Signed contribution of each pixel to f(x) - f(untouched sensor), in margin units."""
+    """Signed contribution of each pixel to f(x) - f(baseline), in margin units."""
+    baseline: BaselineName = "untouched"

@@ -153,7 +153,7 @@ class RemovalGap(MethodGap):
 class RemovalCurve:
     """Change of a network's predictions while parts of frames are removed, by one method, fill and unit.
 
-    Changes are in margin units, along the sign of f(x) - f(untouched sensor) where it is known, else by size.
+    Changes are in margin units, along the sign of f(x) - f(baseline) where it is known, else by size.
 
     Examples
     --------

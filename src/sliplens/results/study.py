@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, Shaped
@@ -12,7 +12,7 @@ from jaxtyping import Float32, Float64, Int64, Shaped
 from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
 from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, PIXEL, Evaluation, OfNetwork
-from sliplens.results.explanation import Explanation
+from sliplens.results.explanation import BASELINES, BaselineName, Explanation
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, Lead, MethodGap
 
 REGIONS = ("markers", "slip_annulus", "edges")
@@ -392,6 +392,8 @@ class StudyConfig:
     """Explainers to compare."""
     budget: float = STUDY_BUDGET
     """Share of the channels that Poly-CAM measures at first."""
+    baseline: Literal["untouched", "stick"] = "stick"
+    """What predictions are compared with: the last frame before the pull of the trial, or the untouched sensor."""
     split: str = "test"
     condition: str = "dry"
     """Split and condition of the trials to choose from."""
@@ -411,11 +413,11 @@ class StudyConfig:
     """Seed of random orders, new weights and noise."""
 
 
-def say_left_out(dropped: int, chosen: int, name: str) -> str:
+def say_left_out(dropped: int, chosen: int, name: str, baseline: BaselineName) -> str:
     """Say how many of the frames to score are left out of the scores of an input."""
     return (
         f"{dropped} of {chosen} frames to score are left out with the {name} network: it predicts nearly the margin "
-        "of the untouched sensor there, so that there is nothing to explain and the direction is chance"
+        f"of {BASELINES[baseline]} there, so that there is nothing to explain and the direction is chance"
     )
 
 
@@ -459,7 +461,12 @@ class Study:
         chosen = sum(frame.scored for frame in self.choice.frames)
         tested = {**self.faithfulness, **self.truth}
         return {
-            name: say_left_out(chosen - record.frames, chosen, name)
+            name: say_left_out(
+                chosen - record.frames,
+                chosen,
+                name,
+                self.explanations[name].baseline if name in self.explanations else "untouched",
+            )
             for name, record in tested.items()
             if record.frames < chosen
         }

@@ -253,7 +253,7 @@ class Material:
     inputs: Float[Tensor, "frames colours size size"]
     """Inputs of the network, in [0, 1]."""
     references: Float[Tensor, "frames colours size size"]
-    """The untouched sensor for each frame."""
+    """Inputs of the baseline of each frame."""
     markers: Mapping[str, MarkerPlaces]
     """By frame, in camera pixels; frames in which none could be followed are absent."""
     explainers: Mapping[str, Explainer]
@@ -281,8 +281,8 @@ class Material:
 def worth_scoring(chosen: Iterable[ChosenFrame], explained: Explanation) -> tuple[ChosenFrame, ...]:
     """Select the frames to score in which the answer changed by `CLOSE` or more.
 
-    The sign of a smaller change, along which maps are ranked, is chance. Of a network that tells no frame from the
-    untouched sensor all are scored.
+    The sign of a smaller change, along which maps are ranked, is chance. If a network tells no frame from the
+    baseline, all are scored.
     """
     changes = {frame.id: abs(frame.prediction - frame.reference_prediction) for frame in explained.frames}
     scored = tuple(frame for frame in chosen if frame.scored)

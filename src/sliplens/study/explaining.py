@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypedDict, Unpack
+from typing import Literal, TypedDict, Unpack
 
 import numpy as np
 from jaxtyping import UInt8
@@ -32,6 +32,7 @@ from sliplens.explainers.frames import (
     frames_from_folder,
     nearest_frame,
     require_labels,
+    try_stick_frame,
 )
 from sliplens.explainers.occlusion import markers_in_recording
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
@@ -321,10 +322,12 @@ def make_strip(
     source: str,
     method: str = RECOMMENDED_METHOD,
     levels: Sequence[float] = MARGIN_LEVELS,
+    baseline: Literal["untouched", "stick"] = "stick",
 ) -> Strip:
     """Predict every frame of a trial, and explain those nearest to some safety margins in [0, 1].
 
-    `source` is `simulated` or `real`. A method by marker becomes one by tile where no markers are found.
+    `source` is `simulated` or `real`. Without a stick frame the baseline is the untouched sensor. A method by
+    marker becomes one by tile where no markers are found.
     """
     margin = require_labels(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
     rows = tuple(sorted({nearest_frame(margin, level) for level in levels}))
@@ -334,7 +337,11 @@ def make_strip(
     withheld = estimate.withheld(np.isfinite(margin))
     trusted = np.array([reason is None for reason in withheld])
     pictures, size = recording.frames[list(rows)], network.manifest.image_size
-    chosen, explainers = frames_from_arrays(network, pictures, recording.reference), study_explainers([method])
+    stick = try_stick_frame(recording.trial, recording.frames, recording.reference, margin)[0]
+    stick = None if baseline == "untouched" else stick
+    compared = "untouched" if stick is None else recording.frames[stick]
+    chosen = frames_from_arrays(network, pictures, recording.reference, baseline=compared)
+    explainers = study_explainers([method])
     inputs = network.encoding.normalise(chosen.images)
     try:
         explainers = with_markers(
@@ -363,4 +370,5 @@ def make_strip(
         shown=rows,
         pictures=pictures,
         relevance=maps,
+        baseline="untouched" if stick is None else "stick",
     )

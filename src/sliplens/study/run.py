@@ -275,7 +275,8 @@ def _note_markers(records: Records) -> Iterator[str]:
 
 def _explain(records: Records) -> Explaining:
     run, chosen, markers = records.run, records["choice"].frames, records["states"].markers
-    frames = frames_at(run, records.data, [(frame.trial, frame.frame) for frame in chosen])
+    places = [(frame.trial, frame.frame) for frame in chosen]
+    frames = frames_at(run, records.data, places, baseline=records.config.baseline)
     images = run.encoding.normalise(frames.images)
     explainers = with_markers(records.explainers, images, lambda: marker_places(run, chosen, markers))
     return Explaining(trained=run, chosen=replace(frames, find_markers=None), explainers=explainers)
@@ -284,7 +285,7 @@ def _explain(records: Records) -> Explaining:
 def _note_left_out(records: Records) -> Iterator[str]:
     scored = [frame for frame in records["choice"].frames if frame.scored]
     if records.config.tests and (dropped := len(scored) - len(worth_scoring(scored, records["explain"]))):
-        yield say_left_out(dropped, len(scored), records.network)
+        yield say_left_out(dropped, len(scored), records.network, records["explain"].baseline)
 
 
 def _delete(records: Records) -> PixelDeletion:
@@ -344,7 +345,7 @@ class Step:
     needs: tuple[str, ...] = ("explain",)
     """Steps whose records it takes."""
     options: tuple[str, ...] = ()
-    """Fields of `StudyConfig`, or `redrawn`, that its record depends on, beside methods, budget and seed."""
+    """Fields of `StudyConfig`, or `redrawn`, that its record depends on, beside methods, budget, baseline and seed."""
     notes: Callable[[Records], Iterator[str]] = lambda _: iter(())
     """Sentences that the user should know once it is made."""
     shared: bool = False
@@ -352,7 +353,7 @@ class Step:
 
     def config(self, records: Records) -> Mapping[str, object]:
         """Return all that the record depends on: a folder with another configuration is not reused."""
-        names = self.options if self.shared else ("methods", "budget", "seed", *self.options)
+        names = self.options if self.shared else ("methods", "budget", "baseline", "seed", *self.options)
         values = vars(records.config) | {"redrawn": records.redrawn}
         config = {name: values[name] for name in names} | {"data_hash": records.data.hash}
         weights = {name: run.manifest.weights_sha256 for name, run in records.networks.items()}

@@ -67,10 +67,10 @@ def score(
 ) -> Faithfulness:
     """Score maps by removing what they call influential first, and last, against random orders and controls.
 
-    The score is the symmetric gain, in margin units: how much further the prediction moves towards that on the
-    untouched sensor with the most influential parts removed first rather than the least. Maps that gain no more than
+    The score is the symmetric gain, in margin units: how much further the prediction moves towards that of the
+    baseline with the most influential parts removed first rather than the least. Maps that gain no more than
     the controls, which use nothing the network learned, show nothing. Every frame counts; an alarm names how many are
-    predicted nearly like the untouched sensor, which a study leaves out (`worth_scoring`). The record also holds the
+    predicted nearly like the baseline, which a study leaves out (`worth_scoring`). The record also holds the
     deletion score of the thesis, under its grey fill, to compare with published figures (docs/deletion.md).
 
     Parameters
@@ -88,7 +88,8 @@ def score(
         as those of an `Explanation` do. If False, larger where a pixel matters more, whichever way the prediction went,
         as a saliency in [0, 1].
     fill
-        Content of removed pixels, a row of `FILLS`; `reference`, the untouched sensor, is one that networks know.
+        Content of removed pixels, a row of `FILLS`; `reference`, the baseline of the explanation, is one that networks
+        know.
     unit
         What is removed at once: pixels, or square tiles of a fourteenth of the image.
     random_orders
