@@ -15,7 +15,7 @@ import torch
 from sliplens.errors import InputError, SliplensError
 from sliplens.files import machine, scratch_folder, shipped_names, versions
 from sliplens.images import list_images, read_image
-from sliplens.live.camera import list_cameras
+from sliplens.live.sources import list_cameras
 from sliplens.models.checkpoint import Network, load
 from sliplens.models.engines import ENGINES, find_obstacle, prepare
 from sliplens.models.onnx import TOLERANCE

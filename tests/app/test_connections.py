@@ -14,7 +14,6 @@ import pytest
 uvicorn = pytest.importorskip("uvicorn", reason="the page needs NiceGUI (extra live), which brings it")
 
 from sliplens.app import connections  # noqa: E402 (needs it)
-from sliplens.app.server import Gate  # noqa: E402
 
 GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n"
 POST = GET.replace(b"GET", b"POST")
@@ -50,7 +49,7 @@ def serving(token: str | None) -> Iterator[int]:
     """Serve `inside` behind the gate; gives the port."""
     with socket.create_server(("127.0.0.1", 0)) as listening:
         port = listening.getsockname()[1]
-        server = uvicorn.Server(connections.server_config(Gate(inside, token=token, port=port)))
+        server = uvicorn.Server(connections.server_config(connections.Gate(inside, token=token, port=port)))
         thread = Thread(target=lambda: asyncio.run(server.serve([listening])), daemon=True)
         thread.start()
         try:

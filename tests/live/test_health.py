@@ -1,12 +1,13 @@
 """Health: each fault is told by its own check, and healthy frames by none."""
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from sliplens.errors import InputError
 from sliplens.live import Check, HealthMonitor, LiveFrame
 from sliplens.live.health import check_novelty, margin_risk, severity
 from sliplens.markers import Tracker
@@ -88,22 +89,28 @@ def test_a_camera_that_moved_is_told_in_pixels(
     assert "take a new reference" in checks["camera"].sentence
 
 
-def test_defocus_takes_sharpness(monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator):
-    assert "focus" in failed(monitor.check(shot(blurred(untouched), rng)))
+def covered(level: float, picture: np.ndarray) -> np.ndarray:
+    """A picture whose upper part is black or white."""
+    return np.concatenate([np.full((30, *picture.shape[1:]), level), picture[30:]])
 
 
-def test_a_lamp_that_is_out_darkens_one_side(monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator):
-    ramp = np.linspace(0.5, 1.0, SIDE)[None, :, None]
-    assert "light" in failed(monitor.check(shot(ramp * untouched, rng)))
-
-
-def test_a_picture_that_turns_white_or_black_is_told(
-    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator
+@pytest.mark.parametrize(
+    ("fault", "name"),
+    [
+        (blurred, "focus"),
+        (lambda picture: np.linspace(0.5, 1.0, SIDE)[None, :, None] * picture, "light"),
+        (partial(covered, -10.0), "saturation"),
+        (partial(covered, 265.0), "saturation"),
+    ],
+)
+def test_a_fault_of_the_picture_fails_its_check(
+    fault: Callable[[np.ndarray], np.ndarray],
+    name: str,
+    monitor: HealthMonitor,
+    untouched: np.ndarray,
+    rng: np.random.Generator,
 ):
-    for level in (0.0, 255.0):
-        covered = untouched.copy()
-        covered[:30] = level + np.sign(127 - level) * -10
-        assert "saturation" in failed(monitor.check(shot(covered, rng)))
+    assert name in failed(monitor.check(shot(fault(untouched), rng)))
 
 
 def test_frames_that_repeat_come_late_or_are_lost_are_told(
@@ -189,12 +196,6 @@ def test_a_frame_is_strange_where_predict_withholds_it(known: float, ok: bool):
     assert check is not None
     assert check.ok == ok
     assert (severity(check) <= 1) == ok
-
-
-@pytest.mark.parametrize(("name", "limit"), [("focus", -1.0), ("haze", 1.0)])
-def test_a_limit_that_cannot_be_is_refused_with_those_that_can(untouched: np.ndarray, name: str, limit: float):
-    with pytest.raises(InputError, match=f"the health limit {name} is {limit:g}; give a positive limit of one of"):
-        HealthMonitor(untouched.astype(np.uint8), {name: limit})
 
 
 def check_of(name: str, value: float, *, limit: float = 1.0) -> Check:

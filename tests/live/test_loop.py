@@ -16,9 +16,8 @@ import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import sliplens as sl
-from sliplens.errors import ImageError, InputError
+from sliplens.errors import ImageError
 from sliplens.live.contract import LiveSource
-from sliplens.live.frame_reader import LowPass
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.recordings import ContactState, Dataset, Recording
@@ -342,23 +341,9 @@ def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another
     assert kept[5:9] == [sequence and not same_object] * 4
 
 
-def test_only_a_network_that_tells_f_t_over_f_n_can_learn_friction(difference_run: Path):
-    with pytest.raises(InputError, match="--same-object needs a network; name one with --network"):
-        plain_reader("simulated", same_object=True)
-    with pytest.raises(InputError, match="--same-object learns friction from F_t / F_n"):
-        plain_reader("simulated", difference_run, same_object=True)
-
-
 def test_a_network_of_another_sensor_is_refused_before_anything_runs(difference_run: Path):
     with pytest.raises(ImageError, match=r"224 x 224 pixels but the network was trained on 48 x 48"):
         plain_reader("simulated", difference_run).__enter__()
-
-
-def test_a_low_pass_delays_a_ramp_by_its_time_constant(rng: np.random.Generator):
-    smooth, time_s = LowPass(time_constant_s=0.2), np.cumsum(rng.uniform(0.0005, 0.0015, 4000))
-    values = [smooth.update(np.array([3.0 * now]), now)[0] for now in time_s.tolist()]
-    # a sampled filter lags up to a sample less than a continuous one
-    assert values[-1] == pytest.approx(3.0 * (time_s[-1] - 0.2), abs=3.0 * 0.0015)
 
 
 def test_by_default_health_and_slip_are_watched_and_no_touch_has_no_margin(trials: dict[str, Recording]):

@@ -91,9 +91,3 @@ def test_without_a_network_the_markers_are_described(contact: bool | None):
     words = describe_reading(reading(markers=markers, slip=markers.state, contact_state=state))
     assert words.contact == {None: "unknown", False: "no contact", True: "contact"}[contact]
     assert not words.margin
-
-
-def test_a_line_says_what_its_parts_say():
-    for one in READINGS:
-        words = describe_reading(one)
-        assert all(part in str(one) for part in (words.margin, words.interval, words.advice))

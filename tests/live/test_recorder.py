@@ -19,7 +19,7 @@ from data_sets import contents
 
 import sliplens as sl
 from sliplens.errors import RecordingError, SliplensError
-from sliplens.live import ForceStream, LiveFrame, LiveOptions, Recorder, SimulatedSource, open_live
+from sliplens.live import ForceStream, LiveFrame, LiveOptions, Recorder, open_live
 from sliplens.recordings import Dataset, Recording, TrialFacts, load_dataset
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.dataset import begin_recording, finish_recording, recover_dataset
@@ -284,23 +284,6 @@ def test_a_reader_records_every_frame_whether_it_was_read_or_not(recording: Reco
     assert data is not None
     assert [info.frames for info in data.trials] == [12]
     assert sl.check_dataset(data) == ()
-
-
-def test_a_simulated_fingertip_is_recorded_with_its_forces_and_margins(tmp_path: Path):
-    source = SimulatedSource(rate_hz=100.0)
-    source.load(normal_force_n=1.5, tangential_force_n=0.6)
-    with sl.LiveReader(source) as reader:
-        reader.record(tmp_path / "data")
-        readings, recorder = reader.readings(), reader.recorder
-        assert recorder is not None
-        while recorder.state.sent < 3:
-            next(readings)
-    data = load_dataset(tmp_path / "data")
-    assert data.simulated
-    trial = data.load(data.trials[0])
-    np.testing.assert_allclose(trial.safety_margin, 1 - 0.6 / (0.775 * 1.5))
-    forces = load_forces(forces_path(data.folder, data.trials[0].trial))
-    np.testing.assert_allclose(forces.force_n, np.tile([0.6, 0.0, 1.5], (len(forces.time_s), 1)))
 
 
 # force samples that another program writes

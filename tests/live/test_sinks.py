@@ -142,11 +142,11 @@ def test_what_zenoh_carries_is_read_as_messages_of_ros(monkeypatch: pytest.Monke
     assert {key: len(heard) for key, heard in own.items()} == {
         "tip/left/margin": 1, "tip/left/reading": 2, "tip/left/image/compressed": 1,
     }  # fmt: skip
-    for topic in ROS_TOPICS:
-        by_name = own[f"tip/left/{topic.name}"]
+    for topic, kind in ROS_TOPICS.items():
+        by_name = own[f"tip/left/{topic}"]
         # the name that rmw_zenoh listens to, with the attachment without which it drops a message
-        by_type = samples[f"7/tip/left/{topic.name}/{topic.kind.replace('/', '::').replace('msg::', 'msg::dds_::')}_/"
-                          f"{types.hash_rihs01(topic.kind)}"]  # fmt: skip
+        by_type = samples[f"7/tip/left/{topic}/{kind.replace('/', '::').replace('msg::', 'msg::dds_::')}_/"
+                          f"{types.hash_rihs01(kind)}"]  # fmt: skip
         assert [bytes(sample.payload) for sample in by_type] == [bytes(sample.payload) for sample in by_name]
         attached = [bytes(sample.attachment) for sample in by_type]
         assert {len(words) for words in attached} == {8 + 8 + 1 + 16}

@@ -1,7 +1,6 @@
 """Running sources: each frame at its time, and the simulated fingertip under the load that it is given."""
 
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +12,6 @@ from sliplens.mechanics import safety_margin
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import open_source
-from sliplens.simulation.filming import prepare_film
-from sliplens.simulation.loading import load_at_margins
-from sliplens.simulation.nuisances import Day, Grasp, Nuisances, draw_unit
-from sliplens.simulation.sensor import CHROMATOUCH
 
 
 def test_a_trial_is_replayed_whole_with_its_labels_and_forces(small_dataset: Dataset):
@@ -94,18 +89,6 @@ def test_the_grip_that_repeats_touches_slips_and_lets_go():
 def test_a_load_that_cannot_be_is_refused(load: tuple[float, float]):
     with pytest.raises(InputError, match="give forces of 0 or more"):
         SimulatedSource().load(normal_force_n=load[0], tangential_force_n=load[1])
-
-
-def test_a_film_under_another_load_is_one_that_was_prepared_for_it(rng: np.random.Generator):
-    grasp, day = Grasp(blur_px=0.4), Day(camera_shift_px=(2.0, -1.0), camera_rotation_rad=0.03, modulus_factor=0.9)
-    unit = draw_unit(Nuisances(), markers=CHROMATOUCH.geometry.markers, rng=rng)
-    facts = {"grasp": grasp, "day": day, "unit": unit, "rng": rng, "noise": None}
-    untouched, pulled = (load_at_margins(np.array(margins), grasp=grasp) for margins in ([np.nan], [0.7, 0.2]))
-    film = prepare_film(CHROMATOUCH, loading=untouched, **facts).under(pulled, rng=rng)
-    whole = prepare_film(CHROMATOUCH, loading=pulled, **facts)
-    np.testing.assert_allclose(film.marker_px, whole.marker_px)
-    whole = replace(whole, blur_px=film.blur_px)  # drawn anew for every frame
-    np.testing.assert_array_equal(film.draw(slice(0, 2)), whole.draw(slice(0, 2)))
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 import subprocess
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,15 +16,10 @@ from there import there
 from sliplens.errors import InputError
 from sliplens.images import decode_png
 from sliplens.live import viewer as viewer_process
-from sliplens.live.viewer import Overlays, view_capture, view_explained, view_stored, write_rrd
+from sliplens.live.viewer import view_capture, view_explained, view_stored, write_rrd
 from sliplens.progress import reporting
-from sliplens.recordings import ContactState, Dataset, Recording, load_dataset
-from sliplens.recordings.capture import Capture, Forces
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.labels import LabelSettings
+from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.source import open_source
-from sliplens.recordings.store import forces_path, read_header
-from sliplens.recordings.trial_writer import import_trial
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -141,15 +135,6 @@ def test_labels_and_forces_are_those_of_the_recording(trial: Recording, simulate
     assert "label/high" not in simulated
 
 
-def test_states_begin_where_they_change(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
-    found = rows(simulated, "state/contact", "StateChange:state")
-    states = [state for (state,) in found.values]
-    last = np.searchsorted(there(found.frame), np.arange(FRAMES), side="right") - 1
-    assert [states[at] for at in last] == [str(state) for state in trial.contact_state]
-    assert all(one != other for one, other in pairwise(states))
-    assert "state/label" not in simulated
-
-
 def test_truth_lies_over_the_pixels_it_belongs_to(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
     truth = there(trial.truth)
     found = rows(simulated, "frame/zones", "SegmentationImage:buffer").values
@@ -216,8 +201,9 @@ def test_what_networks_and_trackers_say_stands_on_the_clock_of_the_frames(trial:
     tracks = pa.table({"trial": [trial.trial] * len(flat), **place, "x_px": flat[:, 0], "y_px": flat[:, 1]})
     pq.write_table(tracks, tmp_path / "tracks.parquet")
     maps = explained_of(trial, [3, 4, 9])
-    overlays = Overlays(predictions=tmp_path / "margins.parquet", maps=maps, tracks=tmp_path / "tracks.parquet")
-    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd", overlays=overlays)
+    viewed = view_stored(data, data.trials[0])
+    margins, followed = tmp_path / "margins.parquet", tmp_path / "tracks.parquet"
+    write_rrd(replace(viewed, predictions=margins, maps=maps, tracks=followed), tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
     read = rows(found, "margin", "Scalars:scalars")
     np.testing.assert_array_equal(read.frame, frames)
@@ -241,13 +227,14 @@ def test_what_is_of_another_trial_is_refused(trial: Recording, tmp_path: Path):
     data = save_dataset(tmp_path / "data", trial)
     nothing = {"trial": ["other"], "frame": [0], "prediction": [0.5], "low_90": [0.1], "high_90": [0.9]}
     pq.write_table(pa.table(nothing), tmp_path / "margins.parquet")
-    for overlays, words in (
-        (Overlays(predictions=tmp_path / "margins.parquet"), f"has no frame of {trial.trial}; it has other"),
-        (Overlays(maps=explained_of(replace(trial, trial="other"), [3])), "of no frame of"),
-        (Overlays(tracks=tmp_path / "margins.parquet"), "lacks the column"),
+    viewed, margins = view_stored(data, data.trials[0]), tmp_path / "margins.parquet"
+    for with_results, words in (
+        (replace(viewed, predictions=margins), f"has no frame of {trial.trial}; it has other"),
+        (replace(viewed, maps=explained_of(replace(trial, trial="other"), [3])), "of no frame of"),
+        (replace(viewed, tracks=margins), "lacks the column"),
     ):
         with pytest.raises(InputError, match=words):
-            write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd", overlays=overlays)
+            write_rrd(with_results, tmp_path / "a.rrd")
     assert not (tmp_path / "a.rrd").exists()
 
 
@@ -258,7 +245,7 @@ def test_frames_of_any_source_and_explained_ones_are_viewed_alike(trial: Recordi
     np.testing.assert_array_equal(pictures(found, "frame"), trial.frames)
     np.testing.assert_array_equal(pictures(found, "reference"), trial.reference[None])
     maps = explained_of(trial, [3, 9])
-    write_rrd(view_explained(maps), tmp_path / "b.rrd", overlays=Overlays(maps=maps))
+    write_rrd(replace(view_explained(maps), maps=maps), tmp_path / "b.rrd")
     found = read_rrd(tmp_path / "b.rrd")
     np.testing.assert_array_equal(pictures(found, "frame"), maps.pictures)
     np.testing.assert_allclose(numbers(found, "label/margin"), trial.safety_margin[[3, 9]])
@@ -291,58 +278,11 @@ def explained_of(trial: Recording, frames: list[int]) -> Explanation:
     )
 
 
-def test_an_imported_trial_says_what_its_labels_rest_on(tmp_path: Path):
-    long = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=120))
-    rng = np.random.default_rng(1)
-    time = np.arange(0, long.time_s[-1] + 0.1, 1 / 500)
-    pull, press = (np.interp(time, long.time_s, one) for one in (long.tangential_force_n, long.normal_force_n))
-    force = np.stack([pull, np.zeros_like(pull), press], axis=-1) + rng.normal(0, 0.02, (len(time), 3))
-    capture = Capture(
-        trial="cup_1",
-        sensor="mine",
-        object="paper_cup*",
-        source="cup",
-        frame_time_s=long.time_s + LAG_S,
-        frame_size=(224, 224),
-        read_frames=lambda: iter(long.frames),
-        forces=Forces(time_s=time, force_n=force, source="table of forces"),
-    )
-    path = trial_path(tmp_path, "cup_1")
-    import_trial(
-        capture,
-        path,
-        settings=LabelSettings(),
-        rng=rng,
-        forces_file=forces_path(tmp_path, "cup_1"),
-    )
-    write_dataset_table(tmp_path, [trial_info(path, split="test")])
-    data = load_dataset(tmp_path)
-    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
-    labelling, found = read_header(path).labelling, read_rrd(tmp_path / "a.rrd")
-    assert labelling is not None
-    assert labelling.basis is not None
-    np.testing.assert_array_equal(numbers(found, "ratio/friction"), labelling.basis.friction.mu)
-    (text,) = rows(found, "about", "TextDocument:text").values[0]
-    # as it was typed, not as Markdown reads it
-    assert r"- object: paper\_cup\*" in text
-    assert "**Friction found**" in text
-    assert "table of forces" in text
-
-
 def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
     def interrupt(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt), reporting(interrupt):
-        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
-    assert not list(tmp_path.iterdir())
-
-
-def test_rerun_switched_off_writes_no_empty_file(
-    monkeypatch: pytest.MonkeyPatch, small_dataset: Dataset, tmp_path: Path
-):
-    monkeypatch.setenv("RERUN", "off")
-    with pytest.raises(InputError, match="the environment variable RERUN switches Rerun off; unset it"):
         write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
     assert not list(tmp_path.iterdir())
 

@@ -9,7 +9,6 @@ from pulled import pulled_frames
 import sliplens as sl
 from sliplens.live import LiveFrame
 from sliplens.live.frame_reader import FrameReader
-from sliplens.live.health import HealthMonitor
 from sliplens.live.reading import Reading
 from sliplens.live.sources import open_live
 from sliplens.models import Network, make_engine
@@ -39,10 +38,7 @@ def turned_frames(direction_deg: float, turn: str, *, margins: tuple[float, ...]
 
 def read_live(network: Network, reference: np.ndarray, frames: np.ndarray) -> list[Reading]:
     """Read frames as a running sensor's, none of them dropped."""
-    reader = FrameReader(
-        open_live(frames), network, friction=None, same_object=False, sequence=False, smoothing_s=0.0,
-        health=HealthMonitor, slip=None,
-    )  # fmt: skip
+    reader = FrameReader(open_live(frames), network, slip=None)
     reader.begin(make_engine("torch", network, batch_size=1), reference)
     return [
         reader.read(LiveFrame(image=image, number=at, time_s=at / 30, captured_s=0.0))

@@ -10,7 +10,6 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from threading import Event, Lock, Thread
-from typing import TypeAlias
 
 import msgspec
 import numpy as np
@@ -49,24 +48,18 @@ _PATIENCE_S = 10.0  # with a thread that is to end
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """A reading on the chart: margins from 0 to 1, None where there is none."""
+    """A reading on the chart: margins from 0 to 1, forces in newtons, None where there is none."""
 
     at_s: float
     """Time of the reading, as `time.monotonic` counts."""
     margin: float | None
     low: float | None
-    """Lower end of the interval, in margin units."""
     high: float | None
-    """Upper end of it, in margin units."""
     true_margin: float | None
     force_n: float | None
     """Grip force, of a simulated gripper alone."""
     least_force_n: float | None
     """Least grip force that holds, of the same."""
-
-
-Arrow: TypeAlias = tuple[float, float, float, float]
-"""Displacement of a marker: x and y at rest, then now, in pixels of the frame."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,31 +71,28 @@ class PageFrame:
     reference: Frame | None
     """The sensor untouched, with which the frame was compared."""
     jpeg: bytes
-    arrows: tuple[Arrow, ...]
-
-
-MarkerRelevance: TypeAlias = tuple[float, float, float]
-"""x and y of a marker in pixels of the frame, and the relevance of the pixels nearest to it, in margin units."""
+    arrows: tuple[tuple[float, float, float, float], ...]
+    """Markers: x and y at rest, then now, in pixels of the frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapFacts:
-    """Header of a map."""
+    """Header of a map; margins and relevance in margin units."""
 
     number: int
     """Frame that is explained."""
     method: str
     prediction: float
-    """Margin that is explained, in margin units."""
     reference_prediction: float
-    """Margin of the untouched sensor, in margin units."""
+    """Margin of the untouched sensor."""
     rows: int
     columns: int
     full: float
-    """Relevance of a cell of 127, in margin units; cells are signed bytes, row by row."""
+    """Relevance of a cell of 127; cells are signed bytes, row by row."""
     alike: bool
     """True where both margins are the same but for the network's error, so that there is nothing to explain."""
-    markers: tuple[MarkerRelevance, ...]
+    markers: tuple[tuple[float, float, float], ...]
+    """x and y of each marker in pixels of the frame, and the relevance of the pixels nearest to it."""
     warnings: tuple[str, ...]
 
 
@@ -120,7 +110,7 @@ class PictureFacts:
 
     width: int
     height: int
-    arrows: tuple[Arrow, ...]
+    arrows: tuple[tuple[float, float, float, float], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,7 +123,6 @@ class Update:
     reading: Reading | None
     words: ReadingWords | None
     grip: GripStatus | None
-    """State of a simulated gripper."""
     points: tuple[Point, ...]
     """Readings since the message before."""
     rate_hz: float
@@ -185,7 +174,7 @@ class Feed:
         self.clients: set[Client] = set()
         """Connected clients."""
         self.expected: dict[str, Client] = {}
-        """Clients that may connect, by the name in the address of their socket."""
+        """Clients that may connect, by the name in their socket's address."""
         self.reading: Reading | None = None
         """Newest reading."""
         self.grip: GripStatus | None = None
@@ -228,11 +217,6 @@ class Feed:
                 thread.join(_PATIENCE_S)
 
     @property
-    def rate_hz(self) -> float:
-        """Readings of frames a second, over the last two seconds."""
-        return len(self.points_since(time.monotonic() - _RATE_S)) / _RATE_S
-
-    @property
     def waiting(self) -> str:
         """Instruction while a new reference is taken, else empty."""
         if self._before is not None and self._before is self.reader.reference:
@@ -265,14 +249,10 @@ class Feed:
         now_s, source = time.monotonic(), self.reader.source
         self.grip = grip = source.status(reading.number) if isinstance(source, GripSource) else None
         point = Point(
-            at_s=now_s,
-            margin=reading.margin,
-            low=reading.low,
-            high=reading.high,
-            true_margin=reading.true_margin,
+            at_s=now_s, margin=reading.margin, low=reading.low, high=reading.high, true_margin=reading.true_margin,
             force_n=None if grip is None else grip.force_n,
             least_force_n=None if grip is None else grip.least_force_n,
-        )
+        )  # fmt: skip
         with self._lock:
             self._points.append(point)
             while self._points[0].at_s < now_s - CHART_S:
@@ -305,10 +285,9 @@ class Feed:
         self._wake()
 
     def _wake(self) -> None:
-        loop = self._loop
-        assert loop is not None
+        assert self._loop is not None
         with suppress(RuntimeError):  # the server has gone
-            loop.call_soon_threadsafe(lambda: [client.wake() for client in tuple(self.clients)])
+            self._loop.call_soon_threadsafe(lambda: [client.wake() for client in tuple(self.clients)])
 
     def _draw(self, reading: Reading, frame: LiveFrame) -> PageFrame:
         thumbnail, markers_px = Image.fromarray(frame.image), self.reader.markers_px
@@ -351,25 +330,23 @@ class Feed:
         full = full_colour(relevance)
         # where both margins are the same but for the network's error, the strongest of nothing is not shown in colour
         alike = abs(frame.prediction - frame.reference_prediction) < CLOSE
-        rows, columns = relevance.shape
-        return Map(
-            facts=MapFacts(
-                number=picture.frame.number,
-                method=method,  # tiles where no markers are found
-                prediction=frame.prediction,
-                reference_prediction=frame.reference_prediction,
-                rows=rows,
-                columns=columns,
-                full=full,
-                alike=alike,
-                markers=() if alike else _sum_by_marker(relevance, picture),
-                warnings=(*warnings, *(one.partition("): ")[2] for one in explanation.methods[method].warnings)),
-            ),
-            cells=np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8).tobytes(),
+        facts = MapFacts(
+            number=picture.frame.number,
+            method=method,  # tiles where no markers are found
+            prediction=frame.prediction,
+            reference_prediction=frame.reference_prediction,
+            rows=relevance.shape[0],
+            columns=relevance.shape[1],
+            full=full,
+            alike=alike,
+            markers=() if alike else _sum_by_marker(relevance, picture),
+            warnings=(*warnings, *(text.partition("): ")[2] for text in explanation.methods[method].warnings)),
         )
+        cells = np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8)
+        return Map(facts=facts, cells=cells.tobytes())
 
 
-def _sum_by_marker(values: np.ndarray, picture: PageFrame) -> tuple[MarkerRelevance, ...]:
+def _sum_by_marker(values: np.ndarray, picture: PageFrame) -> tuple[tuple[float, float, float], ...]:
     """Sum the relevance around each marker."""
     if len(picture.arrows) < 2:
         return ()
@@ -497,7 +474,7 @@ class Client:
             words=None if feed.reading is None else describe_reading(feed.reading),
             grip=feed.grip,
             points=points,
-            rate_hz=feed.rate_hz,
+            rate_hz=len(feed.points_since(time.monotonic() - _RATE_S)) / _RATE_S,
             drawn_ms=self._drawn_ms,
             viewers=len(feed.clients),
             waiting=self.waiting or feed.waiting,

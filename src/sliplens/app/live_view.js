@@ -338,7 +338,6 @@ export default {
         interval.setAttribute("x", calibrated ? 100 * reading.low : 0);
         interval.setAttribute("width", calibrated ? 100 * (reading.high - reading.low) : 0);
         band.textContent = calibrated ? `true margin with 90 % confidence: ${said.interval}` : "";
-        if (reading.lag_s) band.textContent += ` (smoothed: ${Math.round(1000 * reading.lag_s)} ms late)`;
       }
       this.say();
       this.$refs.caption.textContent = this.describePicture(waiting);

@@ -2,7 +2,6 @@
 
 import secrets
 from collections.abc import Awaitable, Callable
-from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -114,7 +113,6 @@ class _Actions:
 def _with_notice(act: Callable[[], Awaitable[None]]) -> Callable[[], Awaitable[None]]:
     """Show the client why an action failed."""
 
-    @wraps(act)
     async def acted() -> None:
         try:
             await act()

@@ -63,7 +63,6 @@ def call_demo(call: Any) -> None:
     "sliplens live 0 --network chromatouch-pair --reference untouched.png",
     ("list_sources", "--list"),
     ("rate_hz", "--rate"),
-    ("smoothing_s", "--smoothing"),
 )
 def call_live(
     call: Any,

@@ -164,8 +164,8 @@ class RosCommand(NamedTuple):
     """Topic, below the key of the gripper."""
     kind: str
     """Type of the message."""
-    fields: Callable[[float], dict[str, object]]
-    """Returns the fields of the message for a force in newtons, or a width in metres."""
+    fields: Callable[[float], tuple[object, ...]]
+    """Returns the fields of the message, in order, for a force in newtons, or a width in metres."""
 
 
 _LEAST_EFFORT_N = 0.01  # effort in place of 0, which some drivers take for no limit
@@ -177,16 +177,16 @@ _DEFINITIONS = {_GRIPPER: "float64 position\nfloat64 max_effort"}  # of types th
 ROS_MESSAGES = {
     # closed as far as the effort brings it
     "gripper-command": (
-        RosCommand("command", _GRIPPER, lambda n: {"position": 0.0, "max_effort": max(n, _LEAST_EFFORT_N)}),
-        RosCommand("command", _GRIPPER, lambda m: {"position": m, "max_effort": _MOVING_EFFORT_N}),
+        RosCommand("command", _GRIPPER, lambda n: (0.0, max(n, _LEAST_EFFORT_N))),
+        RosCommand("command", _GRIPPER, lambda m: (m, _MOVING_EFFORT_N)),
     ),
-    "numbers": tuple(RosCommand(topic, _NUMBER, lambda value: {"data": value}) for topic in ("force", "width")),
+    "numbers": tuple(RosCommand(topic, _NUMBER, lambda value: (value,)) for topic in ("force", "width")),
     # forward controllers of ros2_control take a number a joint
     "controllers": tuple(
         RosCommand(
             f"{kind}_controller/commands",
             "std_msgs/msg/Float64MultiArray",
-            lambda value: {"layout": SimpleNamespace(dim=[], data_offset=0), "data": np.array([value])},
+            lambda value: (SimpleNamespace(dim=[], data_offset=0), np.array([value])),
         )
         for kind in ("effort", "position")
     ),

@@ -1,6 +1,5 @@
 """Live margin of a running sensor: sources, the loop that reads them, its health, and outputs."""
 
-from sliplens.live.camera import Camera, CameraMode, CameraSource, list_cameras
 from sliplens.live.contract import LiveOptions, LiveSource, SourceKind
 from sliplens.live.health import HealthMonitor
 from sliplens.live.loop import LiveReader, read_live
@@ -8,7 +7,18 @@ from sliplens.live.mailbox import OutputState
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.slip import SlipDetector, SlipLimits
-from sliplens.live.sources import SOURCES, FolderSource, ReplaySource, SimulatedSource, StreamSource, open_live
+from sliplens.live.sources import (
+    SOURCES,
+    Camera,
+    CameraMode,
+    CameraSource,
+    FolderSource,
+    ReplaySource,
+    SimulatedSource,
+    StreamSource,
+    list_cameras,
+    open_live,
+)
 
 __all__ = [
     "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthMonitor",

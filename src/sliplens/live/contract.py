@@ -3,6 +3,7 @@
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Event
@@ -76,12 +77,24 @@ class LiveSource(ABC):
         """Event that `close` sets, and entering the source clears."""
         return Event()
 
+    @cached_property
+    def _stack(self) -> ExitStack:
+        return ExitStack()
+
     def __enter__(self) -> "LiveSource":
         self.closed.clear()
+        with ExitStack() as stack:
+            self.open(stack)
+            self._stack.enter_context(stack.pop_all())
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
+        with suppress(OSError):  # a device may be gone already
+            self._stack.close()
+
+    def open(self, stack: ExitStack, /) -> None:  # noqa: B027 (some hold nothing open)
+        """Open the device, file or connection, and leave it to the stack to close it."""
 
     @abstractmethod
     def frames(self) -> Iterator[LiveFrame]:

@@ -1,10 +1,11 @@
-"""From a frame to its reading: reference, markers, health, network and smoothing, in one thread."""
+"""From a frame to its reading: reference, markers, health, and network, in one thread."""
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from pathlib import Path
 from threading import Event
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeAlias, TypedDict, Unpack, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -13,15 +14,17 @@ from torch import Tensor
 from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.images import require_rgb, soften
-from sliplens.live.contract import LiveSource
-from sliplens.live.health import check_direction, check_novelty, margin_risk
+from sliplens.live.contract import LiveOptions, LiveSource
+from sliplens.live.health import HealthMonitor, check_direction, check_novelty, margin_risk
 from sliplens.live.reading import OFF, Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
+from sliplens.live.slip import SlipDetector
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Network
 from sliplens.models.engines import Engine
 from sliplens.models.predictions import LEVEL
 from sliplens.models.sequence import require_frequent
 from sliplens.recordings.capture import Frame
+from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.shear import ShearEstimator
 
@@ -44,6 +47,44 @@ class SlipWatch(Protocol):
         ...
 
 
+class ReaderSettings(TypedDict, total=False):
+    """Settings of `LiveReader` and `read_live`, each optional."""
+
+    reference: Path | str | Frame | None
+    """The sensor untouched, as an image or its path. By default the image that the source brings, else the first still
+    picture: leave the sensor untouched until then."""
+    options: LiveOptions | None
+    """Options of the source."""
+    sensor: SensorProfile | Path | str | None
+    """Profile of the sensor that frames and reference go through, its file, or the name of one that comes with
+    sliplens; it names the network where none is given."""
+    friction: FrictionLike | None
+    """Coefficient of friction, as `predict` takes it, for a network that predicts F_t / F_n. A slip that the markers
+    show narrows a range, until the object is let go; `Reading.friction` states the value used."""
+    same_object: bool
+    """If True, every grasp is of one object, until `new_object`: the friction that a slip taught counts in later
+    grasps."""
+    sequence: bool
+    """If True, the earlier frames of a contact count, as `predict` takes it. Health and markers show when a contact
+    ends: without both, all frames count as one."""
+    engine: str
+    """Row of `ENGINES`; `auto`, the default, for the fastest that pays for `seconds`, or for hours without it."""
+    device: str
+    """Device of a network that is loaded here: cpu (default) or cuda."""
+    seconds: float | None
+    """Time after which it ends; with the source by default."""
+    stall_s: float
+    """Time without a frame after which a reading says so, 1 second by default."""
+    forces: Path | str | None
+    """File or named pipe into which another program writes the samples of a force sensor (`ForceStream`)."""
+    health: Callable[[Frame], HealthWatch] | None
+    """Called with each new reference, returns the checks of frames: `HealthMonitor` by default; None for none, not
+    even of the network's novelty."""
+    slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None
+    """Called with the places of the markers in each new reference, returns the slip detector: `SlipDetector` by
+    default; None to track no markers."""
+
+
 _JUMP_S = 1.0
 _NO_CONTACT = "nothing touches the sensor, and without a contact there is no margin; press it"
 _STILL_S = 0.3
@@ -61,49 +102,20 @@ class _ReferenceTaker:
         self._soft: np.ndarray | None = None
         self._frames = 0
 
-    def offer(self, frame: LiveFrame) -> Frame | None:
-        """Take the next frame; returns it as the reference once the picture was still for long enough."""
+    def offer(self, frame: LiveFrame) -> bool:
+        """Take the next frame; True once the picture was still for long enough and can be the reference."""
         soft = soften(frame.image)
         moved = self._soft is None or float(np.abs(soft - self._soft).mean()) > _STILL_GREY
         if moved or self._since is None:
             self._since, self._soft, self._frames = frame, soft, 1
-            return None
+            return False
         self._frames += 1
-        if self._frames < _STILL_FRAMES or frame.time_s - self._since.time_s < _STILL_S:
-            return None
-        brightness = float(soft.mean())
-        if not _DARK < brightness < _BRIGHT:
-            return None
-        return frame.image
+        still = self._frames >= _STILL_FRAMES and frame.time_s - self._since.time_s >= _STILL_S
+        return still and _DARK < float(soft.mean()) < _BRIGHT
 
 
-class LowPass:
-    """Exponential filter of irregularly timed values; it delays slow changes by its time constant."""
-
-    def __init__(self, *, time_constant_s: float) -> None:
-        self.time_constant_s = time_constant_s
-        self._before: tuple[Float[np.ndarray, " values"], float] | None = None
-
-    def forget(self) -> None:
-        """Begin anew with the next values."""
-        self._before = None
-
-    def update(self, values: Float[np.ndarray, " values"], time_s: float) -> Float[np.ndarray, " values"]:
-        """Filter values at a time; returns the values themselves where the time constant is 0."""
-        if self.time_constant_s > 0 and self._before is not None:
-            before, then_s = self._before
-            values = before + (values - before) * -np.expm1(-max(0.0, time_s - then_s) / self.time_constant_s)
-        self._before = values, time_s
-        return values
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Output:
-    """Output of the network for a frame, and the time that it took."""
-
-    parts: tuple[Tensor, ...]
-    encode_ms: float
-    network_ms: float
+_Output: TypeAlias = tuple[tuple[Tensor, ...], Latency]
+"""Output of the network for a frame, and the time that it took."""
 
 
 class FrameReader:
@@ -116,37 +128,29 @@ class FrameReader:
     Parameters are those of `LiveReader`.
     """
 
-    def __init__(
-        self,
-        source: LiveSource,
-        network: Network | None,
-        *,
-        friction: FrictionLike | None,
-        same_object: bool,
-        sequence: bool,
-        smoothing_s: float,
-        health: Callable[[Frame], HealthWatch] | None,
-        slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None,
-    ) -> None:
+    def __init__(self, source: LiveSource, network: Network | None, **settings: Unpack[ReaderSettings]) -> None:
         self.source, self.network = source, network
         self.engine: Engine | None = None
         """Engine of the network; set by `begin`."""
         self.reference: Frame | None = None
         """The sensor untouched, as the next frame is compared with it."""
-        self.doubts: tuple[str, ...] = ()
-        """Doubt about the colours of the reference for this network; None without."""
+        self.colour_doubts: tuple[str, ...] = ()
+        """Doubts about the colours of the reference for this network."""
         self.new_reference = Event()
         """Set to take a new reference as soon as the picture is still."""
         self.markers_px: tuple[np.ndarray, np.ndarray] | None = None
-        """Places (x, y) of the markers at rest and in the newest frame, in pixels; None where they are not tracked."""
+        """Places (x, y) of the markers at rest and in the newest frame, in pixels, NaN where one is not seen.
+
+        None where no markers are tracked.
+        """
         self.learner: SlipLearner
         """Friction that was set, and that slips teach."""
-        self.begin_object(friction, same_object=same_object)
+        friction, sequence = settings.get("friction"), settings.get("sequence", False)
+        self.begin_object(friction, same_object=settings.get("same_object", False))
         if sequence and network is None:
             raise InputError("--sequence needs a network; name one with --network")
         self._follower = network.follow(friction=friction) if network is not None and sequence else None
-        self._smooth = LowPass(time_constant_s=smoothing_s)
-        self._make_health, self._make_slip = health, slip
+        self._make_health, self._make_slip = settings.get("health", HealthMonitor), settings.get("slip", SlipDetector)
         self._health: HealthWatch | None = None
         self._shear: ShearEstimator | None = None
         self._slip: SlipWatch | None = None
@@ -207,29 +211,36 @@ class FrameReader:
             dropped=self._dropped,
             true_margin=frame.safety_margin,
         )
-        if jump_s := 0.0 if last is None else self._clock_jump(last, frame):
-            self._begin_anew()
-            why = f"the clock of {self.source.name} jumped by {jump_s:+.3g} s; the next frame is read again"
+        if (why := self._unready(last, frame)) is not None:
             return self._withhold(begin, frame, why)
-        if frame.size != self._size:
-            sizes = f"{_in_pixels(frame.size)} pixels, they were {_in_pixels(self._size)}"
-            why = f"the frames of {self.source.name} are now {sizes}; set the camera as it was, or start again"
-            return self._withhold(begin, frame, why)
-        if self.new_reference.is_set():
-            self.new_reference.clear()
-            self._taker = _ReferenceTaker()
-        if self._taker is not None and (image := self._taker.offer(frame)) is not None:
-            self._taker = None
-            self._set_reference(image)
-        if self.reference is None:
-            still = "the picture must be still for a moment: leave the sensor untouched"
-            return self._withhold(begin, frame, f"there is no reference frame yet; {still}")
         checked: list[tuple[Reading, str | None]] = []
         output = self._predict(frame, lambda: checked.append(self._check(begin, frame))) if self._has_margin else None
         [(reading, withheld)] = checked or [self._check(begin, frame)]
         if self.network is None or withheld is not None:
             return self._withhold(reading, frame, withheld)
         return self._estimate(reading, frame, output or self._predict(frame))
+
+    def _unready(self, last: LiveFrame | None, frame: LiveFrame) -> str | None:
+        """Explain why a frame cannot be compared with a reference, after taking a new one where that is due."""
+        name = self.source.name
+        if last is not None:
+            passed_s = frame.time_s - last.time_s
+            off_s = passed_s - self.source.speed * (frame.captured_s - last.captured_s)
+            if not (passed_s > 0 and abs(off_s) <= _JUMP_S):
+                self._begin_anew()
+                return f"the clock of {name} jumped by {off_s:+.3g} s; the next frame is read again"
+        if frame.size != self._size:
+            sizes = f"{_in_pixels(frame.size)} pixels, they were {_in_pixels(self._size)}"
+            return f"the frames of {name} are now {sizes}; set the camera as it was, or start again"
+        if self.new_reference.is_set():
+            self.new_reference.clear()
+            self._taker = _ReferenceTaker()
+        if self._taker is not None and self._taker.offer(frame):
+            self._taker = None
+            self._set_reference(frame.image)
+        if self.reference is None:
+            return "there is no reference frame yet; the picture must be still for a moment: leave the sensor untouched"
+        return None
 
     def _check(self, begin: Reading, frame: LiveFrame) -> tuple[Reading, str | None]:
         """Track the markers of a frame and check its health; returns its reading, and why it has no margin."""
@@ -258,7 +269,6 @@ class FrameReader:
         return reading, withheld
 
     def _withhold(self, reading: Reading, frame: LiveFrame, why: str | None) -> Reading:
-        self._smooth.forget()
         self._has_margin = False
         latency = replace(reading.latency, decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
         return replace(reading, withheld=why, latency=latency)
@@ -281,14 +291,15 @@ class FrameReader:
 
         [parts] = self.engine.answers(batches())
         waited_s = time.perf_counter() - encoded - spent_s
-        return _Output(parts=parts, encode_ms=1e3 * (encoded - begun), network_ms=1e3 * waited_s)
+        return parts, Latency(encode_ms=1e3 * (encoded - begun), network_ms=1e3 * waited_s)
 
     def _estimate(self, reading: Reading, frame: LiveFrame, output: _Output) -> Reading:
         assert self.network is not None
         friction = self.learner.friction
         follower = self._follower if friction is None else None  # it takes no friction
-        estimate = self.network.to_estimate(*output.parts, friction=friction)
-        latency = replace(reading.latency, encode_ms=output.encode_ms, network_ms=output.network_ms)
+        parts, took = output
+        estimate = self.network.to_estimate(*parts, friction=friction)
+        latency = replace(reading.latency, encode_ms=took.encode_ms, network_ms=took.network_ms)
         reading = replace(reading, latency=latency)
         novelty = None if self._health is None else check_novelty(estimate)
         if novelty is not None:
@@ -302,8 +313,7 @@ class FrameReader:
         if ratio is not None and estimate.ratio is not None:
             self.learner.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
         interval = estimate.interval(LEVEL)
-        values = [estimate.margin] if interval is None else [estimate.margin, *interval]
-        values = self._smooth.update(np.clip(np.concatenate(values), 0, 1), frame.time_s)
+        values = np.concatenate([estimate.margin] if interval is None else [estimate.margin, *interval]).clip(0, 1)
         [state] = contact_states(values[:1], without=ContactState.UNKNOWN)
         margin, *ends = values.tolist()
         low, high = ends or (None, None)
@@ -317,13 +327,12 @@ class FrameReader:
             sequence=follower is not None and not follower.lost,
             risk=margin_risk(reading.health, float(estimate.beyond(OFF)[0])) if reading.health else None,
             contact_state=state,
-            lag_s=self._smooth.time_constant_s,
             latency=replace(latency, total_ms=_since_ms(frame.captured_s)),
         )
 
     def _set_reference(self, image: Frame) -> None:
         self.reference = image
-        self.doubts = () if self.network is None else self.network.doubts(frame=image)
+        self.colour_doubts = () if self.network is None else self.network.doubts(frame=image)
         self._health = None if self._make_health is None else self._make_health(image)
         network = None if self._health is None else self.network
         self._shear = None if network is None else network.shear_estimator(image)
@@ -331,7 +340,6 @@ class FrameReader:
 
     def _begin_anew(self) -> None:
         """Forget earlier frames, where frames no longer follow each other."""
-        self._smooth.forget()
         self.learner.release()
         if self._follower is not None:
             self._follower.forget()
@@ -346,12 +354,6 @@ class FrameReader:
     def _in_frame(self, places_px: Float[np.ndarray, "markers 2"]) -> Float[np.ndarray, "markers 2"]:
         """Convert places of the picture in which markers are tracked to the frame; pixel centres are whole numbers."""
         return (places_px + 0.5) * self._smaller - 0.5
-
-    def _clock_jump(self, last: LiveFrame, frame: LiveFrame) -> float:
-        """Return the seconds by which the clock of the source jumped; 0 where it went on."""
-        passed_s = frame.time_s - last.time_s
-        off_s = passed_s - self.source.speed * (frame.captured_s - last.captured_s)
-        return 0.0 if passed_s > 0 and abs(off_s) <= _JUMP_S else off_s
 
 
 def _follow(reference: Frame) -> tuple[Tracker, int]:

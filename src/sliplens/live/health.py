@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from sliplens.errors import InputError
 from sliplens.images import LEAST_TOUCH, picture_change, soften
 from sliplens.live.reading import Check, LiveFrame, small_picture
 from sliplens.markers import MarkerStatus, TrackedFrame
@@ -116,8 +115,6 @@ class HealthMonitor:
     ----------
     reference
         The sensor untouched.
-    limits
-        Limits in place of those of `CHECKS`, by name.
 
     Examples
     --------
@@ -131,13 +128,7 @@ class HealthMonitor:
     'the picture is 1.3 times as bright as the reference; fix exposure and gain of the camera, or take a new reference'
     """
 
-    def __init__(self, reference: Frame, limits: Mapping[str, float] | None = None) -> None:
-        self._limits = dict(limits or {})
-        for name, limit in self._limits.items():
-            if name not in CHECKS or not limit > 0:
-                raise InputError(
-                    f"the health limit {name} is {limit:g}; give a positive limit of one of {', '.join(CHECKS)}"
-                )
+    def __init__(self, reference: Frame) -> None:
         small = small_picture(reference)
         self._soft, self._sharpness, self._saturated = soften(small), _sharpness(_green(small)), _saturated_share(small)
         self._camera, self._stillness = CameraWatch(small), _Stillness()
@@ -159,7 +150,7 @@ class HealthMonitor:
             if name in slow and name not in due:
                 checks.append(self._last[name][1])
             elif (measured := measure(self, view)) is not None:
-                checks.append(make_check(name, *measured, limit=self._limits.get(name)))
+                checks.append(make_check(name, *measured))
                 self._last[name] = frame.time_s, checks[-1]
         return tuple(checks)
 
@@ -202,6 +193,18 @@ class HealthMonitor:
         value = max(0.0, 1 - (len(numbers) - 1) / span) if span > 0 else 0.0
         return value, f"{value:.0%} of the frames of the last second were lost"
 
+    def _late(self, view: _FrameView) -> Measured:
+        captured_s = view.frame.captured_s
+        value = max(0.0, time.monotonic() - captured_s) if captured_s > 0 else 0.0
+        return value, f"the frame is {value:.2g} s old"
+
+    def _exposure(self, view: _FrameView) -> Measured:
+        return abs(view.gain), f"the picture is {2**view.gain:.2g} times as bright as the reference"
+
+    def _touch(self, view: _FrameView) -> Measured:
+        change = f"the picture differs by {view.change:.2g} grey levels from the untouched sensor"
+        return view.change, "nothing touches the sensor" if view.change < LEAST_TOUCH else change
+
     def _saturation(self, view: _FrameView) -> Measured:
         value = max(0.0, _saturated_share(view.frame.small) - self._saturated)
         return value, f"{value:.0%} of the picture have turned black or white"
@@ -211,7 +214,7 @@ class HealthMonitor:
         return max(0.0, 1 - share), f"edges are {share:.0%} as sharp as in the reference"
 
     def _camera_motion(self, view: _FrameView) -> Measured:
-        touches = view.change >= self._limits.get("touch", LEAST_TOUCH)
+        touches = view.change >= LEAST_TOUCH
         motion = self._camera.update(view.frame.small, view.markers, touches=touches)
         if motion is None:
             return 0.0, "the border of the picture shows too little to measure a motion of the camera"
@@ -221,23 +224,13 @@ class HealthMonitor:
         )
 
 
-def make_check(name: str, value: float, sentence: str, *, cure: str | None = None, limit: float | None = None) -> Check:
-    """Compare a value with its limit: that of `CHECKS`, if None. A check that fails states its cure."""
+def make_check(name: str, value: float, sentence: str, *, cure: str | None = None) -> Check:
+    """Compare a value with its limit in `CHECKS`; a check that fails states its cure."""
     kind = CHECKS[name]
-    limit = kind.limit if limit is None else limit
+    limit = kind.limit
     ok = value >= limit if kind.is_minimum else value <= limit
     cure = kind.cure if cure is None else cure
     return Check(name=name, value=value, limit=limit, ok=ok, sentence=sentence if ok else f"{sentence}; {cure}")
-
-
-def _late(_: HealthMonitor, view: _FrameView) -> Measured:
-    captured_s = view.frame.captured_s
-    value = max(0.0, time.monotonic() - captured_s) if captured_s > 0 else 0.0
-    return value, f"the frame is {value:.2g} s old"
-
-
-def _exposure(_: HealthMonitor, view: _FrameView) -> Measured:
-    return abs(view.gain), f"the picture is {2**view.gain:.2g} times as bright as the reference"
 
 
 def _light(_: HealthMonitor, view: _FrameView) -> Measured:
@@ -270,25 +263,19 @@ def _absent_markers(_: HealthMonitor, view: _FrameView) -> Measured | None:
     return value, f"{value:.0%} of the markers are not seen where they should be"
 
 
-def _touch(_: HealthMonitor, view: _FrameView) -> Measured:
-    if view.change < LEAST_TOUCH:
-        return view.change, "nothing touches the sensor"
-    return view.change, f"the picture differs by {view.change:.2g} grey levels from the untouched sensor"
-
-
 _MEASURES: dict[str, Callable[[HealthMonitor, _FrameView], Measured | None]] = {
     "repeated": HealthMonitor._repeated,
     "halves": HealthMonitor._halves,
     "frozen": HealthMonitor._frozen,
-    "late": _late,
+    "late": HealthMonitor._late,
     "drops": HealthMonitor._drops,
     "saturation": HealthMonitor._saturation,
-    "exposure": _exposure,
+    "exposure": HealthMonitor._exposure,
     "focus": HealthMonitor._focus,
     "light": _light,
     "camera": HealthMonitor._camera_motion,
     "markers": _absent_markers,
-    "touch": _touch,
+    "touch": HealthMonitor._touch,
 }
 """Functions that measure the checks of `CHECKS`, in the order of causes; None where there is nothing to measure."""
 _SLOW = "focus", "light", "camera"

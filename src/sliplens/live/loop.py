@@ -8,12 +8,11 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Lock, Thread
-from typing import TypeAlias, TypedDict, Unpack
+from typing import TypeAlias, Unpack
 from weakref import WeakSet
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from threadpoolctl import threadpool_limits
 
 from sliplens.errors import InputError, RecordingError, SourceError
@@ -21,20 +20,18 @@ from sliplens.extras import import_cv2, missing_packages
 from sliplens.friction import Friction, FrictionLike
 from sliplens.images import read_image
 from sliplens.live.contract import LiveOptions, LiveSource
-from sliplens.live.frame_reader import FrameReader, HealthWatch, SlipWatch
-from sliplens.live.health import HealthMonitor
+from sliplens.live.frame_reader import FrameReader, HealthWatch, ReaderSettings, SlipWatch
 from sliplens.live.mailbox import Mailbox, OutputState
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.sinks import Sender
-from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import Images, open_live
 from sliplens.models.checkpoint import Network, open_run
 from sliplens.models.engines import Engine, make_engine
 from sliplens.progress import number_of
-from sliplens.recordings.capture import Capture, Frame
+from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import Dataset, save_profile
-from sliplens.recordings.sensor import SensorProfile, load_profile
+from sliplens.recordings.sensor import load_profile
 from sliplens.recordings.trial import TrialFacts
 
 Subscriber = Callable[[Reading, LiveFrame | None], None]
@@ -91,47 +88,7 @@ def _limit_threads(restore: Callable[..., object]) -> None:
 LiveInput: TypeAlias = "str | Path | Images | Capture | LiveSource"
 
 
-class ReaderSettings(TypedDict, total=False):
-    """Settings of `LiveReader` and `read_live`, each optional."""
-
-    reference: Path | str | Frame | None
-    """The sensor untouched, as an image or its path. By default the image that the source brings, else the first still
-    picture: leave the sensor untouched until then."""
-    options: LiveOptions | None
-    """Options of the source."""
-    sensor: SensorProfile | Path | str | None
-    """Profile of the sensor that frames and reference go through, its file, or the name of one that comes with
-    sliplens; it names the network where none is given."""
-    friction: FrictionLike | None
-    """Coefficient of friction, as `predict` takes it, for a network that predicts F_t / F_n. A slip that the markers
-    show narrows a range, until the object is let go; `Reading.friction` states the value used."""
-    same_object: bool
-    """If True, every grasp is of one object, until `new_object`: the friction that a slip taught counts in later
-    grasps."""
-    sequence: bool
-    """If True, the earlier frames of a contact count, as `predict` takes it. Health and markers show when a contact
-    ends: without both, all frames count as one."""
-    engine: str
-    """Row of `ENGINES`; `auto`, the default, for the fastest that pays for `seconds`, or for hours without it."""
-    device: str
-    """Device of a network that is loaded here: cpu (default) or cuda."""
-    smoothing_s: float
-    """Time constant of a low-pass on margin and interval, in seconds, 0 by default (`Reading.lag_s`)."""
-    seconds: float | None
-    """Time after which it ends; with the source by default."""
-    stall_s: float
-    """Time without a frame after which a reading says so, 1 second by default."""
-    forces: Path | str | None
-    """File or named pipe into which another program writes the samples of a force sensor (`ForceStream`)."""
-    health: Callable[[Frame], HealthWatch] | None
-    """Called with each new reference, returns the checks of frames: `HealthMonitor` by default; None for none, not
-    even of the network's novelty."""
-    slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None
-    """Called with the places of the markers in each new reference, returns the slip detector: `SlipDetector` by
-    default; None to track no markers."""
-
-
-class LiveReader:
+class LiveReader(FrameReader):
     """Readings of a running sensor; a context manager that captures and reads while it is entered.
 
     One thread captures and one reads, with a place for the newest frame only between them: a network that is slower
@@ -173,20 +130,18 @@ class LiveReader:
     ) -> None:
         if unknown := settings.keys() - ReaderSettings.__annotations__.keys():
             raise TypeError(f"LiveReader takes no {', '.join(sorted(unknown))}")
-        smoothing_s, self._seconds = settings.get("smoothing_s", 0.0), settings.get("seconds")
-        if not smoothing_s >= 0:
-            raise InputError(f"--smoothing must be 0 or more seconds, got {smoothing_s:g}")
+        self._seconds = settings.get("seconds")
         if self._seconds is not None and not self._seconds > 0:
             raise InputError(f"--seconds must be positive, got {self._seconds:g}")
         sensor, reference, forces = (settings.get(name) for name in ("sensor", "reference", "forces"))
         profile = None if sensor is None else load_profile(sensor)
         if network is None and profile is not None:
             network = profile.network
-        self.network = None if network is None else open_run(network, device=settings.get("device", "cpu"))
+        run = None if network is None else open_run(network, device=settings.get("device", "cpu"))
         options = settings.get("options") or LiveOptions()
-        if self.network is not None and profile is None:
-            options = replace(options, fit_size=self.network.manifest.frame_size)
-        self.source = open_live(source, options=options)
+        if run is not None and profile is None:
+            options = replace(options, fit_size=run.manifest.frame_size)
+        super().__init__(open_live(source, options=options), run, **settings)
         untouched = read_image(Path(reference)) if isinstance(reference, Path | str) else reference
         self.recorder: Recorder | None = None
         """Recorder, while it records."""
@@ -196,16 +151,6 @@ class LiveReader:
         self._untouched, self._profile = untouched, profile
         self._engine_name, self._stall_s = settings.get("engine", "auto"), settings.get("stall_s", 1.0)
         self._forces = None if forces is None else ForceStream(forces)
-        self._reader = FrameReader(
-            self.source,
-            self.network,
-            friction=settings.get("friction"),
-            same_object=settings.get("same_object", False),
-            sequence=settings.get("sequence", False),
-            smoothing_s=smoothing_s,
-            health=settings.get("health", HealthMonitor),
-            slip=settings.get("slip", SlipDetector),
-        )
         self._frames: Mailbox[LiveFrame] = Mailbox()
         self._lock = Lock()
         self._newest: Reading | None = None
@@ -216,24 +161,6 @@ class LiveReader:
         self._trouble: str | None = None
         self._threads: list[Thread] = []
         self._stack = ExitStack()
-
-    @property
-    def reference(self) -> Frame | None:
-        """The sensor untouched, as the next frame is compared with it."""
-        return self._reader.reference
-
-    @property
-    def engine(self) -> Engine | None:
-        """Engine of the network, while the reader is entered."""
-        return self._reader.engine
-
-    @property
-    def markers_px(self) -> tuple[Float[np.ndarray, "markers 2"], Float[np.ndarray, "markers 2"]] | None:
-        """Places (x, y) of the markers at rest and in the newest frame, in pixels, NaN where one is not seen.
-
-        None where no markers are tracked.
-        """
-        return self._reader.markers_px
 
     @property
     def outputs(self) -> tuple[OutputState, ...]:
@@ -249,9 +176,9 @@ class LiveReader:
         """
         if self.network is None:
             return ()
-        profile, friction = self._profile, self._reader.learner.friction
+        profile, friction = self._profile, self.learner.friction
         sensor = "" if profile is None else profile.name
-        return self._reader.doubts + self.network.doubts(sensor=sensor, profile=profile, friction=friction)
+        return self.colour_doubts + self.network.doubts(sensor=sensor, profile=profile, friction=friction)
 
     @property
     def troubles(self) -> tuple[str, ...]:
@@ -295,7 +222,7 @@ class LiveReader:
             if self.network is not None:
                 self.network.require_frame_size(size, what=f"the frames of {self.source.name}")
                 engine = self._make_engine(self.network)
-            self._reader.begin(engine, untouched, size=size)
+            self.begin(engine, untouched, size=size)
             self._stack = stack.pop_all()
         jobs = (self._capture, self._frames.close), (self._infer, self._finish)
         self._threads = [Thread(target=self._run, args=job, daemon=True) for job in jobs]
@@ -359,12 +286,12 @@ class LiveReader:
     @property
     def learnt(self) -> Friction | None:
         """Friction of the object that slipped last, for a later grasp; None before any slip."""
-        return self._reader.learner.learnt
+        return self.learner.learnt
 
     @property
     def lesson(self) -> str | None:
         """That friction in a sentence, with the option for the next time; None before any slip."""
-        learner = self._reader.learner
+        learner = self.learner
         if learner.learnt is None:
             return None
         slips = number_of(learner.slips, "slip")
@@ -386,11 +313,11 @@ class LiveReader:
         InputError
             If the friction is none, or the network takes none.
         """
-        self._reader.begin_object(friction, same_object=self._reader.learner.same_object)
+        self.begin_object(friction, same_object=self.learner.same_object)
 
     def take_reference(self) -> None:
         """Take a new reference as soon as the picture is still; the old one holds until then."""
-        self._reader.new_reference.set()
+        self.new_reference.set()
 
     def send_to(self, *sinks: str) -> None:
         """Send every reading and its frame to other programs from now on, until it is closed.
@@ -513,11 +440,11 @@ class LiveReader:
         while (left_s := ends_s - time.monotonic()) > 0:
             frame = self._frames.take(min(self._stall_s, left_s))
             if frame is not None:
-                self._publish(self._reader.read(frame), frame)
+                self._publish(self.read(frame), frame)
             elif self._frames.closed:
                 break
             elif time.monotonic() < ends_s:
-                self._publish(self._reader.missing(self._trouble or silent), None)
+                self._publish(self.missing(self._trouble or silent), None)
 
     def _finish(self) -> None:
         self._end()

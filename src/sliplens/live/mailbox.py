@@ -33,18 +33,14 @@ class Mailbox(Generic[Item]):
             self._items.append(item)
             self._changed.notify_all()
 
-    def close(self) -> None:
-        """Wake the waiting thread: no more items come."""
+    def close(self, *, discard: bool = False) -> None:
+        """Wake the waiting thread: no more items come; with `discard` those that wait are lost."""
         with self._changed:
             self.closed = True
+            if discard:
+                self.lost += len(self._items)
+                self._items.clear()
             self._changed.notify_all()
-
-    def discard(self) -> None:
-        """Close it, and lose the waiting items."""
-        self.close()
-        with self._changed:
-            self.lost += len(self._items)
-            self._items.clear()
 
     def take(self, timeout_s: float | None = None) -> Item | None:
         """Wait for the oldest item; None where none came in time, or none will come any more."""
@@ -69,11 +65,12 @@ class OutputState:
     """Why it failed, with the cure; None while it works."""
 
     def __str__(self) -> str:
-        what = "reading" if self.seconds is None else "frame"
-        span = " sent" if self.seconds is None else f" in {self.seconds:.1f} s"
+        span = f"{number_of(self.sent, 'reading')} sent"
+        if self.seconds is not None:
+            span = f"{number_of(self.sent, 'frame')} in {self.seconds:.1f} s"
         lost = f", {self.lost:,} lost" if self.lost else ""
         trouble = f"; {self.trouble}" if self.trouble else ""
-        return f"{self.name}: {number_of(self.sent, what)}{span}{lost}{trouble}"
+        return f"{self.name}: {span}{lost}{trouble}"
 
 
 class Outlet(Generic[Item]):
@@ -99,15 +96,14 @@ class Outlet(Generic[Item]):
         self._thread = Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    @property
-    def lost(self) -> int:
-        """Items that were not handed on, it being too slow or ended."""
-        return self._box.lost
-
-    @property
-    def reason(self) -> str:
-        """The error in the words of the system, where it has any."""
-        return str((self.error.strerror if isinstance(self.error, OSError) else None) or self.error)
+    def state(self, name: str, *, broke: str, cure: str, seconds: float | None = None) -> OutputState:
+        """Describe the progress; where it failed, begin the trouble with `broke` and end it with `cure`."""
+        trouble, error = None, self.error
+        if error is not None:
+            reason = (error.strerror if isinstance(error, OSError) else None) or error
+            items = number_of(self.sent, "reading" if seconds is None else "frame")
+            trouble = f"{broke} after {items} ({reason}); {cure}"
+        return OutputState(name=name, sent=self.sent, lost=self._box.lost, seconds=seconds, trouble=trouble)
 
     def put(self, item: Item, *, size_bytes: int) -> None:
         """Take an item, without waiting."""
@@ -121,7 +117,7 @@ class Outlet(Generic[Item]):
 
     def discard(self) -> None:
         """Hand on nothing more."""
-        self._box.discard()
+        self._box.close(discard=True)
 
     def _run(self) -> None:
         try:
@@ -131,7 +127,7 @@ class Outlet(Generic[Item]):
         except Exception as error:  # any: the producer reports it
             self.error = error
             self._box.lost += 1
-            self._box.discard()
+            self.discard()
         try:
             self._end()
         except Exception as error:

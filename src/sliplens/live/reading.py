@@ -142,8 +142,6 @@ class Reading:
     """True where the earlier frames of the contact count too."""
     risk: float | None = None
     """Chance that the margin is off by more than 0.2 (`margin_risk`); None without a margin."""
-    lag_s: float = 0.0
-    """Delay of margin and interval by smoothing; 0 without."""
     contact_state: ContactState = ContactState.UNKNOWN
     slip: SlipState | None = None
     """Slip as the markers show it; None where they are not tracked."""

@@ -12,7 +12,6 @@ import numpy as np
 from sliplens.errors import RecordingError
 from sliplens.live.mailbox import Outlet, OutputState
 from sliplens.live.reading import LiveFrame
-from sliplens.progress import number_of
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.dataset import Dataset, begin_recording, finish_recording, load_dataset
 from sliplens.recordings.formats.tables import (
@@ -79,15 +78,9 @@ class Recorder:
     @property
     def state(self) -> OutputState:
         """Current progress."""
-        outlet, trouble = self._outlet, None
-        if outlet.error is not None:
-            trouble = (
-                f"recording into {self.folder} stopped after {number_of(outlet.sent, 'frame')} "
-                f"({outlet.reason}); make room, and record again: what is there stays"
-            )
-        return OutputState(
-            name=str(self.folder), sent=outlet.sent, lost=outlet.lost, seconds=self._seconds, trouble=trouble
-        )
+        broke = f"recording into {self.folder} stopped"
+        cure = "make room, and record again: what is there stays"
+        return self._outlet.state(str(self.folder), broke=broke, cure=cure, seconds=self._seconds)
 
     def set_reference(self, image: Frame) -> None:
         """Begin a new trial with the next frame, with this image of the untouched sensor."""
@@ -123,13 +116,8 @@ class Recorder:
 
     def _append(self, item: tuple[LiveFrame, Frame | None]) -> None:
         (frame, reference), last = item, self._last
-        if (
-            self._journal is None
-            or last is None
-            or frame.size != last.size
-            or frame.time_s <= last.time_s
-            or reference is not self._trial_reference
-        ):
+        goes_on = last is not None and frame.size == last.size and frame.time_s > last.time_s
+        if self._journal is None or not goes_on or reference is not self._trial_reference:
             self._begin_trial(frame, reference)
         assert self._journal is not None
         forces = frame.forces

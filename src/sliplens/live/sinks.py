@@ -9,7 +9,7 @@ import secrets
 import socket
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,6 @@ from sliplens.files import to_builtins
 from sliplens.images import encode_jpeg, encode_png
 from sliplens.live.mailbox import Outlet, OutputState
 from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
-from sliplens.progress import number_of
 from sliplens.recordings.capture import Frame
 
 
@@ -188,29 +187,25 @@ class RerunSink:
         self.stream.set_time("time", duration=np.timedelta64(round(1e9 * time_s), "ns"))
         self.stream.set_time("frame", sequence=number)
 
-    def log(self, entity: str, value: Any, *, static: bool = False) -> None:
-        """Log a value of Rerun's at the frame that was set, or for all frames."""
-        self.stream.log(entity, value, static=static)
-
     def log_image(self, entity: str, image: Frame, *, static: bool = False) -> None:
         """Log an image."""
         if self._lossless:
             picture = self._rerun.EncodedImage(contents=encode_png(image), media_type="image/png")
         else:
             picture = self._rerun.Image(image).compress(jpeg_quality=_QUALITY)
-        self.log(entity, picture, static=static)
+        self.stream.log(entity, picture, static=static)
 
     def send(self, reading: Reading, image: Frame | None, /) -> None:
         """Log a reading on the clock of the source; one without a time is left out."""
         if not np.isfinite(reading.time_s):
             return
         self.set_frame(reading.number, reading.time_s)
-        for entity, value in (
-            ("margin", reading.margin), ("interval/low", reading.low), ("interval/high", reading.high),
-        ):  # fmt: skip
+        ends = ("margin", reading.margin), ("interval/low", reading.low), ("interval/high", reading.high)
+        for entity, value in ends:
             # a withheld margin ends the line, and is no longer shown as the newest
-            self.log(entity, self._rerun.Clear(recursive=False) if value is None else self._rerun.Scalars(value))
-        self.log("words", self._rerun.TextLog(str(describe_reading(reading))))
+            scalar = self._rerun.Clear(recursive=False) if value is None else self._rerun.Scalars(value)
+            self.stream.log(entity, scalar)
+        self.stream.log("words", self._rerun.TextLog(str(describe_reading(reading))))
         if image is not None:
             self.log_image("frame", image)
 
@@ -226,29 +221,12 @@ def _open_rerun(address: str) -> Sink:
     return Sink(sink.send, sink.close)
 
 
-class RosTopic(NamedTuple):
-    """Topic of ROS 2, and how its messages are made."""
-
-    name: str
-    """Below the key of the sink."""
-    kind: str
-    """Type of its messages."""
-    fields: Callable[[Reading, Frame | None, object], Mapping[str, object] | None]
-    """Fields of the message of a reading, its frame and a header; None to send nothing."""
-
-
-def _image_fields(_: Reading, image: Frame | None, header: object) -> Mapping[str, object] | None:
-    if image is None:
-        return None
-    return {"header": header, "format": "jpeg", "data": np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8)}
-
-
-ROS_TOPICS = (
-    RosTopic("margin", "std_msgs/msg/Float32", lambda read, *_: None if read.margin is None else {"data": read.margin}),
-    RosTopic("reading", "std_msgs/msg/String", lambda read, *_: {"data": encode_reading(read).decode()}),
-    RosTopic("image/compressed", "sensor_msgs/msg/CompressedImage", _image_fields),
-)
-"""Topics of ROS 2 that the sink `zenoh` sends; a margin that is withheld is not sent at all."""
+ROS_TOPICS = {
+    "margin": "std_msgs/msg/Float32",
+    "reading": "std_msgs/msg/String",
+    "image/compressed": "sensor_msgs/msg/CompressedImage",
+}
+"""Topics of ROS 2 below the key of the sink `zenoh`, and their types; a withheld margin is not sent at all."""
 ZENOH_ADDRESS = "tcp/127.0.0.1:7447"
 _ZENOH_PATIENCE_MS = 3000
 
@@ -307,26 +285,24 @@ class ZenohRos:
         if kind not in self._types.types:
             self._types.register(get_types_from_msg(definition, kind))
 
-    def header(self, at_ns: int) -> object:
-        """Make the header of a message, at nanoseconds since 1970."""
-        stamp = self._types.types["builtin_interfaces/msg/Time"](sec=at_ns // 10**9, nanosec=at_ns % 10**9)
-        return self._types.types["std_msgs/msg/Header"](stamp=stamp, frame_id=_FRAME_ID)
+    def message(self, kind: str, *values: Any) -> object:
+        """Make a message of a type from its fields in order."""
+        return self._types.types[kind](*values)
 
-    def publisher(self, topic: str, kind: str) -> Callable[[Mapping[str, Any], int], None]:
-        """Declare a topic; returns a function that sends a message of some fields, at nanoseconds since 1970.
+    def publisher(self, topic: str, kind: str) -> Callable[[Sequence[object], int], None]:
+        """Declare a topic; returns a function that sends a message of some fields at nanoseconds since 1970.
 
         It raises `OSError` where the connection is closed.
         """
-        publishers = [self._session.declare_publisher(name) for name in self._names(topic, kind)]
+        by_name, by_type = (self._session.declare_publisher(name) for name in self._names(topic, kind))
         ext, sender_id, count = self._ext, secrets.token_bytes(16), itertools.count(1)
 
-        def send(fields: Mapping[str, Any], at_ns: int) -> None:
-            message = bytes(self._types.serialize_cdr(self._types.types[kind](**fields), kind))
+        def send(fields: Sequence[object], at_ns: int) -> None:
+            encoded = bytes(self._types.serialize_cdr(self.message(kind, *fields), kind))
             attachment = ext.z_serialize((ext.Int64(next(count)), ext.Int64(at_ns), sender_id))
-            by_name, by_type = publishers
             try:
-                by_name.put(message)
-                by_type.put(message, attachment=attachment)
+                by_name.put(encoded)
+                by_type.put(encoded, attachment=attachment)
             except self._error as error:
                 raise OSError(str(error)) from None
 
@@ -366,14 +342,19 @@ def _open_zenoh(address: str) -> Sink:
     """Send readings and frames to ROS; the key `tip` names `/tip/margin`, `/tip/reading`, `/tip/image/compressed`."""
     key, router = parse_zenoh(address, purpose="--sink zenoh")
     ros = ZenohRos(router, purpose="--sink zenoh")
-    publishers = {topic: ros.publisher(f"{key}/{topic.name}", topic.kind) for topic in ROS_TOPICS}
+    publishers = {name: ros.publisher(f"{key}/{name}", kind) for name, kind in ROS_TOPICS.items()}
 
     def send(reading: Reading, image: Frame | None) -> None:
         at_ns = _stamp_ns(reading)
-        for topic, publish in publishers.items():
-            fields = topic.fields(reading, image, ros.header(at_ns))
-            if fields is not None:
-                publish(fields, at_ns)
+        fields: dict[str, tuple[object, ...]] = {"reading": (encode_reading(reading).decode(),)}
+        if reading.margin is not None:
+            fields["margin"] = (reading.margin,)
+        if image is not None:
+            stamp = ros.message("builtin_interfaces/msg/Time", at_ns // 10**9, at_ns % 10**9)
+            header = ros.message("std_msgs/msg/Header", stamp, _FRAME_ID)
+            fields["image/compressed"] = header, "jpeg", np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8)
+        for name, values in fields.items():
+            publishers[name](values, at_ns)
 
     return Sink(send, ros.close)
 
@@ -428,11 +409,7 @@ class Sender:
     @property
     def state(self) -> OutputState:
         """Current progress."""
-        outlet, trouble = self._outlet, None
-        if outlet.error is not None:
-            sent = number_of(outlet.sent, "reading")
-            trouble = f"--sink {self._name} broke off after {sent} ({outlet.reason}); begin it anew"
-        return OutputState(name=self._name, sent=outlet.sent, lost=outlet.lost, trouble=trouble)
+        return self._outlet.state(self._name, broke=f"--sink {self._name} broke off", cure="begin it anew")
 
     @property
     def error(self) -> Exception | None:
@@ -452,6 +429,6 @@ class Sender:
 
 
 __all__ = [
-    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "RerunSink", "RosTopic", "Sender", "Sink",
+    "IMAGE_TOPIC", "READING_TOPIC", "ROS_TOPICS", "SINKS", "RerunSink", "Sender", "Sink",
     "ZenohRos", "encode_reading", "open_sink", "parse_zenoh", "reading_schema",
 ]  # fmt: skip

@@ -287,19 +287,14 @@ class SlipBatch:
         self._pressed[rows] = self._hold_s[rows] = self._recoil_s[rows] = 0.0
         self._inner[rows], self._least_px[rows] = False, np.inf
 
-    def trial(self, row: int, since: Field) -> FieldTrial:
-        """Make two frames of a contact for the estimators: as it was pressed, and some motion since."""
-        hold = self._hold[row].T
-        return FieldTrial(rest_px=self._rest[row].T, displacement_px=np.stack([hold, hold + since]), hold=0)
-
-    def step_px(self, row: int) -> float:
-        """Compute the length below which 95 % of the differences between two places of a still marker lie."""
-        return _RAYLEIGH_95 * float(np.sqrt(2) * self._noise_px[row])
-
-    def since_press(self, row: int) -> Field:
-        """Return the motion of a contact's markers since it was pressed, in the newest frame."""
-        frame = self._frames[-1]
-        return np.where(frame.visible[row], frame.moved[row] - self._hold[row], np.nan).T
+    def stick_share(self, row: int) -> float:
+        """Compute the share of a contact's markers that move with its middle, in the newest frame."""
+        frame, hold = self._frames[-1], self._hold[row].T
+        since = np.where(frame.visible[row], frame.moved[row] - self._hold[row], np.nan).T
+        trial = FieldTrial(rest_px=self._rest[row].T, displacement_px=np.stack([hold, hold + since]), hold=0)
+        # 95 % of the differences between two places of a still marker are shorter
+        tolerance_px = _RAYLEIGH_95 * float(np.sqrt(2) * self._noise_px[row])
+        return float(stick_area(trial, tolerance_px=tolerance_px)[1, 0])
 
     def _middle_noise_px(self) -> Float[np.ndarray, " contacts"]:
         """Compute the noise of a difference of two means over the contact's middle."""
@@ -341,8 +336,7 @@ class SlipBatch:
         searched = (self._window > 1) & np.isfinite(self._pattern[:, 0]).any(axis=1)
         for count in np.unique(self._window[searched]).tolist():
             rows = np.flatnonzero(searched & (self._window == count))
-            frames = [self._frames[at] for at in range(-count, 0)]
-            began_s[rows] = self._recoils_of(rows, frames)
+            began_s[rows] = self._recoils_of(rows, [self._frames[at] for at in range(-count, 0)])
         return began_s
 
     def _recoils_of(self, rows: Int[np.ndarray, " rows"], frames: Sequence[_Frame]) -> Float[np.ndarray, " rows"]:
@@ -474,18 +468,18 @@ class SlipDetector:
             return MarkerReading(state=SlipState.CANNOT_TELL)
         if not states.contact[0]:
             return MarkerReading(state=SlipState.CANNOT_TELL, contact=False)
-        share = float(stick_area(batch.trial(0, batch.since_press(0)), tolerance_px=batch.step_px(0))[1, 0])
         state = SlipState.CANNOT_TELL if states.unknown[0] else SlipState.STICKING
-        shear_px, slipping_s, slipped_s = (
-            float(values[0]) for values in (states.shear_px, states.slipping_s, states.slipped_s)
+        shear_px, share, slipping_s, slipped_s = (
+            float(value) if np.isfinite(value) else None
+            for value in (states.shear_px[0], batch.stick_share(0), states.slipping_s[0], states.slipped_s[0])
         )
         return MarkerReading(
             state=SlipState.SLIP if states.slip[0] else state,
             contact=True,
-            shear_px=shear_px if np.isfinite(shear_px) else None,
-            stick_share=share if np.isfinite(share) else None,
-            slipping_s=slipping_s if np.isfinite(slipping_s) else None,
-            slipped_s=slipped_s if np.isfinite(slipped_s) else None,
+            shear_px=shear_px,
+            stick_share=share,
+            slipping_s=slipping_s,
+            slipped_s=slipped_s,
         )
 
 

@@ -1,26 +1,29 @@
-"""Running sources: replays, growing folders, network streams, and a simulated fingertip to press and pull."""
+"""Running sources: cameras, network streams, growing folders, replays, and a simulated fingertip."""
 
+import errno
+import select
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import av
 import numpy as np
 from av.error import FFmpegError, InvalidDataError
+from av.video.codeccontext import VideoCodecContext
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, SourceError
-from sliplens.extras import Table, pick
+from sliplens.extras import Table, pick, require_packages
 from sliplens.files import require_folder
 from sliplens.images import is_image, list_images, natural_key
-from sliplens.live.camera import CameraSource
 from sliplens.live.contract import LiveOptions, LiveSource, Pace, SourceKind
 from sliplens.live.reading import LiveFrame
-from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.video import upright
@@ -30,6 +33,393 @@ from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp, Nuisances, draw_unit
 from sliplens.simulation.sensor import SENSORS
+
+if TYPE_CHECKING:
+    from linuxpy.video.device import Device
+
+_DECODERS = {
+    "MJPG": ("mjpeg", "", 0),
+    "JPEG": ("mjpeg", "", 0),
+    "YUYV": ("rawvideo", "yuyv422", 2),
+    "UYVY": ("rawvideo", "uyvy422", 2),
+    "RGB3": ("rawvideo", "rgb24", 3),
+    "BGR3": ("rawvideo", "bgr24", 3),
+    "GREY": ("rawvideo", "gray", 1),
+}
+"""Formats of V4L2 by their four letters: the decoder of FFmpeg, its pixel format, and bytes a pixel."""
+_BUFFERS = 4  # two are not enough where a process is now and then late
+_POLL_S, _STALL_S = 0.1, 2.0
+_MOST_BAD = 30  # frames in a row that cannot be decoded
+_CURES = {
+    errno.EBUSY: "is taken by another program; close that one",
+    errno.EACCES: "may not be opened; add yourself to the group video and log in again",
+    errno.ENOENT: "is not there; plug it in, and see `sliplens live --list`",
+    errno.ENODEV: "was unplugged; plug it in again",
+    errno.ENXIO: "was unplugged; plug it in again",
+    errno.ENOTTY: "is no camera; see `sliplens live --list`",
+    errno.EINVAL: "does not take these settings; see `sliplens live --list`",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraMode:
+    """Format, size and rates of a camera."""
+
+    pixel_format: str
+    """Four letters, such as MJPG."""
+    size: tuple[int, int]
+    """Height and width, in pixels."""
+    rates_hz: tuple[float, ...]
+    """Frames a second; empty where unknown."""
+
+    def in_words(self) -> tuple[str, str, str]:
+        """Describe format, size and rates."""
+        rates = ", ".join(f"{rate:g}" for rate in self.rates_hz)
+        return self.pixel_format, f"{self.size[1]}x{self.size[0]}", rates or "unknown"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A camera of this machine."""
+
+    path: Path
+    """Device file, such as /dev/video0."""
+    name: str
+    """Name of the driver."""
+    modes: tuple[CameraMode, ...]
+    """Modes that sliplens can read; empty where the camera cannot be opened."""
+
+
+class FrameDecoder:
+    """Decoder of a camera's frames, of a size (height, width) in pixels; scales them down to `wanted`."""
+
+    def __init__(self, pixel_format: str, *, size: tuple[int, int], wanted: tuple[int, int] | None = None) -> None:
+        codec, pixels, pixel_bytes = _DECODERS[pixel_format]
+        self._height, self._row_bytes, self._wanted = size[0], size[1] * pixel_bytes, wanted or size
+        context = av.CodecContext.create(codec, "r")
+        assert isinstance(context, VideoCodecContext)
+        context.thread_count = 1  # frame by frame: more threads would each keep one back
+        if pixels:
+            context.height, context.width = size
+            context.pix_fmt = pixels
+        else:  # a JPEG decoder halves the picture up to three times for nothing
+            ratio = min(have / want for have, want in zip(size, self._wanted, strict=True))
+            context.options = {"lowres": str(min(max(int(np.log2(ratio)), 0), 3)), "err_detect": "explode"}
+        self._context, self._to_rgb = context, VideoReformatter()
+
+    def decode(self, data: bytes, *, row_bytes: int = 0) -> Frame | None:
+        """Decode one frame as RGB; None where the bytes are no whole frame. `row_bytes`: length of a padded row."""
+        if row_bytes > self._row_bytes > 0 and len(data) >= self._height * row_bytes:
+            rows = np.frombuffer(data, dtype=np.uint8, count=self._height * row_bytes).reshape(self._height, row_bytes)
+            data = rows[:, : self._row_bytes].tobytes()
+        if len(data) < max(1, self._height * self._row_bytes):
+            return None
+        try:
+            frames = self._context.decode(av.Packet(data))
+        except FFmpegError:
+            return None
+        if len(frames) != 1 or frames[0].is_corrupt:
+            return None
+        height, width = self._wanted
+        rgb = self._to_rgb.reformat(frames[0], width=width, height=height, format="rgb24", interpolation="AREA")
+        return rgb.to_ndarray()
+
+
+class CameraSource(LiveSource):
+    """V4L2 camera, in MJPG where it has that; its frames carry the kernel's stamps and numbers.
+
+    Parameters
+    ----------
+    path
+        Device file.
+    options
+        Rate, size and pixel format; the camera's own where None.
+    """
+
+    reconnects = True
+
+    def __init__(self, path: Path, options: LiveOptions) -> None:
+        require_packages("linuxpy", extra="live", purpose="reading a camera")
+        options.require_only("rate_hz", "size", "pixel_format", what=f"the camera {path}")
+        self.name, self._path, self._options = f"the camera {path}", path, options
+
+    def open(self, stack: ExitStack, /) -> None:
+        """Open the device in the mode that suits the options, and start it."""
+        from linuxpy.video.device import Device, VideoCapture  # noqa: PLC0415 (an extra)
+
+        options = self._options
+        try:
+            self._device = stack.enter_context(Device(self._path))
+            mode = self._choose(read_modes(self._device))
+            self._capture = VideoCapture(self._device, size=_BUFFERS)
+            if mode is not None:
+                self._capture.set_format(mode.size[1], mode.size[0], mode.pixel_format)
+            if options.rate_hz is not None:
+                self._capture.set_fps(options.rate_hz)
+            chosen = self._capture.get_format()
+            pixel_format, size = chosen.pixel_format.human_str(), (chosen.height, chosen.width)
+            if pixel_format not in _DECODERS:
+                formats = ", ".join(_DECODERS)
+                raise SourceError(
+                    f"{self.name} gives {pixel_format}, which is not read; choose one of {formats} with --pixel-format"
+                )
+            fit = options.fit_size
+            fits = fit is not None and _is_alike(size, fit) and size[0] >= fit[0]
+            self.size = options.size or (fit if fit is not None and fits else size)
+            self._decoder = FrameDecoder(pixel_format, size=size, wanted=self.size)
+            self._row_bytes = chosen.bytes_per_line
+            self.rate_hz = float(self._capture.get_fps())
+            stack.enter_context(self._capture)
+        except (OSError, ZeroDivisionError) as error:
+            raise self._explained(error) from None
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Iterate over frames; those that are broken, or cannot be decoded, are missing in the numbers."""
+        from linuxpy.video.device import BufferFlag  # noqa: PLC0415 (an extra)
+
+        buffers, last_s, bad = self._capture.buffer, time.monotonic(), 0
+        assert buffers is not None
+        while not self.closed.is_set():
+            try:
+                ready, _, _ = select.select([self._device], [], [], _POLL_S)
+                sent = buffers.raw_read() if ready else None
+            except BlockingIOError:
+                sent = None
+            except (OSError, ValueError) as error:
+                raise self._explained(error) from None
+            now_s = time.monotonic()
+            if sent is None:
+                if now_s - last_s > _STALL_S:
+                    raise SourceError(
+                        f"{self.name} has given no frame for {_STALL_S:g} s; check its cable, "
+                        "or plug it into a port of its own"
+                    )
+                continue
+            last_s, image = now_s, None
+            if BufferFlag.ERROR not in sent.flags:
+                image = self._decoder.decode(bytes(sent.data), row_bytes=self._row_bytes)
+            if image is None:
+                bad += 1
+                if bad >= _MOST_BAD:
+                    raise SourceError(
+                        f"{self.name} sends frames that cannot be decoded; check its cable, choose another "
+                        "--pixel-format, or a smaller --size"
+                    )
+                continue
+            bad = 0
+            monotonic = (sent.flags & BufferFlag.TIMESTAMP_MASK) == BufferFlag.TIMESTAMP_MONOTONIC
+            yield LiveFrame(
+                image=image,
+                number=int(sent.frame_nb),
+                time_s=float(sent.timestamp),
+                captured_s=float(sent.timestamp) if monotonic else now_s,
+                decode_ms=1e3 * (time.monotonic() - now_s),
+            )
+
+    def _choose(self, modes: Sequence[CameraMode]) -> CameraMode | None:
+        """Choose the mode that suits the options; None to leave the camera as it is."""
+        options = self._options
+        wanted, rate_hz = options.size or options.fit_size, options.rate_hz or 0.0
+        usable = [mode for mode in modes if options.pixel_format in {None, mode.pixel_format}]
+        if modes and not usable:
+            formats = ", ".join(sorted({mode.pixel_format for mode in modes}))
+            raise SourceError(f"{self.name} has no format {options.pixel_format}; choose {formats} with --pixel-format")
+        # compressed first: what is not compressed fills the cable, and the rate falls
+        usable.sort(key=lambda mode: list(_DECODERS).index(mode.pixel_format))
+        if wanted is None or not usable:
+            return usable[0] if usable and options.pixel_format is not None else None
+        fitting = [
+            mode
+            for mode in usable
+            if mode.pixel_format == usable[0].pixel_format
+            and _is_alike(mode.size, wanted)
+            and mode.size[0] >= wanted[0]
+            and max(mode.rates_hz, default=np.inf) >= rate_hz
+        ]
+        if fitting or options.size is None:  # the network refuses frames of another size
+            return min(fitting, key=lambda mode: mode.size, default=None)
+        sizes = ", ".join(dict.fromkeys(f"{mode.size[1]}x{mode.size[0]}" for mode in usable))
+        raise SourceError(
+            f"{self.name} has no mode that gives {wanted[1]}x{wanted[0]} at {rate_hz:g} frames a second; "
+            f"choose a --size of the same shape as one of {sizes}, or a lower --rate"
+        )
+
+    def _explained(self, error: Exception) -> SourceError:
+        number = getattr(error, "errno", None) or 0
+        return SourceError(f"{self.name} {_CURES.get(number, f'cannot be read ({error}); plug it in again')}")
+
+
+def _is_alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Return True where two sizes have the same shape."""
+    return size[0] * other[1] == size[1] * other[0]
+
+
+def read_modes(device: "Device") -> tuple[CameraMode, ...]:
+    """List the modes of an open camera that can be read, the largest rate first in each."""
+    assert device.info is not None
+    kinds = sorted(
+        (kind.pixel_format.human_str(), (kind.height, kind.width), float(kind.max_fps))
+        for kind in device.info.frame_types
+    )
+    return tuple(
+        CameraMode(
+            pixel_format=pixel_format,
+            size=size,
+            rates_hz=tuple(sorted({rate for *_, rate in same if rate > 0}, reverse=True)),
+        )
+        for (pixel_format, size), same in groupby(kinds, key=lambda mode: mode[:2])
+        if pixel_format in _DECODERS
+    )
+
+
+def list_cameras(folder: Path = Path("/dev")) -> tuple[Camera, ...]:
+    """List the cameras of this machine, with their modes.
+
+    Raises
+    ------
+    InputError
+        If the extra `live` is not installed.
+    """
+    require_packages("linuxpy", extra="live", purpose="listing cameras")
+    from linuxpy.video.device import Capability, Device  # noqa: PLC0415 (an extra)
+
+    cameras = []
+    for path in sorted(folder.glob("video*"), key=lambda path: (len(path.name), path.name)):
+        try:
+            with Device(path) as device:
+                assert device.info is not None
+                if Capability.VIDEO_CAPTURE in device.info.device_capabilities:
+                    cameras.append(Camera(path=path, name=device.info.card, modes=read_modes(device)))
+        except OSError as error:
+            if error.errno not in {errno.ENOTTY, errno.ENODEV}:
+                cameras.append(Camera(path=path, name=f"cannot be opened ({error.strerror})", modes=()))
+    return tuple(cameras)
+
+
+_FOLDER_S = 0.02
+_WRITTEN_S = 1.0  # after which a file that cannot be read is damaged, not half written
+
+
+class FolderSource(LiveSource):
+    """Folder into which another program saves images; the newest is the first frame.
+
+    An image's time is that of its file.
+    """
+
+    cure = "nothing new was saved there"
+
+    def __init__(self, folder: Path) -> None:
+        self.name, self._folder = f"the folder {folder}", folder
+        self._taken: set[str] = set()
+
+    def open(self, _: ExitStack, /) -> None:
+        """Skip the images that are there, but for the newest."""
+        if not any(map(is_image, require_folder(self._folder, what="the folder").iterdir())):
+            raise InputError(f"{self.name} holds no image yet; begin when the first has been saved there")
+        *before, newest = list_images(self._folder)
+        self.size, self._taken = frame_size(newest), {path.name for path in before}
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Iterate over images in the natural order of their names; a damaged one is missing in the numbers."""
+        number, last_s, broken_s = 0, -np.inf, np.inf
+        while not self.closed.is_set():
+            try:
+                new = [path for path in self._folder.iterdir() if path.name not in self._taken and is_image(path)]
+            except OSError as error:
+                raise SourceError(
+                    f"{self.name} cannot be read ({error.strerror}); make it again, and begin anew"
+                ) from None
+            for path in sorted(new, key=lambda path: natural_key(path.name)):
+                before = time.monotonic()
+                try:
+                    written_s, image = path.stat().st_mtime, read_frame(path, size=frame_size(path))
+                except (ImageError, OSError):
+                    broken_s = min(broken_s, before)
+                    if path.exists() and before - broken_s < _WRITTEN_S:
+                        break  # it may be half written; the next ones wait too, so that they come in order
+                    written_s, image = 0.0, None
+                broken_s = np.inf
+                self._taken.add(path.name)
+                number += 1
+                if image is not None:
+                    last_s, now_s = max(written_s, last_s + 1e-6), time.monotonic()
+                    yield LiveFrame(
+                        image=image,
+                        number=number - 1,
+                        time_s=last_s,
+                        captured_s=now_s - max(0.0, time.time() - written_s),
+                        decode_ms=1e3 * (now_s - before),
+                    )
+            self.closed.wait(_FOLDER_S)
+
+
+_NETWORK = ("rtsp", "rtp", "udp", "tcp", "http", "https", "rtmp", "srt")
+_OPEN_S, _READ_S = 5.0, 2.0
+_QUICK = {
+    # a stream must not lead to a file of this machine
+    "protocol_whitelist": ",".join((*_NETWORK, "rtsps", "tls", "crypto", "rtmps")),
+    "rtsp_transport": "tcp",
+    "fflags": "nobuffer",
+    "flags": "low_delay",
+    "analyzeduration": "500000",
+}
+
+
+class StreamSource(LiveSource):
+    """Video that a network camera sends, as far as FFmpeg reads it: RTSP, HTTP, MPEG-TS over UDP or TCP, SRT."""
+
+    reconnects = True
+
+    def __init__(self, address: str, *, size: tuple[int, int] | None = None) -> None:
+        self.name, self._address, self._size = f"the stream {address}", address, size
+
+    def open(self, stack: ExitStack, /) -> None:
+        """Connect, and look for pictures."""
+        try:
+            self._container = stack.enter_context(av.open(self._address, options=_QUICK, timeout=(_OPEN_S, _READ_S)))
+        except (FFmpegError, OSError, ValueError) as error:
+            raise self._explained(error) from None
+        if not self._container.streams.video:
+            raise SourceError(f"{self.name} shows no pictures; name the address of a camera")
+        self._video = self._container.streams.video[0]
+        self._video.thread_type = "SLICE"  # by frame, each thread would keep one back
+        self.size = self._size or (self._video.codec_context.height, self._video.codec_context.width)
+        self.rate_hz = float(self._video.average_rate or 0) or None
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Iterate over frames as they arrive; those that cannot be decoded are missing in the numbers."""
+        to_rgb, number = VideoReformatter(), 0
+        packets = self._container.demux(self._video)
+        while not self.closed.is_set():
+            try:
+                packet = next(packets)
+                arrived_s = time.monotonic()
+                frames = packet.decode()
+            except InvalidDataError:
+                number += 1
+                continue
+            except (FFmpegError, OSError) as error:
+                if self.closed.is_set():
+                    return
+                raise self._explained(error) from None
+            except StopIteration:
+                raise SourceError(f"{self.name} has ended; start the camera again") from None
+            for frame in frames:
+                size = self._size or (frame.height, frame.width)
+                height, width = size[::-1] if self._size and frame.rotation % 180 else size
+                pixels = to_rgb.reformat(frame, width=width, height=height, format="rgb24").to_ndarray()
+                yield LiveFrame(
+                    image=upright(frame, pixels, where=self.name),
+                    number=number,
+                    time_s=arrived_s if frame.time is None else float(frame.time),
+                    captured_s=arrived_s,
+                    decode_ms=1e3 * (time.monotonic() - arrived_s),
+                )
+                number += 1
+
+    def _explained(self, error: Exception) -> SourceError:
+        reason = getattr(error, "strerror", None) or str(error)
+        return SourceError(f"{self.name} cannot be read ({reason}); check its address and that the camera runs")
 
 
 class ReplaySource(LiveSource):
@@ -98,147 +488,9 @@ class ReplaySource(LiveSource):
         return Forces(time_s=time_s, force_n=force_n, source=forces.source) if first < last else None
 
 
-_POLL_S = 0.02
-_WRITTEN_S = 1.0  # after which a file that cannot be read is damaged, not half written
-
-
-class FolderSource(LiveSource):
-    """Folder into which another program saves images; the newest is the first frame.
-
-    An image's time is that of its file.
-    """
-
-    cure = "nothing new was saved there"
-
-    def __init__(self, folder: Path) -> None:
-        self.name, self._folder = f"the folder {folder}", folder
-        self._taken: set[str] = set()
-
-    def __enter__(self) -> "FolderSource":
-        self.closed.clear()
-        if not any(map(is_image, require_folder(self._folder, what="the folder").iterdir())):
-            raise InputError(f"{self.name} holds no image yet; begin when the first has been saved there")
-        *before, newest = list_images(self._folder)
-        self.size, self._taken = frame_size(newest), {path.name for path in before}
-        return self
-
-    def frames(self) -> Iterator[LiveFrame]:
-        """Iterate over images in the natural order of their names; a damaged one is missing in the numbers."""
-        number, last_s, broken_s = 0, -np.inf, np.inf
-        while not self.closed.is_set():
-            try:
-                new = [path for path in self._folder.iterdir() if path.name not in self._taken and is_image(path)]
-            except OSError as error:
-                raise SourceError(
-                    f"{self.name} cannot be read ({error.strerror}); make it again, and begin anew"
-                ) from None
-            for path in sorted(new, key=lambda path: natural_key(path.name)):
-                before = time.monotonic()
-                try:
-                    written_s, image = path.stat().st_mtime, read_frame(path, size=frame_size(path))
-                except (ImageError, OSError):
-                    broken_s = min(broken_s, before)
-                    if path.exists() and before - broken_s < _WRITTEN_S:
-                        break  # it may be half written; the next ones wait too, so that they come in order
-                    written_s, image = 0.0, None
-                broken_s = np.inf
-                self._taken.add(path.name)
-                number += 1
-                if image is not None:
-                    last_s, now_s = max(written_s, last_s + 1e-6), time.monotonic()
-                    yield LiveFrame(
-                        image=image,
-                        number=number - 1,
-                        time_s=last_s,
-                        captured_s=now_s - max(0.0, time.time() - written_s),
-                        decode_ms=1e3 * (now_s - before),
-                    )
-            self.closed.wait(_POLL_S)
-
-
-_NETWORK = ("rtsp", "rtp", "udp", "tcp", "http", "https", "rtmp", "srt")
-_OPEN_S, _READ_S = 5.0, 2.0
-_QUICK = {
-    # a stream must not lead to a file of this machine
-    "protocol_whitelist": ",".join((*_NETWORK, "rtsps", "tls", "crypto", "rtmps")),
-    "rtsp_transport": "tcp",
-    "fflags": "nobuffer",
-    "flags": "low_delay",
-    "analyzeduration": "500000",
-}
-
-
-class StreamSource(LiveSource):
-    """Video that a network camera sends, as far as FFmpeg reads it: RTSP, HTTP, MPEG-TS over UDP or TCP, SRT."""
-
-    reconnects = True
-
-    def __init__(self, address: str, *, size: tuple[int, int] | None = None) -> None:
-        self.name, self._address, self._size, self._stack = f"the stream {address}", address, size, ExitStack()
-
-    def __enter__(self) -> "StreamSource":
-        self.closed.clear()
-        with ExitStack() as stack:
-            try:
-                opened = av.open(self._address, options=_QUICK, timeout=(_OPEN_S, _READ_S))
-            except (FFmpegError, OSError, ValueError) as error:
-                raise self._explained(error) from None
-            self._container = stack.enter_context(opened)
-            if not opened.streams.video:
-                raise SourceError(f"{self.name} shows no pictures; name the address of a camera")
-            self._video = opened.streams.video[0]
-            self._video.thread_type = "SLICE"  # by frame, each thread would keep one back
-            self.size = self._size or (self._video.codec_context.height, self._video.codec_context.width)
-            rate = self._video.average_rate
-            self.rate_hz = float(rate) if rate else None
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-        self._stack.close()
-
-    def frames(self) -> Iterator[LiveFrame]:
-        """Iterate over frames as they arrive; those that cannot be decoded are missing in the numbers."""
-        to_rgb, number = VideoReformatter(), 0
-        packets = self._container.demux(self._video)
-        while not self.closed.is_set():
-            try:
-                packet = next(packets)
-                arrived_s = time.monotonic()
-                frames = packet.decode()
-            except InvalidDataError:
-                number += 1
-                continue
-            except (FFmpegError, OSError) as error:
-                if self.closed.is_set():
-                    return
-                raise self._explained(error) from None
-            except StopIteration:
-                raise SourceError(f"{self.name} has ended; start the camera again") from None
-            for frame in frames:
-                size = self._size or (frame.height, frame.width)
-                height, width = size[::-1] if self._size and frame.rotation % 180 else size
-                pixels = to_rgb.reformat(frame, width=width, height=height, format="rgb24").to_ndarray()
-                yield LiveFrame(
-                    image=upright(frame, pixels, where=self.name),
-                    number=number,
-                    time_s=arrived_s if frame.time is None else float(frame.time),
-                    captured_s=arrived_s,
-                    decode_ms=1e3 * (time.monotonic() - arrived_s),
-                )
-                number += 1
-
-    def _explained(self, error: Exception) -> SourceError:
-        reason = getattr(error, "strerror", None) or str(error)
-        return SourceError(f"{self.name} cannot be read ({reason}); check its address and that the camera runs")
-
-
 _GRIP_N = 1.5
-_GRIP_TIMES_S = (0.0, 1.0, 2.0, 2.5, 7.5, 8.5, 9.0, 10.0)
-_GRIP_PRESS = (0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0)
-_GRIP_PULL = (0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0)
-"""Grip that the simulated fingertip repeats until `load` is called."""
+_GRIP_COURSE = np.array([[0, 1, 2, 2.5, 7.5, 8.5, 9, 10], [0, 0, 1, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1, 0, 0]])
+"""Grip that the simulated fingertip repeats until `load` is called: seconds, and shares of press and pull."""
 
 
 class SimulatedSource(LiveSource):
@@ -330,19 +582,14 @@ class SimulatedSource(LiveSource):
         """Return the force that presses and the one that pulls at a time, before friction limits the latter."""
         if (forces_n := self._forces_n) is not None:
             return forces_n
-        press, pull = (
-            float(np.interp(time_s % _GRIP_TIMES_S[-1], _GRIP_TIMES_S, course)) for course in (_GRIP_PRESS, _GRIP_PULL)
-        )
+        times_s, *courses = _GRIP_COURSE
+        press, pull = (float(np.interp(time_s % times_s[-1], times_s, course)) for course in courses)
         return _GRIP_N * press, pull * self._grasp.friction * _GRIP_N
 
 
 def _open_simulated(name: str, options: LiveOptions) -> LiveSource:
     options.require_only("rate_hz", what="the simulated fingertip")
     return SimulatedSource(name.partition(":")[2] or "chromatouch", rate_hz=options.rate_hz or 30.0)
-
-
-def _open_camera(name: str, options: LiveOptions) -> LiveSource:
-    return CameraSource(Path(f"/dev/video{int(name)}" if name.isdecimal() else name), options)
 
 
 def _open_stream(name: str, options: LiveOptions) -> LiveSource:
@@ -370,7 +617,7 @@ _ROWS = {
     "camera": SourceKind(
         words="camera by its number or device file (0, or /dev/video0)",
         recognises=lambda name: name.isdecimal() or name.startswith("/dev/"),
-        open=_open_camera,
+        open=lambda name, options: CameraSource(Path(f"/dev/video{int(name)}" if name.isdecimal() else name), options),
     ),
     "stream": SourceKind(
         words="network stream by its address (rtsp://, http://, udp://)",
@@ -435,4 +682,7 @@ def open_live(
     raise InputError(f"{name} is no source that is known, nor a path that exists; name a {kinds}")
 
 
-__all__ = ["SOURCES", "FolderSource", "ReplaySource", "SimulatedSource", "StreamSource", "open_live"]
+__all__ = [
+    "SOURCES", "Camera", "CameraMode", "CameraSource", "FolderSource", "FrameDecoder", "ReplaySource",
+    "SimulatedSource", "StreamSource", "list_cameras", "open_live",
+]  # fmt: skip

@@ -1,7 +1,6 @@
 """A recorded trial in the Rerun viewer: frames, forces, labels, predictions, maps and markers on one clock."""
 
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -30,17 +29,17 @@ from sliplens.files import require_new_file
 from sliplens.images import absolute_difference
 from sliplens.live.reading import Reading
 from sliplens.live.sinks import RerunSink
-from sliplens.plots.audit import Fact, audit_facts, end_of_ratio, force_ratio
+from sliplens.plots.audit import end_of_ratio, force_ratio
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.saliency import full_colour, overlay_relevance
 from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name, written_whole
-from sliplens.progress import OnProgress, open_stage, report_each, reporting, visible
+from sliplens.progress import OnProgress, open_stage, report_each, reporting
 from sliplens.recordings import Dataset, Recording, TrialFacts, TrialInfo, load_dataset
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, trial_path
 from sliplens.recordings.source import SourceOptions
 from sliplens.recordings.store import load_recording, read_header, stream_frames
-from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS, GroundTruth, Labels, labels_of_margins
+from sliplens.recordings.trial import OUTSIDE, SLIPS, STICKS, Labels, labels_of_margins
 from sliplens.results.explanation import Explanation, is_explanation, load_explanation
 
 if TYPE_CHECKING:
@@ -49,20 +48,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewedTrial:
-    """A trial to show, its frames read one at a time."""
+    """A trial to show, its frames read one at a time, and the results beside them."""
 
     trial: Recording
     """Times, labels and the truth of a simulated trial."""
     read_frames: Callable[[], Iterator[Frame]]
-    split: str = ""
     files: tuple[str, ...] = ()
     """Names of the images of a folder."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Overlays:
-    """Results to show beside the frames of a trial."""
-
     predictions: Path | None = None
     """Table that `sliplens predict` or `sliplens evaluate` wrote (Parquet)."""
     maps: Explanation | None = None
@@ -123,13 +115,13 @@ def view(
     maps = source if isinstance(source, Explanation) else maps
     explained = load_explanation(Path(maps)) if isinstance(maps, Path | str) else maps
     viewed = view_explained(source) if isinstance(source, Explanation) else _open_trial(source, source_options)
-    overlays = Overlays(predictions=table, maps=explained, tracks=None if tracks is None else Path(tracks))
+    viewed = replace(viewed, predictions=table, maps=explained, tracks=None if tracks is None else Path(tracks))
     with reporting(on_progress), open_stage(f"Reading {viewed.trial.trial}"):
         if path is None:
             address, failure = start_viewer(), "the Rerun viewer was closed too early; leave it open"
-            _play_into(viewed, lambda stream: stream.connect_grpc(address), overlays, failure=failure)
+            _play_into(viewed, lambda stream: stream.connect_grpc(address), failure=failure)
         else:
-            write_rrd(viewed, path, overlays=overlays)
+            write_rrd(viewed, path)
     return viewed
 
 
@@ -164,7 +156,6 @@ def view_stored(data: Dataset, info: TrialInfo) -> ViewedTrial:
     return ViewedTrial(
         trial=trial,
         read_frames=partial(stream_frames, path) if trial.truth is None else lambda: iter(trial.frames),
-        split=info.split,
     )
 
 
@@ -207,17 +198,12 @@ def require_rerun() -> ModuleType:
     require_packages("rerun", extra="view", purpose="the viewer")
     import rerun  # noqa: PLC0415 (an extra, and large)
 
-    if not hasattr(rerun, "StateChange"):
-        raise InputError(
-            f"Rerun is too old for the viewer ({rerun.__version__}); upgrade it with "
-            '`pip install --upgrade "sliplens[view]"`'
-        )
     if not rerun.RecordingStream("sliplens").is_enabled():
         raise InputError("the environment variable RERUN switches Rerun off; unset it")
     return rerun
 
 
-def write_rrd(viewed: ViewedTrial, path: Path, *, overlays: Overlays = Overlays()) -> None:
+def write_rrd(viewed: ViewedTrial, path: Path) -> None:
     """Write a trial as a file of the Rerun viewer; it appears when complete."""
     if path.suffix.lower() != ".rrd":
         raise InputError(f"{path} does not end in .rrd; name a file of the Rerun viewer, such as trial.rrd")
@@ -225,13 +211,13 @@ def write_rrd(viewed: ViewedTrial, path: Path, *, overlays: Overlays = Overlays(
     with written_whole(path) as part:
         part.touch()  # Rerun reports a file that cannot be written in its own way
         failure = f"{path} could not be written; see what space is left"
-        _play_into(viewed, lambda stream: stream.save(part), overlays, failure=failure)
+        _play_into(viewed, lambda stream: stream.save(part), failure=failure)
 
 
-def _play_into(viewed: ViewedTrial, connect: Callable[[Any], None], overlays: Overlays, *, failure: str) -> None:
+def _play_into(viewed: ViewedTrial, connect: Callable[[Any], None], *, failure: str) -> None:
     sink = RerunSink(connect, application="sliplens", lossless=True)
     try:
-        play_trial(viewed, sink, overlays)
+        play_trial(viewed, sink)
         sink.stream.flush()
     except RuntimeError as error:
         raise InputError(f"{failure} ({error})") from None
@@ -266,21 +252,19 @@ def _rgba(colour: str) -> list[int]:
     return [round(255 * part) for part in to_rgba(colour)]
 
 
-def play_trial(viewed: ViewedTrial, sink: RerunSink, overlays: Overlays) -> None:
+def play_trial(viewed: ViewedTrial, sink: RerunSink) -> None:
     """Send a trial, the results beside it and the viewer's layout to a sink, a frame in memory at a time."""
     trial, rerun = viewed.trial, require_rerun()
-    readings = {} if overlays.predictions is None else _load_readings(trial, overlays.predictions)
-    followed = {} if overlays.tracks is None else _load_tracks(trial, overlays.tracks)
-    maps = {} if overlays.maps is None else _find_maps(viewed, overlays.maps)
+    readings = {} if viewed.predictions is None else _load_readings(trial, viewed.predictions)
+    followed = {} if viewed.tracks is None else _load_tracks(trial, viewed.tracks)
+    maps = {} if viewed.maps is None else _find_maps(viewed, viewed.maps)
     sampled = np.stack(list(islice(viewed.read_frames(), 0, None, -(-len(trial) // _SAMPLED_FRAMES))))
     factor = brightening([absolute_difference(sampled, trial.reference)])
     numbers = _frame_numbers(trial)
-    methods = () if overlays.maps is None else tuple(overlays.maps.methods)
+    methods = () if viewed.maps is None else tuple(viewed.maps.methods)
 
     sink.stream.send_recording_name(trial.trial)
     sink.stream.send_blueprint(_lay_out(viewed, factor, numbers["ratio/friction"], methods))
-    about = _describe_trial(viewed)
-    sink.log("about", rerun.TextDocument(about, media_type=rerun.MediaType.MARKDOWN), static=True)
     sink.log_image("reference", trial.reference, static=True)
     _set_styles(sink, rerun, trial, [*numbers, *(["margin", "interval/high", "interval/low"] if readings else [])])
     _log_states(sink, rerun, trial)
@@ -293,16 +277,21 @@ def play_trial(viewed: ViewedTrial, sink: RerunSink, overlays: Overlays) -> None
             sink.log_image("frame", frame)
         sink.log_image("difference", brighten(absolute_difference(frame, trial.reference), factor))
         for entity, values in numbers.items():
-            sink.log(entity, rerun.Scalars(values[number]))
+            sink.stream.log(entity, rerun.Scalars(values[number]))
         if number in followed:
-            sink.log("frame/followed", rerun.Points2D(followed[number]))
+            sink.stream.log("frame/followed", rerun.Points2D(followed[number]))
         if trial.truth is not None:
-            _log_truth(sink, rerun, trial.truth, number)
+            places, rest = trial.truth.marker_px[number], trial.truth.marker_rest_px
+            zones = rerun.SegmentationImage(trial.truth.contact_map[number], opacity=_ZONE_OPACITY)
+            sink.stream.log("frame/zones", zones)
+            sink.stream.log("frame/markers", rerun.Points2D(places + _HALF_PX))
+            arrows = rerun.Arrows2D(vectors=places - rest, origins=rest + _HALF_PX)
+            sink.stream.log("frame/displacements", arrows)
         for method in methods:
             if number in maps:
                 sink.log_image(f"map/{method}", maps[number][method])
             elif number - 1 in maps:  # a map describes its own frame alone
-                sink.log(f"map/{method}", rerun.Clear(recursive=False))
+                sink.stream.log(f"map/{method}", rerun.Clear(recursive=False))
 
 
 def _set_styles(sink: RerunSink, rerun: ModuleType, trial: Recording, lines: Iterable[str]) -> None:
@@ -310,15 +299,15 @@ def _set_styles(sink: RerunSink, rerun: ModuleType, trial: Recording, lines: Ite
     for entity in lines:
         name, colour = _LINES[entity]
         width = 1.0 if entity.endswith(("high", "low")) else 2.0
-        sink.log(entity, rerun.SeriesLines(names=name, colors=[_rgba(colour)], widths=width), static=True)
+        sink.stream.log(entity, rerun.SeriesLines(names=name, colors=[_rgba(colour)], widths=width), static=True)
     for entity, points_colour, radius in (("frame/followed", GREEN, 2.5), ("frame/markers", YELLOW, 2.0)):
         points = rerun.Points2D.from_fields(colors=[_rgba(points_colour)], radii=[rerun.Radius.ui_points(radius)])
-        sink.log(entity, points, static=True)
+        sink.stream.log(entity, points, static=True)
     if trial.truth is not None:
         arrows = rerun.Arrows2D.from_fields(colors=[_rgba(YELLOW)], radii=[rerun.Radius.ui_points(1.0)])
-        sink.log("frame/displacements", arrows, static=True)
+        sink.stream.log("frame/displacements", arrows, static=True)
         zones = [(OUTSIDE, "no contact", [0] * 4), (SLIPS, "slips", _rgba(ORANGE)), (STICKS, "sticks", _rgba(SKY))]
-        sink.log("frame/zones", rerun.AnnotationContext(zones), static=True)
+        sink.stream.log("frame/zones", rerun.AnnotationContext(zones), static=True)
 
 
 def _log_states(sink: RerunSink, rerun: ModuleType, trial: Recording) -> None:
@@ -328,20 +317,11 @@ def _log_states(sink: RerunSink, rerun: ModuleType, trial: Recording) -> None:
         lanes["state/label"] = (["valid" if valid else "not valid" for valid in trial.labelled], _LABEL_COLOURS)
     for entity, (states, colours) in lanes.items():
         style = rerun.StateConfiguration(values=list(colours), colors=[_rgba(colour) for colour in colours.values()])
-        sink.log(entity, style, static=True)
+        sink.stream.log(entity, style, static=True)
         for number, (before, state) in enumerate(pairwise(["", *states])):
             if state != before:
                 sink.set_frame(number, float(trial.time_s[number]))
-                sink.log(entity, rerun.StateChange(state=state))
-
-
-def _log_truth(sink: RerunSink, rerun: ModuleType, truth: GroundTruth, number: int) -> None:
-    """Log contact and stick zone, and the markers with their displacements, of a frame of a simulated trial."""
-    places = truth.marker_px[number]
-    sink.log("frame/zones", rerun.SegmentationImage(truth.contact_map[number], opacity=_ZONE_OPACITY))
-    sink.log("frame/markers", rerun.Points2D(places + _HALF_PX))
-    rest = truth.marker_rest_px
-    sink.log("frame/displacements", rerun.Arrows2D(vectors=places - rest, origins=rest + _HALF_PX))
+                sink.stream.log(entity, rerun.StateChange(state=state))
 
 
 def _frame_numbers(trial: Recording) -> dict[str, Float[np.ndarray, " frames"]]:
@@ -366,17 +346,10 @@ def _frame_numbers(trial: Recording) -> dict[str, Float[np.ndarray, " frames"]]:
 
 def _load_readings(trial: Recording, path: Path) -> dict[int, Reading]:
     """Load the predictions of a trial, by frame."""
-    rows = _rows_of(trial, path, _PREDICTION_KINDS, command="sliplens predict").to_pylist()
+    rows = _rows_of(trial, path, _PREDICTION_KINDS, command="sliplens predict").select(list(_PREDICTION_KINDS)[1:])
     return {
-        row["frame"]: Reading(
-            number=row["frame"],
-            time_s=np.nan,
-            captured_s=np.nan,
-            margin=row["prediction"],
-            low=row["low_90"],
-            high=row["high_90"],
-        )
-        for row in rows
+        number: Reading(number=number, time_s=np.nan, captured_s=np.nan, margin=margin, low=low, high=high)
+        for number, margin, low, high in zip(*rows.to_pydict().values(), strict=True)
     }
 
 
@@ -435,13 +408,13 @@ def _lay_out(
     rrb, trial = require_rerun().blueprint, viewed.trial
     height, width = trial.reference.shape[:2]
     bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
+    views = {
+        "frame": f"camera T_n{': contact, stick zone, markers' if trial.truth else ''}",
+        "difference": f"difference |T_n \N{MINUS SIGN} T_0| {TIMES} {factor:g}",
+        "reference": "reference T_0",
+    }
     camera, difference, reference = (
-        rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds)
-        for origin, name in (
-            ("frame", f"camera T_n{': contact, stick zone, markers' if trial.truth else ''}"),
-            ("difference", f"difference |T_n \N{MINUS SIGN} T_0| {TIMES} {factor:g}"),
-            ("reference", "reference T_0"),
-        )
+        rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds) for origin, name in views.items()
     )
 
     def chart(origin: str, name: str, legend: str = "RightBottom", **settings: Any) -> object:
@@ -461,13 +434,11 @@ def _lay_out(
         for method in methods
     ]
     states = rrb.StateTimelineView(origin="state", name="contact state")
-    about = rrb.TextDocumentView(origin="about", name="about this trial")
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(camera, difference, *([rrb.Tabs(*maps)] if maps else [])),
+            rrb.Vertical(camera, difference, rrb.Tabs(*maps, reference)),
             rrb.Vertical(states, *charts, row_shares=[0.6, *(1 for _ in charts)]),
-            rrb.Vertical(about, reference, row_shares=[2, 1]),
-            column_shares=[2, 3, 1.4],
+            column_shares=[2, 3],
         ),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
@@ -475,42 +446,6 @@ def _lay_out(
         rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="off"),
         auto_views=False,
     )
-
-
-def _describe_trial(viewed: ViewedTrial) -> str:
-    """Write in Markdown what a trial is, and what its labels rest on."""
-    trial, split = viewed.trial, viewed.split
-    height, width = trial.reference.shape[:2]
-    span = float(trial.time_s[-1] - trial.time_s[0])
-    facts = {
-        "sensor": trial.sensor,
-        "object": trial.object,
-        "condition": trial.condition,
-        "day": str(trial.day),
-        "split": split,
-        "frames": f"{len(trial):,} of {width} × {height} pixels in {span:.2f} s",  # noqa: RUF001 (times is meant)
-    }
-    lines = [f"# {_escape(trial.trial)}", *(f"- {name}: {_escape(value)}" for name, value in facts.items() if value)]
-    lines += ["", "## What its labels rest on"]
-    labelling = trial.labelling
-    if trial.truth is not None:
-        nominal = "nominal" if trial.truth.displacement == "calibrated" else "exact"
-        model = f"markers moved as {trial.truth.displacement}: the stick zone is {nominal}"
-        basis = [Fact("Simulated", ["labels are the mechanics' own, without error", model])]
-    elif labelling is None:
-        basis = [Fact("Unknown", [], ("their origin was not recorded",))]
-    else:
-        sources = [words for words in (labelling.source, labelling.forces) if words]
-        basis = [Fact("Recorded", sources), *audit_facts(trial, labelling)]
-    for fact in basis:
-        lines.append(f"\n**{'▲ ' if fact.doubts else ''}{_escape(fact.head)}**\n")
-        lines += [f"- {_escape(words)}" for words in fact.lines if words]
-    return "\n".join(lines)
-
-
-def _escape(text: str) -> str:
-    """Escape what Markdown would take for markup: names in files may hold anything."""
-    return re.sub(r"([\\`*_{}\[\]<>#|~])", r"\\\1", visible(text.removeprefix("• ")))
 
 
 _LOOPBACK = "127.0.0.1"
