@@ -104,9 +104,10 @@ def description(thing: object, name: str) -> str:
     paragraphs = re.findall(rf"^(?:[\w, ]+, )?{name}(?:, [\w, ]+)?\n((?:    .*\n?|\n)+)", doc, flags=re.MULTILINE)
     summary = re.split(r"\n[A-Z][a-z]+\n-+\n", doc)[0]
     if inspect.isclass(thing):
-        [definition] = ast.parse(inspect.cleandoc(inspect.getsource(thing))).body
-        assert isinstance(definition, ast.ClassDef)
-        paragraphs.append(strings_below(definition.body).get(name, ""))
+        for base in (thing, *(base for base in thing.__mro__[1:] if is_dataclass(base))):
+            [definition] = ast.parse(inspect.cleandoc(inspect.getsource(base))).body
+            assert isinstance(definition, ast.ClassDef)
+            paragraphs.append(strings_below(definition.body).get(name, ""))
     return " ".join([*paragraphs, summary])
 
 

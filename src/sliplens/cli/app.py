@@ -177,7 +177,8 @@ def _further(run: Callable[..., object]) -> list[_Option]:
 def _parameter_help(kind: Any) -> dict[str, str]:
     """Return the description of each parameter or field, as one paragraph."""
     helps = {}
-    for param in docstring_parser.parse_from_object(kind).params:
+    inherited = [base for base in getattr(kind, "__mro__", ())[1:] if is_dataclass(base)]
+    for param in (param for each in (*inherited, kind) for param in docstring_parser.parse_from_object(each).params):
         for name in param.arg_name.split(","):
             helps[name.strip()] = " ".join((param.description or "").split())
     return helps

@@ -33,13 +33,11 @@ class Violation:
 def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None = None) -> tuple[Violation, ...]:
     """Read every trial of a data set and list its errors.
 
-    For each trial: its file exists, has the hash and the facts of the table, and every image can be decoded; forces are
-    finite, labels are missing only without contact, margin and forces agree, and contact states follow the margin. For
-    the data set: no trial is listed twice, which would put its frames into two splits, no file is unlisted, and no
-    recording was cut off. Flags on labels, such as faults of the force sensor, are notes and not violations: frames
-    at a fault are not valid.
+    For each trial: its file exists, has the hash and the facts of the table, and every image can be decoded; margin,
+    forces and contact states agree. For the data set: no trial is listed twice, no file is unlisted, and no recording
+    was cut off. Flags on labels, such as faults of the force sensor, are notes: frames at a fault are not valid.
     """
-    data = data if isinstance(data, Dataset) else load_dataset(data)
+    data = load_dataset(data)
     folder, violations, labellings = data.folder, [], []
     for trial, count in Counter(info.trial for info in data.trials).items():
         if count > 1:

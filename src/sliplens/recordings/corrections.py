@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.files import MOST_TEXT, output_folder, require_file, whole_file
+from sliplens.files import MOST_TEXT, output_folder, remove, require_file, whole_file
 from sliplens.progress import OnProgress, add_note, number_of, reporting
 from sliplens.recordings.dataset import (
     Dataset,
@@ -24,12 +24,12 @@ from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.labelling import Corrections
 from sliplens.recordings.labels import require_inside
 from sliplens.recordings.manifest import read_csv
-from sliplens.recordings.options import LabelSettings
+from sliplens.recordings.options import LabelSettings, TrialSettings
 from sliplens.recordings.store import read_first_reference, read_header
 from sliplens.recordings.trial import ContactState, Recording
-from sliplens.recordings.trial_writer import TrialJob, TrialWork, write_trials
+from sliplens.recordings.trial_writer import PARTS, TrialJob, TrialWork, write_trials
 
-_SETTINGS = tuple(field.name for field in fields(Corrections))
+_SETTINGS = ("exclude", *(field.name for field in fields(TrialSettings)))
 _CURRENT = ("reference_frame", "contact_s", "slip_s", "tare", "normal_sign", "mu")
 _COLUMNS = ("trial", *_SETTINGS, *(f"current_{name}" for name in _CURRENT), "valid_frames", "frames", "flags")
 _WORDS = {**dict.fromkeys(("yes", "true", "1", "x"), True), **dict.fromkeys(("no", "false", "0"), False)}
@@ -40,20 +40,21 @@ def _parse_tare(text: str) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _parse_spans(text: str) -> tuple[tuple[int, int], ...]:
-    # two dots: a spreadsheet would take 10-12 for a date
-    ends = [span.split("..") for span in re.split(r"[\s;]+", text)]
-    if any(len(span) > 2 for span in ends):
-        raise ValueError(text)
-    return tuple((int(span[0]), int(span[-1])) for span in ends)
+def _parse_span(text: str) -> tuple[int, int]:
+    first, _, last = text.partition("..")  # two dots: a spreadsheet would take 10-12 for a date
+    return int(first), int(last or first)
 
 
 _PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
     "exclude": (lambda text: _WORDS[text.lower()], "write yes or no"),
-    **dict.fromkeys(("reference_frame", "normal_sign"), (int, "write a whole number")),
+    "reference_frame": (int, "write a whole number"),
+    "normal_sign": (lambda text: {1: 1, -1: -1}[int(text)], "write 1 or -1"),
     **dict.fromkeys(("contact_s", "slip_s", "mu"), (float, "write a number with a decimal point")),
     "tare": (_parse_tare, "write three numbers, such as 0.01 0 -0.2"),
-    "bad_frames": (_parse_spans, "write spans of frames, such as 10..19 34"),
+    "bad_frames": (
+        lambda text: tuple(map(_parse_span, re.split(r"[\s;]+", text))),
+        "write spans of frames, such as 10..19 34",
+    ),
 }
 """Function that parses the cells of a column, and the cure where it cannot."""
 
@@ -92,7 +93,7 @@ def draft_corrections(data: Dataset | Path | str, path: Path | str) -> None:
     Columns that begin with `current_` show the values of the present labels and are ignored on reading: write the value
     that should hold instead into the column without that prefix. `sliplens label DATA --corrections` applies the table.
     """
-    data, path = data if isinstance(data, Dataset) else load_dataset(data), Path(path)
+    data, path = load_dataset(data), Path(path)
     if path.exists():
         raise InputError(f"{path} exists and may hold corrections; name a file that does not")
     with whole_file(path) as part, part.open("w", encoding="utf-8", newline="") as stream:
@@ -159,7 +160,7 @@ def label_dataset(
         See `import_recordings`.
     """
     with reporting(on_progress):
-        data = data if isinstance(data, Dataset) else load_dataset(data)
+        data = load_dataset(data)
         labelling, out = labelling or LabelSettings(), data.folder if out is None else Path(out)
         in_place = out.resolve() == data.folder.resolve()
         stored = {info.trial: read_header(trial_path(data.folder, info.trial)).labelling for info in data.trials}
@@ -173,20 +174,20 @@ def label_dataset(
         work = _Relabelling(data=data, labelling=labelling, corrections=corrections)
         for number in range(len(data.trials)):  # mistakes are found before anything slow
             work.open(number)
-        for trial, origin in stored.items():
-            excluded = origin is not None and origin.corrections is not None and origin.corrections.exclude
-            if in_place and (origin is None or (origin.basis is None and not excluded)):
+        for trial, origin in stored.items() if in_place else ():
+            excluded = trial in before and before[trial].exclude
+            if origin is None or (origin.basis is None and not excluded):
                 raise InputError(f"the labels of {trial} did not come from its forces and would be lost; give --output")
         config = {"labelling": labelling, "data_hash": data.hash, "corrections": dict(corrections)}
         with output_folder(out, stage="label", config=config, overwrite=overwrite or in_place) as output:
             if not output.complete:
+                folder = output.folder
                 items = [(number, info.trial, info.frames) for number, info in enumerate(data.trials)]
-                with write_trials(
-                    work, items, output.folder, title="Labelling frames", on=on, retry_failed=retry_failed
-                ) as (rows, _):
-                    table = [replace(row, split=info.split) for row, info in zip(rows, data.trials, strict=True)]
-                    write_dataset_table(output.folder, table, simulated=data.simulated, left_out=data.left_out)
-                    copy_profiles(data.folder, output.folder)
+                rows, _ = write_trials(work, items, folder, title="Labelling frames", on=on, retry_failed=retry_failed)
+                table = [replace(row, split=info.split) for row, info in zip(rows, data.trials, strict=True)]
+                write_dataset_table(folder, table, simulated=data.simulated, left_out=data.left_out)
+                copy_profiles(data.folder, folder)
+                remove(folder / PARTS)
         if corrections:
             add_note(f"corrections of {number_of(len(corrections), 'trial')} applied")
         if removed := sorted(before.keys() - corrections.keys()):

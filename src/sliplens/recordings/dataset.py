@@ -2,7 +2,7 @@
 
 import shlex
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -16,25 +16,19 @@ from sliplens.progress import OnProgress, add_note, fold_equal, number_of, repor
 from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, finish_journal, journals_of, lock_journals
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
-from sliplens.recordings.store import SCHEMA_VERSION, forces_path, load_recording, read_header, require_stored
-from sliplens.recordings.trial import Recording, TrialFacts
+from sliplens.recordings.store import SCHEMA_VERSION, StoredFacts, forces_path, load_recording, read_header
+from sliplens.recordings.trial import Recording
 
 DATASET_FILE = "dataset.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialInfo(TrialFacts):
+class TrialInfo(StoredFacts):
     """Row of a data set's table: a trial, its split, and the hashes of its files."""
 
     split: str
-    frames: int
-    height: int  #: Rows of its frames, in pixels.
-    width: int
     sha256: str
     forces_sha256: str = ""  #: Hash of the samples of the force sensor; empty where none are kept.
-
-    def __post_init__(self) -> None:
-        require_stored(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,15 +40,16 @@ class LeftOut:
     why: str  #: Error and its cure.
 
 
+_UNITS = {"time_s": "s", "normal_force_n": "N", "tangential_force_n": "N"}
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Table:
     """Contents of `dataset.json`."""
 
     schema_version: int = SCHEMA_VERSION
     simulated: bool = False
-    units: dict[str, str] = field(
-        default_factory=lambda: {"time_s": "s", "normal_force_n": "N", "tangential_force_n": "N"}
-    )
+    units: Mapping[str, str] = field(default_factory=_UNITS.copy)
     trials: tuple[TrialInfo, ...]
     left_out: tuple[LeftOut, ...] = ()
 
@@ -85,24 +80,20 @@ class Dataset:
 
     def find(self, trial: str) -> TrialInfo:
         """Return the trial of a name; a `RecordingError` lists the trials if there is none."""
-        by_name = {info.trial: info for info in reversed(self.trials)}
-        if trial not in by_name:
-            ends = list(dict.fromkeys([*[info.trial for info in self.trials[:5]], self.trials[-1].trial]))
-            raise RecordingError(f"{self.folder} has no trial {trial}; it has {', '.join(ends)}")
-        return by_name[trial]
+        for info in self.trials:
+            if info.trial == trial:
+                return info
+        some = ", ".join(dict.fromkeys(info.trial for info in (*self.trials[:5], self.trials[-1])))
+        raise RecordingError(f"{self.folder} has no trial {trial}; it has {some}")
 
     def select(self, *, split: str | None = None, condition: str | None = None) -> tuple[TrialInfo, ...]:
         """Return the trials of a split and a condition; a `RecordingError` lists both if there is none."""
-        chosen = tuple(
-            trial
-            for trial in self.trials
-            if (split is None or trial.split == split) and (condition is None or trial.condition == condition)
-        )
+        chosen = [info for info in self.trials if split in {None, info.split} and condition in {None, info.condition}]
         if not chosen:
             present = sorted({f"{trial.split}/{trial.condition}" for trial in self.trials})
             wanted = f"split {split or 'any'} and condition {condition or 'any'}"
             raise RecordingError(f"{self.folder} has no trial with {wanted}; it has {', '.join(present)}")
-        return chosen
+        return tuple(chosen)
 
     def load(self, info: TrialInfo, *, truth: bool = True) -> Recording:
         """Read one trial with its frames, and with the ground truth of a simulated one unless `truth` is False."""
@@ -121,13 +112,15 @@ class Dataset:
 _RECORDED_SPLIT = "test"  # nothing was trained on it
 
 
-def load_dataset(folder: Path | str) -> Dataset:
+def load_dataset(folder: Dataset | Path | str) -> Dataset:
     """Open a data set that `import_recordings` or `simulate` made; trials are read on request.
 
-    A recording that was cut off is noted, and no trial of the data set until `recover_dataset` finishes it.
+    A recording that was cut off is noted, and no trial of the data set until `recover_dataset` finishes it. An open
+    data set is returned as it is.
     """
-    folder = Path(folder)
-    require_folder(folder, what="the data set")
+    if isinstance(folder, Dataset):
+        return folder
+    folder = require_folder(Path(folder), what="the data set")
     table, unfinished = _read_table(folder), ""
     if (folder / JOURNAL_FOLDER).is_dir():
         cure = f"stop it, or finish it with `{shlex.join(['sliplens', 'recover', str(folder)])}`"
@@ -144,15 +137,14 @@ def recover_dataset(folder: Path | str, *, on_progress: OnProgress | None = None
 
     A data set without such a recording stays as it is.
     """
-    folder = Path(folder)
-    require_folder(folder, what="the data set")
+    folder = require_folder(Path(folder), what="the data set")
     with reporting(on_progress):
-        if not (folder / JOURNAL_FOLDER).is_dir():
-            add_note(f"{folder} holds no recording that was cut off; nothing was changed")
-        else:
+        if (folder / JOURNAL_FOLDER).is_dir():
             finish_recording(folder)
             if not (folder / DATASET_FILE).is_file():
                 raise RecordingError(f"{folder} held no whole frame and was removed; record again")
+        else:
+            add_note(f"{folder} holds no recording that was cut off; nothing was changed")
         return load_dataset(folder)
 
 
@@ -240,12 +232,10 @@ def trial_path(folder: Path, trial: str) -> Path:
 
 def trial_info(path: Path, *, split: str) -> TrialInfo:
     """Make the row of the data set's table for the trial stored at `path`."""
-    header = read_header(path)
-    samples = forces_path(path.parent.parent, path.stem)
-    values = {field.name: getattr(header, field.name) for field in fields(TrialInfo) if hasattr(header, field.name)}
-    return TrialInfo(
-        **values, split=split, sha256=hash_file(path), forces_sha256=hash_file(samples) if samples.is_file() else ""
-    )
+    header, samples = read_header(path), forces_path(path.parent.parent, path.stem)
+    values = {field.name: getattr(header, field.name) for field in fields(StoredFacts)}
+    forces = hash_file(samples) if samples.is_file() else ""
+    return TrialInfo(**values, split=split, sha256=hash_file(path), forces_sha256=forces)
 
 
 def write_dataset_table(

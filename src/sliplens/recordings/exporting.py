@@ -88,7 +88,7 @@ def _export(
     overwrite: bool,
     run_file: str,
 ) -> Export:
-    data = data if isinstance(data, Dataset) else load_dataset(data)
+    data = load_dataset(data)
     chosen = tuple(data.find(trial) for trial in dict.fromkeys(trials)) if trials else data.trials
     names, frames = tuple(info.trial for info in chosen), sum(info.frames for info in chosen)
     config = {"format": write.__name__, "data_hash": data.hash, "trials": list(names)}

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TypeAlias, TypedDict, Unpack
 
 from sliplens.errors import InputError, RecordingError, SliplensError
-from sliplens.files import output_folder, whole_file
+from sliplens.files import output_folder, remove, whole_file
 from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, reporting
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import (
@@ -27,7 +27,7 @@ from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import SensorProfile, is_profile, load_profile
 from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import Group, SplitResult, assign_splits, deal_splits, load_splits
-from sliplens.recordings.trial_writer import TrialJob, TrialWork, require_forces, write_trials
+from sliplens.recordings.trial_writer import PARTS, TrialJob, TrialWork, require_forces, write_trials
 from sliplens.runner import require_executor
 
 
@@ -98,9 +98,7 @@ def import_recordings(
         Where trials are made, a row of `runner.EXECUTORS`: `serial` (several side by side in threads), `processes`,
         `processes=4`, `ray`.
     **options
-        `ImportOptions`: `reference` (image of the untouched sensor; by default that of the source, else one of the
-        frames before the contact), `day`, `condition` and `object` (by default those of the source), `format`,
-        `validation_trials` and `test_trials` (numbers of the last trials, in place of `splits`), `retry_failed`.
+        `ImportOptions`. By default the reference is that of the source, else one of the frames before the contact.
     """
     require_executor(on)
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]
@@ -113,9 +111,9 @@ def import_recordings(
     work = _prepare_work(paths, sensor=sensor, reading=reading, labelling=labelling, options=options)
     with reporting(on_progress):
         before = load_dataset(out) if add else None
-        with open_stage("Opening the recordings"):
-            left_out = work.open_all()
         old = () if before is None else before.trials
+        with open_stage("Opening the recordings"):
+            lost = work.open_all()
         names = {info.trial for info in old}
         if existing := [job.capture.trial for job in work.jobs.values() if job.capture.trial in names]:
             count = number_of(len(existing), "trial")
@@ -123,34 +121,41 @@ def import_recordings(
         jobs = {item: job for item, job in work.jobs.items() if job.capture.trial not in names}
         if before is not None and not jobs:
             report_dataset(before, existed=True)
-            return replace(before, left_out=tuple(left_out))
+            return replace(before, left_out=tuple(lost))
         captures = [job.capture for job in jobs.values()]
-        _require_names(captures, left_out)
+        _require_names(captures, lost)
         plan = None if splits is None else load_splits(splits)
         dealt = _deal(old, captures, plan, last)  # a mistake in the splits is found before anything slow
         config = {**work.recipe(), "splits": plan, "last_trials": last}
         config |= {} if before is None else {"added_to": before.hash}
         with output_folder(Path(out), stage="import", config=config, overwrite=overwrite or add) as output:
             if not output.complete:
+                folder = output.folder
                 if before is not None:
-                    _link_trials(before.folder, output.folder)
+                    _link_trials(before.folder, folder)
                 trials = [(item, job.capture.trial, len(job.capture)) for item, job in jobs.items()]
-                retry_failed = options.get("retry_failed", False)
-                with write_trials(
-                    work, trials, output.folder, title="Importing frames", on=on, retry_failed=retry_failed
-                ) as (rows, failed):
-                    names = {info.trial for info in rows}
-                    written = [job for job in jobs.values() if job.capture.trial in names]
-                    dealt = _deal(old, [job.capture for job in written], plan, last)
-                    for profile in {job.profile.name: job.profile for job in written if job.profile}.values():
-                        save_profile(output.folder, profile)
-                    every = zip([*old, *rows], dealt.splits, strict=True)
-                    table = [replace(info, split=split) for info, split in every]
-                    # trials left out before stay listed
-                    lost = {trial.trial: trial for trial in (*(before.left_out if before else ()), *left_out, *failed)}
-                    lost = [trial for name, trial in lost.items() if name not in {info.trial for info in table}]
-                    simulated = all(job.capture.simulated for job in written) and (before is None or before.simulated)
-                    write_dataset_table(output.folder, table, simulated=simulated, left_out=lost)
+                listed = [job.capture for item, job in jobs.items() if work.rows[item[0]].trial]
+                new, failed = write_trials(
+                    work,
+                    trials,
+                    folder,
+                    title="Importing frames",
+                    on=on,
+                    retry_failed=options.get("retry_failed", False),
+                    optional={capture.trial: capture.source for capture in listed},
+                )
+                names = {info.trial for info in new}
+                written = [job for job in jobs.values() if job.capture.trial in names]
+                dealt = _deal(old, [job.capture for job in written], plan, last)
+                for used in {job.profile.name: job.profile for job in written if job.profile}.values():
+                    save_profile(folder, used)
+                table = [replace(info, split=split) for info, split in zip([*old, *new], dealt.splits, strict=True)]
+                # trials left out before stay listed
+                missing = {trial.trial: trial for trial in (*(before.left_out if before else ()), *lost, *failed)}
+                missing = [trial for name, trial in missing.items() if name not in {info.trial for info in table}]
+                simulated = all(job.capture.simulated for job in written) and (before is None or before.simulated)
+                write_dataset_table(folder, table, simulated=simulated, left_out=missing)
+                remove(folder / PARTS)
         for message in dealt.notes:
             add_note(message)
         data = load_dataset(out)
@@ -167,9 +172,9 @@ def _prepare_work(
     options: ImportOptions,
 ) -> "_ImportWork":
     """List the recordings, each with the facts that its manifest or else the call gives."""
-    reference, format = options.get("reference"), options.get("format")
     if reading.forces is not None and len(paths) > 1:
         raise InputError("one table of forces goes with one recording; name what belongs together in a manifest (CSV)")
+    reference = options.get("reference")
     if reference is not None and labelling.reference_frame is not None:
         raise InputError("the untouched sensor is named twice; give --reference or --reference-frame, not both")
     profile = load_profile(sensor) if sensor is not None and is_profile(sensor) else None
@@ -184,14 +189,16 @@ def _prepare_work(
         mu=labelling.mu,
         reference=labelling.reference_frame if reference is None else Path(reference),
     )
-    single = format is not None or reading.forces is not None
-    rows = []
-    for path in paths:
+    single = options.get("format") is not None or reading.forces is not None
+    rows = [
+        replace(defaults, **{name: value for name, value in vars(row).items() if value is not None})
+        for path in paths
         # a path that is one recording becomes a row without a name
-        for row in (None if single else find_rows(path)) or (replace(defaults, video=path),):
-            values = {name: value for name, value in vars(row).items() if value is not None}
-            rows.append(replace(defaults, **values))
-    return _ImportWork(rows=tuple(rows), reading=reading, labelling=labelling, profile=profile, format=format)
+        for row in (None if single else find_rows(path)) or (replace(defaults, video=path),)
+    ]
+    return _ImportWork(
+        rows=tuple(rows), reading=reading, labelling=labelling, profile=profile, format=options.get("format")
+    )
 
 
 _Item: TypeAlias = tuple[int, int]  #: Number of a row, and of a trial in it.
@@ -250,30 +257,25 @@ class _ImportWork(TrialWork):
                 require_forces(capture)
         settings = settings if profile is None else profile.settings(settings)
         for index, capture in enumerate(captures):
-            job = TrialJob(capture=capture, settings=settings, profile=profile, one_of_many=bool(row.trial))
-            self.jobs[number, index] = job
+            self.jobs[number, index] = TrialJob(capture=capture, settings=settings, profile=profile)
 
     def recipe(self) -> dict:
         """Return all that shapes the trials; a change of a file beside them changes nothing."""
 
-        def describe(values: dict) -> dict:
-            return {name: _fingerprint(value) if isinstance(value, Path) else value for name, value in values.items()}
+        def describe(value: object) -> object:
+            if not isinstance(value, Path):
+                return value
+            files = [value] if value.is_file() else [file for file in value.rglob("*") if file.is_file()]
+            stats = [file.stat() for file in files]  # quicker than to read all of it
+            changed = max((each.st_mtime_ns for each in stats), default=0)
+            return str(value.resolve()), sum(each.st_size for each in stats), changed
 
-        return {
-            "rows": [describe(vars(row)) for row in self.rows],
-            "reading": describe({name: getattr(self.reading, name) for name in self.reading.given()}),
-            "labelling": self.labelling,
-            "profile": self.profile,
-            "format": self.format,
+        settings = {name: value for name, value in vars(self).items() if name not in {"rows", "reading", "jobs"}}
+        rows = [{name: describe(value) for name, value in vars(row).items()} for row in self.rows]
+        return settings | {
+            "rows": rows,
+            "reading": {name: describe(value) for name, value in vars(self.reading).items()},
         }
-
-
-def _fingerprint(path: Path) -> tuple[str, int, int]:
-    """Return path, size and time of the last change of a file or folder, without reading all of it."""
-    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    stats = [file.stat() for file in files]
-    changed = max((each.st_mtime_ns for each in stats), default=0)
-    return str(path.resolve()), sum(each.st_size for each in stats), changed
 
 
 def _link_trials(source: Path, folder: Path) -> None:

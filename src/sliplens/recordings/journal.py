@@ -60,11 +60,8 @@ class Journal:
     ) -> None:
         """Append a frame, completely when this returns; an `OSError` where there is no room."""
         samples = ([], []) if forces is None else (forces.time_s.tolist(), forces.force_n.ravel().tolist())
-        self._writer.write_batch(
-            pa.record_batch(
-                [[time_s], [safety_margin], [samples[0]], [samples[1]], [encode_pixels(image)]], schema=_SCHEMA
-            )
-        )
+        row = [[value] for value in (time_s, safety_margin, *samples, encode_pixels(image))]
+        self._writer.write_batch(pa.record_batch(row, schema=_SCHEMA))
         self._file.flush()
 
     def close(self) -> None:
@@ -98,10 +95,13 @@ def finish_journal(journal: Path, trial: Path) -> bool:
             rows = [row.drop_columns(["image"]) for row in _rows(file)]
             if not rows:
                 return False
-            header, picture = _read_head(file)
+            file.seek(0)
+            metadata, where = pa.ipc.open_stream(file).schema.metadata or {}, "the header of a journal"
+            values = parse_json(metadata.get(_HEADER, b""), where=where, cure="move it away")
+            header = from_builtins(values, JournalHeader, where=where, command="sliplens live")
             numbers = pa.Table.from_batches(rows)
             images = (row.column("image")[0].as_py() for row in _rows(file))
-            if picture is None:
+            if (picture := metadata.get(_REFERENCE)) is None:
                 first = next(images)
                 images = chain([first], images)
                 reference = decode_pixels(first, size=(*header.size, 3), where=f"the first frame of {journal}")
@@ -131,14 +131,6 @@ def finish_journal(journal: Path, trial: Path) -> bool:
     except pa.ArrowException as error:
         raise RecordingError(f"{journal} is damaged ({one_line(error)}); move it away") from None
     return True
-
-
-def _read_head(file: pa.NativeFile) -> tuple[JournalHeader, bytes | None]:
-    """Read the facts of the trial and the image of the untouched sensor."""
-    file.seek(0)
-    metadata, where = pa.ipc.open_stream(file).schema.metadata or {}, "the header of a journal"
-    values = parse_json(metadata.get(_HEADER, b""), where=where, cure="move it away")
-    return from_builtins(values, JournalHeader, where=where, command="sliplens live"), metadata.get(_REFERENCE)
 
 
 def _rows(file: pa.NativeFile) -> Iterator[pa.RecordBatch]:

@@ -1,7 +1,7 @@
 """Provenance of the labels of a trial, stored with it and shown by the audit and the viewer."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import TypeAlias
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from sliplens.errors import RecordingError
 from sliplens.friction import MOST_FRICTION
-from sliplens.recordings.options import LabelSettings
+from sliplens.recordings.options import LabelSettings, TrialSettings
 
 AXES = ("x", "y", "z")
 
@@ -196,28 +196,18 @@ def describe_faults(faults: Sequence[ForceFault]) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Corrections:
+class Corrections(TrialSettings):
     """Settings of one trial that a person set in place of the automatic ones; None where those stay.
 
     A value that no trial can have is a `RecordingError`.
     """
 
     exclude: bool = False  #: If True, no frame of the trial has a label.
-    reference_frame: int | None = None  #: Number of the untouched frame.
-    contact_s: float | None = None  #: Begin of the contact, in seconds on the clock of the forces.
-    slip_s: float | None = None  #: First gross slip, in seconds on the clock of the forces.
-    tare: Vector | None = None  #: Reading of the untouched force sensor, in newtons.
-    normal_sign: int | None = None  #: 1 where pressing is positive as recorded, -1 where it is negative.
-    mu: float | None = None
-    """Static coefficient of friction."""
-    bad_frames: tuple[tuple[int, int], ...] = ()  #: First and last frame of each span whose frames are not valid.
 
     def __post_init__(self) -> None:
         for name in ("contact_s", "slip_s", "tare"):
             if (value := getattr(self, name)) is not None and not np.isfinite(value).all():
                 raise RecordingError(f"{name} is {value}; give a finite number, or leave it empty")
-        if self.normal_sign not in (None, 1, -1):
-            raise RecordingError(f"normal_sign is {self.normal_sign}; give 1 or -1, or leave it empty")
         if self.mu is not None and not 0 < self.mu <= MOST_FRICTION:
             raise RecordingError(f"mu is {self.mu:g}; give more than 0 and at most {MOST_FRICTION:g}")
 
@@ -231,9 +221,8 @@ class Corrections:
         >>> settings.mu, settings.slip_s
         (0.5, 1.25)
         """
-        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "exclude"}
-        values["bad_frames"] = (*settings.bad_frames, *self.bad_frames)
-        return replace(settings, **{name: value for name, value in values.items() if value is not None})
+        values = {name: value for name, value in vars(self).items() if value is not None and name != "exclude"}
+        return replace(settings, **values | {"bad_frames": (*settings.bad_frames, *self.bad_frames)})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,5 +236,4 @@ class Labelling:
     clip: Clip | None = None
     basis: LabelBasis | None = None  #: None where the labels came with the frames.
     corrections: Corrections | None = None  #: Settings that were corrected by hand; None where none were.
-    first_reference: ReferenceChoice | None = None
-    """Choice of the reference before a correction named another frame; None where none did."""
+    first_reference: ReferenceChoice | None = None  #: Choice before a correction named another; None where none did.

@@ -4,7 +4,7 @@ import csv
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -33,9 +33,6 @@ class ManifestRow:
     condition: str | None = None  #: State of the surface, such as dry or wet.
     mu: float | None = None  #: Static coefficient of friction.
     reference: Path | int | None = None  #: Image of the untouched sensor, or the number of the frame that shows it.
-
-
-_COLUMNS = tuple(field.name for field in fields(ManifestRow))
 
 
 def find_rows(source: Path) -> tuple[ManifestRow, ...] | None:
@@ -86,7 +83,8 @@ def read_rows(path: Path) -> tuple[ManifestRow, ...]:
 
     Paths are relative to the manifest; `reference` is an image or the number of a frame.
     """
-    rows = tuple(_parse_row(cells, path.parent, where) for where, cells in read_csv(path, _COLUMNS, what="a manifest"))
+    columns = tuple(field.name for field in fields(ManifestRow))
+    rows = tuple(_parse_row(cells, path.parent, where) for where, cells in read_csv(path, columns, what="a manifest"))
     if not rows:
         raise RecordingError(f"{path} lists no trial; write a row for each below the header")
     return _require_unique(rows, path)
@@ -137,18 +135,18 @@ def _parse_row(cells: dict[str, str], folder: Path, where: str) -> ManifestRow:
     for name, text in cells.items():
         if max(map(len, re.split(r"[/\\]", text))) > _LONGEST_NAME:
             raise RecordingError(f"{where}: {name} has {len(text):,} characters, which no name has; correct it")
-    facts: dict[str, Any] = {name: cells[name] for name in ("sensor", "object", "condition") if name in cells}
-    for name, kind in (("day", int), ("mu", float)):
-        if name in cells:
-            try:
-                facts[name] = kind(cells[name])
-            except ValueError:
-                raise RecordingError(f"{where}: {name} is {cells[name]!r}, which is no number; correct it") from None
-    if facts.get("sensor", "").endswith(".toml"):
-        facts["sensor"] = str(folder / facts["sensor"])
-    if "forces" in cells:
-        facts["forces"] = folder / cells["forces"]
-    if "reference" in cells:
-        facts["reference"] = int(cells["reference"]) if cells["reference"].isdecimal() else folder / cells["reference"]
-    video = folder / cells["video"]
-    return ManifestRow(trial=trial_name(cells.get("trial") or Path(cells["video"]).stem), video=video, **facts)
+    kinds: dict[str, Callable[[str], object]] = {
+        **dict.fromkeys(("video", "forces"), folder.joinpath),
+        "sensor": lambda text: str(folder / text) if text.endswith(".toml") else text,
+        "reference": lambda text: int(text) if text.isdecimal() else folder / text,
+        "day": int,
+        "mu": float,
+    }
+    facts: dict[str, Any] = {"trial": Path(cells["video"]).stem}
+    for name, text in cells.items():
+        try:
+            facts[name] = kinds.get(name, str)(text)
+        except ValueError:
+            raise RecordingError(f"{where}: {name} is {text!r}, which is no number; correct it") from None
+    facts["trial"] = trial_name(facts["trial"])
+    return ManifestRow(**facts)

@@ -1,7 +1,7 @@
 """Options of reading and labelling recordings: arguments of the library, and of the command line."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -60,24 +60,36 @@ class ReadOptions:
 
     def given(self) -> tuple[str, ...]:
         """Return the names of the options that are set, of those that a reader must support."""
-        return tuple(
-            field.name
-            for field in fields(self)
-            if field.name != "allow_large" and getattr(self, field.name) not in (None, False)
-        )
+        return tuple(name for name, value in vars(self).items() if value not in (None, False) and name != "allow_large")
 
 
 @dataclass(frozen=True, kw_only=True)
-class LabelSettings:
-    """Settings for labels from forces; what is not given is estimated from the trial."""
+class TrialSettings:
+    """Settings of one trial; what is not set is estimated."""
 
+    reference_frame: int | None = None
+    """Number of the untouched frame."""
+    contact_s: float | None = None
+    """Time at which the contact begins, on the clock of the forces; estimated if not given."""
+    slip_s: float | None = None
+    """Time at which the contact slips as a whole, on the clock of the forces; estimated if not given."""
+    tare: tuple[float, float, float] | None = None
+    """Output of the untouched force sensor (x y z), in newtons; estimated if not given."""
+    normal_sign: Literal[1, -1] | None = None
+    """1 if pressing is positive as recorded, -1 if negative; estimated if not given."""
     mu: float | None = None
     """Static coefficient of friction, if you know it; estimated where the contact begins to slip otherwise."""
+    bad_frames: tuple[tuple[int, int], ...] = ()
+    """First and last frame of each span that is wrong: its frames are not valid, and its forces are left out."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelSettings(TrialSettings):
+    """Settings for labels from forces; what is not given is estimated from the trial."""
+
     friction_change: float = 0.0
     """Relative standard deviation by which friction may change from touch to slip; on wet objects some 0.1 to 0.2. It
     widens the uncertainty."""
-    tare: tuple[float, float, float] | None = None
-    """Output of the untouched force sensor (x y z), in newtons; estimated if not given."""
     drift_rate: float | None = None
     """Standard deviation of the rate at which the force sensor's zero may drift, in N/s; 0 for none. Estimated from the
     untouched sensor if not given."""
@@ -87,19 +99,9 @@ class LabelSettings:
     """Shift the forces by the estimated lag between camera and force sensor; it is always shown."""
     normal_axis: Literal["x", "y", "z"] | None = None
     """Axis of the force sensor that presses; estimated if not given."""
-    normal_sign: Literal[1, -1] | None = None
-    """1 if pressing is positive as recorded, -1 if negative; estimated if not given."""
     contact_threshold: float | None = None
     """Least normal force of a contact, in newtons; chosen from the noise if not given."""
     force_range: float | None = None
     """Range of each axis of the force sensor, in newtons; frames beyond are not valid."""
-    reference_frame: int | None = None
-    """Number of the untouched frame."""
-    contact_s: float | None = None
-    """Time at which the contact begins, on the clock of the forces; estimated if not given."""
-    slip_s: float | None = None
-    """Time at which the contact slips as a whole, on the clock of the forces; estimated if not given."""
-    bad_frames: tuple[tuple[int, int], ...] = ()
-    """First and last frame of each span that is wrong: its frames are not valid, and its forces are left out."""
     seed: int = 0
     """Seed of the random draws behind the uncertainties."""

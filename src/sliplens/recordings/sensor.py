@@ -3,7 +3,6 @@
 import json
 import re
 import tomllib
-from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from importlib.resources import files
 from pathlib import Path
@@ -33,35 +32,23 @@ class SensorProfile:
     that are not set are left out.
     """
 
-    name: str
-    """Name of the sensor in trials and networks."""
+    name: str  #: Name of the sensor in trials and networks.
     camera_size_px: tuple[int, int] | None = None
     """Width and height of the frames to which the crop refers; it is scaled for others of the same shape."""
-    colours: Literal["rgb", "rbg", "grb", "gbr", "brg", "bgr"] = "rgb"
-    """Order in which the channels arrive."""
-    crop_px: tuple[int, int, int, int] | None = None
-    """Left, top, width and height of the gel."""
-    rotate_deg: Literal[0, 90, 180, 270] = 0
-    """Clockwise."""
-    flip: Literal["none", "horizontal", "vertical", "both"] = "none"
-    """Horizontal swaps left and right."""
-    resize_px: tuple[int, int] | None = None
-    """Width and height of prepared frames, of the same shape; those a network was trained on."""
-    markers: str | None = None
-    """Kind of markers, a row of `markers.KINDS`; None where there are none, or unknown."""
-    reference_frame: int | None = None
-    """Number of the untouched frame where the source has none, as in a video without forces."""
-    frame_rate_hz: float | None = None
-    """Frame rate of images, and of videos whose stamps are missing or wrong."""
-    normal_axis: Literal["x", "y", "z"] | None = None
-    """Axis of the force sensor that presses; estimated if None."""
-    normal_sign: Literal[1, -1] | None = None
-    """1 if pressing is positive as recorded, -1 if negative; estimated if None."""
+    colours: Literal["rgb", "rbg", "grb", "gbr", "brg", "bgr"] = "rgb"  #: Order in which the channels arrive.
+    crop_px: tuple[int, int, int, int] | None = None  #: Left, top, width and height of the gel.
+    rotate_deg: Literal[0, 90, 180, 270] = 0  #: Clockwise.
+    flip: Literal["none", "horizontal", "vertical", "both"] = "none"  #: Horizontal swaps left and right.
+    resize_px: tuple[int, int] | None = None  #: Width and height of prepared frames, of the same shape.
+    markers: str | None = None  #: Kind of markers, a row of `markers.KINDS`; None where there are none, or unknown.
+    reference_frame: int | None = None  #: Number of the untouched frame where the source has none.
+    frame_rate_hz: float | None = None  #: Frame rate of images, and of videos whose stamps are missing or wrong.
+    normal_axis: Literal["x", "y", "z"] | None = None  #: Axis of the force sensor that presses; estimated if None.
+    normal_sign: Literal[1, -1] | None = None  #: 1 if pressing is positive as recorded, else -1; estimated if None.
     pull_direction_deg: float | None = None
     """Direction in which the object pulls, mostly that of gravity, in prepared frames: 0 is right, 90 down the image.
     Checked against the directions that a network was trained on."""
-    network: str | None = None
-    """Network for these frames: a folder, or the name of one that comes with sliplens."""
+    network: str | None = None  #: Network for these frames: a folder, or the name of one that comes with sliplens.
 
     def __post_init__(self) -> None:
         # a data set stores the profile in a file of this name
@@ -70,9 +57,9 @@ class SensorProfile:
         for what, size in (("camera_size_px", self.camera_size_px), ("resize_px", self.resize_px)):
             if size is not None and min(size) <= 0:
                 raise ValueError(f"{what} is {size}; widths and heights are positive")
-        if self.camera_size_px is None and self.crop_px is not None:
-            raise ValueError("crop_px is in pixels of a frame; set its camera_size_px, too")
-        if self.crop_px is not None and self.camera_size_px is not None:
+        if self.crop_px is not None:
+            if self.camera_size_px is None:
+                raise ValueError("crop_px is in pixels of a frame; set its camera_size_px, too")
             x, y, width, height = self.crop_px
             inside = x + width <= self.camera_size_px[0] and y + height <= self.camera_size_px[1]
             if min(x, y) < 0 or min(width, height) <= 0 or not inside:
@@ -109,10 +96,8 @@ class SensorProfile:
         height, width = self.output_size(size)
         if self.colours != "rgb":
             frame = frame[..., [self.colours.index(channel) for channel in "rgb"]]
-        if self.crop_px is not None:
-            x0, y0, x1, y1 = self._box(size)
-            frame = frame[y0:y1, x0:x1]
-        frame = np.rot90(frame, k=-self.rotate_deg // 90)
+        x0, y0, x1, y1 = self._box(size)
+        frame = np.rot90(frame[y0:y1, x0:x1], k=-self.rotate_deg // 90)
         if self.flip in {"horizontal", "both"}:
             frame = frame[:, ::-1]
         if self.flip in {"vertical", "both"}:
@@ -125,11 +110,6 @@ class SensorProfile:
 
     def prepare(self, capture: Capture) -> Capture:
         """Return a recording with prepared frames and reference, and the name of the sensor."""
-        size = self.output_size(capture.frame_size)
-
-        def read_frames() -> Iterator[Frame]:
-            return map(self.apply, capture.read_frames())
-
         has_reference = capture.reference is not None or capture.reference_index is not None
         index = capture.reference_index if has_reference else self.reference_frame
         if index is not None and not 0 <= index < len(capture):
@@ -138,37 +118,31 @@ class SensorProfile:
         return replace(
             capture,
             sensor=self.name,
-            frame_size=size,
-            read_frames=read_frames,
+            frame_size=self.output_size(capture.frame_size),
+            read_frames=lambda: map(self.apply, capture.read_frames()),
             reference=None if capture.reference is None else self.apply(capture.reference),
             reference_index=index,
         )
 
     def settings(self, settings: LabelSettings) -> LabelSettings:
         """Return settings with the axis and sign of the profile where the user set none."""
-        axis, sign = settings.normal_axis, settings.normal_sign
-        axis, sign = self.normal_axis if axis is None else axis, self.normal_sign if sign is None else sign
+        axis = self.normal_axis if settings.normal_axis is None else settings.normal_axis
+        sign = self.normal_sign if settings.normal_sign is None else settings.normal_sign
         return replace(settings, normal_axis=axis, normal_sign=sign)
-
-    def _scale(self, size: tuple[int, int]) -> tuple[float, float]:
-        """Return how many times wider and higher a frame is than `camera_size_px`."""
-        if self.camera_size_px is None:
-            return 1.0, 1.0
-        across, down = size[1] / self.camera_size_px[0], size[0] / self.camera_size_px[1]
-        if abs(across / down - 1) > _MOST_STRETCH:
-            (width, height), (rows, columns) = self.camera_size_px, size
-            camera = f"is for a camera of {width} x {height}, and frames are {columns} x {rows}"
-            raise ImageError(f"the profile {self.name} {camera}; make one with `sliplens sensor new`")
-        return across, down
 
     def _box(self, size: tuple[int, int]) -> tuple[int, int, int, int]:
         """Return the corners of the crop: x, y of the first pixel, and of the first one beyond."""
-        across, down = self._scale(size)
-        if self.crop_px is None:
-            return 0, 0, size[1], size[0]
-        x, y, width, height = self.crop_px
-        box = (round(x * across), round(y * down), round((x + width) * across), round((y + height) * down))
-        return box[0], box[1], min(box[2], size[1]), min(box[3], size[0])
+        rows, columns = size
+        if self.camera_size_px is None:
+            return 0, 0, columns, rows
+        width, height = self.camera_size_px
+        across, down = columns / width, rows / height
+        if abs(across / down - 1) > _MOST_STRETCH:
+            camera = f"is for a camera of {width} x {height}, and frames are {columns} x {rows}"
+            raise ImageError(f"the profile {self.name} {camera}; make one with `sliplens sensor new`")
+        x, y, width, height = self.crop_px or (0, 0, width, height)
+        right, bottom = min(round((x + width) * across), columns), min(round((y + height) * down), rows)
+        return round(x * across), round(y * down), right, bottom
 
 
 def shipped_profiles() -> tuple[str, ...]:

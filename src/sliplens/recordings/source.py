@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeAlias, TypedDict, TypeVar, Unpack
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.files import hash_file, hash_json, hash_tree
@@ -147,16 +147,11 @@ class Trials:
         recipe = hash_json(recipe)
         return [
             part(
-                (trial, first, frames := min(longest or total, total - first)),
-                trial=trial,
-                first=first,
-                frames=frames,
-                suffix=".parquet",
-                recipe=recipe,
-                content=content,
+                (trial, at, size), trial=trial, first=at, frames=size, suffix=".parquet", recipe=recipe, content=content
             )
             for trial, total, content in self.rows
-            for first in range(0, total, longest or total)
+            for at in range(0, total, longest or total)
+            for size in (min(longest or total, total - at),)
         ]
 
     @property
@@ -234,37 +229,32 @@ def open_trials(
 def _read_captures(
     source: Path | Frames, format: str | None, options: ReadOptions, *, whole: bool
 ) -> Sequence[Capture]:
+    own = set(options.given()) <= {"frame_rate"}  # options that frames in memory take
     if isinstance(source, Path):
-        images = set(options.given()) <= {"frame_rate"} and (format or recognise(source)) == "images"
-        if whole or not images:
-            return open_captures(source, format=format, options=options)
         # unlike on import, the times of images may stay unknown
+        if whole or not own or (format or recognise(source)) != "images":
+            return open_captures(source, format=format, options=options)
         paths = list_images(source)
-        size, count = frame_size(paths[0]), len(paths)
-        return [
-            Capture(
-                trial=trial_name(source.resolve().name),
-                source=str(source),
-                frame_time_s=_frame_times(count, options.frame_rate),
-                frame_size=size,
-                read_frames=lambda: (read_frame(path, size=size) for path in paths),
-                files=tuple(path.name for path in paths),
-            )
-        ]
-    if not len(source):
-        raise InputError("there is no frame; give one or more")
-    require_rgb(source)
-    if strange := [name for name in options.given() if name != "frame_rate"]:
-        raise InputError(f"{Capture.opened} do not take {option_flags(strange)}; leave it out")
-    return [
-        Capture(
-            trial="frames",
-            source=Capture.opened,
-            frame_time_s=_frame_times(len(source), options.frame_rate),
-            frame_size=source.shape[1:3],
-            read_frames=lambda: iter(source),
-        )
-    ]
+        name, where, count, size = trial_name(source.resolve().name), str(source), len(paths), frame_size(paths[0])
+        files = tuple(path.name for path in paths)
+
+        def read() -> Iterator[Frame]:
+            return (read_frame(path, size=size) for path in paths)
+    else:
+        if not len(source):
+            raise InputError("there is no frame; give one or more")
+        require_rgb(source)
+        if not own:
+            flags = option_flags(name for name in options.given() if name != "frame_rate")
+            raise InputError(f"{Capture.opened} do not take {flags}; leave it out")
+        name, where, files, count, size = "frames", Capture.opened, None, len(source), source.shape[1:3]
+
+        def read() -> Iterator[Frame]:
+            return iter(source)
+
+    rate = options.frame_rate
+    time_s = np.full(count, np.nan) if rate is None else evenly_spaced(count, frame_rate=rate)
+    return [Capture(trial=name, source=where, frame_time_s=time_s, frame_size=size, read_frames=read, files=files)]
 
 
 def _require_usual(capture: Capture, allowed: Sequence[Budget]) -> None:
@@ -290,10 +280,6 @@ def _choose_trial(names: Sequence[str], trial: str | None, source: str) -> Seque
     if trial not in names:
         raise InputError(f"{source} has no trial {trial}; choose one such as {names[0]}")
     return [names.index(trial)]
-
-
-def _frame_times(count: int, frame_rate: float | None) -> Float[np.ndarray, " frames"]:
-    return np.full(count, np.nan) if frame_rate is None else evenly_spaced(count, frame_rate=frame_rate)
 
 
 def _with_reference(trial: Capture, image: Path | str | Frame | None, number: int | None) -> Capture:

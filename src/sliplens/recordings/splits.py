@@ -146,7 +146,7 @@ def split_dataset(
     dry_run
         If True, nothing is written.
     """
-    data = data if isinstance(data, Dataset) else load_dataset(data)
+    data = load_dataset(data)
     splits = load_splits(splits)
     if isinstance(splits, Mapping):
         result = assign_splits(data.trials, splits)

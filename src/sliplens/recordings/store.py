@@ -90,38 +90,37 @@ class TruthHeader:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialHeader(TrialFacts):
-    """Facts of a stored trial that can be read without its frames."""
+class StoredFacts(TrialFacts):
+    """Facts of a stored trial; a name or size that none has is a `ValueError`."""
 
     frames: int
-    height: int
+    height: int  #: Rows of its frames, in pixels.
     width: int
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"\w(?:[\w.-]*\w)?", self.trial):
+            raise ValueError(f"a trial is named with letters, digits, dots, dashes and underscores, not {self.trial!r}")
+        if self.frames < 0 or min(self.height, self.width) <= 0 or self.height * self.width > MOST_PIXELS:
+            raise ValueError(f"no trial has {self.frames} frames of {self.height} x {self.width} pixels")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialHeader(StoredFacts):
+    """Facts of a stored trial that can be read without its frames."""
+
     labelling: Labelling | None = None
     truth: TruthHeader | None = None
 
-    def __post_init__(self) -> None:
-        require_stored(self)
-
-
-def require_stored(trial: TrialFacts) -> None:
-    """Check name and frame size of a stored trial."""
-    if not _NAME.fullmatch(trial.trial):
-        raise ValueError(f"a trial is named with letters, digits, dots, dashes and underscores, not {trial.trial!r}")
-    frames, height, width = (getattr(trial, name) for name in ("frames", "height", "width"))
-    if frames < 0 or min(height, width) <= 0 or height * width > MOST_PIXELS:
-        raise ValueError(f"no trial has {frames} frames of {height} x {width} pixels")
-
 
 _FACTS = tuple(field.name for field in fields(TrialFacts))
-_NAME = re.compile(r"\w(?:[\w.-]*\w)?")
 _HEADER, _FIRST_REFERENCE = b"sliplens", b"first_reference"
 
 
 def read_header(path: Path) -> TrialHeader:
     """Read the facts of a trial and the provenance of its labels, without its frames."""
     file, header = _open(path)
-    file.close()
-    return header
+    with file:
+        return header
 
 
 def read_first_reference(path: Path) -> Frame | None:
@@ -183,25 +182,19 @@ def write_trial(
 ) -> None:
     """Write the Parquet file of a trial, its encoded images a row group at a time; it appears when complete."""
     columns: dict[str, Any] = {"time_s": time_s, "contact_state": labels.contact_state}
-    columns |= {name: getattr(labels, name) for name in (*SIGNALS[1:], *OPTIONAL_LABELS)}
-    columns = {name: values for name, values in columns.items() if values is not None}
+    for name in (*SIGNALS[1:], *OPTIONAL_LABELS):
+        columns |= {} if getattr(labels, name) is None else {name: getattr(labels, name)}
     truth_header = None
     if truth is not None:
-        rest = tuple((float(x), float(y)) for x, y in truth.marker_rest_px)
+        rest = tuple(map(tuple, truth.marker_rest_px.tolist()))
         truth_header = TruthHeader(recipe=truth.recipe, displacement=truth.displacement, marker_rest_px=rest)
         columns |= {name: getattr(truth, name) for name in _TRUTH_SIGNALS}
         columns["marker_px"] = pa.FixedSizeListArray.from_arrays(truth.marker_px.ravel(), list_size=2 * len(rest))
         maps = [encoded for chunk in encode_frames(truth.contact_map) for encoded in chunk]
         columns["contact_map"] = pa.array(maps, type=pa.binary())
     height, width, _ = reference.shape
-    header = TrialHeader(
-        **{name: getattr(facts, name) for name in _FACTS},
-        frames=len(time_s),
-        height=height,
-        width=width,
-        labelling=labels.labelling,
-        truth=truth_header,
-    )
+    stored = {name: getattr(facts, name) for name in _FACTS} | {"frames": len(time_s), "height": height, "width": width}
+    header = TrialHeader(**stored, labelling=labels.labelling, truth=truth_header)
     metadata = {_HEADER: msgspec.json.encode(to_builtins(header)), b"codec": CODEC.encode()}
     for key, image in ((b"reference", reference), (_FIRST_REFERENCE, first_reference)):
         if image is not None:
@@ -282,8 +275,7 @@ def stream_frames(path: Path, places: Collection[int] | None = None) -> Iterator
 def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
     """Read some frames of a stored trial, in the order of `places`, with one row group in memory at a time."""
     header, wanted = read_header(path), set(places)
-    outside = [place for place in places if not 0 <= place < header.frames]
-    if outside:
+    if outside := [place for place in places if not 0 <= place < header.frames]:
         raise RecordingError(f"{path} has no frame {outside[0]}; name one from 0 to {header.frames - 1}")
     frames = np.empty((len(places), header.height, header.width, 3), dtype=np.uint8)
     for place, frame in zip(sorted(wanted), stream_frames(path, wanted), strict=True):
@@ -321,11 +313,11 @@ def _decode(images: pa.ChunkedArray, size: tuple[int, ...], where: str) -> UInt8
     """Decode the images of a trial in threads."""
     pixels = np.empty((len(images), *size), dtype=np.uint8)
 
-    def decode(index: int) -> None:
-        pixels[index] = decode_pixels(images[index].as_buffer(), size=size, where=f"frame {index} {where}")
+    def decode(index: int) -> Pixels:
+        return decode_pixels(images[index].as_buffer(), size=size, where=f"frame {index} {where}")
 
-    with ThreadPoolExecutor() as pool:
-        list(pool.map(decode, range(len(images))))
+    for index, image in enumerate(in_turn(decode, range(len(images)))):
+        pixels[index] = image
     return pixels
 
 

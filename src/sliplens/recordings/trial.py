@@ -75,8 +75,7 @@ class Labels:
     def _require_consistent(self, count: int, where: str) -> None:
         """Check that there is one value a frame, each in its range."""
         for name in (*SIGNALS, "contact_state", *OPTIONAL_LABELS):
-            values = getattr(self, name, None)
-            if values is None:
+            if (values := getattr(self, name, None)) is None:
                 continue
             if len(values) != count:
                 begin = f"trial {where} has" if where else "there are"

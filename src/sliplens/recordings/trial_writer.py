@@ -3,8 +3,7 @@
 import tempfile
 from abc import abstractmethod
 from array import array
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -36,6 +35,8 @@ from sliplens.recordings.store import (
 from sliplens.recordings.trial import labels_of_margins
 from sliplens.runner import MakePart, Work, part, run_parts
 
+PARTS = "parts"  #: Folder of a data set in the making, with a data set of each trial; the caller removes it.
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrialJob:
@@ -46,15 +47,6 @@ class TrialJob:
     corrections: Corrections | None = None  #: Corrections by hand, which `settings` follow already.
     cure: str = ""  #: End of an error message, where corrections may be the cause.
     profile: SensorProfile | None = None  #: Profile that its frames go through.
-    one_of_many: bool = False  #: If True, a failure leaves the trial out instead of stopping the others.
-
-
-@dataclass(frozen=True, kw_only=True)
-class WrittenTrial:
-    """Row of the data set's table for a trial, or the reason why the trial was left out."""
-
-    info: TrialInfo | None = None
-    left_out: LeftOut | None = None
 
 
 class TrialWork(Work):
@@ -71,66 +63,59 @@ class TrialWork(Work):
         # matrix products are small here: idle threads would spin on all cores
         threadpool_limits(1, user_api="blas")
 
-        def make(item: Any, path: Path) -> None:
+        def make(item: Any, folder: Path) -> None:
             job = self.open(item)
-            capture, settings = job.capture, job.settings
-            trial, samples = trial_path(path, capture.trial), forces_path(path, capture.trial)
-            # random numbers that do not depend on the other trials
-            rng = np.random.default_rng((settings.seed, *capture.trial.encode()))
+            trial, samples = trial_path(folder, job.capture.trial), forces_path(folder, job.capture.trial)
             try:
                 import_trial(
-                    capture, trial, settings=settings, corrections=job.corrections, rng=rng, forces_file=samples
+                    job.capture, trial, settings=job.settings, corrections=job.corrections, forces_file=samples
                 )
-                written = WrittenTrial(info=trial_info(trial, split=""))
             except SliplensError as error:
-                if job.cure:
-                    raise RecordingError(f"{error}{job.cure}") from None
-                if not job.one_of_many:
-                    raise
-                samples.unlink(missing_ok=True)
-                written = WrittenTrial(left_out=LeftOut(trial=capture.trial, source=capture.source, why=str(error)))
-            save_record(written, path / RESULT_FILE)
+                raise RecordingError(f"{error}{job.cure}") from None
+            save_record(trial_info(trial, split=""), folder / RESULT_FILE)
 
         return make
 
 
-@contextmanager
 def write_trials(
-    work: TrialWork, trials: Sequence[tuple[Any, str, int]], folder: Path, *, title: str, on: str, retry_failed: bool
-) -> Iterator[tuple[list[TrialInfo], list[LeftOut]]]:
-    """Write trials into the folder of a data set; yields their rows, and the trials that were left out of many."""
-    parts = folder / "parts"
+    work: TrialWork,
+    trials: Sequence[tuple[Any, str, int]],
+    folder: Path,
+    *,
+    title: str,
+    on: str,
+    retry_failed: bool,
+    optional: Mapping[str, str] | None = None,
+) -> tuple[list[TrialInfo], list[LeftOut]]:
+    """Write trials (item, name, number of frames) into the folder of a data set; return their rows.
+
+    Those of `optional`, names and sources, are left out where they fail; without any other the error is raised.
+    """
     # the folder is of these recordings and settings alone (`files.output_folder`)
     every = [part(item, trial=name, frames=frames, recipe="trial", content=name) for item, name, frames in trials]
-    rows: list[TrialInfo] = []
     left_out: list[LeftOut] = []
     with threadpool_limits(1, user_api="blas"), open_stage(title):
         try:
-            run_parts(work, every, parts, title=title, on=on, retry_failed=retry_failed)
+            run_parts(work, every, folder / PARTS, title=title, on=on, retry_failed=retry_failed)
         except PartError as error:
-            failed = {name: work.open(item) for item, name, _ in trials if name in error.errors}
-            if len(failed) == len(trials) or not all(job.one_of_many for job in failed.values()):
+            if not error.errors.keys() <= (optional or {}).keys():
                 raise
-            for name, job in failed.items():
-                why = f"{error.errors[name]}; the same command with --add tries it again"
-                left_out.append(LeftOut(trial=name, source=job.capture.source, why=why))
-    set_aside = {trial.trial for trial in left_out}
-    for made in (parts / each.path for each in every if each.name not in set_aside):
-        written = load_record(made / RESULT_FILE, WrittenTrial, command="the interrupted command")
-        if written.left_out is not None:
-            left_out.append(written.left_out)
-        if written.info is not None:
-            rows.append(written.info)
-            for path in (trial_path(made, written.info.trial), forces_path(made, written.info.trial)):
-                if path.exists():  # else there are none, or they were moved before an interruption
-                    target = folder / path.relative_to(made)
-                    target.parent.mkdir(exist_ok=True)
-                    path.replace(target)
-    if left_out and not rows:
-        remove(parts)
+            for name, failure in error.errors.items():
+                why = f"{failure}; the same command with --add tries it again"
+                left_out.append(LeftOut(trial=name, source=(optional or {})[name], why=why))
+    if len(left_out) == len(trials):
+        remove(folder / PARTS)
         raise RecordingError(f"no trial could be imported; the first: {left_out[0].why}")
-    yield rows, left_out
-    remove(parts)
+    rows: list[TrialInfo] = []
+    failed = {trial.trial for trial in left_out}
+    for made in (folder / PARTS / each.path for each in every if each.name not in failed):
+        rows.append(load_record(made / RESULT_FILE, TrialInfo, command="the interrupted command"))
+        for path in (trial_path(made, rows[-1].trial), forces_path(made, rows[-1].trial)):
+            if path.exists():  # else there are none, or they were moved before an interruption
+                target = folder / path.relative_to(made)
+                target.parent.mkdir(exist_ok=True)
+                path.replace(target)
+    return rows, left_out
 
 
 def require_forces(capture: Capture) -> None:
@@ -146,7 +131,6 @@ def import_trial(
     *,
     settings: LabelSettings | None = None,
     corrections: Corrections | None = None,
-    rng: np.random.Generator,
     forces_file: Path | None = None,
 ) -> None:
     """Write a recording as a trial of a data set, with its own or automatic labels; complete or not at all."""
@@ -156,13 +140,15 @@ def import_trial(
     with tempfile.TemporaryFile(dir=path.parent) as file:
         footage = _Footage(capture, file)
         motion = measure_motion(footage.soften())
+        labels, untouched, basis = capture.labels, None, None
         try:
-            labels, untouched, basis = capture.labels, None, None
             if labels is None and corrections is not None and corrections.exclude:
                 labels = labels_of_margins(np.full(len(capture), np.nan))
                 labels = replace(labels, reason=(Reason.EXCLUDED,) * len(capture))
             elif labels is None:
                 assert capture.forces is not None
+                # random numbers that do not depend on the other trials
+                rng = np.random.default_rng((settings.seed, *capture.trial.encode()))
                 labels = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
                 basis, untouched = labels.basis, np.array([reason is Reason.NO_CONTACT for reason in labels.reason])
                 if (doubt := describe_repeats(motion, capture.frame_time_s)) is not None:
@@ -205,24 +191,22 @@ class _Footage:
         self.capture, self._file, self._ends = capture, file, array("q", [0])
 
     def soften(self) -> Iterator[Soft]:
-        """Decode and spool the frames; yields them softened."""
-        for image, soft in in_turn(lambda frame: (encode_pixels(frame), soften(frame)), self._decode()):
+        """Decode, check and spool the frames; yields them softened."""
+        capture = self.capture
+
+        def encode(item: tuple[int, Frame]) -> tuple[bytes, Soft]:
+            number, frame = item
+            require_rgb(frame, what=f"levels of frame {number} of {capture.source}")
+            if frame.shape[:2] != capture.frame_size:
+                raise RecordingError(f"frame {number} of {capture.source} is of another size; cut the recording there")
+            return encode_pixels(frame), soften(frame)
+
+        for image, soft in in_turn(encode, enumerate(capture.read_frames())):
             self._file.write(image)
             self._ends.append(self._file.tell())
             yield soft
-            report_progress(len(self._ends) - 1, len(self.capture))
-
-    def _decode(self) -> Iterator[Frame]:
-        """Read the frames, which must be of one size and as many as promised."""
-        capture, count = self.capture, 0
-        for count, frame in enumerate(capture.read_frames(), start=1):
-            require_rgb(frame, what=f"levels of frame {count - 1} of {capture.source}")
-            if frame.shape[:2] != capture.frame_size:
-                raise RecordingError(
-                    f"frame {count - 1} of {capture.source} is of another size; cut the recording there"
-                )
-            yield frame
-        if count != len(capture):
+            report_progress(len(self._ends) - 1, len(capture))
+        if (count := len(self._ends) - 1) != len(capture):
             raise RecordingError(f"{capture.source} promised {len(capture)} frames but gave {count}; copy it again")
 
     def _image(self, place: int) -> bytes:
@@ -250,14 +234,10 @@ def _choose_reference(
     if capture.reference is not None and index is None:
         method = "came with the recording" if untouched is None else "recorded apart from the frames"
         return capture.reference, capture.reference_choice or ReferenceChoice(method=method)
-    if untouched is not None:
-        choice = choose_reference(footage.read, untouched, index=index)
-    elif index is None:
-        raise RecordingError("no frame is known to be untouched; name one with --reference-frame")
-    elif not 0 <= index < len(capture):
-        raise RecordingError(f"the reference is frame {index} of {len(capture)}; name one from 0 on that is there")
-    else:
-        choice = ReferenceChoice(index=index, method="named")
+    of_forces = np.zeros(len(capture), dtype=np.bool_) if untouched is None else untouched
+    choice = choose_reference(footage.read, of_forces, index=index)
+    if untouched is None:
+        choice = replace(choice, contact_energy=None)
     assert choice.index is not None
     (image,) = footage.read([choice.index])
     return image, choice
