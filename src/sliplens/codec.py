@@ -173,11 +173,8 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
             for key in keys:
                 if key not in stored:
                     raise InputError(f"{path} lacks {key!r}; {cure}")
-                # not in a function: there the type checker of the tests would forget the sizes of other arrays
-                if not isinstance(stored[key], field.kind):
-                    actual = f"{stored[key].dtype} of shape {stored[key].shape}"
-                    raise InputError(f"{path} holds {actual} as {key!r} where {field.words} belongs; {cure}")
-                field.require(stored[key], name=key, path=path, cure=cure)
+                fits = isinstance(stored[key], field.kind)
+                field.require(stored[key], fits=fits, name=key, path=path, cure=cure)
             values[name] = {key[len(name) + 1 :]: stored[key] for key in keys} if field.mapping else stored[name]
     try:
         return kind(**values)
@@ -319,8 +316,11 @@ class _ArrayField:
             return "texts"
         return "true and false" if "Bool" in self.words else "whole numbers" if "Int" in self.words else "numbers"
 
-    def require(self, values: np.ndarray, *, name: str, path: Path, cure: str) -> None:
-        """Check the bounds."""
+    def require(self, values: np.ndarray, *, fits: bool, name: str, path: Path, cure: str) -> None:
+        """Check type and shape, which the caller compares in its own context of sizes, and bounds."""
+        if not fits:
+            actual = f"{values.dtype} of shape {values.shape}"
+            raise InputError(f"{path} holds {actual} as {name!r} where {self.words} belongs; {cure}")
         if self.bounds is None:
             return
         sides = {side: limit for side in _SIDES if (limit := getattr(self.bounds, side)) is not None}
@@ -359,7 +359,7 @@ def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
         value = np.array(column.to_pylist(), dtype=str) if field.column == "texts" else column.to_numpy()
         # a context of its own: "rows" of one table need not be as many as "rows" of another
         with jaxtyped("context"):
-            field.require(value, name=name, path=path, cure=cure)
+            field.require(value, fits=isinstance(value, field.kind), name=name, path=path, cure=cure)
         if value.dtype.kind == "f" and (np.abs(value) > _LARGEST).any():
             raise InputError(f"{path} holds {value[np.nanargmax(np.abs(value))]:g} as {name!r}; {cure}")
         values[name] = value

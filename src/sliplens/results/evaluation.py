@@ -30,6 +30,7 @@ AMOUNT = Meta(ge=0)
 _ROUNDED = 1 + 1e-6
 AT_MOST_ONE = Meta(le=_ROUNDED)
 SHARE = Meta(ge=0, le=_ROUNDED)
+CORRELATION = Meta(ge=-_ROUNDED, le=_ROUNDED)
 EXCESS = PLACE = Meta(ge=-1)
 """Of a ratio less one, and of a number in a list, -1 for none."""
 PIXEL = Meta(ge=-1e5, le=1e5)

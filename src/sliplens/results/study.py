@@ -11,7 +11,7 @@ from jaxtyping import Float32, Float64, Int64, Shaped
 
 from sliplens.codec import UNKNOWN, Columns
 from sliplens.intervals import Difference
-from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, PIXEL, Evaluation, OfNetwork
+from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, PIXEL, Evaluation, OfNetwork
 from sliplens.results.explanation import BASELINES, BaselineName, Explanation
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, Lead, MethodGap
 
@@ -271,7 +271,7 @@ class NeutralScores(Columns):
     day: Int64[np.ndarray, " rows"]
     trial: Shaped[np.ndarray, " rows"]
     method: Shaped[np.ndarray, " rows"]
-    correlation: Annotated[Float64[np.ndarray, " rows"], UNKNOWN]
+    correlation: Annotated[Float64[np.ndarray, " rows"], CORRELATION, UNKNOWN]
     """NaN where the effects do not vary."""
 
 
