@@ -1,10 +1,13 @@
-"""Which explanation ranks the markers as they matter, on trials and networks that nothing was chosen by.
+"""Which explanation agrees with the effects of moved markers, on several networks, days and trials.
 
-The truth are Shapley values of the markers over scenes drawn anew (docs/study.md). A method is recommended where its
-signed rank correlation with them leads every control and every other method, both intervals off zero. With networks of
-a second seed (`--second-network`) the whole is done once more on other trials of the same sensor, of four later days,
-and the two answers are compared. Other networks have been chosen with other trials: `--seed` simulates those.
-Each seed is a study that can be interrupted and goes on where it stopped (`--keep`).
+The truth is neutral: no map is made to predict how groups of markers, moved to another margin of their trial, change
+the prediction (docs/study.md). Several networks of an input are pooled: intervals are over networks, then days, then
+trials. A method is recommended where it leads every control and every other method for sure; `lead_over_rivals` is that
+of the best method over Integrated Gradients and occlusion by marker. With networks and data of a second set
+(`--second-network`, `--second-data`) the whole is done once more and the verdicts are compared.
+
+Data are simulated with the preset `thesis` where none are named; the second set is then of four later days of the same
+sensor. Each network's study can be interrupted and continues where it stopped (`--keep`).
 """
 
 import argparse
@@ -12,6 +15,8 @@ import json
 import os
 import sys
 import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,110 +24,171 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch 
 
 import numpy as np
 
+import sliplens as sl
 from sliplens.cli.console import Terminal
 from sliplens.errors import SliplensError
-from sliplens.intervals import Difference
-from sliplens.recordings import load_dataset
-from sliplens.report.verdict import recommend
-from sliplens.results.study import Study, StudyConfig
+from sliplens.faithfulness.controls import lead_over_controls
+from sliplens.intervals import Difference, mean_interval, paired_difference
+from sliplens.models import Network
+from sliplens.recordings import Dataset, load_dataset
+from sliplens.results.faithfulness import CHANCE, is_control
+from sliplens.results.study import RIVALS, NeutralScores, Study, StudyConfig
 from sliplens.simulation import simulate
 from sliplens.study.run import run_study
 
 LATER: dict[str, Any] = {"dry_trials": 32, "wet_trials": 8, "days": 8, "test_days": 4}
 """Days 5 to 8 of the preset's sensor, which has four."""
+ORACLES = ("oracle", "degraded-oracle")
 
 
-def look(networks: list[str], folder: Path, *, days: dict[str, Any], options: argparse.Namespace) -> Study:
-    """Study the explanations of the networks that are named on test trials of the preset, or of other days."""
+def test_trials(data: Dataset, *, a_day: int | None) -> Dataset:
+    """Keep the first dry test trials of each day."""
+    days: dict[int, list[Any]] = {}
+    for info in data.select(split="test", condition="dry"):
+        days.setdefault(info.day, []).append(info)
+    return replace(data, trials=tuple(info for day in sorted(days) for info in days[day][:a_day]))
+
+
+def each_round(networks: Sequence[Network]) -> Iterator[list[Network]]:
+    """Yield networks of different inputs, until each is used once."""
+    left = list(networks)
+    while left:
+        first = {network.manifest.input: network for network in reversed(left)}
+        left = [network for network in left if network is not first[network.manifest.input]]
+        yield list(first.values())
+
+
+def judge_networks(
+    names: Sequence[str], data: Dataset | None, folder: Path, *, days: dict[str, Any], options: argparse.Namespace
+) -> list[Study]:
+    """Study the explanations of all networks on the same trials, those of the preset if `data` is None."""
     terminal = Terminal()
-    data = folder / "data"
-    frames = options.frames_per_trial
-    simulated = (
-        load_dataset(data)
-        if data.exists()
-        else simulate(data, preset="thesis", frames_per_trial=frames, seed=options.seed, on_progress=terminal, **days)
-    )
-    return run_study(
-        simulated,
-        networks,
-        StudyConfig(trials=options.trials, tests=("truth",)),
-        out=folder / "study",
-        on=options.on,
-        on_progress=terminal,
-    )
+    if data is None:
+        stored, frames = folder / "data", options.frames_per_trial
+        data = (
+            load_dataset(stored)
+            if stored.exists()
+            else simulate(
+                stored, preset="thesis", frames_per_trial=frames, seed=options.seed, on_progress=terminal, **days
+            )
+        )
+    data = test_trials(data, a_day=options.trials_a_day)
+    return [
+        run_study(
+            data,
+            some,
+            StudyConfig(trials=options.trials or len(data.trials), tests=("truth",)),
+            out=folder / f"study-{number}",
+            on=options.on,
+            on_progress=terminal,
+        )
+        for number, some in enumerate(each_round([sl.load(name) for name in names]))
+    ]
 
 
-def interval(gap: Difference | None) -> list[float] | None:
-    """Estimate, lower and upper end; None of a single trial."""
-    return None if gap is None or gap.low is None or gap.high is None else [gap.estimate, gap.low, gap.high]
+def ends(gap: Difference | None) -> list[float | None] | None:
+    """Estimate, lower and upper end; these are None of a single trial."""
+    return None if gap is None else [gap.estimate, gap.low, gap.high]
 
 
-def judged(study: Study, name: str) -> dict[str, Any]:
-    """What the truth says of one network's explanations."""
-    truth, best = study.truth[name], recommend(study.truth[name])
-    leads = {method: own.lead_over_controls for method, own in truth.methods.items()}
-    effects = truth.effects
-    sums = {frame: own.shapley.sum() for (frame,), own in effects.groups("frame_id").items()}
-    towards = np.sign([sums[frame] for frame in effects.frame_id])
+def pool(studies: Sequence[Study], name: str) -> dict[str, Any]:
+    """Pool the judgements of all networks of an input."""
+    truths = [study.truth[name] for study in studies if name in study.truth]
+    rows = NeutralScores.joined([truth.neutral for truth in truths])
+    network = np.repeat(np.arange(len(truths)), [len(truth.neutral) for truth in truths])
+    # maps of a method are in the order of networks and frames: all methods have the same
+    of_method = {str(method): np.flatnonzero(rows.method == method) for method in dict.fromkeys(rows.method.tolist())}
+    valid = np.isfinite(rows.correlation[of_method[CHANCE]])
+    scores = {method: rows.correlation[at][valid] for method, at in of_method.items()}
+    at = of_method[CHANCE][valid]
+    labels: dict[str, Any] = {"clusters": [network[at], rows.day[at], rows.trial[at]]}
+
+    def compare(first: str, second: str) -> Difference:
+        return paired_difference(scores[first], scores[second], rng=np.random.default_rng(0), **labels)
+
+    neutral = {
+        method: mean_interval(of_map, rng=np.random.default_rng(0), limits=(-1.0, 1.0), **labels)
+        for method, of_map in scores.items()
+    }
+    controls = {
+        method: np.copysign(1.0, of_map.mean()) * of_map
+        for method, of_map in scores.items()
+        if is_control(method) and method != CHANCE
+    }
+    methods = [method for method in scores if not is_control(method) and method not in ORACLES]
+    best = max(methods, key=lambda method: neutral[method].estimate)
+    lead = lead_over_controls(scores[best], controls, rng=np.random.default_rng(0), **labels)
+    over = {method: compare(best, method) for method in methods if method != best}
+    sure = lead.gap.above_zero and all(gap.above_zero for gap in over.values())
     return {
-        "spearman": {method: interval(own.shapley) for method, own in truth.methods.items()},
-        "lead_over_controls": {method: interval(lead.gap) for method, lead in leads.items() if lead is not None},
-        "best": best and best.method,
-        "tied": best and best.tied,
-        "recommended": best.method if best is not None and best.shown else None,
-        "spearman_single": {method: interval(own.network) for method, own in truth.methods.items()},
-        "reliability": interval(truth.reliability),
-        "sums": truth.sums,
-        "opposing": {kind: float((towards * getattr(effects, kind) < 0).mean()) for kind in ("network", "shapley")},
-        "frames": truth.frames,
-        "left_out": study.left_out.get(name),
-        "qualifying_trials": study.choice and study.choice.qualified_alone[name],
-        "mean_error": study.choice and study.choice.mean_error[name],
+        "neutral": {method: ends(gap) for method, gap in neutral.items()},
+        "over": neutral[best].over,
+        "best": best,
+        "recommended": best if sure else None,
+        "strongest_control": lead.control,
+        "lead_over_controls": ends(lead.gap),
+        "lead_over_rivals": {rival: ends(over[rival]) for rival in RIVALS if rival in over},
+        "lead_over_methods": {method: ends(gap) for method, gap in over.items()},
+        **{
+            kind: {method: [ends(getattr(truth.methods[method], kind)) for truth in truths] for method in methods}
+            for kind in ("stick", "shapley")
+        },
+        "neutral_reliability": [truth.neutral_reliability for truth in truths],
+        "frames": [truth.frames for truth in truths],
+        "left_out": [study.left_out.get(name) for study in studies],
+        "qualifying_trials": [study.choice and study.choice.qualified_alone.get(name) for study in studies],
+        "mean_error": [study.choice and study.choice.mean_error.get(name) for study in studies],
     }
 
 
-def show(name: str, found: dict[str, Any]) -> None:
-    """Print one network's answers, the best method first."""
-    print(f"{name}: recommended {found['recommended'] or 'none'}; {found['qualifying_trials']} trials qualify")
-    known = {method: own for method, own in found["spearman"].items() if own}
-    for method in sorted(known, key=lambda method: -known[method][0]):
-        lead = found["lead_over_controls"].get(method)
-        words = "" if lead is None else ", lead over controls {:+.2f} ({:+.2f} to {:+.2f})".format(*lead)
-        print("  {:32} {:+.2f} ({:+.2f} to {:+.2f})".format(method, *known[method]) + words)
+def show(title: str, pooled: dict[str, Any]) -> None:
+    """Print the judgement of an input, the best method first."""
+    print(f"{title}: recommended {pooled['recommended'] or 'none'}; {pooled['over']}")
+    neutral = pooled["neutral"]
+    for method in sorted(neutral, key=lambda method: -neutral[method][0]):
+        estimate, low, high = neutral[method]
+        print(f"  {method:32} {estimate:+.2f}" + ("" if low is None else f" ({low:+.2f} to {high:+.2f})"))
+    for rival, gap in pooled["lead_over_rivals"].items():
+        print(f"  lead of {pooled['best']} over {rival}: {gap}")
 
 
 def main() -> None:
     """Print correlations, leads and verdicts by input, as text or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
-    own = ["thesis-difference", "thesis-raw"]
-    parser.add_argument("--network", nargs="+", default=own, help="networks, one an input: folders or names")
-    parser.add_argument("--second-network", nargs="+", default=[], help="networks of another seed")
+    default = ["thesis-difference", "thesis-raw"]
+    parser.add_argument("--network", nargs="+", default=default, help="networks, several an input: folders or names")
+    parser.add_argument("--data", type=Path, help="data set of the networks' sensor; simulated if left out")
+    parser.add_argument("--second-network", nargs="+", default=[], help="networks of the second set")
+    parser.add_argument("--second-data", type=Path, help="data set of the second set; simulated if left out")
     parser.add_argument("--seed", type=int, default=0, help="seed of the simulated trials")
-    parser.add_argument("--trials", type=int, default=14)
+    parser.add_argument("--trials-a-day", type=int, help="dry test trials of each day; all if left out")
+    parser.add_argument("--trials", type=int, help="trials of all days, those that qualify first; all if left out")
     parser.add_argument("--frames-per-trial", type=int, default=80)
     parser.add_argument("--on", default="processes=2")
-    parser.add_argument("--keep", type=Path, help="folder to keep data and studies in, and to go on from")
+    parser.add_argument("--keep", type=Path, help="folder to keep data and studies in, and to continue from")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    sets = [(options.network, options.data, "1", {}), (options.second_network, options.second_data, "2", LATER)]
     with tempfile.TemporaryDirectory() as scratch:
         work = options.keep or Path(scratch)
         try:
-            looks = [
-                look(networks, work / folder, days=days, options=options)
-                for networks, folder, days in ((options.network, "1", {}), (options.second_network, "2", LATER))
-                if networks
+            judged = [
+                judge_networks(names, data and load_dataset(data), work / folder, days=days, options=options)
+                for names, data, folder, days in sets
+                if names
             ]
         except SliplensError as error:
             sys.exit(f"{Path(__file__).name}: {error}")
     result = {}
-    for name in looks[0].truth:
-        one, *others = [judged(study, name) for study in looks if name in study.truth]
-        show(name, one)
-        for other in others:
-            show(f"{name}, second seed", other)
-        again = others[0] if others else None
-        same = again and again["recommended"] == one["recommended"]
-        result[name] = {**one, "second_seed": again, "same_verdict_second_seed": same}
+    for name in sorted({name for study in judged[0] for name in study.truth}):
+        first, *others = [pool(studies, name) for studies in judged if any(name in study.truth for study in studies)]
+        second = others[0] if others else None
+        if not options.json:
+            show(name, first)
+            if second:
+                show(f"{name}, second set", second)
+        same = None if second is None else second["recommended"] == first["recommended"]
+        result[name] = {**first, "second_set": second, "same_verdict_second_set": same}
     if options.json:
         print(json.dumps(result))
 

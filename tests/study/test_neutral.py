@@ -8,7 +8,6 @@ from sliplens.study.neutral import (
     draw_groups,
     marker_sums,
     neutral_frame,
-    place_regions,
     split_half_reliability,
 )
 
@@ -40,13 +39,11 @@ def test_markers_move_to_a_frame_before_the_first_slip():
     assert neutral_frame(margins, 2) == 4
 
 
-def test_a_pixel_is_that_of_the_marker_now_before_that_of_the_baseline():
-    now, baseline = np.array([[5.0, 5.0], [15.0, 5.0]]), np.array([[5.0, 15.0], [5.0, 6.0]])
-    regions = place_regions(24, now, baseline)
-    assert (regions[5, 5], regions[5, 15], regions[15, 5], regions[23, 23]) == (0, 1, 0, 2)
-    relevance = np.zeros((24, 24))
-    relevance[5, 5], relevance[15, 5], relevance[5, 15], relevance[23, 23] = 1.0, 2.0, 4.0, 8.0
-    np.testing.assert_array_equal(marker_sums(relevance, regions, markers=2), [3.0, 4.0])
+def test_relevance_is_summed_by_marker():
+    regions = np.array([[0, 0, 2], [1, 2, 1], [2, 2, 2]])
+    relevance = np.array([[1.0, 2.0, 8.0], [4.0, 8.0, -1.0], [8.0, 8.0, 8.0]])
+    sums = marker_sums(relevance, regions, markers=2)
+    np.testing.assert_array_equal(sums, [3.0, 3.0])
 
 
 def test_the_reliability_is_the_correlation_with_scores_by_other_groups(rng):

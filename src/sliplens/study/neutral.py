@@ -4,9 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Float64, Int, Int64
-from torch import from_numpy
-
-from sliplens.explainers.occlusion import marker_regions
 
 GROUPS, GROUP_MARKERS = 24, 5
 """Groups of a frame, and markers of a group."""
@@ -28,21 +25,10 @@ def draw_groups(markers: int, *, rng: np.random.Generator) -> Int64[np.ndarray, 
     return np.stack([rng.choice(markers, size, replace=False) for _ in range(GROUPS)])
 
 
-def place_regions(
-    size: int, now_px: Float[np.ndarray, "markers 2"], baseline_px: Float[np.ndarray, "markers 2"]
-) -> Int[np.ndarray, "size size"]:
-    """Number of the marker whose relevance a pixel holds, and their number where it is none's.
-
-    Pixels near the place of a marker in the frame are its own; of the others, those near its place in the baseline.
-    """
-    now, before = (marker_regions((size, size), from_numpy(places)).numpy() for places in (now_px, baseline_px))
-    return np.where(now < len(now_px), now, before)
-
-
 def marker_sums(
     relevance: Float[np.ndarray, "size size"], regions: Int[np.ndarray, "size size"], *, markers: int
 ) -> Float64[np.ndarray, " markers"]:
-    """Sum a map over the region of each marker."""
+    """Sum a map over the region of each marker (`marker_regions`)."""
     return np.bincount(regions.ravel(), relevance.astype(np.float64).ravel(), minlength=markers + 1)[:markers]
 
 

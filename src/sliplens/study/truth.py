@@ -13,6 +13,7 @@ from torch import Tensor
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import change_of
 from sliplens.explainers.explain import network_inputs, network_references
+from sliplens.explainers.occlusion import marker_regions
 from sliplens.explainers.shapley import shapley_values
 from sliplens.faithfulness.controls import lead_over_controls, relevance_mass
 from sliplens.faithfulness.fills import get_fill
@@ -54,7 +55,6 @@ from sliplens.study.neutral import (
     draw_groups,
     marker_sums,
     neutral_frame,
-    place_regions,
     split_half_reliability,
 )
 from sliplens.study.stages import MakeRecord, Stage, mean_of_known
@@ -97,7 +97,7 @@ class Places:
     edges: Bool[np.ndarray, "size size"]
     """All markers in the image, those at its border too: their areas, and their rims alone."""
     regions: Int[np.ndarray, "size size"]
-    """Marker whose relevance each pixel holds (`place_regions`)."""
+    """Marker near to each pixel, or their number where there is none: all regions are of about one size."""
     slip_annulus: Bool[np.ndarray, "size size"]
     """Where the skin slips over the object."""
     now_px: Float[np.ndarray, "markers 2"]
@@ -196,10 +196,7 @@ def find_places(frame: StagedFrame, *, image_size: int) -> Places:
     now_px = outlines.now_px[frame.markers]
     x, y = np.clip(np.round(now_px).astype(np.int64), 0, [width - 1, height - 1]).T
     return Places(
-        regions=place_regions(
-            image_size,
-            *((px + 0.5) * scale - 0.5 for px in (now_px, rest_px[frame.markers])),
-        ),
+        regions=marker_regions((image_size, image_size), torch.from_numpy((now_px + 0.5) * scale - 0.5)).numpy(),
         units=np.where(covered, place[nearest], len(frame.markers)),
         markers=covered,
         edges=np.minimum(np.abs(rest), np.abs(now)).min(axis=0) <= _RIM_PX,
