@@ -36,3 +36,5 @@ from .study.run import run_study as run_study
 from .study.scoring import score as score
 from .training.evaluation import evaluate as evaluate
 from .training.fitting import train as train
+
+__all__: list[str]

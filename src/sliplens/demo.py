@@ -115,7 +115,8 @@ def run_demo(
         ("what the network predicts from real frames",) if real is not None else ()
     )
     trials = SHOWN_DATA if train_minutes is None else TRAINING_DATA
-    data = simulate(folder / "data", on_progress=on_progress, **{"seed": seed, **trials})
+    settings: dict[str, Any] = {"seed": seed} | trials
+    data = simulate(folder / "data", on_progress=on_progress, **settings)
     networks = dict(NETWORKS)
     if train_minutes is not None:
         minutes = max(SHORTEST_TRAINING, (train_minutes - _OTHER_MINUTES) / len(INPUTS))
