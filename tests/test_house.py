@@ -26,17 +26,17 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 47_800,
-    "modules": 183,
-    "riddles_per_1000": 0.5,
-    "vague_docstrings": 15,
+    "lines": 43_000,
+    "modules": 175,
+    "riddles_per_1000": 0.35,
+    "vague_docstrings": 0,
     "most_parameters": 12,
     "functions_with_on_progress": 19,
     "functions_with_out": 23,
     "functions_with_overwrite": 23,
-    "functions_with_device": 21,
-    "names_defined_twice": 7,
-    "dicts_across_functions": 14,
+    "functions_with_device": 20,
+    "names_defined_twice": 0,
+    "dicts_across_functions": 2,
 }
 
 

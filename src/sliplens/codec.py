@@ -208,7 +208,7 @@ COLUMN_KINDS: dict[str, Callable[[pa.DataType], bool]] = {
     "values": lambda _: True,
     "lists of numbers": lambda kind: pa.types.is_fixed_size_list(kind) and pa.types.is_floating(kind.value_type),
 }
-"""What a column may hold, by its words."""
+"""Kind of values of a column, from its declaration."""
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""What may be installed beside sliplens: packages of its extras, and packages that add rows to its tables."""
+"""Packages of the extras, and packages that add rows to the tables of sliplens."""
 
 import os
 import sys

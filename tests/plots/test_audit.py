@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from sliplens.plots.audit import choose_frames, draw_audit
+from sliplens.plots.audit import draw_audit, spread_audit_frames
 from sliplens.plots.contact_sheet import STATE_COLOURS
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.labelling import (
@@ -251,7 +251,7 @@ def test_pictures_are_the_reference_and_frames_in_the_order_of_time(changes):
     trial = make_trial(**changes)
     camera, difference = pictures(draw_audit(trial, make_labelling()))
 
-    along = choose_frames(trial)
+    along = spread_audit_frames(trial)
     assert len(camera) == len(difference) == 1 + len(along)
     assert along == sorted(set(along))
     np.testing.assert_array_equal(camera[0].images[0].get_array(), trial.reference)
@@ -282,7 +282,7 @@ def test_marks_stand_where_the_frames_were_taken():
     trial = make_trial()
     figure = draw_audit(trial, make_labelling())
 
-    taken = trial.time_s[[2, *choose_frames(trial)]]
+    taken = trial.time_s[[2, *spread_audit_frames(trial)]]
     for ax in charts(figure):
         marks = [np.asarray(line.get_xdata())[0] for line in ax.lines if line.get_label() == "_frame"]
         np.testing.assert_array_equal(marks, taken)

@@ -10,7 +10,7 @@ import pytest
 
 from sliplens.errors import InputError
 from sliplens.report import load_results, write_report
-from sliplens.report.plates import choose_frames
+from sliplens.report.plates import frames_by_margin
 
 HOSTILE = "<script>alert(1)</script>"
 
@@ -188,7 +188,7 @@ def test_frames_fall_from_stick_to_slip_and_without_labels_stand_in_order(comple
     frames = [replace(explained.frames[0], id=str(at), safety_margin=label) for at, label in enumerate(labels)]
     frames.append(replace(explained.frames[0], id="wet", condition="wet", safety_margin=0.5))
     many = explained.take([0] * len(frames))
-    rows = choose_frames(results, replace(many, frames=tuple(frames)))
+    rows = frames_by_margin(results, replace(many, frames=tuple(frames)))
     assert [frames[row].safety_margin for row in rows] == chosen
 
 

@@ -40,11 +40,11 @@ def encode_reading(reading: Reading) -> bytes:
     return msgspec.json.encode({**to_builtins(reading), "words": to_builtins(describe_reading(reading))})
 
 
-def reading_schema() -> dict[str, object]:
-    """Return the JSON schema of an encoded reading, an object at its root as Foxglove wants it."""
+def reading_schema() -> bytes:
+    """Return the JSON schema of an encoded reading as JSON, an object at its root as Foxglove wants it."""
     (_, words), parts = msgspec.json.schema_components([Reading, ReadingWords], ref_template="#/$defs/{name}")
     schema = parts.pop("Reading")
-    return {**schema, "properties": {**schema["properties"], "words": words}, "$defs": parts}
+    return msgspec.json.encode({**schema, "properties": {**schema["properties"], "words": words}, "$defs": parts})
 
 
 _EPOCH_S = time.time() - time.monotonic()
@@ -123,7 +123,7 @@ def _open_foxglove(address: str, *, file: bool = False) -> Sink:
     from foxglove.messages import CompressedImage, Timestamp  # noqa: PLC0415
 
     context = foxglove.Context()
-    readings = foxglove.Channel(READING_TOPIC, schema=reading_schema(), context=context)
+    readings = foxglove.Channel(READING_TOPIC, schema=msgspec.json.decode(reading_schema()), context=context)
     frames = CompressedImageChannel(IMAGE_TOPIC, context=context)
     try:
         if path is not None:

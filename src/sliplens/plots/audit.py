@@ -235,7 +235,7 @@ ReadFrames = Callable[[Sequence[int]], UInt8[np.ndarray, "frames height width 3"
 
 def draw_audit(recording: Recording, labelling: Labelling, *, read_frames: ReadFrames | None = None) -> Figure:
     """Draw a page from which to judge the labels of an imported trial."""
-    frames = [labelling.reference.index, *choose_frames(recording)]
+    frames = [labelling.reference.index, *spread_audit_frames(recording)]
     with drawing_style():
         figure = Figure(figsize=(_WIDTH, _HEIGHT))
         _draw_charts(figure, recording, labelling, [at for at in frames if at is not None])
@@ -266,7 +266,7 @@ def write_audits(data: Dataset, folder: Path, *, on_progress: OnProgress | None 
     return drawn
 
 
-def choose_frames(recording: Recording) -> list[int]:
+def spread_audit_frames(recording: Recording) -> list[int]:
     """Choose the frames nearest to Γ = 100, 80, ... 0 %, in the order of time; evenly spread without margins."""
     if not np.isfinite(recording.safety_margin).any():
         return np.unique(np.linspace(0, len(recording) - 1, _FRAMES).round().astype(int)).tolist()

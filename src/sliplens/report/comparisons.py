@@ -129,7 +129,7 @@ def write_sample(choice: Choice) -> str:
     )
 
 
-def write_over(gaps: Iterable[Difference | None]) -> str:
+def write_units(gaps: Iterable[Difference | None]) -> str:
     """Write what the intervals of a table were taken over: "14 trials, one day, one network"."""
     return next((gap.over for gap in gaps if gap is not None), "trials")
 

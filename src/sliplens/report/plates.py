@@ -124,7 +124,7 @@ def plate_strip(strip: Strip) -> Plate:
 
 def plate_states(results: Results, explained: Explanation) -> Plate:
     """Draw every method across the states of one trial (thesis, Figs. 15 and 16)."""
-    rows = choose_frames(results, explained)
+    rows = frames_by_margin(results, explained)
     frames = [explained.frames[row] for row in rows]
     methods = methods_in_order(name for name in explained.relevance if not is_control(name))
     what = f"Methods across the contact states, {input_name(explained.input).lower()}, {source_name(explained.source)}"
@@ -231,7 +231,7 @@ def explained_of(results: Results, name: str) -> Explanation | None:
     return results.explanations.get((name, results.study.source))
 
 
-def choose_frames(results: Results, explained: Explanation) -> list[int]:
+def frames_by_margin(results: Results, explained: Explanation) -> list[int]:
     """Numbers of the frames to show: those of the study's choice, else a few of one condition; the margin falls."""
     places = {frame.id: index for index, frame in enumerate(explained.frames)}
     choice = results.study.choice

@@ -32,7 +32,7 @@ from sliplens.report.comparisons import (
     thesis_row,
     write_ends,
     write_gap,
-    write_over,
+    write_units,
 )
 from sliplens.report.results import Results
 from sliplens.results.evaluation import Diagnosis
@@ -152,8 +152,9 @@ def table_scores(name: str, faithful: Faithfulness | None, scored: DeletionScore
     }
     text = (
         " Symmetric relevance gain, SRG, in margin units (0 = uninformative), with 95 % intervals over "
-        f"{write_over(score.srg for score in scores.values())}; * = excludes zero. Bold: ahead of every control beyond "
-        "the interval of the difference; otherwise the method has shown nothing about this network under that fill."
+        f"{write_units(score.srg for score in scores.values())}; * = excludes zero. Bold: ahead of every control "
+        "beyond the interval of the difference; otherwise the method has shown nothing about this network under that "
+        "fill."
     )
     return make_table(
         f"{input_name(name)}: deletion score D of the thesis{fill}, mean ± standard deviation over frames; lower = "
@@ -248,7 +249,7 @@ def table_localisation(truth: Truth) -> CellTable:
         "less that of the strongest control; a method whose interval includes zero has shown nothing about this "
         "network on these days. Beside it the signed rank correlation of the map's means over the markers with their "
         "Shapley values, put back to the stick frame or to the untouched sensor, single effects, and effects on the "
-        f"best estimate of the margin (95 % interval over {write_over(row.neutral for row in truth.methods.values())}"
+        f"best estimate of the margin (95 % interval over {write_units(row.neutral for row in truth.methods.values())}"
         ").",
         {
             # here chance is a map, not an order

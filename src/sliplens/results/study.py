@@ -393,7 +393,7 @@ class StudyConfig:
     budget: float = STUDY_BUDGET
     """Share of the channels that Poly-CAM measures at first."""
     baseline: Literal["untouched", "stick"] = "stick"
-    """What predictions are compared with: the last frame before the pull of the trial, or the untouched sensor."""
+    """Baseline of the predictions: the last frame before the pull of the trial, or the untouched sensor."""
     split: str = "test"
     condition: str = "dry"
     """Split and condition of the trials to choose from."""
