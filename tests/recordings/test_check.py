@@ -85,3 +85,43 @@ def test_a_broken_law_is_found_at_its_frame(tmp_path: Path, recording: Recording
     found = whats(save_dataset(tmp_path / "bad", replace(recording, **change(recording))).folder)
     assert len(found) == 1
     assert f"trial: {message}" in found[0]
+
+
+def with_friction(trial: Recording, mu: float, *, sigma: float, slip: int | None = None) -> Recording:
+    """Labels as another friction would give them, consistent among themselves; slipping from a frame on."""
+    normal, tangential = trial.normal_force_n, trial.tangential_force_n
+    contact = np.isfinite(trial.safety_margin)
+    slips = contact & (np.arange(len(trial)) >= (len(trial) if slip is None else slip))
+    used = np.where(contact, tangential / (mu * np.where(contact, normal, 1)), np.nan)
+    margin = np.where(slips, 0.0, np.clip(1 - used, 0, 1))
+    states = np.where(slips, ContactState.FULL_SLIP, ContactState.INCIPIENT_SLIP)
+    return replace(
+        trial,
+        friction_coefficient=np.where(slips, used * mu, mu),
+        safety_margin=margin,
+        stick_ratio=margin ** (2 / 3),
+        contact_state=tuple(
+            ContactState(state) if here else ContactState.NO_CONTACT
+            for state, here in zip(states, contact, strict=True)
+        ),
+        safety_margin_sigma=np.full(len(trial), sigma),
+    )
+
+
+def test_a_ratio_above_the_friction_is_found_before_and_after_the_slip(tmp_path: Path, recording: Recording):
+    contact = np.isfinite(recording.safety_margin)
+    ratio = np.where(contact, recording.tangential_force_n / np.where(contact, recording.normal_force_n, 1), 0)
+    top, highest = int(np.argmax(ratio)), float(ratio.max())
+    early = int(np.argmax(ratio > 0.4 * highest))
+    assert early < top
+    cases = {
+        "sound": with_friction(recording, highest, sigma=0.01),
+        # within 3 sigma
+        "unsure": with_friction(recording, 0.9 * highest, sigma=0.04),
+        "before": with_friction(recording, 0.6 * highest, sigma=0.01),
+        "after": with_friction(recording, ratio[early - 1], sigma=0.01, slip=early),
+    }
+    found = {name: whats(save_dataset(tmp_path / name, case).folder) for name, case in cases.items()}
+    assert found["sound"] == found["unsure"] == []
+    assert any(f"before a slip, and the friction {0.6 * highest:.2f}" in what for what in found["before"])
+    assert any(f"after a slip, and the friction {ratio[early - 1]:.2f}" in what for what in found["after"])

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool
 
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file
@@ -34,8 +35,9 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
     """Read every trial of a data set and list its errors.
 
     For each trial: its file exists, has the hash and the facts of the table, and every image can be decoded; margin,
-    forces and contact states agree. For the data set: no trial is listed twice, no file is unlisted, and no recording
-    was cut off. Flags on labels, such as faults of the force sensor, are notes: frames at a fault are not valid.
+    forces and contact states agree, and F_t / F_n stays within the friction by 3 sigma, before a slip and after it. For
+    the data set: no trial is listed twice, no file is unlisted, and no recording was cut off. Flags on labels, such as
+    faults of the force sensor, are notes: frames at a fault are not valid.
     """
     data = load_dataset(data)
     folder, violations, labellings = data.folder, [], []
@@ -99,13 +101,44 @@ def _check_laws(recording: Recording) -> Iterator[str]:
     # samples may be missing, where there is no label
     measured = labelled & np.isfinite(normal).any()
     laws = {f"{name} is not a number": measured & ~np.isfinite(getattr(recording, name)) for name in SIGNALS[1:4]} | {
+        "the time is not a number": ~np.isfinite(recording.time_s),
         "the normal force is negative; flip its sign on import": labelled & (normal < 0),
         "only one of margin and stick ratio has a label": np.isfinite(recording.stick_ratio) != present,
         "the safety margin is not 1 - F_t / (mu F_n)": pressing & ~let_go & (np.abs(margin - expected) > _ROUNDING),
         "a frame without contact has a safety margin": (states == ContactState.NO_CONTACT) & present,
         "full slip has a margin above 0": slips & present & (margin > 0),
     }
-    for law, wrong in laws.items():
+    for law, wrong in (laws | _check_friction(recording, slips=slips)).items():
         if wrong.any():
             count = f" ({int(wrong.sum())} frames)" if wrong.sum() > 1 else ""
             yield f"frame {int(np.argmax(wrong))}: {law}{count}"
+
+
+_LAW_SIGMAS = 3.0
+_PRESSED_SHARE = 0.25  # of the largest normal force: in a lighter touch F_t / F_n is all noise
+
+
+def _check_friction(
+    recording: Recording, *, slips: Bool[np.ndarray, " frames"]
+) -> dict[str, Bool[np.ndarray, " frames"]]:
+    """Find the frames whose F_t / F_n exceeds the static friction by more than 3 sigma, before a slip and after it."""
+    normal, coefficient = recording.normal_force_n, recording.friction_coefficient
+    pressed = normal > _PRESSED_SHARE * np.nanmax(normal, initial=0.0)
+    ratio = np.where(pressed, recording.tangential_force_n / np.where(pressed, normal, 1), np.nan)
+    sigma = np.zeros(len(normal)) if recording.safety_margin_sigma is None else recording.safety_margin_sigma
+    basis = recording.labelling.basis if recording.labelling else None
+    # of the margin, and so of the ratio as a share of the friction: at the slip, where all of it is used, no less
+    sigma = np.maximum(np.nan_to_num(sigma), basis.friction.sigma / basis.friction.mu if basis else 0.0)
+    # the last frame before a slip has the friction that holds until then
+    last = np.maximum.accumulate(np.where(recording.labelled & ~slips, np.arange(len(normal)), -1))
+    most = (coefficient * (1 + _LAW_SIGMAS * sigma))[last] + _ROUNDING
+    beyond = (last >= 0) & (ratio > most)
+    # exact labels may have a friction that changes from frame to frame: until the slip it may have grown
+    estimated = recording.safety_margin_sigma is not None
+    after = beyond & slips & np.isfinite(recording.safety_margin) & estimated
+    laws = {}
+    for wrong, when in ((beyond & ~slips & recording.labelled, "before a slip"), (after, "after a slip")):
+        at = int(np.argmax(wrong))
+        allowed = f"the friction {coefficient[last[at]]:.2f} and 3 sigma allow {most[at]:.2f}"
+        laws[f"F_t / F_n is {ratio[at]:.2f} {when}, and {allowed}; label the trial again"] = wrong
+    return laws
