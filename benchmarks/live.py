@@ -8,7 +8,7 @@
 `p50_ms` and `p99_ms` are from the moment a replayed frame is due to its margin, over the frames that have one, while a
 headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page shows maps,
 twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
-the end than after the first 10 seconds (or a tenth of a shorter run), `opens_s` the time from the browser's first visit
+the end than after the first 10 seconds (or a tenth of a shorter run), `opens_s` the time from the browser's connection
 to the first picture that it has drawn. `of_it_ms` says where the time of the slowest hundredth went, on average:
 `network` is what a frame waits for that after its checks, `waiting` what none of them took, `gc_ms` the longest pause
 of Python's garbage collector.
@@ -74,22 +74,18 @@ class Latencies:
     """Pictures that the page had drawn."""
     maps: int
     opens_s: float
-    """From the browser's asking for the page to its having drawn the first picture; infinite without a page."""
+    """Time from the browser's connection to its first picture; infinite without a page."""
 
 
 class TimedPage(LivePage):
-    """Page that notes when it is asked for, and what is drawn of it."""
+    """Page that times how long its first viewer takes to draw a picture."""
 
     asked_s = opens_s = np.inf
 
-    def build(self) -> None:
-        """Make the page of one viewer."""
-        self.asked_s = min(self.asked_s, time.monotonic())
-        super().build()
-
     def look(self, *, maps: bool) -> None:
-        """Have viewers show maps or not, and see whether the first has drawn a picture."""
+        """Switch the viewers' maps on or off, and time the first picture."""
         for viewer in tuple(self.feed.clients):
+            self.asked_s = min(self.asked_s, time.monotonic())
             viewer.shows_map = maps
             if np.isinf(self.opens_s) and viewer.takes_s > 0:
                 self.opens_s = time.monotonic() - self.asked_s
