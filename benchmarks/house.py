@@ -9,6 +9,7 @@ The source is parsed without importing the package; `modules_predict_passes` is 
 import argparse
 import ast
 import json
+import re
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -56,6 +57,8 @@ class House:
     test_lines: int
     benchmark_lines: int
     doc_words: int
+    words_per_sentence: float
+    """Mean over the docs; code, tables and headings do not count."""
     riddles_per_1000: float
     """Variables and parameters named by a riddle word, in 1,000 lines."""
     vague_docstrings: int
@@ -116,6 +119,15 @@ def bags(tree: ast.Module) -> Iterator[tuple[int, str]]:
             yield function.lineno, function.name
 
 
+def sentences(page: str) -> list[str]:
+    """Return the sentences of a Markdown page, without code, tables, headings and directives."""
+    text = re.sub(r"^(```|:::).*?^\1$|\$\$.*?\$\$", "", page, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^(?:[|#:]|\(.*\)=$|\{).*$", "", text, flags=re.MULTILINE)
+    blocks = re.split(r"\n\s*\n|\n\s*(?:[-*]|\d+\.) ", text)
+    every = [part.strip() for block in blocks for part in re.split(r"(?<=[.!?:;])\s+", block)]
+    return [sentence for sentence in every if len(sentence.split()) > 2]
+
+
 def public_names(tree: ast.Module) -> set[str]:
     """Return the public classes and functions that a module defines."""
     return {
@@ -128,6 +140,8 @@ def measure(root: Path = ROOT) -> House:
     package = sources(root / "src" / "sliplens")
     trees = {path: ast.parse(text) for path, text in package.items()}
     lines = count_lines(package)
+    pages = [path.read_text(encoding="utf-8") for path in sorted((root / "docs").rglob("*.md"))]
+    prose = [sentence for page in pages for sentence in sentences(page)]
     every = [function for tree in trees.values() for function in functions(tree)]
     names = Counter(name for tree in trees.values() for name in public_names(tree))
     uses = Counter(argument.arg for function in every for argument in parameters(function))
@@ -136,7 +150,8 @@ def measure(root: Path = ROOT) -> House:
         modules=len(package),
         test_lines=count_lines(sources(root / "tests")),
         benchmark_lines=count_lines(sources(root / "benchmarks")),
-        doc_words=sum(len(path.read_text(encoding="utf-8").split()) for path in (root / "docs").rglob("*.md")),
+        doc_words=sum(len(page.split()) for page in pages),
+        words_per_sentence=round(sum(len(one.split()) for one in prose) / len(prose), 1),
         riddles_per_1000=round(1000 * sum(len(list(riddles(tree))) for tree in trees.values()) / lines, 2),
         vague_docstrings=sum(len(list(vague_docstrings(tree))) for tree in trees.values()),
         most_parameters=max(len(parameters(function)) for function in every),

@@ -102,6 +102,7 @@ napoleon_use_ivar = True
 sphinx_gallery_conf = {
     "examples_dirs": "../examples",
     "gallery_dirs": "gallery",
+    "subsection_order": ["../examples/tutorials", "../examples/gallery"],
     "filename_pattern": r"plot_",
     "within_subsection_order": "FileNameSortKey",
     "backreferences_dir": "gallery/backreferences",

@@ -1,9 +1,9 @@
 """
-The same frame by every method
-==============================
+Maps of one frame by several methods
+====================================
 
-Every explainer answers one question: why does the network read this margin rather than that of the untouched sensor?
-Each map is signed and in margin units: orange lowers the margin, blue raises it.
+Each map answers why the network predicts this margin rather than that of the untouched sensor. Maps are signed and in
+margin units: orange lowers the margin, blue raises it.
 """
 
 import matplotlib.pyplot as plt
@@ -16,8 +16,8 @@ trial = data.load(data.trials[0])
 frame = trial.frames[24:25]
 
 # %%
-# Coarse tiles and few steps keep this page quick. ``budget=0.05`` measures a twentieth of Poly-CAM's channels, and
-# ``likeness=None`` stops there; leave both out for a map that is as good as the exact one.
+# Coarse tiles and few steps make this page fast. ``budget=0.05`` measures 5 % of the channels of Poly-CAM, and
+# ``likeness=None`` stops there. Leave both out for an accurate map.
 options = {
     "grad-cam": {},
     "layer-cam": {},
@@ -43,11 +43,11 @@ for ax, (method, explanation) in zip(axes.flat, maps.items(), strict=True):
 plt.show()
 
 # %%
-# They do not agree, and that alone tells none of them true. What else an explanation says of itself:
+# The maps disagree. Each explanation has warnings of its own:
 for method, explanation in maps.items():
     for notes in explanation.methods.values():
         for warning in notes.warnings:
             print(f"{method}: {warning}")
 
 # %%
-# See :doc:`plot_06_does_the_map_tell_the_truth` for a test that asks no map.
+# :doc:`plot_2_maps_against_redrawn_scenes` tests maps without using any map.

@@ -1,9 +1,9 @@
 """
-Does the map tell the truth?
-============================
+Test maps against redrawn scenes
+================================
 
-In simulation the question has an answer that rests on no map: put one marker back to where it lay untouched, draw the
-frame anew, and see what the network reads then. A map tells the truth as far as it ranks the markers by that.
+In simulation the effect of a marker can be measured without a map: move the marker back to its rest position, draw the
+frame again, and predict. A map is right if it ranks the markers by these effects.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ from sliplens.simulation.intervention import draw_with_markers_back, visible_mar
 from sliplens.simulation.trials import prepare_trial, simulate_trial
 
 # %%
-# A trial, and the scene behind it, from which any frame can be drawn again with some of its markers put back.
+# A trial, and the scene from which any frame can be drawn again with some markers at rest.
 plan = replace(plan_trials(PRESETS["thesis"])[0], frames=60)
 trial = simulate_trial(plan)
 _, film = prepare_trial(plan)
@@ -27,20 +27,20 @@ number = 36
 frame, network = trial.frames[number], sl.load("thesis-difference")
 
 # %%
-# Every marker alone: what the answer becomes without what this marker has to tell.
+# Move each marker back alone, and predict.
 markers = visible_markers(film.sensor)
 back = np.zeros((1 + len(markers), len(film.marker_rest_px)), dtype=bool)
 back[1 + np.arange(len(markers)), markers] = True
 drawn = draw_with_markers_back(film, number, back).numpy()
-answers = network.predict(network.encode(drawn, trial.reference)).numpy()
-effects = answers[0] - answers[1:]
+predictions = network.predict(network.encode(drawn, trial.reference)).numpy()
+effects = predictions[0] - predictions[1:]
 print(
-    f"true margin {trial.safety_margin[number]:.2f}, read {answers[0]:.2f}; one marker moves it by up to "
+    f"true margin {trial.safety_margin[number]:.2f}, predicted {predictions[0]:.2f}; one marker changes it by up to "
     f"{np.abs(effects).max():.3f}"
 )
 
 # %%
-# What three maps say of the same markers: the mean of the map in a disc on each.
+# The same markers in three maps: the mean of the map in a disc around each.
 methods = {
     "occlusion": {"tile_px": 7},
     "integrated-gradients": {"steps": 20},
@@ -50,12 +50,12 @@ size = network.manifest.image_size
 places = film.marker_px[number][markers] * size / frame.shape[0]
 y, x = np.mgrid[:size, :size]
 near = np.hypot(x - places[:, 0, None, None], y - places[:, 1, None, None]) < 4
-said = {}
+values_of = {}
 for method, options in methods.items():
     explainer = get_explainer(method, **options)
     explanation = sl.explain(network, frame[None], reference=trial.reference, method=explainer)
     [relevance] = explanation.relevance[explanation.method]
-    said[method] = np.array([relevance[disc].mean() for disc in near])
+    values_of[method] = np.array([relevance[disc].mean() for disc in near])
 
 # %%
 figure, axes = plt.subplots(ncols=4, figsize=(13, 3.8), layout="compressed")
@@ -64,9 +64,9 @@ top = np.abs(effects).max()
 dots = axes[0].scatter(
     *film.marker_px[number][markers].T, c=effects, cmap="PuOr", vmin=-top, vmax=top, s=50, edgecolor="k"
 )
-axes[0].set(title="what each marker does", xticks=[], yticks=[])
+axes[0].set(title="effect of each marker", xticks=[], yticks=[])
 figure.colorbar(dots, ax=axes[0], label="margin units", location="bottom")
-for ax, (method, values) in zip(axes[1:], said.items(), strict=True):
+for ax, (method, values) in zip(axes[1:], values_of.items(), strict=True):
     ax.scatter(effects, 1e3 * values, color="#0072B2", s=18)
     ax.axhline(0, color="grey", linewidth=0.8)
     ax.axvline(0, color="grey", linewidth=0.8)
@@ -76,5 +76,5 @@ axes[1].set_ylabel("Map (thousandths a pixel)")
 plt.show()
 
 # %%
-# One frame of one trial shows how the test works and decides nothing. :doc:`/study` makes it over many frames, with
-# the Shapley values of the markers, maps that know nothing of the network, and intervals.
+# One frame shows how the test works and decides nothing. A :doc:`/study` tests many frames, with groups of markers,
+# controls that use nothing of the network, and intervals.

@@ -2,8 +2,8 @@
 Markers of a GelSight-like gel
 ==============================
 
-Where the dots of a gel are, and how far each has moved, needs no network. This gel is simulated: flat, with a grid of
-dots, lit from three sides. A video, a folder of images or a data set goes in the same way.
+Detect and track the dots of a gel; no network is needed. This gel is simulated: flat, with a grid of dots and three
+lights. `track` takes a video, a folder of images or a data set too.
 """
 
 import matplotlib.pyplot as plt
@@ -17,14 +17,14 @@ data = sl.simulate(sensor="flat-gel", dry_trials=4, wet_trials=1, days=4, frames
 trial = data.load(data.trials[0])
 
 # %%
-# One row for each marker of each frame; what is not known is null, never a guess.
+# The table has one row per marker and frame; unknown positions are null.
 tracking = sl.track(trial.frames, reference=trial.reference, markers="auto")
 table = tracking.frame()
 status, counts = np.unique(table["status"].to_numpy(zero_copy_only=False), return_counts=True)
 print(dict(zip(status.tolist(), counts.tolist(), strict=True)))
 
 # %%
-# Half-way through the pull: arrows from where each dot rests, and the field between them. Grey is a guess.
+# One frame during the pull: displacement of each dot, and the interpolated field. Grey is extrapolated.
 number = 26
 rows = table.filter(np.asarray(table["frame"]) == number)
 rest, moved = (
@@ -36,11 +36,11 @@ field = interpolate_field(rest[known], moved[known], size=trial.reference.shape[
 
 figure, (left, right) = plt.subplots(ncols=2, figsize=(10, 4.6), layout="compressed")
 plot_arrows(trial.frames[number], rest, moved, ax=left)
-left.set_title("each dot, from where it rests")
+left.set_title("displacement of each dot")
 scale = plot_field(field, size=trial.reference.shape[:2], ax=right)
 figure.colorbar(scale, ax=right, label="Displacement (px)")
-right.set_title("the field between them")
+right.set_title("interpolated field")
 plt.show()
 
 # %%
-# :doc:`/markers` tells what the margin is that model-based estimators read from such a field, beside a network's.
+# :doc:`/markers` compares margins computed from such fields with those of a network.

@@ -2,8 +2,8 @@
 Add your own explainer and controller
 =====================================
 
-Explainers, fills, readers of files, encodings and controllers are rows of tables. One of your own goes in wherever a
-name goes, and a package of yours adds it for good through an entry point.
+Pass an explainer or a controller of your own in place of a name, or register it under a name by an entry point of your
+package.
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,8 @@ trial = data.load(data.trials[0])
 # %%
 # An explainer
 # ------------
-# One function of checked images and a frozen network. This one takes the gradient half-way between the untouched
-# sensor and the image, times what the image adds.
+# A function of images and a frozen network. This one multiplies the gradient half-way between the untouched sensor and
+# the image by their difference.
 @dataclass(frozen=True)
 class Midpoint(Method):
     """Gradient half-way between reference and image, times their difference."""
@@ -54,8 +54,8 @@ plt.show()
 # %%
 # A controller
 # ------------
-# One method: what to press with, given what is known. This one presses with a force in proportion to what the
-# readings lack, and with 1 N where none is shown.
+# One method gives the force for an observation. This one is proportional to the missing margin, and 1 N where no margin
+# is known.
 class Proportional:
     """Force in proportion to the missing margin."""
 
@@ -71,14 +71,12 @@ sl.plot(grip, ax)
 plt.show()
 
 # %%
-# For good
-# --------
-# In the ``pyproject.toml`` of a package of yours::
+# Register it
+# -----------
+# In the ``pyproject.toml`` of your package::
 #
 #     [project.entry-points."sliplens.explainers"]
 #     midpoint = "my_package:MIDPOINT"
 #
-# with ``MIDPOINT = ExplainerRow(title="Midpoint gradient", load=Midpoint)``, and a colour and line where you like.
-#
-# Then ``--method midpoint`` and ``method="midpoint"`` know it. CONTRIBUTING.md lists all tables with their entry
-# points.
+# with ``MIDPOINT = ExplainerRow(title="Midpoint gradient", load=Midpoint)``. Then ``--method midpoint`` and
+# ``method="midpoint"`` work. CONTRIBUTING.md lists all tables and their entry points.
