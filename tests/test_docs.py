@@ -223,6 +223,4 @@ def test_sentences_are_short_and_without_riddle_words():
             continue
         prose = sentences(text := page.read_text(encoding="utf-8"))
         assert np.mean([len(sentence.split()) for sentence in prose] or [0]) <= 22, page.name
-        assert not re.findall(r"\b(?:tells?|told|mends?|mended|at hand|nobody|untouched test|hears?)\b", text), (
-            page.name
-        )
+        assert not re.findall(r"\b(?:tells|told|mends?|mended|at hand|nobody|untouched test)\b", text), page.name
