@@ -184,7 +184,7 @@ def measure(
         for reading in reader.readings():
             if page is not None:
                 page.look(maps=maps)
-                pictures |= set() if page.feed.picture is None else {page.feed.picture.frame.number}
+                pictures |= set() if page.feed.picture is None else {page.feed.picture.moment.frame.number}
                 explained |= set() if page.feed.map is None else {page.feed.map.facts.number}
             if np.isinf(begins_s[0]) and (page is None or page.feed.picture is not None):
                 begins_s[0] = reading.time_s + WARM_S

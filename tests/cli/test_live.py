@@ -35,7 +35,7 @@ def told_by_a_process(*words: str) -> str:
 
 
 def test_the_address_of_the_page_is_told_with_its_token(small_dataset: Dataset):
-    pytest.importorskip("nicegui")
+    pytest.importorskip("websockets")
     told = told_by_a_process(str(small_dataset.folder), "--seconds", "1", "--port", "0", "--host", "0.0.0.0")
     assert re.search(r"open http://\S+:\d+/\?token=\S{32}", told)
 

@@ -4,18 +4,18 @@ import asyncio
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from threading import Event, Lock, Thread
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
 import torch
 from PIL import Image
-from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from sliplens.errors import SliplensError
 from sliplens.explainers.attribution import CLOSE
@@ -23,15 +23,16 @@ from sliplens.explainers.explain import choose_explainers, explain_frames
 from sliplens.explainers.frames import frames_from_arrays
 from sliplens.explainers.occlusion import marker_regions, to_network_px
 from sliplens.explainers.table import RECOMMENDED_METHOD
-from sliplens.files import to_builtins
 from sliplens.grip.source import GripSource, GripStatus
 from sliplens.images import encode_jpeg
 from sliplens.live.loop import LiveReader
-from sliplens.live.mailbox import OutputState
-from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
+from sliplens.live.reading import LiveFrame, Reading, SlipState
 from sliplens.models.checkpoint import Network
 from sliplens.plots.saliency import full_colour
 from sliplens.recordings.capture import Frame
+
+if TYPE_CHECKING:
+    from sliplens.app.client import Client
 
 CHART_S = 30.0
 """Time that the chart of the page spans, in seconds."""
@@ -40,15 +41,14 @@ LIVE_METHOD = "grad-cam"
 _PICTURES_HZ, _LEAST_HZ, _MAPS_HZ = 30.0, 5.0, 2.0
 _LONGEST_PX = 800
 _QUALITY = 85
-_UNANSWERED = 2  # messages under way to one client: one is drawn while the next one travels
-_KEEP_ALIVE_S = 1.0  # the page takes a longer silence for a lost connection
-_RATE_S = 2.0
+_START_SHEAR, _STICK_SHARE, _LEAST_STICK = 0.0025, 0.97, 0.9
+"""Frames before the pull: largest shear in heights of the frame, least share of the contact's largest margin, and
+least margin at all."""
 _PATIENCE_S = 10.0  # with a thread that is to end
 
 
-@dataclass(frozen=True, kw_only=True)
-class Point:
-    """A reading on the chart: margins from 0 to 1, forces in newtons, None where there is none."""
+class Point(msgspec.Struct, frozen=True, kw_only=True):
+    """A reading on the chart: margins from 0 to 1, forces in newtons, shear in pixels, None where there is none."""
 
     at_s: float
     """Time of the reading, as `time.monotonic` counts."""
@@ -56,18 +56,26 @@ class Point:
     low: float | None
     high: float | None
     true_margin: float | None
+    shear_px: float | None
     force_n: float | None
     """Grip force, of a simulated gripper alone."""
     least_force_n: float | None
     """Least grip force that holds, of the same."""
 
 
+class Moment(NamedTuple):
+    """A reading with its frame, and the last frame of the same contact before the pull, where that is known."""
+
+    reading: Reading
+    frame: LiveFrame
+    start: LiveFrame | None
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PageFrame:
     """Frame as the page shows it."""
 
-    reading: Reading
-    frame: LiveFrame
+    moment: Moment
     reference: Frame | None
     """The sensor untouched, with which the frame was compared."""
     jpeg: bytes
@@ -75,16 +83,16 @@ class PageFrame:
     """Markers: x and y at rest, then now, in pixels of the frame."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class MapFacts:
+class MapFacts(msgspec.Struct, frozen=True, kw_only=True):
     """Header of a map; margins and relevance in margin units."""
 
     number: int
     """Frame that is explained."""
     method: str
+    baseline: int | None
+    """Frame with which it is compared, the last before the pull; None for the untouched sensor."""
     prediction: float
-    reference_prediction: float
-    """Margin of the untouched sensor."""
+    baseline_prediction: float
     rows: int
     columns: int
     full: float
@@ -96,65 +104,11 @@ class MapFacts:
     warnings: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Map:
+class Map(NamedTuple):
     """Relevance of a frame's pixels."""
 
     facts: MapFacts
     cells: bytes
-
-
-@dataclass(frozen=True, kw_only=True)
-class PictureFacts:
-    """Size of the frame that a JPEG shows, and the arrows over it."""
-
-    width: int
-    height: int
-    arrows: tuple[tuple[float, float, float, float], ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Update:
-    """Header of a message to a client; the JPEG and the cells of the map follow where they are new."""
-
-    serial: int
-    now_s: float
-    """Time of the message, as `time.monotonic` counts."""
-    reading: Reading | None
-    words: ReadingWords | None
-    grip: GripStatus | None
-    points: tuple[Point, ...]
-    """Readings since the message before."""
-    rate_hz: float
-    """Readings a second, over the last two."""
-    drawn_ms: float | None
-    """Time from the capture of a frame until this client had drawn it, in milliseconds."""
-    viewers: int
-    waiting: str
-    """Work in progress, in words; empty for none."""
-    ended: str | None
-    """Why no more readings come; None while they may."""
-    recording: OutputState | None
-    sinks: tuple[OutputState, ...]
-    troubles: tuple[str, ...]
-    """Doubts about the network, and outputs that failed, with the cure."""
-    frozen: str | None
-    """Frame and reading of the picture in words, where it is frozen."""
-    has_map: bool
-    """True where a map lies over the picture: this one, or the one sent before."""
-    picture: PictureFacts | None
-    picture_bytes: int
-    map: MapFacts | None
-    map_bytes: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class Answer:
-    """Answer of a client to a message."""
-
-    serial: int
-    drawn: bool = True
-    """False where it was passed over in a hidden window."""
 
 
 class Feed:
@@ -173,12 +127,12 @@ class Feed:
         self.reader = reader
         self.clients: set[Client] = set()
         """Connected clients."""
-        self.expected: dict[str, Client] = {}
-        """Clients that may connect, by the name in their socket's address."""
         self.reading: Reading | None = None
         """Newest reading."""
         self.grip: GripStatus | None = None
         """State of a simulated gripper at that reading."""
+        self.forces_n: tuple[float, float] | None = None
+        """Normal and tangential force of the newest frame that brings them."""
         self.picture: PageFrame | None = None
         """Newest picture."""
         self.map: Map | None = None
@@ -187,9 +141,11 @@ class Feed:
         """Why no more readings come; None while they may."""
         self._points: deque[Point] = deque()
         self._lock = Lock()
-        self._newest: tuple[Reading, LiveFrame] | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._newest: Moment | None = None
+        self._start: LiveFrame | None = None
+        self._largest = 0.0
         self._closed = Event()
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._end_subscription: Callable[[], None] = lambda: None
         self._before: Frame | None = None
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="explain")
@@ -197,24 +153,22 @@ class Feed:
         network = reader.network
         self._network: Network | None = None if network is None else replace(network, model=deepcopy(network.model))
         self._thread = Thread(target=self._run, daemon=True)
-        self._mapper = Thread(target=self._make_maps, daemon=True)
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Begin; clients are served in this loop."""
+        """Begin; clients are served in this loop, which runs in the thread that calls."""
         self._loop = loop
         self._end_subscription = self.reader.subscribe(self._take)
         self._thread.start()
         if self._network is not None:
-            self._mapper.start()
+            self._mapping = loop.create_task(self._make_maps())
 
     def close(self) -> None:
         """Make nothing more; the reader goes on."""
         self._closed.set()
         self._end_subscription()
         self._pool.shutdown(wait=False, cancel_futures=True)
-        for thread in (self._thread, self._mapper):
-            if thread.is_alive():  # one that is in OpenCV as the interpreter ends aborts the process
-                thread.join(_PATIENCE_S)
+        if self._thread.is_alive():  # one that is in OpenCV as the interpreter ends aborts the process
+            self._thread.join(_PATIENCE_S)
 
     @property
     def waiting(self) -> str:
@@ -246,10 +200,15 @@ class Feed:
         return await asyncio.get_running_loop().run_in_executor(self._pool, self._explain, picture, method)
 
     def _take(self, reading: Reading, frame: LiveFrame | None) -> None:
+        """Note a reading, in the thread that reads: nothing is drawn here."""
         now_s, source = time.monotonic(), self.reader.source
         self.grip = grip = source.status(reading.number) if isinstance(source, GripSource) else None
+        if frame is not None and frame.forces is not None:
+            x_n, y_n, normal_n = frame.forces.force_n[-1].tolist()
+            self.forces_n = normal_n, float(np.hypot(x_n, y_n))
         point = Point(
             at_s=now_s, margin=reading.margin, low=reading.low, high=reading.high, true_margin=reading.true_margin,
+            shear_px=None if reading.markers is None else reading.markers.shear_px,
             force_n=None if grip is None else grip.force_n,
             least_force_n=None if grip is None else grip.least_force_n,
         )  # fmt: skip
@@ -258,7 +217,21 @@ class Feed:
             while self._points[0].at_s < now_s - CHART_S:
                 self._points.popleft()
         self.reading = reading
-        self._newest = None if frame is None else (reading, frame)
+        if frame is not None:
+            self._note_start(reading, frame)
+            self._newest = Moment(reading, frame, self._start)
+        else:
+            self._newest = None
+
+    def _note_start(self, reading: Reading, frame: LiveFrame) -> None:
+        """Keep the last frame of the contact before the pull: its markers show no shear, its margin is the largest."""
+        markers, margin = reading.markers, reading.margin
+        if markers is None or not markers.contact or markers.shear_px is None:
+            self._start, self._largest = None, 0.0
+        elif markers.shear_px > _START_SHEAR * frame.size[0] or reading.slip is SlipState.SLIP:
+            self._largest = np.inf  # the pull has begun
+        elif margin is not None and margin >= max(_STICK_SHARE * self._largest, _LEAST_STICK):
+            self._start, self._largest = frame, max(margin, self._largest)
 
     def _run(self) -> None:
         """Draw the newest reading, until there are no more."""
@@ -275,7 +248,7 @@ class Feed:
                 drawn_s = time.monotonic()
                 newest = self._newest
                 if newest is not None and any(client.wants_picture for client in tuple(self.clients)):
-                    self.picture = self._draw(*newest)
+                    self.picture = self._draw(newest)
                 self._wake()
             self.ended = f"{self.reader.source.name} has ended"
         except Exception as error:  # whatever it was: the page must not show the last margin as a new one
@@ -289,52 +262,54 @@ class Feed:
         with suppress(RuntimeError):  # the server has gone
             self._loop.call_soon_threadsafe(lambda: [client.wake() for client in tuple(self.clients)])
 
-    def _draw(self, reading: Reading, frame: LiveFrame) -> PageFrame:
-        thumbnail, markers_px = Image.fromarray(frame.image), self.reader.markers_px
+    def _draw(self, moment: Moment) -> PageFrame:
+        thumbnail, markers_px = Image.fromarray(moment.frame.image), self.reader.markers_px
         thumbnail.thumbnail((_LONGEST_PX, _LONGEST_PX), reducing_gap=1.0)
         ways = [] if markers_px is None else np.column_stack(markers_px).round(1).tolist()
         return PageFrame(
-            reading=reading,
-            frame=frame,
+            moment=moment,
             reference=self.reader.reference,
             jpeg=encode_jpeg(np.asarray(thumbnail), _QUALITY),
             arrows=tuple((x, y, to_x, to_y) for x, y, to_x, to_y in ways if np.isfinite(to_x)),
         )
 
-    def _make_maps(self) -> None:
+    async def _make_maps(self) -> None:
         """Explain the newest picture at a few hertz, while a client shows maps."""
         explained = None
-        while not self._closed.wait(1 / _MAPS_HZ):
+        while not self._closed.is_set():
+            await asyncio.sleep(1 / _MAPS_HZ)
             picture = self.picture
-            is_wanted = any(client.shows_map and client.ready for client in tuple(self.clients))
+            is_wanted = any(client.shows_map and client.ready for client in self.clients)
             if self.ended is not None or not is_wanted or picture is None or picture is explained:
                 continue
-            explained = picture
-            try:
-                if picture.reading.margin is None:
-                    self.map = None  # without a margin there is nothing to explain
-                else:
-                    self.map = self._pool.submit(self._explain, picture, LIVE_METHOD).result()
-            except (SliplensError, RuntimeError, CancelledError):
-                self.map = None
-            self._wake()
+            explained, self.map = picture, None if picture.moment.reading.margin is None else self.map
+            if picture.moment.reading.margin is not None:  # without a margin there is nothing to explain
+                try:
+                    self.map = await self.explain(picture, LIVE_METHOD)
+                except (SliplensError, RuntimeError):
+                    self.map = None
+            for client in self.clients:
+                client.wake()
 
     def _explain(self, picture: PageFrame, method: str) -> Map:
         assert self._network is not None
-        chosen = frames_from_arrays(self._network, picture.frame.image[None], picture.reference)
+        (_, frame, start), reference = picture.moment, picture.reference
+        baseline = "untouched" if start is None else start.image
+        chosen = frames_from_arrays(self._network, frame.image[None], reference, baseline=baseline)
         methods = None if method == RECOMMENDED_METHOD else method
         explainers, warnings = choose_explainers(self._network, chosen, methods)
         explanation = explain_frames(self._network, chosen, explainers)
         method, relevance = explanation.method, explanation.relevance[explanation.method][0]
-        [frame] = explanation.frames
+        [explained] = explanation.frames
         full = full_colour(relevance)
         # where both margins are the same but for the network's error, the strongest of nothing is not shown in colour
-        alike = abs(frame.prediction - frame.reference_prediction) < CLOSE
+        alike = abs(explained.prediction - explained.reference_prediction) < CLOSE
         facts = MapFacts(
-            number=picture.frame.number,
+            number=frame.number,
             method=method,  # tiles where no markers are found
-            prediction=frame.prediction,
-            reference_prediction=frame.reference_prediction,
+            baseline=None if start is None else start.number,
+            prediction=explained.prediction,
+            baseline_prediction=explained.reference_prediction,
             rows=relevance.shape[0],
             columns=relevance.shape[1],
             full=full,
@@ -343,7 +318,7 @@ class Feed:
             warnings=(*warnings, *(text.partition("): ")[2] for text in explanation.methods[method].warnings)),
         )
         cells = np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8)
-        return Map(facts=facts, cells=cells.tobytes())
+        return Map(facts, cells.tobytes())
 
 
 def _sum_by_marker(values: np.ndarray, picture: PageFrame) -> tuple[tuple[float, float, float], ...]:
@@ -352,147 +327,7 @@ def _sum_by_marker(values: np.ndarray, picture: PageFrame) -> tuple[tuple[float,
         return ()
     places = np.array(picture.arrows)[:, 2:]
     relevance = torch.from_numpy(values).double()
-    centres = to_network_px(places, picture.frame.size, image_size=len(relevance))
+    centres = to_network_px(places, picture.moment.frame.size, image_size=len(relevance))
     regions = marker_regions((relevance.shape[0], relevance.shape[1]), centres)
     sums = torch.bincount(regions.flatten(), weights=relevance.flatten(), minlength=len(places) + 1)
     return tuple((*place, value) for place, value in zip(places.tolist(), sums[: len(places)].tolist(), strict=True))
-
-
-class Client:
-    """A connected browser: its last message, frozen picture and settings."""
-
-    def __init__(self, feed: Feed) -> None:
-        self.feed = feed
-        self.frozen: PageFrame | None = None
-        """Picture that stays until `thaw`; number and chart go on."""
-        self.explained: Map | None = None
-        """Map of the frozen picture."""
-        self.waiting = ""
-        """Work in progress for this client, in words."""
-        self.shows_map = self.shows_arrows = True
-        self.takes_s = 0.0
-        """Time from sending a message to its answer, over the last few, in seconds."""
-        self._changed = asyncio.Event()
-        self._sending: asyncio.Task[None] | None = None
-        self._has_news = True
-        self._serial = 0
-        self._unanswered: dict[int, tuple[float, float]] = {}
-        self._reset()
-
-    def _reset(self) -> None:
-        self._sent_until_s, self._drawn_ms = -np.inf, None
-        self._picture: PageFrame | None = None
-        self._map: Map | None = None
-        self._unanswered.clear()
-
-    def wake(self) -> None:
-        """Send the news as soon as this client has answered; called in the thread of the server."""
-        self._has_news = True
-        self._changed.set()
-
-    @property
-    def ready(self) -> bool:
-        """True where it has answered the message before the last."""
-        return len(self._unanswered) < _UNANSWERED
-
-    @property
-    def wants_picture(self) -> bool:
-        """True where a newer picture would be sent; one that waits for a slow client is not drawn again."""
-        return self.ready or self._picture is self.feed.picture
-
-    def freeze(self) -> PageFrame | None:
-        """Stop at the picture on the screen; None before the first."""
-        self.frozen = self.frozen or self._picture or self.feed.picture
-        self.wake()
-        return self.frozen
-
-    def thaw(self) -> None:
-        """Let the picture run again."""
-        self.frozen = self.explained = None
-        self.wake()
-
-    async def serve(self, socket: WebSocket) -> None:
-        """Send news whenever the message before the last was answered, until the client is gone."""
-        await socket.accept()
-        if self._sending is not None:
-            self._sending.cancel()  # to a connection that is lost without notice
-        self._reset()
-        self.feed.clients.add(self)
-        self._sending = sending = asyncio.create_task(self._send(socket))
-        try:
-            while True:
-                answer = msgspec.json.decode(await socket.receive_text(), type=Answer)
-                captured_s, sent_s = self._unanswered.pop(answer.serial, (np.nan, np.nan))
-                if answer.drawn and np.isfinite(captured_s):
-                    now_s = time.monotonic()
-                    self._drawn_ms = 1e3 * (now_s - captured_s)
-                    self.takes_s += 0.2 * (now_s - sent_s - self.takes_s)
-                self._changed.set()
-        except (WebSocketDisconnect, RuntimeError, msgspec.MsgspecError, KeyError):
-            pass  # it has gone, which starlette calls a RuntimeError where sending saw it first, or is of another kind
-        finally:
-            sending.cancel()
-            if self._sending is sending:
-                self._sending = None
-                self.feed.clients.discard(self)
-            await asyncio.gather(sending, return_exceptions=True)
-            with suppress(RuntimeError, WebSocketDisconnect, OSError):
-                await socket.close()
-
-    async def _send(self, socket: WebSocket) -> None:
-        self.wake()
-        while True:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(_KEEP_ALIVE_S):  # `wait_for` of Python 3.11 may miss that it is cancelled
-                    await self._changed.wait()
-            is_idle = not self._changed.is_set()
-            self._changed.clear()
-            if self.ready and (self._has_news or is_idle):
-                self._has_news = False
-                await socket.send_bytes(self._message())
-
-    def _message(self) -> bytes:
-        """Make a message: length of the header in 4 bytes, the header as JSON, the JPEG and the cells of the map."""
-        feed, reader = self.feed, self.feed.reader
-        picture = self.frozen or feed.picture
-        overlay = self.explained if self.frozen is not None else feed.map
-        overlay = overlay if self.shows_map else None
-        jpeg = picture.jpeg if picture is not None and picture is not self._picture else b""
-        cells = overlay.cells if overlay is not None and overlay is not self._map else b""
-        facts = frozen = None
-        if picture is not None and jpeg:
-            height, width = picture.frame.size
-            facts = PictureFacts(width=width, height=height, arrows=picture.arrows if self.shows_arrows else ())
-        if self.frozen is not None:
-            frozen = f"frame {self.frozen.frame.number}, {describe_reading(self.frozen.reading)}"
-        points = feed.points_since(self._sent_until_s)
-        self._serial += 1
-        update = Update(
-            serial=self._serial,
-            now_s=time.monotonic(),
-            reading=feed.reading,
-            words=None if feed.reading is None else describe_reading(feed.reading),
-            grip=feed.grip,
-            points=points,
-            rate_hz=len(feed.points_since(time.monotonic() - _RATE_S)) / _RATE_S,
-            drawn_ms=self._drawn_ms,
-            viewers=len(feed.clients),
-            waiting=self.waiting or feed.waiting,
-            ended=feed.ended,
-            recording=None if (recorder := reader.recorder) is None else recorder.state,
-            sinks=tuple(sender.state for sender in reader.senders),
-            troubles=(*reader.doubts, *reader.troubles),
-            frozen=frozen,
-            has_map=overlay is not None,
-            picture=facts,
-            picture_bytes=len(jpeg),
-            map=overlay.facts if overlay is not None and cells else None,
-            map_bytes=len(cells),
-        )
-        # a picture that was drawn before says nothing of how long drawing takes
-        captured_s = picture.frame.captured_s if jpeg and picture is not None else np.nan
-        self._unanswered[self._serial] = captured_s, update.now_s
-        self._picture, self._map = picture, overlay
-        self._sent_until_s = points[-1].at_s if points else self._sent_until_s
-        header = msgspec.json.encode(to_builtins(update))
-        return b"".join([len(header).to_bytes(4, "little"), header, jpeg, cells])

@@ -2,14 +2,13 @@
 
 import asyncio
 import errno
+import logging
 import secrets
 import socket
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from functools import cache, partial
-from ipaddress import ip_address
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import TYPE_CHECKING, TypeVar
 
 from sliplens.errors import InputError
@@ -17,27 +16,19 @@ from sliplens.extras import require_packages
 from sliplens.recordings.trial import TrialFacts
 
 if TYPE_CHECKING:
-    from fastapi import FastAPI
-    from starlette.types import ASGIApp
+    from websockets.asyncio.server import ServerConnection
 
-    from sliplens.app.feed import Feed
     from sliplens.live.loop import LiveReader
 
 _PORT = 8090
 _PATIENCE_S = 10.0
-_ICON = (
-    '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 16 16"><path d="M2 12a6 6 0 1 1 12 0" fill="none" '
-    'stroke="#009E73" stroke-width="3"/><path d="M8 12 5 6" stroke="#D55E00" stroke-width="2"/></svg>'
-)
-
-
 _Page = TypeVar("_Page", bound="LivePage")
 
 
 class LivePage:
     """Page of a reader, for browsers; a context manager that serves it while it is entered.
 
-    Several browsers see the same frames, and cost one inference. One page at a time runs in a process.
+    Several browsers see the same frames, and cost one inference.
 
     Parameters
     ----------
@@ -75,7 +66,9 @@ class LivePage:
         record_into: Path | str = "recorded",
         facts: TrialFacts | None = None,
     ) -> None:
-        require_packages("nicegui", extra="live", purpose="the page")
+        require_packages("websockets", extra="live", purpose="the page")
+        from sliplens.app.access import is_loopback  # noqa: PLC0415 (needs it)
+
         if port is not None and not 0 <= port <= 65535:
             raise InputError(f"--port must be from 0 to 65535, got {port}")
         self.reader, self.record_into, self.facts = reader, Path(record_into), facts
@@ -94,113 +87,57 @@ class LivePage:
         return f"http://{host}:{port}/" + ("" if self.token is None else f"?token={self.token}")
 
     def __enter__(self: _Page) -> _Page:
-        # explainers, and with them torch
-        from sliplens.app.connections import Gate  # noqa: PLC0415
-        from sliplens.app.feed import Feed  # noqa: PLC0415
-        from sliplens.app.page import Hand  # noqa: PLC0415
+        from sliplens.app.feed import Feed  # noqa: PLC0415 (explainers, and with them torch)
 
         with ExitStack() as stack:
             self._socket = stack.enter_context(_listen(self._host, self._port))
-            self.feed, self.hand = Feed(self.reader), Hand()
+            self.feed = Feed(self.reader)
+            started = Event()
+            thread = Thread(target=lambda: asyncio.run(self._serve(started)), daemon=True)
+            thread.start()
+            while not started.wait(0.01):
+                if not thread.is_alive():
+                    raise InputError("the page could not be served; run without it, with --no-page")
+            stack.callback(thread.join, _PATIENCE_S)
+            stack.callback(self._loop.call_soon_threadsafe, self._over.set)
             stack.callback(self.feed.close)
-            app = _application()
-            if getattr(app.state, "page", None) is not None:
-                raise InputError("a page is being shown by this process already; close that one first")
-            app.state.page = self
-            stack.callback(setattr, app.state, "page", None)
-            gate = Gate(app, token=self.token, port=self._socket.getsockname()[1])
-            stack.enter_context(_serving(gate, self._socket, self.feed))
             self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
+    async def _serve(self, started: Event) -> None:
+        from websockets.asyncio.server import serve  # noqa: PLC0415 (an extra)
 
-@cache
-def _application() -> "FastAPI":
-    """Make the one application of NiceGUI in this process; it shows the page that is entered."""
-    import nicegui  # noqa: PLC0415 (the extra)
-    from fastapi import FastAPI  # noqa: PLC0415 (comes with it)
-    from starlette.middleware.gzip import GZipMiddleware  # noqa: PLC0415
-    from starlette.websockets import WebSocket  # noqa: PLC0415
+        from sliplens.app import access  # noqa: PLC0415 (needs it)
 
-    from sliplens.app.page import build_live  # noqa: PLC0415 (torch comes with it)
+        self._loop, self._over = asyncio.get_running_loop(), asyncio.Event()
+        crowd: dict[access.BoundedConnection, None] = {}
+        silent = logging.Logger("sliplens.app", logging.CRITICAL)  # of failed requests nobody wants to read
+        async with serve(
+            self._talk,
+            sock=self._socket,
+            process_request=access.Gate(token=self.token, port=self._socket.getsockname()[1]),
+            create_connection=partial(access.BoundedConnection, crowd=crowd),  # pyright: ignore[reportArgumentType]
+            open_timeout=access.REQUEST_S,
+            close_timeout=access.REQUEST_S,
+            max_size=access.MOST_MESSAGE_BYTES,
+            compression=None,  # of a JPEG it leaves what it was
+            server_header=None,
+            logger=silent,
+            backlog=access.MOST_CONNECTIONS // 2,  # taken at once: who has sent a request is heard before it must go
+        ):
+            self.feed.start(self._loop)
+            started.set()
+            await self._over.wait()
+            for connection in tuple(crowd):
+                connection.transport.abort()
 
-    _sign_scripts()
-    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+    async def _talk(self, connection: "ServerConnection") -> None:
+        from sliplens.app.client import Client  # noqa: PLC0415 (explainers, and with them torch)
 
-    @app.websocket("/frames/{name}")
-    async def frames(socket: WebSocket, name: str) -> None:
-        client = app.state.page.feed.expected.get(name)
-        await (socket.close(code=1008) if client is None else client.serve(socket))
-
-    @nicegui.ui.page("/", title="sliplens", dark=None)
-    def index() -> None:
-        build_live(app.state.page)
-
-    nicegui.ui.run_with(
-        app,
-        title="sliplens",
-        favicon=_ICON,
-        dark=None,
-        tailwind=False,
-        binding_refresh_interval=0.25,
-        show_welcome_message=False,
-        # the usual level takes ten times as long, of the cores that read
-        gzip_middleware_factory=partial(GZipMiddleware, compresslevel=1),
-    )
-    return app
-
-
-def _sign_scripts() -> None:
-    """Give NiceGUI's own scripts the nonce of the answer, in its template, before any value is in it."""
-    from jinja2 import ChoiceLoader, DictLoader  # noqa: PLC0415 (with the page alone)
-    from nicegui.client import templates  # noqa: PLC0415 (the extra)
-
-    loader = templates.env.loader
-    assert loader is not None
-    text, *_ = loader.get_source(templates.env, "index.html")
-    signed = text.replace("<script", "<script nonce=\"{{ request.scope['nonce'] }}\"")
-    templates.env.loader = ChoiceLoader([DictLoader({"index.html": signed}), loader])
-
-
-@contextmanager
-def _serving(app: "ASGIApp", listening: socket.socket, feed: "Feed") -> Iterator[None]:
-    """Serve in a thread that has started when this is entered and ended when it is left."""
-    import nicegui  # noqa: PLC0415 (the extra)
-    import uvicorn  # noqa: PLC0415 (comes with it)
-
-    from sliplens.app.connections import server_config  # noqa: PLC0415 (needs it)
-
-    server = uvicorn.Server(server_config(app))
-
-    async def serve() -> None:
-        feed.start(asyncio.get_running_loop())
-        # not by the lifespan that `ui.run_with` makes: it walks over all objects of the process, and a tuple that
-        # another thread is just making then fails with a SystemError
-        async with nicegui.app.router.lifespan_context(nicegui.app):
-            await server.serve([listening])
-
-    thread = Thread(target=lambda: asyncio.run(serve()), daemon=True)
-    thread.start()
-    try:
-        while not server.started:
-            thread.join(0.01)
-            if not thread.is_alive():
-                raise InputError("the page could not be served; run without it, with --no-page")
-        yield
-    finally:
-        server.should_exit = True
-        thread.join(_PATIENCE_S)
-
-
-def is_loopback(host: str) -> bool:
-    """Return True where only this machine can reach an address."""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+        await Client(self.feed, record_into=self.record_into, facts=self.facts).serve(connection)
 
 
 def _listen(host: str, port: int | None) -> socket.socket:

@@ -489,7 +489,7 @@ class ReplaySource(LiveSource):
 
 
 _GRIP_N = 1.5
-_GRIP_COURSE = np.array([[0, 1, 2, 2.5, 7.5, 8.5, 9, 10], [0, 0, 1, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1, 0, 0]])
+_GRIP_COURSE = np.array([[0, 0.3, 1.3, 1.8, 6.8, 7.8, 8.3, 9.5], [0, 0, 1, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 1, 0, 0]])
 """Grip that the simulated fingertip repeats until `load` is called: seconds, and shares of press and pull."""
 
 

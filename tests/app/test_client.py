@@ -3,17 +3,25 @@
 import asyncio
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from starlette.websockets import WebSocketDisconnect
+import pytest
+
+pytest.importorskip("websockets", reason="the page needs websockets (extra live)")
+
+from websockets.exceptions import ConnectionClosedOK
 
 import sliplens as sl
-from sliplens.app.feed import Client, Feed, PageFrame
-from sliplens.live import SimulatedSource
+from sliplens.app.client import Client
+from sliplens.app.feed import Feed, Moment, PageFrame
+from sliplens.live import MarkerReading, SimulatedSource, SlipState
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.sensor import SensorProfile
+
+READING = Reading(number=0, time_s=0.0, captured_s=0.0)
 
 
 class Wire:
@@ -22,34 +30,37 @@ class Wire:
     def __init__(self) -> None:
         self.sent: asyncio.Queue[dict] = asyncio.Queue()
         self.answers: asyncio.Queue[dict | None] = asyncio.Queue()
+        self.closed = 0
 
-    async def accept(self) -> None: ...
+    async def close(self, code: int, _: str) -> None:
+        self.closed = code
 
-    async def close(self) -> None: ...
-
-    async def send_bytes(self, message: bytes) -> None:
+    async def send(self, message: bytes) -> None:
         length = int.from_bytes(message[:4], "little")
-        await self.sent.put(json.loads(message[4 : 4 + length]))
+        header = json.loads(message[4 : 4 + length])
+        if "settings" not in header:
+            await self.sent.put(header)
 
-    async def receive_text(self) -> str:
+    async def recv(self) -> str:
         answer = await self.answers.get()
         if answer is None:
-            raise WebSocketDisconnect
+            raise ConnectionClosedOK(None, None)
         return json.dumps(answer)
 
-    async def next(self, *, within_s: float = 30.0) -> dict:
-        return await asyncio.wait_for(self.sent.get(), within_s)
+    async def next(self) -> dict:
+        return await asyncio.wait_for(self.sent.get(), 30.0)
+
+    async def draw(self, message: dict) -> None:
+        await self.answers.put({"act": "drawn", "serial": message["serial"]})
+
+
+def frame(number: int) -> LiveFrame:
+    return LiveFrame(image=np.zeros((224, 224, 3), np.uint8), number=number, time_s=0.0, captured_s=0.0)
 
 
 def picture(number: int) -> PageFrame:
-    frame = LiveFrame(image=np.zeros((4, 4, 3), np.uint8), number=number, time_s=0.0, captured_s=0.0)
-    return PageFrame(
-        reading=Reading(number=number, time_s=0.0, captured_s=0.0),
-        frame=frame,
-        reference=None,
-        jpeg=bytes([number]),
-        arrows=(),
-    )
+    moment = Moment(replace(READING, number=number), frame(number), None)
+    return PageFrame(moment=moment, reference=None, jpeg=bytes([number]), arrows=())
 
 
 def with_client(act, **reader) -> None:
@@ -63,6 +74,7 @@ def with_client(act, **reader) -> None:
         await act(feed, wire, client)
         await wire.answers.put(None)
         await served
+        assert not feed.clients
 
     asyncio.run(run())
 
@@ -70,7 +82,7 @@ def with_client(act, **reader) -> None:
 def test_an_answer_alone_is_not_answered():
     async def act(_: Feed, wire: Wire, client: Client) -> None:
         first = await wire.next()
-        await wire.answers.put({"serial": first["serial"]})
+        await wire.draw(first)
         while first["serial"] in client._unanswered:
             await asyncio.sleep(0.001)
         await asyncio.sleep(0.05)
@@ -90,12 +102,11 @@ def test_a_slow_client_sees_the_picture_move():
                 feed.picture = picture(number)
             client.wake()
             if number > 2:  # it answers after the next reading has come, never before
-                await wire.answers.put({"serial": owed.pop(0)["serial"]})
+                await wire.draw(owed.pop(0))
             owed.append(await wire.next())
-        drawn = [message["picture_bytes"] for message in owed]
-        assert all(drawn)  # pictures that are new
+        assert all(message["picture_bytes"] for message in owed)  # pictures that are new
         assert feed.picture is not None
-        assert feed.picture.frame.number >= 4
+        assert feed.picture.moment.frame.number >= 4
 
     with_client(act)
 
@@ -113,22 +124,40 @@ def test_a_picture_that_nobody_fetches_is_not_drawn_again():
     with_client(act)
 
 
-def test_a_client_that_comes_back_before_its_old_connection_is_given_up_goes_on():
-    async def act(feed: Feed, old: Wire, client: Client) -> None:
-        await old.next()
-        new = Wire()
-        served = asyncio.create_task(client.serve(cast("Any", new)))
-        await new.next()
-        await old.answers.put(None)  # the old one is told to be gone only now
-        await asyncio.sleep(0.01)
-        assert feed.clients == {client}
-        for _ in range(2):
-            client.wake()
-            await new.answers.put({"serial": (await new.next())["serial"]})
-        assert old.sent.empty()
-        await new.answers.put(None)
-        await served
-        assert not feed.clients
+@pytest.mark.parametrize("message", [{"act": "drawn"}, {"act": "no such button"}], ids=["answers", "buttons"])
+def test_who_sends_too_many_messages_is_cut_off(message: dict):
+    async def act(_: Feed, wire: Wire, __: Client) -> None:
+        for _number in range(1000):
+            await wire.answers.put(message)
+        while not wire.closed:
+            await asyncio.sleep(0.001)
+        assert wire.answers.qsize() > 500
+
+    with_client(act)
+
+
+@pytest.mark.parametrize(
+    "message",
+    [{}, {"act": 1}, {"act": "load", "press_n": "1"}, {"act": "load", "more": 1}, {"act": "disturb", "wet": 3}],
+)
+def test_who_sends_something_else_is_cut_off(message: dict):
+    async def run() -> None:
+        wire = Wire()
+        await wire.answers.put(message)
+        await asyncio.wait_for(Client(Feed(sl.LiveReader("simulated"))).serve(cast("Any", wire)), 30)
+
+    asyncio.run(run())
+
+
+def test_a_slider_moves_no_further_than_its_end_and_a_mistake_is_told():
+    async def act(feed: Feed, wire: Wire, _: Client) -> None:
+        source = cast("SimulatedSource", feed.reader.source)
+        await wire.answers.put({"act": "load", "press_n": 1e9, "pull_n": 1e9})
+        await wire.answers.put({"act": "load", "press_n": -1})
+        while not (notices := (await wire.next())["notices"]):
+            await wire.draw({"serial": 1})
+        assert source.forces_n(0.0) == (3.0, 2.4)
+        assert "cannot be pressed by -1 N" in notices[0]
 
     with_client(act)
 
@@ -164,3 +193,17 @@ def test_a_client_is_told_what_the_network_was_not_made_for(difference_run: Path
         assert "reads frames of another" in doubt
 
     with_client(act, network=difference_run, sensor=SensorProfile(name="another"))
+
+
+def test_the_start_of_a_grip_is_its_last_frame_without_shear_at_its_largest_margin():
+    feed = Feed(sl.LiveReader("simulated"))
+    # margin, shear in pixels of 224 (None: nothing touches), and the frame with which a map is compared
+    course = [
+        (None, None, None), (0.7, 0.1, None), (0.95, 0.1, 2), (1.0, 0.2, 3), (0.98, 0.3, 4), (0.9, 0.4, 4),
+        (0.99, 0.9, 4), (0.99, 0.1, 4), (None, None, None), (0.95, 2.0, None), (0.95, 0.1, None),
+    ]  # fmt: skip
+    for number, (margin, shear_px, start) in enumerate(course):
+        markers = MarkerReading(state=SlipState.STICKING, contact=shear_px is not None, shear_px=shear_px)
+        feed._take(replace(READING, number=number, margin=margin, markers=markers), frame(number))
+        assert feed._newest is not None
+        assert (feed._newest.start and feed._newest.start.number) == start
