@@ -39,7 +39,7 @@ _LARGEST = {"press_n": 3.0, "pull_n": 2.4, "water_kg": 0.06, "grip_pull_n": 0.6}
 """Ends of the sliders."""
 
 
-class Command(msgspec.Struct, forbid_unknown_fields=True):
+class ClientMessage(msgspec.Struct, forbid_unknown_fields=True):
     """Message of a browser: the answer to a message, or a button, key or slider with its values."""
 
     act: str
@@ -103,7 +103,7 @@ class Client:
         sending = asyncio.create_task(self._send(connection))
         try:
             while allowance.take():
-                await self._obey(msgspec.json.decode(await connection.recv(), type=Command))
+                await self._obey(msgspec.json.decode(await connection.recv(), type=ClientMessage))
             await connection.close(1008, "too much was sent")
         except (ConnectionClosed, msgspec.MsgspecError):
             pass  # it has gone, or is of another kind
@@ -112,7 +112,7 @@ class Client:
             self.feed.clients.discard(self)
             await asyncio.gather(sending, return_exceptions=True)
 
-    async def _obey(self, command: Command) -> None:
+    async def _obey(self, command: ClientMessage) -> None:
         """Take an answer, or do what a button asks for; what takes long is not begun twice at once."""
         if command.act in {"drawn", "passed"}:
             captured_s, sent_s = self._unanswered.pop(command.serial, (np.nan, np.nan))
@@ -127,33 +127,33 @@ class Client:
             self._running[command.act] = task = asyncio.create_task(self._act(command))
             task.add_done_callback(lambda _: self._running.pop(command.act))
 
-    async def _act(self, command: Command) -> None:
+    async def _act(self, command: ClientMessage) -> None:
         try:
             await pick(_ACTS, command.act, noun="button")(self, command)
         except (SliplensError, OSError) as error:
             self._notices.append(str(error))
         self.wake()
 
-    async def show(self, command: Command) -> None:
+    async def show(self, command: ClientMessage) -> None:
         """Show or hide map and markers."""
         self.shows_map, self.shows_arrows = command.map, command.markers
 
-    async def take_reference(self, _: Command) -> None:
+    async def take_reference(self, _: ClientMessage) -> None:
         """Take a new reference as soon as the picture is still."""
         self.feed.take_reference()
 
-    async def begin_object(self, _: Command) -> None:
+    async def begin_object(self, _: ClientMessage) -> None:
         """Forget the friction of the object, and show what its slips taught."""
         lesson = self.feed.reader.lesson
         self.feed.reader.new_object()
         self._notices.append(lesson or "nothing is known of the friction of the new object")
 
-    async def freeze(self, _: Command) -> None:
+    async def freeze(self, _: ClientMessage) -> None:
         """Stop at the picture on the screen, or let it run again."""
         self.frozen = (self._picture or self.feed.picture) if self.frozen is None else None
         self.explained = None
 
-    async def explain(self, command: Command) -> None:
+    async def explain(self, command: ClientMessage) -> None:
         """Freeze the picture and explain it."""
         if self.feed.reader.network is None:
             raise InputError(NO_NETWORK)
@@ -169,7 +169,7 @@ class Client:
         finally:
             self._waiting = ""
 
-    async def record(self, _: Command) -> None:
+    async def record(self, _: ClientMessage) -> None:
         """Record, or end the recording."""
         reader, loop = self.feed.reader, asyncio.get_running_loop()
         if reader.recorder is None:
@@ -179,18 +179,18 @@ class Client:
         else:
             self._notices.append(f"recorded into {data.folder}; look with `sliplens check {data.folder}`")
 
-    async def load(self, command: Command) -> None:
+    async def load(self, command: ClientMessage) -> None:
         """Press and pull the simulated fingertip."""
         if isinstance(source := self.feed.reader.source, SimulatedSource):
             press_n, pull_n = min(command.press_n, _LARGEST["press_n"]), min(command.pull_n or 0.0, _LARGEST["pull_n"])
             source.load(normal_force_n=press_n, tangential_force_n=pull_n)
 
-    async def let_go(self, _: Command) -> None:
+    async def let_go(self, _: ClientMessage) -> None:
         """Let the simulated fingertip grip by itself."""
         if isinstance(source := self.feed.reader.source, SimulatedSource):
             source.let_go()
 
-    async def disturb(self, command: Command) -> None:
+    async def disturb(self, command: ClientMessage) -> None:
         """Pour, pull, wet, or choose the controller of the simulated gripper."""
         if isinstance(source := self.feed.reader.source, GripSource):
             water_kg, pull_n = command.water_kg, command.pull_n
@@ -201,7 +201,7 @@ class Client:
                 controller=command.controller,
             )
 
-    async def grip_again(self, _: Command) -> None:
+    async def grip_again(self, _: ClientMessage) -> None:
         """Put the object down, and grip it anew."""
         if isinstance(source := self.feed.reader.source, GripSource):
             source.grip_again()
@@ -299,7 +299,7 @@ def _join(header: object, *parts: bytes) -> bytes:
     return b"".join([len(encoded).to_bytes(4, "little"), encoded, *parts])
 
 
-_ACTS: dict[str, Callable[[Client, Command], Awaitable[None]]] = {
+_ACTS: dict[str, Callable[[Client, ClientMessage], Awaitable[None]]] = {
     "show": Client.show,
     "reference": Client.take_reference,
     "object": Client.begin_object,
