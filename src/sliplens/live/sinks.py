@@ -49,12 +49,14 @@ def reading_schema() -> bytes:
 
 _EPOCH_S = time.time() - time.monotonic()
 """Time of the machine's start, computed once so that stamps stay in order: captures count from there."""
+_QUALITY = 90
+_FRAME_ID = "fingertip"
 
 
-def _stamp_ns(reading: Reading) -> int:
-    """Compute the time of a capture, in nanoseconds since 1970."""
+def _stamp(reading: Reading) -> tuple[int, int]:
+    """Compute the time of a capture since 1970, in whole seconds and nanoseconds."""
     captured_s = reading.captured_s if np.isfinite(reading.captured_s) else time.monotonic()
-    return round(1e9 * (captured_s + _EPOCH_S))
+    return divmod(round(1e9 * (captured_s + _EPOCH_S)), 10**9)
 
 
 def _open_json(address: str) -> Sink:
@@ -74,20 +76,16 @@ _TRANSIENT = (
 """Errors at which a datagram is lost and the next, newer one is sent: no listener, a full buffer, no network."""
 
 
-def _parse_address(address: str, *, kind: str, port: int | None = None) -> tuple[str, int]:
-    """Split HOST:PORT, :PORT, or nothing where there is a default port; this machine where no host is named."""
+def _split_address(address: str, *, kind: str) -> tuple[str, int]:
+    """Split HOST:PORT or :PORT; this machine where no host is named."""
     host, _, number = address.rpartition(":")
-    if not address and port is not None:
-        return "127.0.0.1", port
-    if not number.isdecimal() or not 0 <= int(number) <= 65535:
+    if not number.isdecimal() or not 0 < int(number) <= 65535:
         raise InputError(f"--sink {kind}:{address} names no port; give {kind}:HOST:PORT, as {kind}:127.0.0.1:9870")
     return host.strip("[]") or "127.0.0.1", int(number)
 
 
 def _open_udp(address: str) -> Sink:
-    host, port = _parse_address(address, kind="udp")
-    if port == 0:
-        raise InputError("--sink udp cannot send to port 0; give udp:HOST:PORT, as udp:127.0.0.1:9870")
+    host, port = _split_address(address, kind="udp")
     try:
         [(family, kind, protocol, _, target), *_] = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
     except socket.gaierror as error:
@@ -108,15 +106,13 @@ def _open_udp(address: str) -> Sink:
 READING_TOPIC, IMAGE_TOPIC = "/sliplens/reading", "/sliplens/image"
 """Topics of Foxglove and MCAP: readings as JSON, frames as `foxglove.CompressedImage`."""
 _BACKLOG = 8  # messages that wait for a slow viewer: old readings help nobody
-_QUALITY = 90
-_FRAME_ID = "fingertip"
 
 
-def _open_foxglove(address: str, *, file: bool = False) -> Sink:
+def _open_foxglove(address: str, *, is_file: bool = False) -> Sink:
     """Send readings and frames on two topics of Foxglove, of a server or in an MCAP file."""
-    kind = "mcap" if file else "foxglove"
-    path = _new_file(address, kind=kind) if file else None
-    host, port = ("", 0) if file else _parse_address(address, kind=kind, port=8765)
+    kind = "mcap" if is_file else "foxglove"
+    path = _new_file(address, kind=kind) if is_file else None
+    host, port = ("", 0) if is_file else _split_address(address or ":8765", kind=kind)
     require_packages("foxglove", extra="sinks", purpose=f"--sink {kind}")
     import foxglove  # noqa: PLC0415 (an extra)
     from foxglove.channels import CompressedImageChannel  # noqa: PLC0415
@@ -129,18 +125,17 @@ def _open_foxglove(address: str, *, file: bool = False) -> Sink:
         if path is not None:
             close = foxglove.open_mcap(str(path), context=context).close
         else:
-            close = foxglove.start_server(
-                name="sliplens", host=host, port=port, context=context, message_backlog_size=_BACKLOG
-            ).stop
+            server = {"host": host, "port": port, "message_backlog_size": _BACKLOG}
+            close = foxglove.start_server(name="sliplens", context=context, **server).stop
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path or f'{host}:{port}'} cannot be opened ({error}); name another with --sink") from None
 
     def send(reading: Reading, image: Frame | None) -> None:
-        at_ns = _stamp_ns(reading)
+        seconds, nanoseconds = _stamp(reading)
+        at_ns = seconds * 10**9 + nanoseconds
         readings.log(encode_reading(reading), log_time=at_ns)
         if image is not None:
-            stamp = Timestamp(sec=at_ns // 10**9, nsec=at_ns % 10**9)
-            data = encode_jpeg(image, _QUALITY)
+            stamp, data = Timestamp(sec=seconds, nsec=nanoseconds), encode_jpeg(image, _QUALITY)
             frames.log(CompressedImage(timestamp=stamp, frame_id=_FRAME_ID, data=data, format="jpeg"), log_time=at_ns)
 
     # a context that is collected closes its channels
@@ -171,14 +166,11 @@ class RerunSink:
         If True, frames are stored as PNG, else as JPEG.
     """
 
-    def __init__(
-        self, connect: Callable[[Any], None], *, application: str = "sliplens-live", lossless: bool = False
-    ) -> None:
+    def __init__(self, connect: Callable[[Any], None], *, lossless: bool = False) -> None:
         require_packages("rerun", extra="sinks", purpose="--sink rerun")
         import rerun  # noqa: PLC0415 (an extra, and large)
 
-        self._rerun, self._lossless = rerun, lossless
-        self.stream = rerun.RecordingStream(application)
+        self._rerun, self._lossless, self.stream = rerun, lossless, rerun.RecordingStream("sliplens")
         connect(self.stream)
 
     def set_frame(self, number: int, time_s: float) -> None:
@@ -189,11 +181,8 @@ class RerunSink:
 
     def log_image(self, entity: str, image: Frame, *, static: bool = False) -> None:
         """Log an image."""
-        if self._lossless:
-            picture = self._rerun.EncodedImage(contents=encode_png(image), media_type="image/png")
-        else:
-            picture = self._rerun.Image(image).compress(jpeg_quality=_QUALITY)
-        self.stream.log(entity, picture, static=static)
+        data, kind = (encode_png(image), "png") if self._lossless else (encode_jpeg(image, _QUALITY), "jpeg")
+        self.stream.log(entity, self._rerun.EncodedImage(contents=data, media_type=f"image/{kind}"), static=static)
 
     def send(self, reading: Reading, image: Frame | None, /) -> None:
         """Log a reading on the clock of the source; one without a time is left out."""
@@ -216,8 +205,8 @@ class RerunSink:
 
 
 def _open_rerun(address: str) -> Sink:
-    path = _new_file(address, kind="rerun")
-    sink = RerunSink(lambda stream: stream.save(str(path)))
+    path = str(_new_file(address, kind="rerun"))
+    sink = RerunSink(lambda stream: stream.save(path))
     return Sink(sink.send, sink.close)
 
 
@@ -262,16 +251,14 @@ class ZenohRos:
         from zenoh import ext  # noqa: PLC0415
 
         self._types, self._ext, self._error = get_typestore(Stores.LATEST), ext, zenoh.ZError
-        config = zenoh.Config()
-        for name, value in (
-            ("mode", "client"),
-            ("connect/endpoints", [address]),
-            ("connect/timeout_ms", _ZENOH_PATIENCE_MS),
-            ("scouting/multicast/enabled", False),  # it connects to the given address and calls out to nobody else
-        ):
-            config.insert_json5(name, json.dumps(value))
+        # it connects to the given address and calls out to nobody else
+        settings = {
+            "mode": "client",
+            "connect": {"endpoints": [address], "timeout_ms": _ZENOH_PATIENCE_MS},
+            "scouting": {"multicast": {"enabled": False}},
+        }
         try:
-            self._session = zenoh.open(config)
+            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(settings)))
         except zenoh.ZError as error:
             raise InputError(
                 f"{purpose} reaches nobody at {address} ({error}); start zenoh-bridge-ros2dds or rmw_zenohd there, "
@@ -342,19 +329,18 @@ def _open_zenoh(address: str) -> Sink:
     """Send readings and frames to ROS; the key `tip` names `/tip/margin`, `/tip/reading`, `/tip/image/compressed`."""
     key, router = parse_zenoh(address, purpose="--sink zenoh")
     ros = ZenohRos(router, purpose="--sink zenoh")
-    publishers = {name: ros.publisher(f"{key}/{name}", kind) for name, kind in ROS_TOPICS.items()}
+    publish = {name: ros.publisher(f"{key}/{name}", kind) for name, kind in ROS_TOPICS.items()}
 
     def send(reading: Reading, image: Frame | None) -> None:
-        at_ns = _stamp_ns(reading)
-        fields: dict[str, tuple[object, ...]] = {"reading": (encode_reading(reading).decode(),)}
+        seconds, nanoseconds = _stamp(reading)
+        at_ns = seconds * 10**9 + nanoseconds
+        publish["reading"]([encode_reading(reading).decode()], at_ns)
         if reading.margin is not None:
-            fields["margin"] = (reading.margin,)
+            publish["margin"]([reading.margin], at_ns)
         if image is not None:
-            stamp = ros.message("builtin_interfaces/msg/Time", at_ns // 10**9, at_ns % 10**9)
-            header = ros.message("std_msgs/msg/Header", stamp, _FRAME_ID)
-            fields["image/compressed"] = header, "jpeg", np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8)
-        for name, values in fields.items():
-            publishers[name](values, at_ns)
+            stamp = ros.message("builtin_interfaces/msg/Time", seconds, nanoseconds)
+            data = np.frombuffer(encode_jpeg(image, _QUALITY), dtype=np.uint8)
+            publish["image/compressed"]([ros.message("std_msgs/msg/Header", stamp, _FRAME_ID), "jpeg", data], at_ns)
 
     return Sink(send, ros.close)
 
@@ -365,7 +351,7 @@ SINKS = Table[Callable[[str], Sink]](
     {
         "json": _open_json,
         "udp": _open_udp,
-        "mcap": partial(_open_foxglove, file=True),
+        "mcap": partial(_open_foxglove, is_file=True),
         "foxglove": _open_foxglove,
         "rerun": _open_rerun,
         "zenoh": _open_zenoh,
