@@ -138,7 +138,7 @@ def test_who_sends_too_many_messages_is_cut_off(message: dict):
 
 @pytest.mark.parametrize(
     "message",
-    [{}, {"act": 1}, {"act": "load", "press_n": "1"}, {"act": "load", "more": 1}, {"act": "disturb", "wet": 3}],
+    [{}, {"act": 1}, {"act": "load", "press_n": "1"}, {"act": "load", "more": 1}, {"act": "hold", "wet": 3}],
 )
 def test_who_sends_something_else_is_cut_off(message: dict):
     async def run() -> None:

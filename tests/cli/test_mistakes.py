@@ -78,7 +78,7 @@ MISTAKES = {
     "live 99": "the camera /dev/video99 is not there; plug it in",
     "live 0 --size 640": "--size requires 2",
     "live simulated --sink paper": "there is no sink named 'paper'; choose one of json",
-    "live simulated --speed 2": "the simulated fingertip takes no --speed; leave it out",
+    "live simulated --speed 2": "a simulated chromatouch takes no --speed; leave it out",
     "live nowhere": "nowhere is no source that is known",
     "live DATA --sensor PROFILE --no-page": "the run trained-elsewhere does not exist",
     "hold grip": "name one with --gripper",

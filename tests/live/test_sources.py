@@ -95,7 +95,7 @@ def test_a_load_that_cannot_be_is_refused(load: tuple[float, float]):
     ("source", "options", "words"),
     [
         ("nowhere.mp4", LiveOptions(), "nowhere.mp4 is no source that is known, nor a path that exists"),
-        ("simulated", LiveOptions(speed=2.0), "the simulated fingertip takes no --speed; leave it out"),
+        ("simulated", LiveOptions(speed=2.0), "a simulated chromatouch takes no --speed; leave it out"),
         (
             "simulated:thumb",
             LiveOptions(),

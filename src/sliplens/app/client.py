@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import msgspec
 import numpy as np
@@ -21,6 +21,7 @@ from sliplens.extras import pick
 from sliplens.files import to_builtins
 from sliplens.grip.controllers import CONTROLLERS
 from sliplens.grip.source import GripSource
+from sliplens.live.contract import LiveSource
 from sliplens.live.health import CHECKS
 from sliplens.live.reading import NO_NETWORK, TARGET, describe_reading
 from sliplens.live.sources import SimulatedSource
@@ -37,22 +38,23 @@ _KEEP_ALIVE_S = 1.0  # the page takes a longer silence for a lost connection
 _RATE_S = 2.0
 _LARGEST = {"press_n": 3.0, "pull_n": 2.4, "water_kg": 0.06, "grip_pull_n": 0.6}
 """Ends of the sliders."""
+_Source = TypeVar("_Source", bound=LiveSource)
 
 
 class ClientMessage(msgspec.Struct, forbid_unknown_fields=True):
     """Message of a browser: the answer to a message, or a button, key or slider with its values."""
 
     act: str
-    """`drawn`, or a row of `_ACTS`."""
+    """`drawn`, a row of `_SHORT` or `_LONG`."""
     serial: int = -1
     """Message that was drawn, or passed over in a hidden window (act `passed`)."""
     method: str = RECOMMENDED_METHOD
     map: bool = True
     markers: bool = True
     press_n: float = 0.0
-    pull_n: float | None = None
-    water_kg: float | None = None
-    wet: bool | None = None
+    pull_n: float = 0.0
+    water_kg: float = 0.0
+    wet: bool = False
     controller: str | None = None
 
 
@@ -129,26 +131,28 @@ class Client:
 
     async def _act(self, command: ClientMessage) -> None:
         try:
-            await pick(_ACTS, command.act, noun="button")(self, command)
+            if command.act in _LONG:
+                await _LONG[command.act](self, command)
+            else:
+                pick(_SHORT, command.act, noun="button")(self, command)
         except (SliplensError, OSError) as error:
             self._notices.append(str(error))
         self.wake()
 
-    async def show(self, command: ClientMessage) -> None:
-        """Show or hide map and markers."""
-        self.shows_map, self.shows_arrows = command.map, command.markers
+    def source(self, kind: type[_Source]) -> _Source:
+        """Return the source whose sliders are moved."""
+        source = self.feed.reader.source
+        if not isinstance(source, kind):
+            raise InputError(f"{source.name} has no such controls")
+        return source
 
-    async def take_reference(self, _: ClientMessage) -> None:
-        """Take a new reference as soon as the picture is still."""
-        self.feed.take_reference()
-
-    async def begin_object(self, _: ClientMessage) -> None:
+    def begin_object(self) -> None:
         """Forget the friction of the object, and show what its slips taught."""
         lesson = self.feed.reader.lesson
         self.feed.reader.new_object()
         self._notices.append(lesson or "nothing is known of the friction of the new object")
 
-    async def freeze(self, _: ClientMessage) -> None:
+    def freeze(self) -> None:
         """Stop at the picture on the screen, or let it run again."""
         self.frozen = (self._picture or self.feed.picture) if self.frozen is None else None
         self.explained = None
@@ -178,33 +182,6 @@ class Client:
             self._notices.append("nothing was recorded: no frame came")
         else:
             self._notices.append(f"recorded into {data.folder}; look with `sliplens check {data.folder}`")
-
-    async def load(self, command: ClientMessage) -> None:
-        """Press and pull the simulated fingertip."""
-        if isinstance(source := self.feed.reader.source, SimulatedSource):
-            press_n, pull_n = min(command.press_n, _LARGEST["press_n"]), min(command.pull_n or 0.0, _LARGEST["pull_n"])
-            source.load(normal_force_n=press_n, tangential_force_n=pull_n)
-
-    async def let_go(self, _: ClientMessage) -> None:
-        """Let the simulated fingertip grip by itself."""
-        if isinstance(source := self.feed.reader.source, SimulatedSource):
-            source.let_go()
-
-    async def disturb(self, command: ClientMessage) -> None:
-        """Pour, pull, wet, or choose the controller of the simulated gripper."""
-        if isinstance(source := self.feed.reader.source, GripSource):
-            water_kg, pull_n = command.water_kg, command.pull_n
-            source.act(
-                water_kg=None if water_kg is None else min(water_kg, _LARGEST["water_kg"]),
-                pull_n=None if pull_n is None else min(pull_n, _LARGEST["grip_pull_n"]),
-                wet=command.wet,
-                controller=command.controller,
-            )
-
-    async def grip_again(self, _: ClientMessage) -> None:
-        """Put the object down, and grip it anew."""
-        if isinstance(source := self.feed.reader.source, GripSource):
-            source.grip_again()
 
     async def _send(self, connection: "ServerConnection") -> None:
         settings = {
@@ -299,17 +276,23 @@ def _join(header: object, *parts: bytes) -> bytes:
     return b"".join([len(encoded).to_bytes(4, "little"), encoded, *parts])
 
 
-_ACTS: dict[str, Callable[[Client, ClientMessage], Awaitable[None]]] = {
-    "show": Client.show,
-    "reference": Client.take_reference,
-    "object": Client.begin_object,
-    "freeze": Client.freeze,
-    "explain": Client.explain,
-    "record": Client.record,
-    "load": Client.load,
-    "let_go": Client.let_go,
-    "disturb": Client.disturb,
-    "again": Client.grip_again,
+_SHORT: dict[str, Callable[[Client, ClientMessage], object]] = {
+    "show": lambda client, told: vars(client).update(shows_map=told.map, shows_arrows=told.markers),
+    "reference": lambda client, _: client.feed.take_reference(),
+    "object": lambda client, _: client.begin_object(),
+    "freeze": lambda client, _: client.freeze(),
+    "load": lambda client, told: client.source(SimulatedSource).load(
+        normal_force_n=min(told.press_n, _LARGEST["press_n"]), tangential_force_n=min(told.pull_n, _LARGEST["pull_n"])
+    ),
+    "let_go": lambda client, _: client.source(SimulatedSource).let_go(),
+    "pour": lambda client, told: client.source(GripSource).act(
+        water_kg=min(told.water_kg, _LARGEST["water_kg"]), pull_n=min(told.pull_n, _LARGEST["grip_pull_n"])
+    ),
+    "hold": lambda client, told: client.source(GripSource).act(wet=told.wet, controller=told.controller),
+    "again": lambda client, _: client.source(GripSource).grip_again(),
 }
 """Functions of the page's buttons, keys and sliders."""
-_LONG = frozenset({"explain", "record"})
+_LONG: dict[str, Callable[[Client, ClientMessage], Awaitable[None]]] = {
+    "explain": Client.explain,
+    "record": Client.record,
+}

@@ -14,14 +14,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
-import torch
 from PIL import Image
 
 from sliplens.errors import SliplensError
 from sliplens.explainers.attribution import CLOSE
 from sliplens.explainers.explain import choose_explainers, explain_frames
 from sliplens.explainers.frames import frames_from_arrays
-from sliplens.explainers.occlusion import marker_regions, to_network_px
 from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.grip.source import GripSource, GripStatus
 from sliplens.images import encode_jpeg
@@ -99,8 +97,6 @@ class MapFacts(msgspec.Struct, frozen=True, kw_only=True):
     """Relevance of a cell of 127; cells are signed bytes, row by row."""
     alike: bool
     """True where both margins are the same but for the network's error, so that there is nothing to explain."""
-    markers: tuple[tuple[float, float, float], ...]
-    """x and y of each marker in pixels of the frame, and the relevance of the pixels nearest to it."""
     warnings: tuple[str, ...]
 
 
@@ -314,20 +310,7 @@ class Feed:
             columns=relevance.shape[1],
             full=full,
             alike=alike,
-            markers=() if alike else _sum_by_marker(relevance, picture),
             warnings=(*warnings, *(text.partition("): ")[2] for text in explanation.methods[method].warnings)),
         )
         cells = np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8)
         return Map(facts, cells.tobytes())
-
-
-def _sum_by_marker(values: np.ndarray, picture: PageFrame) -> tuple[tuple[float, float, float], ...]:
-    """Sum the relevance around each marker."""
-    if len(picture.arrows) < 2:
-        return ()
-    places = np.array(picture.arrows)[:, 2:]
-    relevance = torch.from_numpy(values).double()
-    centres = to_network_px(places, picture.moment.frame.size, image_size=len(relevance))
-    regions = marker_regions((relevance.shape[0], relevance.shape[1]), centres)
-    sums = torch.bincount(regions.flatten(), weights=relevance.flatten(), minlength=len(places) + 1)
-    return tuple((*place, value) for place, value in zip(places.tolist(), sums[: len(places)].tolist(), strict=True))

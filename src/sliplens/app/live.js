@@ -151,20 +151,7 @@ function drawPicture() {
     context.drawImage(map, 0, 0, canvas.width, canvas.height);
   }
   context.setTransform(scale, 0, 0, scale, 0, 0);
-  const px = devicePixelRatio / scale;
-  if (arrows.length && mapFacts) drawMarkers(context, px);
-  drawArrows(context, arrows, px);
-}
-
-function drawMarkers(context, px) {
-  const most = Math.max(1e-6, ...mapFacts.markers.map(([, , relevance]) => Math.abs(relevance)));
-  for (const [x, y, relevance] of mapFacts.markers) {
-    context.beginPath();
-    context.arc(x, y, 7 * px * Math.sqrt(Math.abs(relevance) / most), 0, 2 * Math.PI);
-    context.strokeStyle = relevance < 0 ? settings.lowers : settings.raises;
-    context.lineWidth = 2 * px;
-    context.stroke();
-  }
+  drawArrows(context, arrows, devicePixelRatio / scale);
 }
 
 function drawArrows(context, arrows, px) {
@@ -466,7 +453,7 @@ function move(slider) {
     slider.sentAt = performance.now();
     const own = slider.closest("section");
     const values = [...own.querySelectorAll("[type=range]")].map(({ name, value }) => [name, Number(value)]);
-    send({ act: own.id === "fingertip" ? "load" : "disturb", ...Object.fromEntries(values) });
+    send({ act: own.id === "fingertip" ? "load" : "pour", ...Object.fromEntries(values) });
   };
   if (slider.movedAt - (slider.sentAt ?? 0) > 50) sends();
   else slider.later = setTimeout(sends, 50);
@@ -528,8 +515,7 @@ document.addEventListener("keydown", ({ key, target, repeat, ctrlKey, altKey, me
 document.addEventListener("visibilitychange", () => document.hidden && owed.forEach((answer) => (answer.act = "passed")));
 document.addEventListener("input", ({ target }) => target.type === "range" && move(target));
 $.map.onchange = $.arrows.onchange = show;
-$.wet.onchange = () => send({ act: "disturb", wet: $.wet.checked });
-$.controller.onchange = () => send({ act: "disturb", controller: $.controller.value });
+$.wet.onchange = $.controller.onchange = () => send({ act: "hold", wet: $.wet.checked, controller: $.controller.value });
 const sizes = new ResizeObserver(redraw);
 [$.picture, $.chart].forEach((canvas) => sizes.observe(canvas));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);

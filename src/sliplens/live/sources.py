@@ -3,10 +3,9 @@
 import errno
 import select
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -14,6 +13,7 @@ import av
 import numpy as np
 from av.error import FFmpegError, InvalidDataError
 from av.video.codeccontext import VideoCodecContext
+from av.video.frame import VideoFrame
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
@@ -63,14 +63,11 @@ _CURES = {
 
 @dataclass(frozen=True, kw_only=True)
 class CameraMode:
-    """Format, size and rates of a camera."""
+    """Mode of a camera: format (four letters, such as MJPG), size (height, width) in pixels, and frames a second."""
 
     pixel_format: str
-    """Four letters, such as MJPG."""
     size: tuple[int, int]
-    """Height and width, in pixels."""
     rates_hz: tuple[float, ...]
-    """Frames a second; empty where unknown."""
 
     def in_words(self) -> tuple[str, str, str]:
         """Describe format, size and rates."""
@@ -80,14 +77,11 @@ class CameraMode:
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A camera of this machine."""
+    """Camera of this machine: its device file, the name of its driver, and the modes that sliplens can read."""
 
     path: Path
-    """Device file, such as /dev/video0."""
     name: str
-    """Name of the driver."""
-    modes: tuple[CameraMode, ...]
-    """Modes that sliplens can read; empty where the camera cannot be opened."""
+    modes: tuple[CameraMode, ...] = ()
 
 
 class FrameDecoder:
@@ -100,8 +94,7 @@ class FrameDecoder:
         assert isinstance(context, VideoCodecContext)
         context.thread_count = 1  # frame by frame: more threads would each keep one back
         if pixels:
-            context.height, context.width = size
-            context.pix_fmt = pixels
+            (context.height, context.width), context.pix_fmt = size, pixels
         else:  # a JPEG decoder halves the picture up to three times for nothing
             ratio = min(have / want for have, want in zip(size, self._wanted, strict=True))
             context.options = {"lowres": str(min(max(int(np.log2(ratio)), 0), 3)), "err_detect": "explode"}
@@ -118,11 +111,12 @@ class FrameDecoder:
             frames = self._context.decode(av.Packet(data))
         except FFmpegError:
             return None
-        if len(frames) != 1 or frames[0].is_corrupt:
-            return None
-        height, width = self._wanted
-        rgb = self._to_rgb.reformat(frames[0], width=width, height=height, format="rgb24", interpolation="AREA")
-        return rgb.to_ndarray()
+        return _to_rgb(self._to_rgb, frames[0], self._wanted) if len(frames) == 1 and not frames[0].is_corrupt else None
+
+
+def _to_rgb(reformatter: VideoReformatter, frame: VideoFrame, size: tuple[int, ...]) -> Frame:
+    height, width = size
+    return reformatter.reformat(frame, width=width, height=height, format="rgb24", interpolation="AREA").to_ndarray()
 
 
 class CameraSource(LiveSource):
@@ -140,7 +134,6 @@ class CameraSource(LiveSource):
 
     def __init__(self, path: Path, options: LiveOptions) -> None:
         require_packages("linuxpy", extra="live", purpose="reading a camera")
-        options.require_only("rate_hz", "size", "pixel_format", what=f"the camera {path}")
         self.name, self._path, self._options = f"the camera {path}", path, options
 
     def open(self, stack: ExitStack, /) -> None:
@@ -160,18 +153,14 @@ class CameraSource(LiveSource):
             pixel_format, size = chosen.pixel_format.human_str(), (chosen.height, chosen.width)
             if pixel_format not in _DECODERS:
                 formats = ", ".join(_DECODERS)
-                raise SourceError(
-                    f"{self.name} gives {pixel_format}, which is not read; choose one of {formats} with --pixel-format"
-                )
+                raise self._failure(f"gives {pixel_format}, which is not read; choose {formats} with --pixel-format")
             fit = options.fit_size
-            fits = fit is not None and _is_alike(size, fit) and size[0] >= fit[0]
-            self.size = options.size or (fit if fit is not None and fits else size)
+            self.size = options.size or (fit if fit is not None and _shrinks_to(size, fit) else size)
             self._decoder = FrameDecoder(pixel_format, size=size, wanted=self.size)
-            self._row_bytes = chosen.bytes_per_line
-            self.rate_hz = float(self._capture.get_fps())
+            self._row_bytes, self.rate_hz = chosen.bytes_per_line, float(self._capture.get_fps())
             stack.enter_context(self._capture)
         except (OSError, ZeroDivisionError) as error:
-            raise self._explained(error) from None
+            raise self._failure(error) from None
 
     def frames(self) -> Iterator[LiveFrame]:
         """Iterate over frames; those that are broken, or cannot be decoded, are missing in the numbers."""
@@ -186,35 +175,28 @@ class CameraSource(LiveSource):
             except BlockingIOError:
                 sent = None
             except (OSError, ValueError) as error:
-                raise self._explained(error) from None
+                raise self._failure(error) from None
             now_s = time.monotonic()
             if sent is None:
                 if now_s - last_s > _STALL_S:
-                    raise SourceError(
-                        f"{self.name} has given no frame for {_STALL_S:g} s; check its cable, "
-                        "or plug it into a port of its own"
-                    )
+                    raise self._failure(f"has given no frame for {_STALL_S:g} s; check its cable, or use another port")
                 continue
-            last_s, image = now_s, None
-            if BufferFlag.ERROR not in sent.flags:
-                image = self._decoder.decode(bytes(sent.data), row_bytes=self._row_bytes)
-            if image is None:
-                bad += 1
-                if bad >= _MOST_BAD:
-                    raise SourceError(
-                        f"{self.name} sends frames that cannot be decoded; check its cable, choose another "
-                        "--pixel-format, or a smaller --size"
-                    )
-                continue
-            bad = 0
-            monotonic = (sent.flags & BufferFlag.TIMESTAMP_MASK) == BufferFlag.TIMESTAMP_MONOTONIC
-            yield LiveFrame(
-                image=image,
-                number=int(sent.frame_nb),
-                time_s=float(sent.timestamp),
-                captured_s=float(sent.timestamp) if monotonic else now_s,
-                decode_ms=1e3 * (time.monotonic() - now_s),
-            )
+            last_s = now_s
+            is_whole = BufferFlag.ERROR not in sent.flags
+            image = self._decoder.decode(bytes(sent.data), row_bytes=self._row_bytes) if is_whole else None
+            bad = bad + 1 if image is None else 0
+            if bad >= _MOST_BAD:
+                cure = "check its cable, choose another --pixel-format, or a smaller --size"
+                raise self._failure(f"sends frames that cannot be decoded; {cure}")
+            if image is not None:
+                is_monotonic = (sent.flags & BufferFlag.TIMESTAMP_MASK) == BufferFlag.TIMESTAMP_MONOTONIC
+                yield LiveFrame(
+                    image=image,
+                    number=int(sent.frame_nb),
+                    time_s=float(sent.timestamp),
+                    captured_s=float(sent.timestamp) if is_monotonic else now_s,
+                    decode_ms=1e3 * (time.monotonic() - now_s),
+                )
 
     def _choose(self, modes: Sequence[CameraMode]) -> CameraMode | None:
         """Choose the mode that suits the options; None to leave the camera as it is."""
@@ -223,7 +205,7 @@ class CameraSource(LiveSource):
         usable = [mode for mode in modes if options.pixel_format in {None, mode.pixel_format}]
         if modes and not usable:
             formats = ", ".join(sorted({mode.pixel_format for mode in modes}))
-            raise SourceError(f"{self.name} has no format {options.pixel_format}; choose {formats} with --pixel-format")
+            raise self._failure(f"has no format {options.pixel_format}; choose {formats} with --pixel-format")
         # compressed first: what is not compressed fills the cable, and the rate falls
         usable.sort(key=lambda mode: list(_DECODERS).index(mode.pixel_format))
         if wanted is None or not usable:
@@ -232,43 +214,39 @@ class CameraSource(LiveSource):
             mode
             for mode in usable
             if mode.pixel_format == usable[0].pixel_format
-            and _is_alike(mode.size, wanted)
-            and mode.size[0] >= wanted[0]
+            and _shrinks_to(mode.size, wanted)
             and max(mode.rates_hz, default=np.inf) >= rate_hz
         ]
         if fitting or options.size is None:  # the network refuses frames of another size
             return min(fitting, key=lambda mode: mode.size, default=None)
-        sizes = ", ".join(dict.fromkeys(f"{mode.size[1]}x{mode.size[0]}" for mode in usable))
-        raise SourceError(
-            f"{self.name} has no mode that gives {wanted[1]}x{wanted[0]} at {rate_hz:g} frames a second; "
-            f"choose a --size of the same shape as one of {sizes}, or a lower --rate"
+        sizes = ", ".join(dict.fromkeys(mode.in_words()[1] for mode in usable))
+        raise self._failure(
+            f"has no mode that gives {wanted[1]}x{wanted[0]} at {rate_hz:g} frames a second; choose a --size of the "
+            f"same shape as one of {sizes}, or a lower --rate"
         )
 
-    def _explained(self, error: Exception) -> SourceError:
-        number = getattr(error, "errno", None) or 0
-        return SourceError(f"{self.name} {_CURES.get(number, f'cannot be read ({error}); plug it in again')}")
+    def _failure(self, reason: Exception | str) -> SourceError:
+        if isinstance(reason, Exception):
+            number = getattr(reason, "errno", None) or 0
+            reason = _CURES.get(number, f"cannot be read ({reason}); plug it in again")
+        return SourceError(f"{self.name} {reason}")
 
 
-def _is_alike(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return True where two sizes have the same shape."""
-    return size[0] * other[1] == size[1] * other[0]
+def _shrinks_to(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
+    """Return True where frames of a size have the wanted shape, and are at least as large."""
+    return size[0] * wanted[1] == size[1] * wanted[0] and size[0] >= wanted[0]
 
 
 def read_modes(device: "Device") -> tuple[CameraMode, ...]:
     """List the modes of an open camera that can be read, the largest rate first in each."""
     assert device.info is not None
-    kinds = sorted(
-        (kind.pixel_format.human_str(), (kind.height, kind.width), float(kind.max_fps))
-        for kind in device.info.frame_types
-    )
+    rates: dict[tuple[str, tuple[int, int]], set[float]] = {}
+    for kind in device.info.frame_types:
+        rates.setdefault((kind.pixel_format.human_str(), (kind.height, kind.width)), set()).add(float(kind.max_fps))
     return tuple(
-        CameraMode(
-            pixel_format=pixel_format,
-            size=size,
-            rates_hz=tuple(sorted({rate for *_, rate in same if rate > 0}, reverse=True)),
-        )
-        for (pixel_format, size), same in groupby(kinds, key=lambda mode: mode[:2])
-        if pixel_format in _DECODERS
+        CameraMode(pixel_format=name, size=size, rates_hz=tuple(sorted(values - {0.0}, reverse=True)))
+        for (name, size), values in sorted(rates.items())
+        if name in _DECODERS
     )
 
 
@@ -292,7 +270,7 @@ def list_cameras(folder: Path = Path("/dev")) -> tuple[Camera, ...]:
                     cameras.append(Camera(path=path, name=device.info.card, modes=read_modes(device)))
         except OSError as error:
             if error.errno not in {errno.ENOTTY, errno.ENODEV}:
-                cameras.append(Camera(path=path, name=f"cannot be opened ({error.strerror})", modes=()))
+                cameras.append(Camera(path=path, name=f"cannot be opened ({error.strerror})"))
     return tuple(cameras)
 
 
@@ -406,8 +384,7 @@ class StreamSource(LiveSource):
                 raise SourceError(f"{self.name} has ended; start the camera again") from None
             for frame in frames:
                 size = self._size or (frame.height, frame.width)
-                height, width = size[::-1] if self._size and frame.rotation % 180 else size
-                pixels = to_rgb.reformat(frame, width=width, height=height, format="rgb24").to_ndarray()
+                pixels = _to_rgb(to_rgb, frame, size[::-1] if self._size and frame.rotation % 180 else size)
                 yield LiveFrame(
                     image=upright(frame, pixels, where=self.name),
                     number=number,
@@ -587,54 +564,57 @@ class SimulatedSource(LiveSource):
         return _GRIP_N * press, pull * self._grasp.friction * _GRIP_N
 
 
-def _open_simulated(name: str, options: LiveOptions) -> LiveSource:
-    options.require_only("rate_hz", what="the simulated fingertip")
-    return SimulatedSource(name.partition(":")[2] or "chromatouch", rate_hz=options.rate_hz or 30.0)
-
-
-def _open_stream(name: str, options: LiveOptions) -> LiveSource:
-    options.require_only("size", what=f"the stream {name}")
-    return StreamSource(name, size=options.size)
-
-
-def _open_folder(name: str, options: LiveOptions) -> LiveSource:
-    options.require_only(what=f"the folder {name}")
-    return FolderSource(Path(name))
-
-
 def _open_replay(name: str, options: LiveOptions) -> LiveSource:
-    options.require_only("rate_hz", "speed", "trial", what=f"replaying {name}")
     capture, *_ = open_source(Path(name), trial=options.trial, options=ReadOptions(), whole=True)
     return ReplaySource(capture, speed=options.speed or 1.0, rate_hz=options.rate_hz)
 
 
+def _kind(
+    words: str, recognises: Callable[[str], bool], make: Callable[[str, LiveOptions], LiveSource], *takes: str
+) -> SourceKind:
+    """Make the row of a source that takes some options only."""
+
+    def open_named(name: str, options: LiveOptions) -> LiveSource:
+        source = make(name, options)
+        options.require_only(*takes, what=source.name)
+        return source
+
+    return SourceKind(words=words, recognises=recognises, open=open_named)
+
+
 _ROWS = {
-    "simulated": SourceKind(
-        words="simulated fingertip (simulated, or simulated:flat-gel)",
-        recognises=lambda name: name.partition(":")[0] == "simulated",
-        open=_open_simulated,
+    "simulated": _kind(
+        "simulated fingertip (simulated, or simulated:flat-gel)",
+        lambda name: name.partition(":")[0] == "simulated",
+        lambda name, options: SimulatedSource(
+            name.partition(":")[2] or "chromatouch", rate_hz=options.rate_hz or 30.0
+        ),
+        "rate_hz",
     ),
-    "camera": SourceKind(
-        words="camera by its number or device file (0, or /dev/video0)",
-        recognises=lambda name: name.isdecimal() or name.startswith("/dev/"),
-        open=lambda name, options: CameraSource(Path(f"/dev/video{int(name)}" if name.isdecimal() else name), options),
+    "camera": _kind(
+        "camera by its number or device file (0, or /dev/video0)",
+        lambda name: name.isdecimal() or name.startswith("/dev/"),
+        lambda name, options: CameraSource(Path(f"/dev/video{int(name)}" if name.isdecimal() else name), options),
+        "rate_hz", "size", "pixel_format",
     ),
-    "stream": SourceKind(
-        words="network stream by its address (rtsp://, http://, udp://)",
-        recognises=lambda name: name.partition("://")[0].lower() in _NETWORK and "://" in name,
-        open=_open_stream,
+    "stream": _kind(
+        "network stream by its address (rtsp://, http://, udp://)",
+        lambda name: name.partition("://")[0].lower() in _NETWORK and "://" in name,
+        lambda name, options: StreamSource(name, size=options.size),
+        "size",
     ),
-    "folder": SourceKind(
-        words="folder into which images are saved",
-        recognises=lambda name: Path(name).is_dir() and recognise(Path(name)) in {None, "images"},
-        open=_open_folder,
+    "folder": _kind(
+        "folder into which images are saved",
+        lambda name: Path(name).is_dir() and recognise(Path(name)) in {None, "images"},
+        lambda name, _: FolderSource(Path(name)),
     ),
-    "replay": SourceKind(
-        words="video, bag or trial of a data set, replayed",
-        recognises=lambda name: Path(name).exists(),
-        open=_open_replay,
+    "replay": _kind(
+        "video, bag or trial of a data set, replayed",
+        lambda name: Path(name).exists(),
+        _open_replay,
+        "rate_hz", "speed", "trial",
     ),
-}
+}  # fmt: skip
 SOURCES = Table("source", "sliplens.sources", _ROWS)
 """Running sources by kind; an installed package adds its own by the entry point `sliplens.sources`."""
 

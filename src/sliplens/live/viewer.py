@@ -215,7 +215,7 @@ def write_rrd(viewed: ViewedTrial, path: Path) -> None:
 
 
 def _play_into(viewed: ViewedTrial, connect: Callable[[Any], None], *, failure: str) -> None:
-    sink = RerunSink(connect, application="sliplens", lossless=True)
+    sink = RerunSink(connect, lossless=True)
     try:
         play_trial(viewed, sink)
         sink.stream.flush()
