@@ -25,8 +25,6 @@ from sliplens.live.contract import LiveSource
 from sliplens.live.health import CHECKS
 from sliplens.live.reading import NO_NETWORK, TARGET, describe_reading
 from sliplens.live.sources import SimulatedSource
-from sliplens.plots.saliency import LOWERS, RAISES
-from sliplens.plots.style import method_name
 from sliplens.recordings.trial import TrialFacts
 
 if TYPE_CHECKING:
@@ -164,7 +162,7 @@ class Client:
         self.frozen = picture = self.frozen or self._picture or self.feed.picture
         if picture is None:
             return
-        self._waiting = f"explaining frame {picture.moment.frame.number} by {method_name(command.method)}"
+        self._waiting = f"explaining frame {picture.moment.frame.number}"
         self.wake()
         try:
             explained = await self.feed.explain(picture, command.method)
@@ -187,8 +185,6 @@ class Client:
         settings = {
             "chart_s": CHART_S,
             "target": TARGET,
-            "lowers": LOWERS,
-            "raises": RAISES,
             "methods": {name: row.title for name, row in EXPLAINERS.items()},
             "recommended": RECOMMENDED_METHOD,
             "units": {name: kind.unit for name, kind in CHECKS.items()},

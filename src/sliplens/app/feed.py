@@ -1,6 +1,7 @@
 """Feed of the page: readings, pictures and maps, each made once for all connected browsers."""
 
 import asyncio
+import gc
 import time
 from collections import deque
 from collections.abc import Callable
@@ -26,8 +27,8 @@ from sliplens.images import encode_jpeg
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading, SlipState
 from sliplens.models.checkpoint import Network
-from sliplens.plots.saliency import full_colour
 from sliplens.recordings.capture import Frame
+from sliplens.results.explanation import full_colour
 
 if TYPE_CHECKING:
     from sliplens.app.client import Client
@@ -148,7 +149,7 @@ class Feed:
         # explainers hook into the network: a copy, not the one that predicts
         network = reader.network
         self._network: Network | None = None if network is None else replace(network, model=deepcopy(network.model))
-        self._thread = Thread(target=self._run, daemon=True)
+        self._thread = Thread(target=self._run, name="draw", daemon=True)
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
         """Begin; clients are served in this loop, which runs in the thread that calls."""
@@ -281,9 +282,12 @@ class Feed:
             explained, self.map = picture, None if picture.moment.reading.margin is None else self.map
             if picture.moment.reading.margin is not None:  # without a margin there is nothing to explain
                 try:
-                    self.map = await self.explain(picture, LIVE_METHOD)
+                    is_first, self.map = self.map is None, await self.explain(picture, LIVE_METHOD)
                 except (SliplensError, RuntimeError):
                     self.map = None
+                else:
+                    if is_first:  # what explainers import: to search it for garbage takes as long as some frames
+                        gc.freeze()
             for client in self.clients:
                 client.wake()
 

@@ -9,6 +9,7 @@ const RETRY_MS = 1000;
 const TOLD_MS = 200; // between two drawings of chart, lamps and facts: numbers that change faster nobody reads
 const HAND_MS = 1000; // for which a slider stays where a person has put it
 const NOTICE_MS = 10000;
+const LOWERS = [230, 159, 0], RAISES = [86, 180, 233]; // as live.css has them
 // Zones of sliplens/live/reading.py, each with a sign beside its colour.
 const SIGNS = { none: "", below: "▼", uncertain: "?", within: "●", "not below": "●", above: "▲" };
 const KEYS = { r: "reference", n: "object", f: "freeze", e: "explain", c: "record" };
@@ -73,8 +74,6 @@ function begin(told) {
   points = [];
   map = mapFacts = null;
   document.body.classList.toggle("bare", !settings.network);
-  $.lowers.style.background = settings.lowers;
-  $.raises.style.background = settings.raises;
   const [low, high] = settings.target;
   place(".zone", low, high);
   $.gauge.querySelector(".goal").style.left = `${50 * (low + high)}%`;
@@ -98,9 +97,8 @@ function show() {
 function paintMap({ rows, columns }, cells) {
   const canvas = new OffscreenCanvas(columns, rows), context = canvas.getContext("2d");
   const pixels = context.createImageData(columns, rows);
-  const below = rgb(settings.lowers), above = rgb(settings.raises);
   cells.forEach((cell, index) => {
-    pixels.data.set(cell < 0 ? below : above, 4 * index);
+    pixels.data.set(cell < 0 ? LOWERS : RAISES, 4 * index);
     pixels.data[4 * index + 3] = 2 * Math.abs(cell);
   });
   context.putImageData(pixels, 0, 0);
@@ -474,10 +472,6 @@ function place(part, from, to = null) {
 
 function set(element, text) {
   if (element.textContent !== text) element.textContent = text;
-}
-
-function rgb(colour) {
-  return [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
 }
 
 // Give a canvas as many pixels as the screen shows of it; the ratio of both.

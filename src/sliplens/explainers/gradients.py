@@ -4,7 +4,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, NamedTuple
 
 import torch
-from captum import attr
 from jaxtyping import Float
 from torch import Tensor
 
@@ -103,6 +102,8 @@ class IntegratedGradients(Method):
         reference_prediction: Float[Tensor, ""],
     ) -> LineIntegral:
         """Integrate from one reference b to one image x, whose predictions are f(b) and f(x)."""
+        from captum import attr  # noqa: PLC0415 (half a second, for some explainers alone)
+
         ends = reference_prediction, prediction
         change = float(prediction - reference_prediction)
         allowed = max(self.tolerance * abs(change), _ROUNDING * max(abs(float(end)) for end in ends))
@@ -228,6 +229,8 @@ class SmoothGrad(Method):
             raise InputError(f"SmoothGrad's noise is {self.noise}; give a standard deviation of at least 0")
 
     def _explain(self, comparison: Comparison) -> Attribution:
+        from captum import attr  # noqa: PLC0415 (half a second, for some explainers alone)
+
         change = comparison.change.tolist()
 
         def smoothed(index: int) -> Tensor:

@@ -6,7 +6,6 @@ from typing import TypeAlias
 
 import numpy as np
 import torch
-from captum import attr
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
@@ -176,6 +175,8 @@ class Occlusion(RegionMethod):
 
     @torch.no_grad()
     def _explain(self, comparison: Comparison) -> Attribution:
+        from captum import attr  # noqa: PLC0415 (half a second, for some explainers alone)
+
         tiles = -(-comparison.images.shape[-2] // self.tile_px) * -(-comparison.images.shape[-1] // self.tile_px)
         engine = comparison.prepare(len(comparison.images) * tiles)  # markers are about as many
 

@@ -1,7 +1,8 @@
 """Recording a running source into a data set, frame by frame, and force samples that come as lines of text."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Lock, Thread
@@ -206,35 +207,30 @@ class ForceStream:
     def _follow(self, begin: int) -> None:
         try:
             with self.path.open(encoding="utf-8") as file:
-                parse = _line_parser(self.path, self._next_line(file))
+                lines = self._lines(file)
+                parse = _line_parser(self.path, next(lines, "time_s,fx,fy,fz"))
                 if file.seekable():
                     file.seek(max(begin, file.tell()))  # past the names, if those came later
-                while not self._closed.is_set():
-                    line = self._next_line(file)
-                    if line:
-                        self._take(*parse(line))
+                for line in lines:
+                    stamp_s, force_n = parse(line)
+                    arrived_s = time.monotonic()
+                    with self._lock:
+                        self._samples.append((stamp_s, arrived_s, force_n))
+                        self._delay_s = min(self._delay_s, arrived_s - stamp_s)  # as it is, where that is NaN
         except (RecordingError, OSError, ValueError) as error:
             self.trouble = f"{error}; the forces of {self.path} end here"
 
-    def _next_line(self, file: TextIO) -> str:
-        """Wait for the next whole line; empty when closed."""
+    def _lines(self, file: TextIO) -> Iterator[str]:
+        """Iterate over whole lines as they are written, until closed; comments are passed over."""
         text = ""
         while not self._closed.is_set():
             text += file.readline()
             if not text.endswith("\n"):
                 self._closed.wait(_TAIL_S)
-            elif text.strip() and not text.startswith(("#", "%")):
-                return text.strip()
-            else:
-                text = ""
-        return ""
-
-    def _take(self, stamp_s: float, force: tuple[float, float, float]) -> None:
-        arrived_s = time.monotonic()
-        with self._lock:
-            self._samples.append((stamp_s, arrived_s, force))
-            if not np.isnan(stamp_s):
-                self._delay_s = min(self._delay_s, arrived_s - stamp_s)
+                continue
+            if text.strip() and not text.startswith(("#", "%")):
+                yield text.strip()
+            text = ""
 
 
 def _line_parser(path: Path, header: str) -> Callable[[str], tuple[float, tuple[float, float, float]]]:
@@ -245,11 +241,9 @@ def _line_parser(path: Path, header: str) -> Callable[[str], tuple[float, tuple[
     def column(name: str, quantity: str, unit: str) -> tuple[int, float]:
         return names.index(name), UNITS[quantity][unit_of(name, quantity=quantity, path=path) or unit][0]
 
-    forces = [column(name, "force", "N") for name in guess_force_columns(names, path=path)]
-    try:
+    forces, stamp = [column(name, "force", "N") for name in guess_force_columns(names, path=path)], None
+    with suppress(RecordingError):
         stamp = column(guess_time_column(names, path=path), "time", "s")
-    except RecordingError:
-        stamp = None
 
     def parse(line: str) -> tuple[float, tuple[float, float, float]]:
         fields = line.split(separator)

@@ -48,10 +48,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewedTrial:
-    """A trial to show, its frames read one at a time, and the results beside them."""
+    """A trial to show (times, labels, truth), its frames read one at a time, and the results beside them."""
 
     trial: Recording
-    """Times, labels and the truth of a simulated trial."""
     read_frames: Callable[[], Iterator[Frame]]
     files: tuple[str, ...] = ()
     """Names of the images of a folder."""
@@ -113,9 +112,12 @@ def view(
         elif is_explanation(source):
             source = load_explanation(source)
     maps = source if isinstance(source, Explanation) else maps
-    explained = load_explanation(Path(maps)) if isinstance(maps, Path | str) else maps
-    viewed = view_explained(source) if isinstance(source, Explanation) else _open_trial(source, source_options)
-    viewed = replace(viewed, predictions=table, maps=explained, tracks=None if tracks is None else Path(tracks))
+    viewed = replace(
+        view_explained(source) if isinstance(source, Explanation) else _open_trial(source, source_options),
+        predictions=table,
+        maps=load_explanation(Path(maps)) if isinstance(maps, Path | str) else maps,
+        tracks=None if tracks is None else Path(tracks),
+    )
     with reporting(on_progress), open_stage(f"Reading {viewed.trial.trial}"):
         if path is None:
             address, failure = start_viewer(), "the Rerun viewer was closed too early; leave it open"
@@ -153,27 +155,22 @@ def view_stored(data: Dataset, info: TrialInfo) -> ViewedTrial:
     """Prepare a trial of a data set for the viewer; only simulated trials are loaded whole, for their truth."""
     path = trial_path(data.folder, info.trial)
     trial = load_recording(path, pixels=read_header(path).truth is not None)
-    return ViewedTrial(
-        trial=trial,
-        read_frames=partial(stream_frames, path) if trial.truth is None else lambda: iter(trial.frames),
-    )
+    read_frames = partial(stream_frames, path) if trial.truth is None else lambda: iter(trial.frames)
+    return ViewedTrial(trial=trial, read_frames=read_frames)
 
 
 def view_capture(capture: Capture) -> ViewedTrial:
     """Prepare a recording of any source for the viewer; its first frame is the reference where it names none."""
     count, labels = len(capture), capture.labels or labels_of_margins(np.full(len(capture), np.nan))
     reference = next(capture.read_frames()) if capture.read_reference is None else capture.read_reference()
-    return ViewedTrial(
-        trial=Recording(
-            **{field.name: getattr(capture, field.name) for field in fields(TrialFacts)},
-            **{field.name: getattr(labels, field.name) for field in fields(Labels)},
-            time_s=np.arange(count) / capture.frame_rate_hz if capture.time_s is None else capture.time_s,
-            reference=reference,
-            frames=np.broadcast_to(reference, (count, *reference.shape)),
-        ),
-        read_frames=capture.read_frames,
-        files=capture.files or (),
+    trial = Recording(
+        **{field.name: getattr(capture, field.name) for field in fields(TrialFacts)},
+        **{field.name: getattr(labels, field.name) for field in fields(Labels)},
+        time_s=np.arange(count) / capture.frame_rate_hz if capture.time_s is None else capture.time_s,
+        reference=reference,
+        frames=np.broadcast_to(reference, (count, *reference.shape)),
     )
+    return ViewedTrial(trial=trial, read_frames=capture.read_frames, files=capture.files or ())
 
 
 def view_explained(explained: Explanation) -> ViewedTrial:
@@ -183,14 +180,9 @@ def view_explained(explained: Explanation) -> ViewedTrial:
     (capture,) = open_source(explained.pictures)
     first = explained.frames[0]
     margins = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in explained.frames]
-    capture = replace(
-        capture,
-        trial=first.trial,
-        condition=first.condition,
-        day=first.day,
-        labels=labels_of_margins(np.array(margins)),
-    )
-    return replace(view_capture(capture), files=tuple(f"{frame.id}.png" for frame in explained.frames))
+    facts = {"trial": first.trial, "condition": first.condition, "day": first.day}
+    viewed = view_capture(replace(capture, **facts, labels=labels_of_margins(np.array(margins))))
+    return replace(viewed, files=tuple(f"{frame.id}.png" for frame in explained.frames))
 
 
 def require_rerun() -> ModuleType:
@@ -296,18 +288,23 @@ def play_trial(viewed: ViewedTrial, sink: RerunSink) -> None:
 
 def _set_styles(sink: RerunSink, rerun: ModuleType, trial: Recording, lines: Iterable[str]) -> None:
     """Send names and colours of lines, markers and zones."""
-    for entity in lines:
-        name, colour = _LINES[entity]
-        width = 1.0 if entity.endswith(("high", "low")) else 2.0
-        sink.stream.log(entity, rerun.SeriesLines(names=name, colors=[_rgba(colour)], widths=width), static=True)
-    for entity, points_colour, radius in (("frame/followed", GREEN, 2.5), ("frame/markers", YELLOW, 2.0)):
-        points = rerun.Points2D.from_fields(colors=[_rgba(points_colour)], radii=[rerun.Radius.ui_points(radius)])
-        sink.stream.log(entity, points, static=True)
+    styles: dict[str, Any] = {
+        entity: rerun.SeriesLines(
+            names=_LINES[entity][0],
+            colors=[_rgba(_LINES[entity][1])],
+            widths=1.0 if entity.endswith(("high", "low")) else 2.0,
+        )
+        for entity in lines
+    }
+    for entity, colour, radius in (("frame/followed", GREEN, 2.5), ("frame/markers", YELLOW, 2.0)):
+        styles[entity] = rerun.Points2D.from_fields(colors=[_rgba(colour)], radii=[rerun.Radius.ui_points(radius)])
     if trial.truth is not None:
-        arrows = rerun.Arrows2D.from_fields(colors=[_rgba(YELLOW)], radii=[rerun.Radius.ui_points(1.0)])
-        sink.stream.log("frame/displacements", arrows, static=True)
+        thin = [rerun.Radius.ui_points(1.0)]
+        styles["frame/displacements"] = rerun.Arrows2D.from_fields(colors=[_rgba(YELLOW)], radii=thin)
         zones = [(OUTSIDE, "no contact", [0] * 4), (SLIPS, "slips", _rgba(ORANGE)), (STICKS, "sticks", _rgba(SKY))]
-        sink.stream.log("frame/zones", rerun.AnnotationContext(zones), static=True)
+        styles["frame/zones"] = rerun.AnnotationContext(zones)
+    for entity, style in styles.items():
+        sink.stream.log(entity, style, static=True)
 
 
 def _log_states(sink: RerunSink, rerun: ModuleType, trial: Recording) -> None:
@@ -449,8 +446,7 @@ def _lay_out(
 
 
 _LOOPBACK = "127.0.0.1"
-_PATIENCE_S = 30.0  # a graphics driver may take its time
-_GRACE_S = 1.0  # a viewer listens first, and only then looks for a screen
+_PATIENCE_S, _GRACE_S = 30.0, 1.0  # a graphics driver takes its time; a viewer listens, and then looks for a screen
 
 
 def start_viewer() -> str:

@@ -16,24 +16,16 @@ from matplotlib.ticker import PercentFormatter
 
 from sliplens.images import write_png
 from sliplens.plots.style import ORANGE, SKY, drawing_style, method_name, percent, place_axes, place_text, reading_words
-from sliplens.results.explanation import BASELINES, Explanation
+from sliplens.results.explanation import BASELINES, Explanation, full_colour
 
 FrameU8: TypeAlias = UInt8[np.ndarray, "height width 3"]
 """A picture, RGB."""
 DIM = 0.55  # of the picture's lightness: leaves the bright end of the colours to the relevance
-FULL_COLOUR_PERCENTILE = 99.5
-"""Percentile of a map that gets the brightest colour: a few outlying pixels would leave the rest of the map black."""
 LOWERS, RAISES = ORANGE, SKY
 """Colours of what lowers an answer and of what raises it: bright on dark, and told apart by everyone."""
 SIGN_COLOURS = LinearSegmentedColormap.from_list("sign", [LOWERS, (DIM / 2,) * 3, RAISES])
 """Both over a mid-grey picture, from -1 to 1."""
 SIGN_BAR = ScalarMappable(Normalize(-1, 1), SIGN_COLOURS)
-
-
-def full_colour(relevance: Float[np.ndarray, "*any"], *, percentile: float = FULL_COLOUR_PERCENTILE) -> float:
-    """Size of signed values that gets the full colour; 1 where all are zero."""
-    sizes = np.abs(relevance)
-    return float(np.percentile(sizes, percentile)) or float(sizes.max()) or 1.0
 
 
 def overlay_relevance(picture: FrameU8, share: Float[np.ndarray, "rows columns"]) -> FrameU8:

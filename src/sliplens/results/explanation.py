@@ -173,6 +173,16 @@ class Explanation(OfNetwork):
         )
 
 
+FULL_COLOUR_PERCENTILE = 99.5
+"""Percentile of a map that gets the brightest colour: a few outlying pixels would leave the rest of the map black."""
+
+
+def full_colour(relevance: Float[np.ndarray, "*any"], *, percentile: float = FULL_COLOUR_PERCENTILE) -> float:
+    """Size of signed values that gets the full colour; 1 where all are zero."""
+    sizes = np.abs(relevance)
+    return float(np.percentile(sizes, percentile)) or float(sizes.max()) or 1.0
+
+
 def require_saliency(
     saliency: Float[np.ndarray, "height width"], shape: Sequence[int], *, where: str = "the saliency map"
 ) -> Float[np.ndarray, "height width"]:
