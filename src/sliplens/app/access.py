@@ -105,8 +105,8 @@ class Gate:
         if (why := self._refusal(request)) is not None:
             return _answer(403, f"sliplens: {why}\n", host=host)
         cookies = [part.strip().partition("=") for part in _header(request, "Cookie").split(";")]
-        shown = any(name == self._cookie and self._shows(token) for name, _, token in cookies)
-        if not (self._token is None or shown):
+        admitted = any(name == self._cookie and self._shows(token) for name, _, token in cookies)
+        if not (self._token is None or admitted):
             if path == SOCKET_PATH or not self._shows(*parse_qs(query).get("token", [])[:1]):
                 return _answer(401, "sliplens: open the whole address that was printed, with its token\n", host=host)
             # whatever the path was: of //elsewhere/ a browser makes another host

@@ -273,18 +273,19 @@ def _join(header: object, *parts: bytes) -> bytes:
 
 
 _SHORT: dict[str, Callable[[Client, ClientMessage], object]] = {
-    "show": lambda client, told: vars(client).update(shows_map=told.map, shows_arrows=told.markers),
+    "show": lambda client, message: vars(client).update(shows_map=message.map, shows_arrows=message.markers),
     "reference": lambda client, _: client.feed.take_reference(),
     "object": lambda client, _: client.begin_object(),
     "freeze": lambda client, _: client.freeze(),
-    "load": lambda client, told: client.source(SimulatedSource).load(
-        normal_force_n=min(told.press_n, _LARGEST["press_n"]), tangential_force_n=min(told.pull_n, _LARGEST["pull_n"])
+    "load": lambda client, message: client.source(SimulatedSource).load(
+        normal_force_n=min(message.press_n, _LARGEST["press_n"]),
+        tangential_force_n=min(message.pull_n, _LARGEST["pull_n"]),
     ),
     "let_go": lambda client, _: client.source(SimulatedSource).let_go(),
-    "pour": lambda client, told: client.source(GripSource).act(
-        water_kg=min(told.water_kg, _LARGEST["water_kg"]), pull_n=min(told.pull_n, _LARGEST["grip_pull_n"])
+    "pour": lambda client, message: client.source(GripSource).act(
+        water_kg=min(message.water_kg, _LARGEST["water_kg"]), pull_n=min(message.pull_n, _LARGEST["grip_pull_n"])
     ),
-    "hold": lambda client, told: client.source(GripSource).act(wet=told.wet, controller=told.controller),
+    "hold": lambda client, message: client.source(GripSource).act(wet=message.wet, controller=message.controller),
     "again": lambda client, _: client.source(GripSource).grip_again(),
 }
 """Functions of the page's buttons, keys and sliders."""
