@@ -28,7 +28,7 @@ _NETWORK = DEFAULT_NETWORK
 
 def draw_pictures(recording: Recording) -> Iterator[Image.Image]:
     """One picture of every other frame in contact: camera, map, and the margin up to here."""
-    rows = sl.predict(_NETWORK, recording.frames, reference=recording.reference).frame()
+    rows = sl.predict(_NETWORK, recording.frames, reference=recording.reference).to_arrow()
     touched = np.flatnonzero(np.isfinite(recording.safety_margin))[::2]
     explanation = sl.explain(_NETWORK, recording.frames[touched], reference=recording.reference, method=METHOD)
     maps = explanation.relevance[METHOD]

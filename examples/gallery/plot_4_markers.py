@@ -19,7 +19,7 @@ trial = data.load(data.trials[0])
 # %%
 # The table has one row per marker and frame; unknown positions are null.
 tracking = sl.track(trial.frames, reference=trial.reference, markers="auto")
-table = tracking.frame()
+table = tracking.to_arrow()
 status, counts = np.unique(table["status"].to_numpy(zero_copy_only=False), return_counts=True)
 print(dict(zip(status.tolist(), counts.tolist(), strict=True)))
 

@@ -4,16 +4,20 @@ A record is a frozen dataclass. Its declaration is what its file must hold: a fi
 not finite is reported in one sentence with its place and its cure, by msgspec for JSON and by jaxtyping for arrays.
 """
 
+import re
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass, fields, is_dataclass, make_dataclass
+from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
+from textwrap import shorten, wrap
 from types import NoneType
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 import numpy as np
@@ -30,12 +34,149 @@ ARRAYS_FILE = "arrays.npz"  #: Arrays beside it.
 
 Record = TypeVar("Record")
 _Columns = TypeVar("_Columns", bound="Columns")
+Scalar: TypeAlias = str | float | None  #: Cell of a table.
 
 UNKNOWN = "NaN where it is not known"  #: Beside the bounds of a column or an array: a number may be missing.
 
 
+class _Described:
+    """Base of results and of tables, whose columns may have any name."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.__repr__ = _Described.__repr__  # in the class itself: `dataclass` then makes none
+
+    def __repr__(self) -> str:
+        head = getattr(self, "summary", None) or (type(self).__doc__ or "").partition("\n")[0]
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "summary"}  # pyright: ignore[reportArgumentType]
+        short, long = [], []
+        for name, value in values.items():
+            if text := _words(value, _unit(type(self), name)):
+                lines = short if isinstance(value, _SCALARS) else long
+                label = _UNIT_ENDING.sub("", name).replace("_", " ")
+                lines.append(shorten(f"{label}: {text}", 110, placeholder=" ..."))
+        lines = [*wrap(", ".join(short), 110, max_lines=3), *long]
+        if (over := len(lines) - _MOST_LINES + 2) > 1:
+            lines[-over:] = [f"and {over} more"]
+        return "\n  ".join([f"{type(self).__name__}: {shorten(head, 240, placeholder=' ...')}", *lines])
+
+    def to_arrow(self) -> pa.Table:
+        """Convert the main rows to an Arrow table.
+
+        These are the values a row of a result that has a length, else its first table, else a row for each of its first
+        records, else its numbers and texts in one row.
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # pyright: ignore[reportArgumentType]
+        if isinstance(self, Sized):
+            kinds = (np.ndarray, tuple)
+            rows = {name: value for name, value in values.items() if isinstance(value, kinds) and np.ndim(value) == 1}
+            return pa.table({name: np.asarray(value) for name, value in rows.items() if len(value) == len(self)})
+        if table := next((value for value in values.values() if isinstance(value, Columns)), None):
+            return table.to_arrow()
+        for value in values.values():
+            records = value.values() if isinstance(value, Mapping) else value if isinstance(value, tuple) else ()
+            if records and all(map(is_dataclass, records)):
+                return pa.Table.from_pylist(rows_of(value))
+        return pa.Table.from_pylist(rows_of([self]))
+
+
+class Result(_Described):
+    """Base of results: a `repr` of ten lines at most with numbers and units, and a table.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> from sliplens.codec import Result
+    >>> @dataclass(frozen=True)
+    ... class Press(Result):
+    ...     '''One press of a fingertip.'''
+    ...
+    ...     object: str
+    ...     force_n: float
+    >>> Press("cup", 1.25)
+    Press: One press of a fingertip.
+      object: cup, force: 1.25 N
+    >>> Press("cup", 1.25).to_arrow().to_pylist()
+    [{'object': 'cup', 'force_n': 1.25}]
+    """
+
+    def frame(self) -> Any:
+        """Convert the main rows to a pandas table, or to the Arrow table where pandas is not installed."""
+        return self.to_arrow().to_pandas() if find_spec("pandas") else self.to_arrow()
+
+
+_MOST_LINES = 10
+_SCALARS = (str, int, float, Path)
+_UNITS = {
+    "n": "N", "px": "px", "s": "s", "ms": "ms", "hz": "Hz", "m": "m", "deg": "degrees", "minutes": "min",
+    "seconds": "s", "mse": "(margin units squared)", "mae": "margin units",
+}  # fmt: skip
+_UNIT_ENDING = re.compile("_(n|px|s|ms|hz|m|deg)$")
+
+
+def _unit(kind: type, name: str) -> str:
+    """Return the unit of a field: that of its declaration, else of its name."""
+    with suppress(NameError):  # of a type that only type checkers import
+        hint = get_type_hints(kind, include_extras=True).get(name)
+        for fact in (fact for part in (hint, *get_args(hint)) for fact in getattr(part, "__metadata__", ())):
+            if isinstance(fact, msgspec.Meta) and fact.description:
+                return fact.description
+    return _UNITS.get(name.rpartition("_")[2], "")
+
+
+def _words(value: object, unit: str = "") -> str:
+    """Describe a value in less than a line; the empty text where there is none."""
+    text = str(value)
+    match value:
+        case None | pa.Schema():
+            text = ""
+        case float() | np.floating():
+            text = f"{value:.3g} {unit}".rstrip()
+        case int() if value is not True and value is not False:
+            text = f"{value:,} {unit}".rstrip()
+        case np.ndarray():
+            text = f"{' x '.join(map(str, value.shape))} {value.dtype}"
+        case Columns() | pa.Table():
+            names = [field.name for field in fields(value)] if isinstance(value, Columns) else value.column_names
+            text = f"{len(value):,} rows of {', '.join(names)}"
+        case Mapping():
+            text = "; ".join(f"{name} {_words(each, unit)}" for name, each in islice(value.items(), 4))
+        case tuple():
+            text = "; ".join(_words(each, unit) for each in value[:3])
+            text = text if len(value) < 4 else f"{len(value)}: {text}; ..."
+        case _ if is_dataclass(value) and type(value).__str__ is object.__str__:
+            parts = ((field.name, getattr(value, field.name)) for field in fields(value))
+            simple = (part for part in parts if not isinstance(part[1], tuple | Mapping | np.ndarray))
+            texts = ((name, _words(part, _unit(type(value), name))) for name, part in simple)
+            text = ", ".join(f"{name} {words}" for name, words in islice(texts, 5) if words)
+        case _ if is_dataclass(value):
+            text = f"{value} {unit}".rstrip()
+    return text
+
+
+def rows_of(records: Mapping[str, Any] | Sequence[Any]) -> list[dict[str, Scalar]]:
+    """Return the numbers and texts of records, a row each, with their names where they have any."""
+    if isinstance(records, Mapping):
+        return [{"name": name} | _flat(record) for name, record in records.items()]
+    return [_flat(record) for record in records]
+
+
+def _flat(record: object, before: str = "") -> dict[str, Scalar]:
+    """Return the numbers and texts of a record by name, those of records in it behind the name of their field."""
+    cells: dict[str, Scalar] = {}
+    items = record.items() if isinstance(record, Mapping) else vars(record).items()
+    for name, value in items:
+        if value is None or isinstance(value, str | int | float):
+            cells[f"{before}{name}"] = value
+        elif isinstance(value, Path):
+            cells[f"{before}{name}"] = str(value)
+        elif (is_dataclass(value) or isinstance(value, Mapping)) and not isinstance(value, Columns):
+            cells |= _flat(value, f"{before}{name}_")
+    return cells
+
+
 @dataclass(frozen=True, kw_only=True)
-class Columns:
+class Columns(_Described):
     """Base of a table: a record whose fields are arrays of one length, a value a row.
 
     Text columns are declared as `Shaped[np.ndarray, " rows"]`, numbers with their jaxtyping type and the bounds that a
@@ -50,10 +191,6 @@ class Columns:
     def where(self: _Columns, rows: np.ndarray) -> _Columns:
         """Select rows by a mask or by their numbers."""
         return type(self)(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
-
-    def table(self) -> pa.Table:
-        """Convert to an Arrow table with a column a field; NaN stays NaN."""
-        return pa.table({field.name: getattr(self, field.name) for field in fields(self)})
 
     def groups(self: _Columns, *names: str) -> dict[tuple[str, ...], _Columns]:
         """Group rows by the values of some text columns, in the order in which these first appear."""
@@ -128,7 +265,7 @@ def save_result(result: object, folder: Path) -> None:
     for field in fields(result):
         value = getattr(result, field.name)
         if isinstance(value, Columns):
-            write_tables([value.table()], folder / f"{field.name}.parquet", value.table().schema)
+            write_tables([table := value.to_arrow()], folder / f"{field.name}.parquet", table.schema)
         elif isinstance(value, np.ndarray):
             arrays[field.name] = value
         elif isinstance(value, Mapping) and value and all(isinstance(each, np.ndarray) for each in value.values()):

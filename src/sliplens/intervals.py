@@ -29,6 +29,11 @@ class Difference:
     networks: int = 1
     """Of a single day or network the interval holds for that one alone: how far others differ is not in it."""
 
+    def __str__(self) -> str:
+        """Write the estimate with its interval."""
+        ends = "" if self.low is None or self.high is None else f" ({self.low:.2g} to {self.high:.2g})"
+        return f"{self.estimate:.3g}{ends}"
+
     @property
     def above_zero(self) -> bool:
         """True where the whole interval lies above zero, and rests on enough trials."""

@@ -57,7 +57,7 @@ def test_a_folder_of_parts_holds_the_same_rows_wherever_they_were_made(folder, t
     reference = tmp_path / "untouched.png"
     whole = track(folder, reference=reference, out=tmp_path / "a.parquet")
     parts = track(folder, reference=reference, out=tmp_path / "set", on=elsewhere)
-    assert parts.frame().to_pylist() == whole.frame().to_pylist()
+    assert parts.to_arrow().to_pylist() == whole.to_arrow().to_pylist()
     assert [str(trial) for trial in parts.trials] == [str(trial) for trial in whole.trials]
     assert whole.trials[0].markers == 30
     assert whole.trials[0].followed_share == 1

@@ -41,7 +41,7 @@ def test_frames_are_compared_with_the_untouched_sensor_and_explained_against_it(
     assert [frame.reference_prediction for frame in explanation.frames] == pytest.approx(
         [float(run.predict(empty))] * 2
     )
-    table = explanation.frame()
+    table = explanation.to_arrow()
     assert expected.completeness_gap is not None
     # float32 sums in another order
     assert table["change"].to_pylist() == pytest.approx(expected.change.tolist(), rel=1e-5, abs=1e-6)
@@ -51,7 +51,7 @@ def test_frames_are_compared_with_the_untouched_sensor_and_explained_against_it(
 def test_difference_images_need_no_reference_and_other_networks_do(trained):
     explanation = sliplens.explain(trained("difference"), FRAMES, method="layer-cam")
     assert not explanation.references.any()
-    assert np.isnan(explanation.frame()["completeness_gap"].to_numpy()).all()  # LayerCAM promises no sum
+    assert np.isnan(explanation.to_arrow()["completeness_gap"].to_numpy()).all()  # LayerCAM promises no sum
     with pytest.raises(InputError, match="a network on raw images needs the untouched sensor; give it as reference"):
         sliplens.explain(trained("raw"), FRAMES, method="grad-cam")
 

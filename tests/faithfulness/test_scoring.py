@@ -62,7 +62,7 @@ def test_the_gain_of_the_true_effects_is_their_ordered_sum(run):
     assert score.lead_over_controls is not None
     assert score.lead_over_controls.gap.estimate > 0
     assert not any("gains" in alarm for alarm in faithfulness.alarms)
-    assert faithfulness.frame().num_rows == len(faithfulness.scores) * 3 * len(AREAS)
+    assert faithfulness.to_arrow().num_rows == len(faithfulness.scores) * 3 * len(AREAS)
 
 
 def test_frames_with_next_to_nothing_to_explain_count_and_an_alarm_says_so(run):

@@ -506,7 +506,7 @@ def _weights_hash(folder: Path) -> None:
 
 def _read_network(folder: Path) -> object:
     frames = np.random.default_rng(0).integers(0, 255, (2, 48, 48, 3), dtype=np.uint8)
-    table = predict(folder / "run", frames, reference_frame=0).frame()
+    table = predict(folder / "run", frames, reference_frame=0).to_arrow()
     return table.column("prediction").to_numpy()
 
 

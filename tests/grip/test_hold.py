@@ -135,7 +135,7 @@ def test_however_it_ends_the_gripper_keeps_what_it_holds_with(source, given, end
         hold = sl.hold_grip(reader, hand, controller=Constant(force_n=1.0), **given)
     assert (hold.ended, hold.why) == (ended, f"{why}; the gripper keeps the last command of 3.00 N")
     assert set(hand.sent) == {"F 3.000"}
-    assert len(hold.steps) == hold.frame().num_rows > 0
+    assert len(hold.steps) == hold.to_arrow().num_rows > 0
     assert hold.sources == ("a finger",)
 
 

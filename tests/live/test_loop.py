@@ -72,7 +72,7 @@ def recording(small_dataset: Dataset) -> Recording:
 
 
 def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, difference_run: Path):
-    table = sl.predict(difference_run, recording.frames, reference=recording.reference).frame()
+    table = sl.predict(difference_run, recording.frames, reference=recording.reference).to_arrow()
     told = table.column("prediction").to_numpy()
     source = Patient(recording.frames, list(range(12)))
     readings = source.all_readings(
@@ -88,7 +88,7 @@ def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, diffe
 def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, sequence_run: Path):
     run, info = sl.load(sequence_run), small_dataset.trials[0]
     recording, [capture] = small_dataset.load(info), open_source(small_dataset, trial=info.trial)
-    table = sl.predict(run, [replace(capture, frame_time_s=0.05 * np.arange(12))], sequence=True).frame()
+    table = sl.predict(run, [replace(capture, frame_time_s=0.05 * np.arange(12))], sequence=True).to_arrow()
     source = Patient(recording.frames[1:], list(range(1, 12)))  # nothing touches the first, and it is forgotten
     readings = source.all_readings(
         plain_reader(source, run, reference=recording.reference, sequence=True, engine="torch", stall_s=10.0)
@@ -98,7 +98,7 @@ def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, 
     # one frame at a time or eight: the network's float32 sums differ by 1e-7, and the head's weights of about 1 add 64
     margins = np.array([reading.margin for reading in readings], dtype=np.float64)
     np.testing.assert_allclose(margins, np.clip(table["prediction"].to_numpy()[1:], 0, 1), atol=1e-5)
-    alone = sl.predict(run, recording.frames, reference=recording.reference).frame()["prediction"].to_numpy()
+    alone = sl.predict(run, recording.frames, reference=recording.reference).to_arrow()["prediction"].to_numpy()
     assert np.abs(margins - alone[1:].clip(0, 1)).max() > 0.01
 
 
@@ -202,7 +202,7 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
     torn[:, 112:] = 0  # the lower part never came
     whole = whole[: len(torn)]
     frames = np.stack([whole, torn], axis=1).reshape(-1, *trial.frames.shape[1:])  # far less than 0.25 s apart
-    known = sl.predict(network, frames, reference=trial.reference).frame()["known"].to_numpy()
+    known = sl.predict(network, frames, reference=trial.reference).to_arrow()["known"].to_numpy()
     assert (known[1::2] < 0.01).any()
     assert (known[::2] > 0.01).any()
     source = Patient(frames, list(range(len(frames))))

@@ -52,7 +52,7 @@ def withheld_by(network: Network, reference: np.ndarray, frames: np.ndarray, *, 
             any(check.name == "direction" and not check.ok for check in reading.health) and reading.margin is None
             for reading in read_live(network, reference, frames)
         ]
-    table = sl.predict(network, frames, reference=reference, engine="torch").frame()
+    table = sl.predict(network, frames, reference=reference, engine="torch").to_arrow()
     hidden = [reason is not None for reason in table["withheld"].to_pylist()]
     assert [margin is None for margin in table["prediction"].to_pylist()] == hidden
     return hidden

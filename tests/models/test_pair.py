@@ -56,7 +56,7 @@ def test_from_training_to_an_explanation(small_dataset: Dataset, raw_run: Path, 
     found = sl.evaluate(again, small_dataset)
     recording = small_dataset.load(small_dataset.select(split="test")[0])
     frames, reference = recording.frames[1:3], recording.reference
-    rows = sl.predict(again, frames, reference=reference).frame().to_pydict()["prediction"]
+    rows = sl.predict(again, frames, reference=reference).to_arrow().to_pydict()["prediction"]
     tested = found.predictions
     own = tested.prediction[tested.trial == recording.trial][:2]
     np.testing.assert_allclose(rows, own, atol=1e-5)

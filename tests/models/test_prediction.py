@@ -87,7 +87,7 @@ def test_where_a_frame_is_withheld_the_table_holds_no_answer_of_the_network(
 ):
     out = None if suffix is None else tmp_path / f"margins{suffix}"
     predictions = sl.predict("chromatouch-difference", foreign.frames, reference=foreign.reference, out=out)
-    rows = predictions.frame()
+    rows = predictions.to_arrow()
     reasons = rows["withheld"].to_pylist()
     assert {None, STRANGE_REASON} <= set(reasons)  # the untouched frames are not judged
     assert [reason is not None for reason in reasons] == rows["touches"].to_pylist()
@@ -105,8 +105,8 @@ def test_the_lowest_margin_is_of_a_frame_that_touches(trained: Network, wet: Rec
     untouched = np.clip(wet.reference.astype(int) + noise, 0, 255).astype(np.uint8)
     frames = np.concatenate([untouched, wet.frames[4:]])
     table = predict_source(trained, frames, reference=wet.reference)
-    assert table.frame()["touches"].to_pylist() == [False] * 6 + [True] * 8
-    margins = table.frame()["prediction"].to_numpy()
+    assert table.to_arrow()["touches"].to_pylist() == [False] * 6 + [True] * 8
+    margins = table.to_arrow()["prediction"].to_numpy()
     (told,) = table.trials()
     assert (told.touching, told.lowest) == (8, 6 + int(margins[6:].argmin()))
     (told,) = predict_source(trained, untouched, reference=wet.reference).trials()
@@ -193,11 +193,11 @@ def test_only_one_batch_of_frames_is_held(trained: Network, wet: Recording, tmp_
 def test_rows_in_memory_are_those_of_the_file(trained: Network, small_dataset: Dataset, tmp_path: Path):
     written = predict_source(trained, small_dataset, split="test", out=tmp_path / "a.parquet")
     kept = predict_source(trained, small_dataset, split="test")
-    assert kept.frame().equals(written.frame(), check_metadata=True)
-    assert kept.frames == kept.frame().num_rows == 24
+    assert kept.to_arrow().equals(written.to_arrow(), check_metadata=True)
+    assert kept.frames == kept.to_arrow().num_rows == 24
     margins = np.concatenate([trial.margin for trial in kept.trials()])
-    assert margins.tolist() == kept.frame()["prediction"].to_pylist()
-    assert [trial.trial for trial in kept.trials()] == list(dict.fromkeys(kept.frame()["trial"].to_pylist()))
+    assert margins.tolist() == kept.to_arrow()["prediction"].to_pylist()
+    assert [trial.trial for trial in kept.trials()] == list(dict.fromkeys(kept.to_arrow()["trial"].to_pylist()))
 
 
 def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_them(
@@ -210,7 +210,7 @@ def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_the
     serial, others = write(tmp_path / "a.parquet"), write(tmp_path / "b.parquet", on=elsewhere)
     assert (tmp_path / "a.parquet").read_bytes() == (tmp_path / "b.parquet").read_bytes()
     folder = write(tmp_path / "set")
-    assert folder.frame().to_pylist() == serial.frame().to_pylist() == others.frame().to_pylist()
+    assert folder.to_arrow().to_pylist() == serial.to_arrow().to_pylist() == others.to_arrow().to_pylist()
     assert sorted(path.name for path in (tmp_path / "set").iterdir()) == [
         "run.json",
         "trial=test-dry-6",

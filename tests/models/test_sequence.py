@@ -125,7 +125,7 @@ def test_frames_are_read_as_the_head_was_taught(run: Network):
 
 def test_a_recording_is_read_as_the_follower_reads_it(run: Network, small_dataset: Dataset, tmp_path: Path):
     info = small_dataset.trials[0]
-    table = sl.predict(run, small_dataset, split="train", sequence=True).frame()
+    table = sl.predict(run, small_dataset, split="train", sequence=True).to_arrow()
     rows = table.filter(np.array([name == info.trial for name in table["trial"].to_pylist()]))
     trial = small_dataset.load(info)
     estimate = run.estimate(run.encode(trial.frames, trial.reference))
@@ -134,7 +134,7 @@ def test_a_recording_is_read_as_the_follower_reads_it(run: Network, small_datase
     np.testing.assert_allclose(rows["prediction"].to_numpy(), expected.margin, atol=1e-5)
     low, _ = expected.interval(0.9) or pytest.fail("a taught head has intervals")
     np.testing.assert_allclose(rows["low_90"].to_numpy(), low, atol=1e-5)
-    written = sl.predict(run, small_dataset, split="train", sequence=True, out=tmp_path / "margins").frame()
+    written = sl.predict(run, small_dataset, split="train", sequence=True, out=tmp_path / "margins").to_arrow()
     assert written["prediction"].equals(table["prediction"])
 
 

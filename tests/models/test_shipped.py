@@ -105,8 +105,10 @@ def test_networks_are_loaded_without_the_compiler_and_pandas():
 def test_the_network_may_be_left_out():
     frames = np.zeros((3, 224, 224, 3), dtype=np.uint8)
     alone, named = sliplens.predict(frames), sliplens.predict("chromatouch-difference", frames)
-    assert pa.table(alone).equals(named.frame())
+    assert pa.table(alone).equals(named.to_arrow())
     assert len(alone) == 3
     # camera frames, for whose reference somebody asks, go to the network that sees both
     alone = sliplens.predict(frames + 90, reference=frames[0] + 90)
-    assert pa.table(alone).equals(sliplens.predict("chromatouch-pair", frames + 90, reference=frames[0] + 90).frame())
+    assert pa.table(alone).equals(
+        sliplens.predict("chromatouch-pair", frames + 90, reference=frames[0] + 90).to_arrow()
+    )

@@ -66,6 +66,6 @@ def test_what_has_no_picture_is_told():
 
 def test_predictions_of_any_trial_are_drawn(results):
     frames: ScoredFrames = results.evaluations["raw"].predictions
-    predictions = Predictions(frames=len(frames.trial), engine="torch", path=None, rows=frames.table())
+    predictions = Predictions(frames=len(frames.trial), engine="torch", path=None, rows=frames.to_arrow())
 
     assert sl.plot(predictions, index=1).axes[0].get_title(loc="left") == "day4-dry-001"

@@ -167,7 +167,7 @@ def two_signed(data) -> tuple[Network, Explanation, Truth]:
 
 
 def rows_of(truth: Truth, frame: str) -> list[dict]:
-    return truth.effects.groups("frame_id")[frame,].table().to_pylist()
+    return truth.effects.groups("frame_id")[frame,].to_arrow().to_pylist()
 
 
 def test_effects_are_what_putting_one_marker_back_changes(trained, explained, data, judged):
@@ -210,7 +210,7 @@ def test_neutral_effects_and_correlations_follow_from_frames_drawn_one_by_one(tr
     judging = judge(trained, explained, data, maps=maps, fills=(), pairs=PAIRS)
     make = judging.prepare()
     records = [make(index) for index in range(len(LEVELS))]
-    rows = {(row["frame_id"], row["method"]): row for row in judging.join(records).neutral.table().to_pylist()}
+    rows = {(row["frame_id"], row["method"]): row for row in judging.join(records).neutral.to_arrow().to_pylist()}
     for index, (frame, record) in enumerate(zip(stage_frames(trained, explained, data), records, strict=True)):
         film, place = frame.scene.film, find_places(frame, image_size=SIZE)
         stored = data.load(next(info for info in data.trials if info.trial == frame.trial)).frames[frame.number]

@@ -43,7 +43,7 @@ def test_a_network_may_stay_in_memory(small_dataset: Dataset):
     # trials that were read, then steps of the two epochs: 44 frames and batches of 11
     assert counts[-1] == (8, 8)
     evaluation = sl.evaluate(run, small_dataset)
-    table = evaluation.frame().to_pydict()
+    table = evaluation.to_arrow().to_pydict()
     assert set(table["trial"]) == set(evaluation.trials)
     squares = (np.array(table["prediction"]) - np.array(table["safety_margin"])) ** 2
     dry = np.array(table["condition"]) == "dry"
@@ -58,7 +58,7 @@ def test_what_was_written_comes_back_as_it_was_returned(small_dataset: Dataset, 
     run = sl.train(small_dataset.folder, tmp_path / "run", **SMALL)
     again = sl.load(tmp_path / "run")
     assert again.manifest == run.manifest
-    assert there(again.training).curve.table() == there(run.training).curve.table()
+    assert there(again.training).curve.to_arrow() == there(run.training).curve.to_arrow()
     first = sl.evaluate(tmp_path / "run", small_dataset.folder, tmp_path / "scores")
     kept = sl.evaluate(run, small_dataset, tmp_path / "scores")
     assert kept.conditions == first.conditions

@@ -18,7 +18,6 @@ import numpy as np
 from PIL import Image
 
 from sliplens.errors import SliplensError
-from sliplens.explainers.attribution import CLOSE
 from sliplens.explainers.explain import choose_explainers, explain_frames
 from sliplens.explainers.frames import frames_from_arrays
 from sliplens.explainers.table import RECOMMENDED_METHOD
@@ -28,7 +27,7 @@ from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading, SlipState
 from sliplens.models.checkpoint import Network
 from sliplens.recordings.capture import Frame
-from sliplens.results.explanation import full_colour
+from sliplens.results.explanation import CLOSE, full_colour
 
 if TYPE_CHECKING:
     from sliplens.app.client import Client

@@ -466,7 +466,7 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
         require_picture_path(plot, example="margins.png")
         require_new_file(plot, overwrite=call.keywords.get("overwrite", False))
     predictions = call()
-    predictions = replace(predictions, rows=predictions.frame())  # a file is loaded once
+    predictions = replace(predictions, rows=predictions.to_arrow())  # a file is loaded once
     output.show_predictions(predictions)
     for reason, frames in predictions.withheld.items():
         say(f"withheld in {number_of(frames, 'frame')}: {reason}")
@@ -477,7 +477,7 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
 
         names = [call.keywords[name] for name in ("source", "run") if name in call.keywords]
         title = ", predicted by ".join(Path(name).name for name in names)
-        trials = draw_margins(predictions.frame(), plot, title=title)
+        trials = draw_margins(predictions.to_arrow(), plot, title=title)
         print_file(plot, f"margin over time of {number_of(trials, 'trial')}")
     if predictions.path is not None:
         print_file(predictions.path, f"{number_of(predictions.frames, 'frame')}, by {predictions.engine}")

@@ -39,7 +39,7 @@ _CLIP_FRAMES_PER_S = 30.0
 def show_predictions(predictions: "Predictions") -> None:
     """Print each frame if they are few, else the course of each trial."""
     if predictions.frames <= _MOST_ROWS:
-        rows = predictions.frame().to_pylist()
+        rows = predictions.to_arrow().to_pylist()
         columns = {"true": "safety_margin", "known": "known"}
         columns = {head: name for head, name in columns.items() if any(row.get(name) is not None for row in rows)}
         cells = [

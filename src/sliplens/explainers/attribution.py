@@ -8,6 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
+from sliplens.results.explanation import CLOSE
+
 FLOOR = 1e-12
 CHANGE_WINDOW = 15 / 224
 """Side of the square over which a change is averaged, as a share of the image's height: about a marker."""
@@ -224,7 +226,6 @@ class Attribution:
         return supporting / torch.where(peak > 0, peak, torch.ones_like(peak))
 
 
-CLOSE = 0.02  # margin units; a difference below the regressor's error explains nothing
 GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
 LOWEST, HIGHEST = -0.1, 1.1  # predictions of a regressor on data like its training data
 ALIKE_R, ALIKE_TOP = 0.99, 0.9  # required likeness of an approximate map to the exact one

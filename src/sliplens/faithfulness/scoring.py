@@ -10,7 +10,6 @@ from scipy.stats import kendalltau
 from torch import Tensor
 
 from sliplens.errors import CheckpointError, InputError, SaliencyError
-from sliplens.explainers.attribution import CLOSE
 from sliplens.explainers.explain import join_maps, network_inputs, network_references
 from sliplens.explainers.frames import frames_from_arrays
 from sliplens.faithfulness.controls import control_maps, lead_over_controls
@@ -19,7 +18,7 @@ from sliplens.faithfulness.removal import Predict, removal_curves
 from sliplens.intervals import mean_interval, paired_difference
 from sliplens.models import Network
 from sliplens.models.engines import Engine, prepare
-from sliplens.results.explanation import BASELINES, Explanation, MethodNotes, require_saliency
+from sliplens.results.explanation import BASELINES, CLOSE, Explanation, MethodNotes, require_saliency
 from sliplens.results.faithfulness import (
     CHANCE,
     DeletionScores,

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
 
-from sliplens.codec import UNKNOWN, Columns
+from sliplens.codec import UNKNOWN, Columns, Result
 from sliplens.results.evaluation import AMOUNT, ANSWER, EXCESS, FORCE, FRICTION, MARGIN
 
 
@@ -78,7 +77,7 @@ class GripSetup:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Grip:
+class Grip(Result):
     """Episodes of one controller."""
 
     setup: GripSetup
@@ -122,7 +121,7 @@ Ending: TypeAlias = Literal["time", "source", "failed", "interrupted"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Hold:
+class Hold(Result):
     """Commands to a gripper while it held something, and how the hold ended."""
 
     sources: tuple[str, ...]
@@ -142,7 +141,3 @@ class Hold:
     troubles: tuple[str, ...]
     """Faults of the gripper, each once."""
     steps: HoldSteps
-
-    def frame(self) -> pa.Table:
-        """Return a table with a row a command."""
-        return self.steps.table()

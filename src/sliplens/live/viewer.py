@@ -22,7 +22,7 @@ import pyarrow.compute as pc
 from jaxtyping import Float
 from matplotlib.colors import to_rgba
 
-from sliplens.codec import open_parquet
+from sliplens.codec import Result, open_parquet
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
 from sliplens.files import require_new_file
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewedTrial:
+class ViewedTrial(Result):
     """A trial to show (times, labels, truth), its frames read one at a time, and the results beside them."""
 
     trial: Recording

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import KDTree
 
+from sliplens.codec import Result
 from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2
 from sliplens.markers.detect import FEWEST, Appearance, MarkerKind, detect_markers
@@ -26,7 +27,7 @@ _COLOURED = 40.0  # grey levels between the channels of a coloured marker agains
 
 
 @dataclass(frozen=True, kw_only=True)
-class SensorProposal:
+class SensorProposal(Result):
     """A sensor profile proposed from a recording, with its evidence."""
 
     profile: SensorProfile

@@ -10,7 +10,7 @@ import pyarrow as pa
 from jaxtyping import Float
 
 from sliplens._version import __version__
-from sliplens.codec import read_written, regrouped, write_tables
+from sliplens.codec import Result, read_written, regrouped, write_tables
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2, pick
 from sliplens.markers.detect import KINDS
@@ -58,7 +58,7 @@ class TrialTracking:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tracking:
+class Tracking(Result):
     """Tracked markers of the trials of a source, a row for each marker of each frame."""
 
     trials: tuple[TrialTracking, ...]
@@ -72,8 +72,8 @@ class Tracking:
         """Frames of all trials."""
         return sum(trial.frames for trial in self.trials)
 
-    def frame(self) -> pa.Table:
-        """Arrow table; `.to_pandas()` where pandas is installed.
+    def to_arrow(self) -> pa.Table:
+        """Arrow table, a row for each marker of each frame.
 
         Columns are `trial`, `frame`, `time_s`, `marker`, `status` (`MarkerStatus`), and in pixels, x to the right and y
         down, `x_px`, `y_px`, `rest_x_px`, `rest_y_px`, `dx_px`, `dy_px`, `radius_px` and `deviation_px`. Unknown

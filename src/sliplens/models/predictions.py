@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sliplens._version import __version__
-from sliplens.codec import TABLE_SUFFIXES, read_written, write_tables
+from sliplens.codec import TABLE_SUFFIXES, Result, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
@@ -82,8 +82,8 @@ class TrialMargins:
     """Ends of its 90 % interval; None for a network without calibration, and without such a frame."""
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
-class Predictions:
+@dataclass(frozen=True, kw_only=True)
+class Predictions(Result):
     """Predicted safety margins, a row a frame.
 
     It is an Arrow table for other libraries: `pandas.DataFrame.from_arrow`, `polars.DataFrame`, `pyarrow.table`.
@@ -101,8 +101,8 @@ class Predictions:
     notes: tuple[str, ...] = ()
     """Assumptions, a sentence each."""
 
-    def frame(self) -> pa.Table:
-        """Arrow table; `.to_pandas()` where pandas is installed.
+    def to_arrow(self) -> pa.Table:
+        """Arrow table, a row a frame.
 
         Columns are `trial`, `frame`, `file` (of a folder of images), `time_s`, `safety_margin` (where the source has
         labels), `normal_force_n` and `tangential_force_n` (where it has forces), `touches` (contact by the labels, else
@@ -123,22 +123,31 @@ class Predictions:
     def __len__(self) -> int:
         return self.frames
 
-    def __repr__(self) -> str:
-        title = f"Predictions of {number_of(self.frames, 'frame')} by {self.engine}"
-        return f"{title}, in {self.path}" if self.rows is None else f"{title}\n{self.rows.to_string(preview_cols=3)}"
+    @property
+    def summary(self) -> str:
+        """Margins in a sentence."""
+        margin = 100 * self.to_arrow()["prediction"].drop_null().to_numpy()
+        withheld = self.frames - len(margin)
+        parts = [f"{number_of(self.frames, 'frame')} by {self.engine}"]
+        parts += (
+            [f"safety margin {np.median(margin):.0f} % (median), {margin.min():.0f} % at least"] if len(margin) else []
+        )
+        parts += [f"margins from {margin.min():.0f} to {margin.max():.0f} %"] if len(margin) else []
+        parts += [f"{withheld:,} withheld"] if withheld else []
+        return ", ".join(parts)
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
         """Return the rows as an Arrow stream (the Arrow PyCapsule interface)."""
-        return self.frame().__arrow_c_stream__(requested_schema)
+        return self.to_arrow().__arrow_c_stream__(requested_schema)
 
     @property
     def withheld(self) -> dict[str, int]:
         """Number of frames whose margin is withheld, by reason."""
-        return dict(Counter(reason for reason in self.frame()["withheld"].to_pylist() if reason is not None))
+        return dict(Counter(reason for reason in self.to_arrow()["withheld"].to_pylist() if reason is not None))
 
     def trials(self) -> list[TrialMargins]:
         """Course and lowest margin of every trial."""
-        table = self.frame().combine_chunks()
+        table = self.to_arrow().combine_chunks()
         has_contact = "touches" in table.column_names
         columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
         names, believed = columns["trial"], table["withheld"].is_null().to_numpy(zero_copy_only=False)
@@ -244,7 +253,7 @@ def predict(
     >>> import sliplens as sl
     >>> touch = np.zeros((2, 224, 224, 3), dtype=np.uint8)  # difference images: nothing has moved
     >>> predictions = sl.predict("chromatouch-difference", touch)
-    >>> predictions.frame().column_names[:4]
+    >>> list(predictions.frame().columns)[:4]
     ['trial', 'frame', 'time_s', 'prediction']
     """
     on, retry_failed = options.pop("on", "serial"), options.pop("retry_failed", False)

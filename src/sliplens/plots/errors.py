@@ -150,7 +150,7 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
         _plot_risk(evaluation.risk, ax=risk)
         ranked = sorted(trials, key=lambda name: trials[name].mse)
         rows = predictions.where(predictions.trial == ranked[(len(ranked) - 1) // 2])
-        plot_margins(rows.where(np.argsort(rows.time_s, kind="stable")).table(), ax=typical)
+        plot_margins(rows.where(np.argsort(rows.time_s, kind="stable")).to_arrow(), ax=typical)
         typical.set_xlabel("Time (s), in the trial of median error")
         save_page(figure, path)
 

@@ -8,17 +8,22 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from sliplens.codec import COLUMN_KINDS, Columns, Result
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, require_new_file, whole_file
 from sliplens.intervals import Difference
 from sliplens.markers.gel import SensorProposal, propose_profile
+from sliplens.plots.contact_sheet import plot_margin
 from sliplens.plots.errors import plot_faithfulness, plot_learning_curves, plot_predictions, plot_removal
 from sliplens.plots.margins import column, plot_grip_force, plot_hold, plot_margins, plot_readings
-from sliplens.plots.saliency import full_colour, overlay_relevance
+from sliplens.plots.saliency import POINTS, SIGN_COLOURS, FrameU8, full_points, overlay_points
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -27,6 +32,7 @@ from sliplens.plots.style import (
     drawing_style,
     fill_name,
     input_name,
+    method_colour,
     method_name,
     methods_in_order,
     percent,
@@ -35,18 +41,19 @@ from sliplens.plots.style import (
 from sliplens.recordings.sensor import profile_text
 from sliplens.recordings.source import Frames
 from sliplens.results.evaluation import Diagnosis
-from sliplens.results.explanation import Explanation
+from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.faithfulness import Faithfulness, is_control
-from sliplens.results.study import Study, Truth
+from sliplens.results.study import Randomisation, States, Study, Truth, UntrainedMaps
 
 
-def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
+def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Figure:
     """Draw the main figure of a result.
 
-    An evaluation shows predictions against labels; a training its learning curve; an explanation the map over the
-    image; scores of explanations their curves or gains; predictions the margin over time; tracked markers their
-    displacement; a study the gain of each method with its 95 % interval; a diagnosis the slices with a larger error; a
-    grip the force over the least that holds; a hold the commanded force. Margins are in percent, gains in margin units.
+    An evaluation shows predictions against labels; a training or a network its learning curve; an explanation the map
+    over the image, with its warnings; scores of explanations their curves or gains; predictions the margin over time;
+    tracked markers their displacement; a study the gain of each method with its 95 % interval; a diagnosis the slices
+    with a larger error; a grip the force over the least that holds; a hold the commanded force; any other result the
+    first number of its table. Margins are in percent, gains in margin units.
 
     Parameters
     ----------
@@ -56,7 +63,8 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     ax
         Axes to draw on; a new figure if None.
     index
-        Number of the image of an explanation, or of the trial of predictions and markers.
+        Number of the image of an explanation, or of the trial of predictions and markers. If None, the image with most
+        to explain, or the first trial.
 
     Returns
     -------
@@ -75,11 +83,12 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     >>> touched = np.zeros((1, 224, 224, 3), dtype=np.uint8)
     >>> touched[:, 80:120, 90:150] = 90
     >>> figure = sl.plot(sl.explain("chromatouch-difference", touched, method="grad-cam"))
-    >>> figure.axes[0].get_title(loc="left").splitlines()[-1]
-    'orange lowers, blue raises'
+    >>> figure.axes[1].get_ylabel().splitlines()[-1]
+    '(points of margin per 1 % of the image)'
     """
     # by the names of the classes: some records live on higher floors, and drawing them needs no torch
     drawer = next((DRAWERS[kind.__name__] for kind in type(result).__mro__ if kind.__name__ in DRAWERS), None)
+    drawer = drawer or (_rows if isinstance(result, Result | Columns) else None)
     if drawer is None:
         raise InputError(f"there is no picture of a {type(result).__name__}; there is one of {', '.join(DRAWERS)}")
     with drawing_style():
@@ -89,18 +98,33 @@ def plot(result: Any, ax: Axes | None = None, *, index: int = 0) -> Figure:
     return figure
 
 
-def _explanation(explanation: Explanation, ax: Axes, index: int) -> None:
-    row = _of(len(explanation.frames), index)
-    frame, relevance = explanation.frames[row], explanation.relevance[explanation.method][row]
-    ax.imshow(overlay_relevance(explanation.pictures[row], relevance / full_colour(relevance)))
-    ax.set_axis_off()
+def _explanation(explanation: Explanation, ax: Axes, index: int | None) -> None:
+    changes = [frame.prediction - frame.reference_prediction for frame in explanation.frames]
+    row = _of(len(changes), int(np.argmax(np.abs(changes))) if index is None else index)
+    frame, method, baseline = explanation.frames[row], explanation.method, explanation.baseline_words(row)
+    _draw_map(explanation.pictures[row], explanation.relevance[method][row], ax=ax)
     predicted = "withheld" if frame.withheld else percent(frame.prediction)
-    why = f"why {predicted} rather than {percent(frame.reference_prediction)}"
-    baseline = explanation.baseline_words(row)
-    ax.set_title(f"{method_name(explanation.method)}: {why},\nthat of {baseline}\norange lowers, blue raises")
+    why = f"{frame.id}: why {predicted} rather than {percent(frame.reference_prediction)}, that of {baseline}"
+    if abs(changes[row]) < CLOSE:
+        why = f"{frame.id}: nothing to explain, for {predicted} is within {percent(CLOSE)} of that of {baseline}"
+    ax.set_title(f"{method_name(method)}\n{wrap(why, 46)}", fontsize=9, parse_math=False)
+    ax.set_xlabel(wrap("; ".join(explanation.methods[method].warnings), 62), fontsize=7.5, loc="left", color=VERMILLION)
 
 
-def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int) -> None:
+def _draw_map(picture: FrameU8, relevance: Float[np.ndarray, "rows columns"], *, ax: Axes) -> None:
+    """Draw a signed map over its picture, with a bar of its colours."""
+    full = full_points(relevance[None])
+    ax.imshow(overlay_points([picture], relevance[None])[0])
+    ax.set(xticks=[], yticks=[])
+    ax.spines[:].set_visible(False)
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    bar = figure.colorbar(ScalarMappable(Normalize(-full, full), SIGN_COLOURS), ax=ax, shrink=0.9)
+    bar.set_label(f"orange lowers the margin, blue raises it\n({POINTS})", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
+
+
+def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int | None) -> None:
     if not faithfulness.scores:
         raise InputError("these scores hold no method; score some explanations first")
     fill, unit = faithfulness.scores[0].fill, faithfulness.scores[0].unit
@@ -117,14 +141,63 @@ def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int) -> None:
     ax.set_title(input_name(faithfulness.input))
 
 
-def _truth(truth: Truth, ax: Axes, _: int) -> None:
+def _truth(truth: Truth, ax: Axes, _: int | None) -> None:
     scores = {name: method.neutral for name, method in truth.methods.items() if method.neutral is not None}
     _plot_methods(scores, ax)
     ax.set(xlabel="Correlation with the effects of moved groups of markers (95 % interval)")
     ax.set_title(input_name(truth.input))
 
 
-def _diagnosis(diagnosis: Diagnosis, ax: Axes, _: int) -> None:
+def _randomisation(record: Randomisation, ax: Axes, _: int | None) -> None:
+    for name in methods_in_order(record.methods):
+        method = record.methods[name]
+        values = np.array(method.similarity, dtype=float)
+        ax.plot(method.layers, values, marker="o", color=method_colour(name), label=method_name(name))
+    ax.set(xlabel="Layers with new weights", ylabel="Similarity to the map of the network", ylim=(-1.05, 1.05))
+    ax.legend(fontsize=8)
+
+
+def _untrained(record: UntrainedMaps, ax: Axes, index: int | None) -> None:
+    name, maps = next(iter(record.maps.items()))
+    row = _of(len(maps), index or 0)
+    _draw_map(np.full((*maps.shape[1:], 3), 128, dtype=np.uint8), maps[row], ax=ax)
+    ax.set_title(method_name(name))
+
+
+def _states(states: States, ax: Axes, index: int | None) -> None:
+    names = list(states.markers)
+    if not names:
+        raise InputError(f"no marker was followed; {'; '.join(states.untracked) or 'choose frames of other trials'}")
+    name = names[_of(len(names), index or 0)]
+    markers = states.markers[name]
+    ax.plot(*markers.rest_px.T, ".", color=GREY, label="at rest")
+    ax.plot(*markers.now_px.T, "o", mfc="none", color=BLUE, label="now")
+    ax.set(xlabel="x (px)", ylabel="y (px)", aspect="equal")
+    ax.invert_yaxis()
+    ax.set_title(name, parse_math=False)
+    ax.legend()
+
+
+def _rows(result: Any, ax: Axes, _: int | None) -> None:
+    """Draw the first number of each row of a table: a bar a row where they are few, else a line."""
+    table = result.to_arrow()
+    kinds = dict(zip(table.column_names, table.schema.types, strict=True))
+    numbers = [name for name, kind in kinds.items() if COLUMN_KINDS["numbers"](kind)]
+    if not (len(table) and numbers):
+        raise InputError(f"this {type(result).__name__} holds no number to draw")
+    name = next((name for name in numbers if pa.types.is_floating(kinds[name])), numbers[0])
+    values, words = column(table, name), name.replace("_", " ")
+    texts = [table[each].to_pylist() for each, kind in kinds.items() if COLUMN_KINDS["texts"](kind)]
+    if len(table) > _MOST_BARS or not texts:
+        ax.plot(values, color=BLUE)
+        ax.set(xlabel="Row", ylabel=words)
+        return
+    ax.barh([f"{number}  {method_name(texts[0][number])}" for number in range(len(table))], values, color=BLUE)
+    ax.invert_yaxis()
+    ax.set(xlabel=words)
+
+
+def _diagnosis(diagnosis: Diagnosis, ax: Axes, _: int | None) -> None:
     if not diagnosis.slices:
         raise InputError("this diagnosis tested no slice of the trials; diagnose a network on more trials")
     rows = [(wrap(part.name, 32), part.excess, BLUE if part.holds else GREY) for part in diagnosis.slices]
@@ -150,14 +223,14 @@ def _plot_gaps(rows: Sequence[tuple[str, Difference, str]], ax: Axes, *, scale: 
     ax.invert_yaxis()
 
 
-def _study(study: Study, ax: Axes, index: int) -> None:
+def _study(study: Study, ax: Axes, index: int | None) -> None:
     if not study.faithfulness:
         raise InputError("this study holds no scores; run `sliplens study` on")
     _faithfulness(study.faithfulness[sorted(study.faithfulness)[0]], ax, index)
 
 
-def _tracking(tracking: Any, ax: Axes, index: int) -> None:
-    rows = _rows_of_trial(tracking.frame(), index)
+def _tracking(tracking: Any, ax: Axes, index: int | None) -> None:
+    rows = _rows_of_trial(tracking.to_arrow(), index)
     frame, right, down = (column(rows, name) for name in ("frame", "dx_px", "dy_px"))
     frames, length = np.unique(frame), np.hypot(right, down)
     lengths = [length[(frame == number) & np.isfinite(length)] for number in frames]
@@ -171,9 +244,11 @@ def _tracking(tracking: Any, ax: Axes, index: int) -> None:
     ax.legend()
 
 
-def _rows_of_trial(table: pa.Table, index: int) -> pa.Table:
+def _rows_of_trial(table: pa.Table, index: int | None) -> pa.Table:
     names = table["trial"].unique().to_pylist()
-    return table.filter(pc.field("trial") == names[_of(len(names), index)])
+    if not names:
+        raise InputError("there is no frame to draw; predict at least one")
+    return table.filter(pc.field("trial") == names[_of(len(names), index or 0)])
 
 
 def _of(count: int, index: int) -> int:
@@ -182,20 +257,32 @@ def _of(count: int, index: int) -> int:
     return index
 
 
-DRAWERS: dict[str, Callable[[Any, Axes, int], object]] = {
+def _network(network: Any, ax: Axes, _: int | None) -> None:
+    if network.training is None:
+        raise InputError("this network has no record of its training, whose learning curve would be drawn")
+    plot_learning_curves({network.training.input: network.training}, ax=ax)
+
+
+_MOST_BARS = 40
+DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "Evaluation": lambda result, ax, _: plot_predictions(result.predictions, ax=ax),
     "Training": lambda result, ax, _: plot_learning_curves({result.input: result}, ax=ax),
+    "Network": _network,
     "Explanation": _explanation,
+    "UntrainedMaps": _untrained,
+    "Randomisation": _randomisation,
+    "States": _states,
     "DeletionScores": lambda result, ax, _: plot_faithfulness(result.curves, ax=ax).set_title(input_name(result.input)),
     "Faithfulness": _faithfulness,
     "Study": _study,
     "Truth": _truth,
     "Diagnosis": _diagnosis,
-    "Predictions": lambda result, ax, index: plot_margins(_rows_of_trial(result.frame(), index), ax=ax),
-    "ScoredFrames": lambda result, ax, index: plot_margins(_rows_of_trial(result.table(), index), ax=ax),
+    "Predictions": lambda result, ax, index: plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
+    "ScoredFrames": lambda result, ax, index: plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
     "Tracking": _tracking,
-    "Grip": lambda result, ax, _: plot_grip_force(result.trace.table(), ax=ax).set_title(result.setup.controller),
-    "Hold": lambda result, ax, _: plot_hold(result.steps.table(), ax=ax).set_title(result.controller),
+    "Grip": lambda result, ax, _: plot_grip_force(result.trace.to_arrow(), ax=ax).set_title(result.setup.controller),
+    "Hold": lambda result, ax, _: plot_hold(result.steps.to_arrow(), ax=ax).set_title(result.controller),
+    "Recording": lambda result, ax, _: plot_margin(result, ax=ax).set_title(result.trial, parse_math=False),
     "Strip": lambda result, ax, _: plot_readings(result, ax=ax),
 }
 """Functions that draw a record, by the name of its class."""

@@ -12,7 +12,6 @@ from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
 from sliplens.images import write_png
 from sliplens.plots.style import ORANGE, SKY, drawing_style, method_name, percent, place_axes, place_text, reading_words
@@ -53,9 +52,9 @@ def overlay_jet(picture: FrameU8, saliency: Float[np.ndarray, "height width"]) -
 
 Colours: TypeAlias = Literal["signed", "jet"]
 """Colours of overlays: `signed`, what raises and what lowers, on one scale; `jet`, what supports, as in the thesis."""
-_BAR_WORDS = (
-    "lowers the margin  |  raises it, in shares of the full colour\n(which is in points of margin per 1 % of the image)"
-)
+POINTS = "points of margin per 1 % of the image"
+"""Unit of maps in figures."""
+_BAR_WORDS = f"orange lowers the margin, blue raises it\n(full colour beside each row, in {POINTS})"
 _CELL_IN, _SIDE_IN, _HEAD_IN = 1.5, 1.35, 0.45
 _BAR_IN = 4.0  # as wide as the label of the colour bar
 _WIDEST = 12
@@ -85,16 +84,16 @@ def draw_explanation(explanation: Explanation, folder: Path, *, colours: Colours
     rows = [PictureRow(name="Network input", pictures=[explanation.pictures[column] for column in columns])]
     for method, relevance in explanation.relevance.items():
         (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
-        scale = ""
+        scale = None
         if colours == "jet":
             pictures = list(map(overlay_jet, explanation.pictures, explanation.saliency[method]))
         else:
             pictures = overlay_points(explanation.pictures, relevance)
-            scale = f"\nfull colour: {full_points(relevance):.2g} points"
+            scale = full_points(relevance)
         for frame, picture in zip(explanation.frames, pictures, strict=True):
             write_png(overlays / f"{frame.id}.png", picture)
         shown = [pictures[column] for column in columns]
-        rows.append(PictureRow(name=f"{method_name(method)}{scale}", pictures=shown))
+        rows.append(PictureRow(name=method_name(method), pictures=shown, full=scale))
     titles = []
     for frame in (explanation.frames[column] for column in columns):
         name = frame.id if len(frame.id) <= 22 else f"\N{HORIZONTAL ELLIPSIS}{frame.id[-21:]}"
@@ -119,6 +118,8 @@ class PictureRow:
     name: str
     pictures: Sequence[FrameU8]
     words: Sequence[str] = ()
+    full: float | None = None
+    """Relevance of the full colour, in `POINTS`; None for pictures without a map."""
 
 
 def draw_pictures(
@@ -133,9 +134,8 @@ def draw_pictures(
         # placed by hand: laying out a hundred axes takes seconds
         figure = Figure(figsize=(_SIDE_IN + max(step * len(heads), _BAR_IN), bottoms[-1] + (0.8 if bar else 0.1)))
         for row, top in zip(rows, [_HEAD_IN, *bottoms], strict=False):
-            place_text(
-                figure, _SIDE_IN - 0.1, top + _CELL_IN / 2, fill(row.name, 20, replace_whitespace=False), **aside
-            )
+            name = row.name if row.full is None else f"{row.name}\nfull colour: {row.full:.2g}"
+            place_text(figure, _SIDE_IN - 0.1, top + _CELL_IN / 2, fill(name, 20, replace_whitespace=False), **aside)
             for column, picture in enumerate(row.pictures):
                 ax = place_axes(figure, _SIDE_IN + column * step, top, _CELL_IN, _CELL_IN)
                 ax.imshow(picture, interpolation="none")
@@ -146,7 +146,9 @@ def draw_pictures(
             place_text(figure, _SIDE_IN + column * step + _CELL_IN / 2, _HEAD_IN - 0.05, text, va="bottom", **small)
         if bar is not None:
             place = place_axes(figure, _SIDE_IN, bottoms[-1] + 0.1, _BAR_IN, 0.12)
-            colour_bar = figure.colorbar(bar, cax=place, orientation="horizontal", format=PercentFormatter(1))
+            colour_bar = figure.colorbar(bar, cax=place, orientation="horizontal")
+            if bar is SIGN_BAR:
+                colour_bar.set_ticks([-1, 0, 1], labels=["\N{MINUS SIGN}full colour", "0", "+full colour"])
             colour_bar.ax.tick_params(labelsize=7)
             colour_bar.ax.set_xlabel(words, fontsize=8)
     return figure

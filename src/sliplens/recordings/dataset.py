@@ -9,7 +9,7 @@ from pathlib import Path
 
 from filelock import FileLock
 
-from sliplens.codec import from_builtins, save_record
+from sliplens.codec import Result, from_builtins, save_record
 from sliplens.errors import RecordingError
 from sliplens.files import hash_file, hash_json, read_json, require_folder, whole_file
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
@@ -55,7 +55,7 @@ class _Table:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dataset:
+class Dataset(Result):
     """A data set on disk; trials are read one at a time."""
 
     folder: Path

@@ -11,6 +11,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Literal, TypeAlias, get_args
 
+from sliplens.codec import Result
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import MOST_TEXT, require_file
 from sliplens.recordings.dataset import Dataset, load_dataset, write_dataset_table
@@ -26,7 +27,7 @@ _MOST_NAMES = 5  # names in a message before the rest is counted
 
 
 @dataclass(frozen=True, kw_only=True)
-class SplitResult:
+class SplitResult(Result):
     """Split of every trial, and remarks on it."""
 
     splits: tuple[str, ...]  #: In the order of the trials.

@@ -7,6 +7,7 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
+from sliplens.codec import Result
 from sliplens.errors import RecordingError
 from sliplens.mechanics import stick_ratio
 from sliplens.recordings.labelling import Labelling
@@ -153,7 +154,7 @@ class GroundTruth:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recording(TrialFacts, Labels):
+class Recording(TrialFacts, Labels, Result):
     """One trial in memory: its facts, its frames (uint8 RGB) at their times, and their labels."""
 
     reference: UInt8[np.ndarray, "_ _ 3"]  #: Image of the untouched sensor.

@@ -201,7 +201,7 @@ def plate_trace(grip: Grip) -> Plate:
     """Draw force, margin and slip of the first episode."""
     figure, axes = _make_charts(3, each=(3.9, 3.0))
     with style.drawing_style():
-        plot_grip(grip.trace.table(), axes=axes)
+        plot_grip(grip.trace.to_arrow(), axes=axes)
     columns = ("time_s", "force_n", "least_force_n", "true_margin", "margin", "low", "high", "slip_m")
     first, setup = grip.episodes.where(np.arange(1)), grip.setup
     fate = "fell" if first.dropped[0] else "was held"

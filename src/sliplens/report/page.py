@@ -14,6 +14,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from sliplens.codec import Result
 from sliplens.errors import InputError
 from sliplens.plots.style import written_whole
 from sliplens.report.comparisons import CITATION, write_gap
@@ -27,7 +28,7 @@ PAGE = "report.html"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Written:
+class Written(Result):
     """Files of a report: the page, and each of its figures as PDF and its numbers as CSV."""
 
     page: Path

@@ -21,6 +21,7 @@ from sliplens.plots.saliency import (
     PictureRow,
     draw_pictures,
     full_colour,
+    full_points,
     overlay_points,
     overlay_relevance,
 )
@@ -133,7 +134,8 @@ def plate_states(results: Results, explained: Explanation) -> Plate:
     lines = [PictureRow(name=title, pictures=pictures)]
     for method in methods:
         relevance = explained.relevance[method][rows]
-        lines.append(PictureRow(name=method_name(method), pictures=overlay_points(pictures, relevance)))
+        maps = overlay_points(pictures, relevance)
+        lines.append(PictureRow(name=method_name(method), pictures=maps, full=full_points(relevance)))
     number = _THESIS_NUMBERS.get(explained.input)
     name = f"fig-{number}-methods-{explained.input}" if number else f"methods-{explained.input}"
     off = [abs(frame.prediction - frame.safety_margin) for frame in frames if frame.safety_margin is not None]
@@ -209,7 +211,8 @@ def plate_moments(grip: Grip) -> Plate:
     """Draw frames of the first finger, and the maps that explain their predictions."""
     heads = [f"{time_s:g} s" for time_s in grip.moments_s]
     maps = overlay_points(grip.pictures, grip.maps)
-    rows = [PictureRow(name="camera", pictures=list(grip.pictures)), PictureRow(name="why", pictures=maps)]
+    rows = [PictureRow(name="camera", pictures=list(grip.pictures))]
+    rows += [PictureRow(name="why", pictures=maps, full=full_points(grip.maps))]
     return Plate(
         name="grip-moments",
         figure=draw_pictures(rows, heads=heads, bar=SIGN_BAR),

@@ -4,11 +4,10 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Float64, Int64, Shaped
 from msgspec import Meta
 
-from sliplens.codec import UNKNOWN, Columns
+from sliplens.codec import UNKNOWN, Columns, Result
 from sliplens.friction import MOST_FRICTION
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.recordings.trial import CLOCK_S, LABEL_BOUNDS
@@ -16,14 +15,17 @@ from sliplens.recordings.trial import CLOCK_S, LABEL_BOUNDS
 
 def _label(name: str) -> Meta:
     low, high, _ = LABEL_BOUNDS[name]
-    return Meta(ge=low, le=high)
+    return Meta(ge=low, le=high, description=UNIT.description if name == "safety_margin" else None)
 
+
+UNIT = Meta(description="margin units")
+"""Of what has neither bounds nor a unit in its name."""
 
 MARGIN, FORCE, RATIO = map(_label, ("safety_margin", "normal_force_n", "friction_coefficient"))
 TIME = Meta(ge=CLOCK_S[0], le=CLOCK_S[1])
 """Bounds of what a recording tells, in its units; those of this table are asked of every result that is loaded."""
 FRICTION = Meta(gt=0, le=MOST_FRICTION)
-ANSWER = Meta(ge=-1000, le=1000)
+ANSWER = Meta(ge=-1000, le=1000, description="margin units")
 """Of answers that are not clipped, and of their parts and changes: a thousand times what there is to tell."""
 AMOUNT = Meta(ge=0)
 """Of counts, sizes and squares."""
@@ -38,7 +40,7 @@ PIXEL = Meta(ge=-1e5, le=1e5)
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfNetwork:
+class OfNetwork(Result):
     """Result of one network on some frames."""
 
     input: str
@@ -60,7 +62,7 @@ class LearningCurve(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Training:
+class Training(Result):
     """One training: what was trained on what, how long, and its learning curve."""
 
     input: str
@@ -184,7 +186,7 @@ class RiskCoverage:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluation:
+class Evaluation(Result):
     """Scores of one network by condition, day and trial, how sure it was, and the predictions behind it all."""
 
     input: str
@@ -211,9 +213,14 @@ class Evaluation:
     risk: RiskCoverage | None = None
     """Error as more and more frames are withheld; None in a result without it."""
 
-    def frame(self) -> pa.Table:
-        """Arrow table of the predictions, a row a frame."""
-        return self.predictions.table()
+    @property
+    def summary(self) -> str:
+        """Errors by condition in a sentence."""
+        scores = ", ".join(
+            f"{name} {'none' if each.r2 is None else f'{each.r2:.3f}'} (MAE {each.mae:.3f} margin units)"
+            for name, each in self.conditions.items()
+        )
+        return f"R2 {scores}; {len(self.predictions):,} frames of {len(self.trials)} {self.split} trials"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,9 +10,10 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float, Float32, Float64, Shaped, UInt8
 
-from sliplens.codec import UNKNOWN, Columns, load_record, load_result
+from sliplens.codec import UNKNOWN, Columns, Result, load_record, load_result
 from sliplens.errors import InputError, SaliencyError
 from sliplens.files import RUN_FILE, Provenance, require_folder
+from sliplens.progress import number_of
 from sliplens.results.evaluation import ANSWER, MARGIN, TIME, OfNetwork
 
 MARGIN_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
@@ -25,6 +26,8 @@ BASELINES: dict[BaselineName, str] = {
     "given": "the given frame",
 }
 """Baselines in words."""
+CLOSE = 0.02
+"""Change of the prediction in margin units below which there is nothing to explain: a regressor's error is larger."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +108,17 @@ class Explanation(OfNetwork):
             maps[method] = supporting / np.where(peak > 0, peak, np.float32(1))
         return maps
 
-    def frame(self) -> pa.Table:
+    @property
+    def summary(self) -> str:
+        """Content in a sentence."""
+        change = max((frame.prediction - frame.reference_prediction for frame in self.frames), key=abs)
+        frames = f"{number_of(len(self.frames), 'frame')} of {number_of(len(self.trials), 'trial')}"
+        return (
+            f"maps of {', '.join(self.methods) or 'no method'} for {frames}; the prediction changes "
+            f"by up to {change:+.2f} margin units from that of {BASELINES[self.baseline]}"
+        )
+
+    def to_arrow(self) -> pa.Table:
         """Arrow table, a row a frame and method: predictions and completeness gap (NaN if not promised)."""
         change = [frame.prediction - frame.reference_prediction for frame in self.frames]
         gaps = [notes.completeness_gap or (np.nan,) * len(change) for notes in self.methods.values()]
@@ -253,7 +266,7 @@ class StripReadings(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Strip:
+class Strip(Result):
     """One trial from stick to slip: true and predicted margin, and the maps of a few frames."""
 
     trial: str

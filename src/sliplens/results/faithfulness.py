@@ -6,13 +6,13 @@ from functools import cached_property
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Float64, Int, Int64, Shaped
 
-from sliplens.codec import UNKNOWN, Columns
+from sliplens.codec import UNKNOWN, Columns, Result
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
-from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, SHARE, OfNetwork
+from sliplens.progress import number_of
+from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, SHARE, UNIT, OfNetwork
 
 _Rows = TypeVar("_Rows", "DeletionTable", "RemovalTable")
 Key = tuple[str, str, str]
@@ -79,7 +79,7 @@ class DeletionCurve:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Deletion:
+class Deletion(Result):
     """Deletion score of the thesis by method, a random order among the methods."""
 
     fill: str
@@ -122,7 +122,7 @@ class RemovalScore:
     unit: str
     method: str
     control: bool
-    srg: Difference
+    srg: Annotated[Difference, UNIT]
     lead_over_controls: Lead | None
     """None for a control."""
 
@@ -254,9 +254,17 @@ class Faithfulness(OfNetwork):
                 return score
         raise InputError(f"no method {method!r} was scored; choose one of {', '.join(s.method for s in self.scores)}")
 
-    def frame(self) -> pa.Table:
-        """Arrow table of the removal curves, in margin units."""
-        return self.table.table()
+    @property
+    def summary(self) -> str:
+        """Gain of the best method in a sentence."""
+        counts = f"{number_of(self.frames, 'frame')} of {number_of(self.trials, 'trial')}"
+        methods = [score for score in self.scores if not score.control and score.key[:2] == self.scores[0].key[:2]]
+        if not methods:
+            return f"no method was scored; {counts}"
+        best = max(methods, key=lambda score: score.srg.estimate)
+        lead = best.lead_over_controls
+        over = "" if lead is None else f", {lead.gap} over the best control ({lead.control})"
+        return f"symmetric relevance gain of {best.method} {best.srg} margin units{over}; {counts}"
 
 
 def _sort_by_frame(

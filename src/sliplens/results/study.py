@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Float32, Float64, Int64, Shaped
 
-from sliplens.codec import UNKNOWN, Columns
+from sliplens.codec import UNKNOWN, Columns, Result, rows_of
 from sliplens.intervals import Difference
 from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, PIXEL, Evaluation, OfNetwork
 from sliplens.results.explanation import BASELINES, BaselineName, Explanation
@@ -53,7 +54,7 @@ class ChosenFrame:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Choice:
+class Choice(Result):
     """Trials and frames of a study, and how they came to be chosen."""
 
     trials_wanted: int
@@ -104,7 +105,7 @@ class MarkerPlaces:
 
 
 @dataclass(frozen=True, kw_only=True)
-class States:
+class States(Result):
     """Markers of all chosen frames."""
 
     untracked: tuple[str, ...]
@@ -422,7 +423,7 @@ def say_left_out(dropped: int, chosen: int, name: str, baseline: BaselineName) -
 
 
 @dataclass(frozen=True, kw_only=True)
-class Study:
+class Study(Result):
     """A study, stage by stage; tables are by input, and empty where a stage was not run."""
 
     folder: Path = Path()
@@ -439,6 +440,17 @@ class Study:
     map_quality: dict[str, MapQuality] = field(default_factory=dict)
     timing: dict[str, Timing] = field(default_factory=dict)
     truth: dict[str, Truth] = field(default_factory=dict)
+
+    @property
+    def summary(self) -> str:
+        """Gain of the best method with each network, in a sentence."""
+        scores = "; ".join(f"{name} images: {record.summary}" for name, record in self.faithfulness.items())
+        return scores or "no method was scored"
+
+    def to_arrow(self) -> pa.Table:
+        """Arrow table of the scores, a row a network, fill, unit and method; gains in margin units."""
+        records = self.faithfulness.items()
+        return pa.Table.from_pylist([{"input": name} | row for name, each in records for row in rows_of(each.scores)])
 
     @property
     def inputs(self) -> set[str]:

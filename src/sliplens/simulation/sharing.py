@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sliplens.codec import Result
 from sliplens.errors import InputError
 from sliplens.recordings import Dataset
 from sliplens.recordings.dataset import TrialInfo, load_dataset, trial_path
@@ -13,7 +14,7 @@ from sliplens.simulation.plan import TrialPlan, plan_trials
 
 
 @dataclass(frozen=True, kw_only=True)
-class SharedMaterial:
+class SharedMaterial(Result):
     """Material in both of two data sets; each pair has the names in the first and in the second."""
 
     by_seeds: bool

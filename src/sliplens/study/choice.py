@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.errors import ImageError, InputError, RecordingError
-from sliplens.explainers.attribution import CLOSE
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import network_inputs, network_references, with_markers
 from sliplens.explainers.frames import MARGIN_LEVELS as LEVELS
@@ -23,7 +22,7 @@ from sliplens.models import Network
 from sliplens.plots.style import input_name, listed
 from sliplens.progress import number_of, report_each
 from sliplens.recordings import Dataset, TrialInfo
-from sliplens.results.explanation import Explanation
+from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.study import (
     STUDY_BUDGET,
     STUDY_METHODS,
