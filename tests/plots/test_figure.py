@@ -54,6 +54,22 @@ def test_what_raises_is_blue_and_what_lowers_is_orange(explanation):
     assert "why 20" in ax.get_title(loc="left")
 
 
+def test_the_frame_with_most_to_explain_is_drawn_with_unit_and_warnings(explanation):
+    frames = (explanation.frames[0], replace(explanation.frames[1], id="most", prediction=0.1))
+    notes = replace(explanation.methods["grad-cam"], warnings=("the map is flat",))
+    picture, bar = sl.plot(replace(explanation, frames=frames, methods={"grad-cam": notes})).axes
+
+    assert "most: why 10" in picture.get_title(loc="left")
+    assert "untouched sensor" in picture.get_title(loc="left").replace("\n", " ")
+    assert picture.get_xlabel() == "the map is flat"
+    assert "per 1 % of the image" in bar.get_ylabel()
+
+
+def test_a_prediction_that_is_that_of_the_baseline_has_nothing_to_explain(explanation):
+    frames = tuple(replace(frame, prediction=0.99) for frame in explanation.frames)
+    assert "nothing to explain" in sl.plot(replace(explanation, frames=frames)).axes[0].get_title(loc="left")
+
+
 def test_a_number_that_is_not_there_is_told(explanation):
     with pytest.raises(InputError, match="there is no number 2 among 2; count from 0"):
         sl.plot(explanation, index=2)

@@ -1,16 +1,21 @@
 """What the figures of a study are made of."""
 
 import csv
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import is_dataclass, replace
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import sliplens as sl
+from sliplens.codec import Result
 from sliplens.report import load_results
 from sliplens.report.plates import Plate, bright_pictures, plate_truth, write_plates
 from sliplens.report.tables import table_scores
+from sliplens.results.evaluation import Evaluation, Training
+from sliplens.results.explanation import Strip, StripReadings
+from sliplens.results.study import RECORDS, Study, UntrainedMaps
 
 from .study_results import METHODS, SPEARMAN, Made, write_choice, write_faithfulness
 
@@ -18,6 +23,35 @@ from .study_results import METHODS, SPEARMAN, Made, write_choice, write_faithful
 @pytest.fixture(scope="module")
 def results(pristine_study):
     return load_results(pristine_study)
+
+
+def public_records(value: object) -> Iterator[Result]:
+    """Records in a record or a mapping, itself included."""
+    if isinstance(value, Result):
+        yield value
+    parts = value.values() if isinstance(value, dict) else vars(value).values() if is_dataclass(value) else ()
+    for part in parts:
+        yield from public_records(part)
+
+
+def test_every_record_has_a_short_repr_a_table_and_a_figure(results, pristine_workspace):
+    workspace = load_results(pristine_workspace)
+    data = sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20)
+    untouched = UntrainedMaps(input="raw", source="simulated", maps={"grad-cam": np.ones((1, 8, 8), np.float32)})
+    margins = {name: np.zeros(2) for name in ("time_s", "safety_margin", "prediction", "low", "high")}
+    readings = StripReadings(contact_state=np.array(["contact"] * 2), withheld=np.array(["", ""]), **margins)
+    facts = {"trial": "t", "condition": "dry", "source": "real", "input": "pair", "method": "grad-cam"}
+    maps = {"pictures": np.zeros((1, 8, 8, 3), np.uint8), "relevance": np.zeros((1, 8, 8), np.float32)}
+    strip = Strip(readings=readings, shown=(0,), **facts, **maps)
+    records = [*public_records(results), *public_records(workspace), data, data.load(data.trials[0]), untouched, strip]
+    kinds = {type(record) for record in records}
+
+    assert {*RECORDS.values(), Training, Evaluation, Strip, Study} <= kinds
+    for record in {type(record): record for record in reversed(records)}.values():
+        assert len(repr(record).splitlines()) <= 10, record
+        assert max(map(len, repr(record).splitlines())) <= 280
+        assert len(record.frame()) == record.to_arrow().num_rows > 0
+        assert sl.plot(record).axes
 
 
 def make_plate(rows: list[tuple] | None = None) -> Plate:

@@ -1,21 +1,25 @@
 """Commands made of functions: options, defaults, types and help come from signature and docstring."""
 
+import ast
 import re
-from ast import FunctionDef, get_docstring, parse
+import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
-from functools import partial
+from functools import cache, partial
 from importlib import import_module
 from inspect import Parameter, Signature, signature
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, Unpack, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, Unpack, get_args, get_origin, get_type_hints, is_typeddict
 
 import cyclopts
 import docstring_parser
 
 from sliplens.cli.console import Terminal
 from sliplens.errors import InputError
+from sliplens.files import find_run, partial_folder, require_folder, require_new_file
 
 ALIASES = {"out": ("-o", "--output")}
 """Further names of parameters on the command line."""
@@ -32,16 +36,111 @@ class Command:
     example: str
     aliases: tuple[tuple[str, str], ...] = ()
     """Parameters with a further name, such as `("source", "--from")`."""
+    suffixes: tuple[str, ...] = ()
+    """Endings of the file `out`; without an ending it is a folder."""
 
     @property
     def summary(self) -> str:
-        """First line of the function's docstring, read from the source: importing all functions takes seconds."""
+        """First line of the function's docstring."""
         module, _, name = self.function.partition(":")
-        path = Path(__file__).parents[1].joinpath(*module.split(".")[1:])
-        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-        tree = parse(path.read_text(encoding="utf-8"))
-        nodes = (node for node in tree.body if isinstance(node, FunctionDef) and node.name == name)
-        return (get_docstring(next(nodes)) or "").partition("\n")[0]
+        return _docstring(_statements(module)[name]).partition("\n")[0]
+
+
+_PACKAGE = Path(__file__).parents[1]
+_LONGEST_TYPE = 100
+
+
+class _AnythingType(type):
+    def __getattr__(cls, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return cls
+
+
+class _Anything(metaclass=_AnythingType):
+    """Stands for all that no option needs, such as arrays and networks."""
+
+    def __init__(self, *_: object, **__: object) -> None: ...
+
+    __class_getitem__ = classmethod(lambda cls, _: cls)
+
+
+@cache
+def _statements(module: str) -> dict[str, ast.stmt]:
+    """Return the statement that binds each name of a module, or of the stub of a package."""
+    path = _PACKAGE.joinpath(*module.split(".")[1:])
+    files = path / "__init__.pyi", path / "__init__.py", path.with_suffix(".py")
+    statements: dict[str, ast.stmt] = {}
+    for node in ast.parse(next(file for file in files if file.is_file()).read_text(encoding="utf-8")).body:
+        match node:
+            case ast.Import() | ast.ImportFrom():
+                names = [alias.asname or alias.name for alias in node.names]
+            case ast.FunctionDef() | ast.ClassDef():
+                names = [node.name]
+            case _:
+                stored = (each for each in ast.walk(node) if isinstance(each, ast.Name))
+                names = [each.id for each in stored if isinstance(each.ctx, ast.Store)]
+        statements |= dict.fromkeys(names, node)
+    return statements
+
+
+_READ: dict[tuple[str, str], Any] = {}
+
+
+def read_name(module: str, name: str) -> Any:
+    """Return a function, a type of options or a value of sliplens, made of its source alone.
+
+    Functions have no body and classes no methods; what comes from another library than Python's own is missing.
+    Importing a function takes seconds where its module needs torch, and a mistake is to be told at once.
+    """
+    if (module, name) not in _READ:
+        _READ[module, name] = _Anything  # for a type that names itself
+        _READ[module, name] = _made(_statements(module).get(name), module, name)
+    return _READ[module, name]
+
+
+def _made(node: ast.stmt | None, module: str, name: str) -> Any:
+    if isinstance(node, ast.ImportFrom):
+        parts = module.split(".")
+        above = parts[: len(parts) - node.level + _PACKAGE.joinpath(*parts[1:]).is_dir()] if node.level else []
+        source = ".".join([*above, node.module or ""])
+        original = next(alias.name for alias in node.names if name in {alias.asname, alias.name})
+        if source.startswith("sliplens"):
+            return read_name(source, original)
+        standard = source.partition(".")[0] in sys.stdlib_module_names
+        return getattr(import_module(source), original) if standard else _Anything
+    if (
+        node is None
+        or isinstance(node, ast.Import)
+        or (isinstance(node, ast.ClassDef) and not _is_options(node, module))
+    ):
+        return _Anything
+    node = deepcopy(node)
+    if isinstance(node, ast.FunctionDef):
+        node.decorator_list, node.body = [], [ast.Expr(ast.Constant(_docstring(node)))]
+    elif isinstance(node, ast.ClassDef):
+        node.body = [each for each in node.body if isinstance(each, ast.AnnAssign)] or [ast.Pass()]
+    texts = [each.value for each in ast.walk(node) if isinstance(each, ast.Constant) and isinstance(each.value, str)]
+    words = {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+    space: dict[str, Any] = {"__name__": module}
+    for _ in range(2):  # types may be texts, and texts may name types
+        words.update(*(re.findall(r"\w+", text) for text in texts if len(text) < _LONGEST_TYPE))
+        space |= {word: read_name(module, word) for word in words & _statements(module).keys() - {name}}
+        texts = [value for value in space.values() if isinstance(value, str)]
+    exec(compile(ast.fix_missing_locations(ast.Module([node], [])), module, "exec"), space)
+    return space[name]
+
+
+def _is_options(node: ast.ClassDef, module: str) -> bool:
+    """Return True for a typed dictionary, and for a dataclass whose fields all have defaults."""
+    if node.decorator_list:
+        return all(each.value for each in node.body if isinstance(each, ast.AnnAssign))
+    bases = [base.id for base in node.bases if isinstance(base, ast.Name)]
+    return any(base == "TypedDict" or is_typeddict(read_name(module, base)) for base in bases)
+
+
+def _docstring(node: ast.stmt) -> str:
+    return (ast.get_docstring(node) if isinstance(node, ast.FunctionDef | ast.ClassDef) else "") or ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,13 +182,17 @@ class _Option:
 def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     """Return the function that cyclopts calls for a command, and the names of its options."""
     module, _, name = command.function.partition(":")
-    function = getattr(import_module(module), name)
+    function = read_name(module, name)
     aliases = {**ALIASES, **{name: (alias,) for name, alias in command.aliases}}
-    ordered = sorted((*_options(function), *_further(command.run)), key=lambda option: not option.positional)
+    further = _further(read_name(command.run.__module__, command.run.__name__))
+    ordered = sorted((*_options(function), *further), key=lambda option: not option.positional)
     options = [replace(option, aliases=aliases.get(option.name, ())) for option in ordered]
     by_name = {option.name: option for option in options}
     reports = _hint_of(function, "on_progress") is not None
     groups = {option.group: _options_type(_hint_of(function, option.group)) for option in options if option.group}
+
+    def run(*positional: object, **arguments: object) -> object:
+        return getattr(import_module(module), name)(*positional, **arguments)
 
     def call(*positional: object, **values: object) -> None:
         places = [option.name for option in options if option.positional]
@@ -102,10 +205,11 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
                 arguments.setdefault(group, {})[name] = value
             else:
                 arguments[name] = constants(value) if _is_constants(function, name) else value
+        _refuse_early(arguments, places=places, suffixes=command.suffixes)
         for group, kind in groups.items():
             if group in arguments:
-                arguments[group] = kind(**arguments[group])
-        command.run(partial(function, **arguments), **further)
+                arguments[group] = getattr(import_module(kind.__module__), kind.__name__)(**arguments[group])
+        command.run(partial(run, **arguments), **further)
 
     parsed = docstring_parser.parse(function.__doc__ or "")
     texts = [parsed.short_description, parsed.long_description, f"Example: {command.example}"]
@@ -113,6 +217,27 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     call.__signature__ = Signature([option.parameter for option in options])  # pyright: ignore[reportFunctionMemberAccess]
     call.__annotations__ = {option.name: option.parameter.annotation for option in options}
     return call, list(by_name)
+
+
+def _refuse_early(arguments: Mapping[str, Any], *, places: Sequence[str], suffixes: Sequence[str]) -> None:
+    """Refuse networks, data and files that are not there before the function is imported: that may take seconds."""
+    given = {name: value if isinstance(value, tuple) else (value,) for name, value in arguments.items()}
+    given = {name: values for name, values in given.items() if values != (None,)}
+    # `predict FILE` names no network
+    names = ("run",) if given.keys() & {*places[1:]} else ()
+    sources = *given.get("sources", ()), *(given.get("source" if names else "run", ()) if "run" in given else ())
+    for network in (
+        network for name in ("network", "networks", "start_from", *names) for network in given.get(name, ())
+    ):
+        find_run(Path(network))
+    for data in given.get("data", ()):
+        require_folder(Path(data), what="the data set")
+    for source in sources:
+        if not Path(source).exists():
+            raise InputError(f"{source} does not exist; check the path")
+    for out in map(Path, given.get("out", ())):
+        if suffixes and out.suffix:
+            require_new_file(out, suffix=suffixes, overwrite="overwrite" in given or partial_folder(out).exists())
 
 
 def _options(function: Callable[..., object]) -> list[_Option]:
@@ -176,12 +301,21 @@ def _further(run: Callable[..., object]) -> list[_Option]:
 
 def _parameter_help(kind: Any) -> dict[str, str]:
     """Return the description of each parameter or field, as one paragraph."""
-    helps = {}
-    inherited = [base for base in getattr(kind, "__mro__", ())[1:] if is_dataclass(base)]
-    for param in (param for each in (*inherited, kind) for param in docstring_parser.parse_from_object(each).params):
-        for name in param.arg_name.split(","):
-            helps[name.strip()] = " ".join((param.description or "").split())
-    return helps
+    node, helps = _statements(kind.__module__)[kind.__name__], {}
+    if isinstance(node, ast.ClassDef):
+        for base in (base.id for base in node.bases if isinstance(base, ast.Name)):
+            above = read_name(kind.__module__, base)
+            helps |= _parameter_help(above) if getattr(above, "__module__", "").startswith("sliplens.") else {}
+        for field, below in pairwise(node.body):
+            if (
+                isinstance(field, ast.AnnAssign)
+                and isinstance(below, ast.Expr)
+                and isinstance(below.value, ast.Constant)
+            ):
+                helps[ast.unparse(field.target)] = str(below.value.value)
+    for param in docstring_parser.parse(_docstring(node)).params:
+        helps |= dict.fromkeys(param.arg_name.replace(" ", "").split(","), param.description or "")
+    return {name: " ".join(text.split()) for name, text in helps.items()}
 
 
 def _options_type(hint: Any) -> Any:

@@ -26,11 +26,14 @@ COMMANDS: dict[str, Command] = {}
 Run = Callable[..., None]
 
 
-def command(name: str, function: str, example: str, *aliases: tuple[str, str]) -> Callable[[Run], Run]:
+def command(
+    name: str, function: str, example: str, *aliases: tuple[str, str], suffixes: tuple[str, ...] = ()
+) -> Callable[[Run], Run]:
     """Register a function that calls a function of the library, given with its arguments, and prints the result."""
 
     def register(run: Run) -> Run:
-        COMMANDS[name] = Command(function=f"sliplens.{function}", run=run, example=example, aliases=aliases)
+        options = {"aliases": aliases, "suffixes": suffixes}
+        COMMANDS[name] = Command(function=f"sliplens.{function}", run=run, example=example, **options)
         return run
 
     return register
@@ -451,6 +454,7 @@ def call_evaluate(call: Any, *, device: str = "cpu") -> None:
     "predict",
     "models.predictions:predict",
     "sliplens predict cup.mp4 --sensor tip.toml --plot margin.png -o margins.csv",
+    suffixes=(".parquet", ".csv", ".json"),
 )
 def call_predict(call: Any, *, plot: Path | None = None) -> None:
     """Print the margins.
@@ -483,24 +487,35 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
         print_file(predictions.path, f"{number_of(predictions.frames, 'frame')}, by {predictions.engine}")
 
 
-@command("export onnx", "models.onnx:export_onnx", "sliplens export onnx runs/mine/train -o tip.onnx")
+@command(
+    "export onnx",
+    "models.onnx:export_onnx",
+    "sliplens export onnx runs/mine/train -o tip.onnx",
+    suffixes=(".onnx",),
+)
 def call_export_onnx(call: Any) -> None:
-    """Print what was written."""
+    """Print what will be written, then that it was."""
     from sliplens.models.checkpoint import load
 
     network = load(call.keywords["run"])
-    with OUT.status("Exporting and comparing"):
-        path = call(run=network)
     manifest = network.manifest
     about = f"{manifest.backbone}, {manifest.head} head, {manifest.image_size} px, {manifest.input} images"
-    print_file(path, f"{about}; predicts as the network does")
+    say(f"writing {call.keywords['out']}: {about}; it appears once ONNX Runtime predicts the same as the network")
+    with OUT.status("Exporting and comparing"):
+        path = call(run=network)
+    print_file(path, "predicts as the network does")
 
 
 @command("export lerobot", "recordings.exporting:export_lerobot", "sliplens export lerobot runs/mine/data -o lerobot")
 @command("export mcap", "recordings.exporting:export_mcap", "sliplens export mcap runs/mine/data -o mcap")
 def call_export_dataset(call: Any) -> None:
-    """Write the data set."""
-    call()
+    """Print what will be written, and write it."""
+    from sliplens.recordings.dataset import load_dataset
+
+    data = load_dataset(call.keywords["data"])
+    trials = number_of(len(call.keywords.get("trials") or data.trials), "trial")
+    say(f"writing {call.keywords['out']}: {trials} of {data.folder}")
+    call(data=data)
 
 
 @command(

@@ -6,8 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
-from scipy.optimize import fminbound
-from scipy.special import comb
 from torch import Tensor
 
 from sliplens.errors import InputError
@@ -103,6 +101,7 @@ def _shrink(
         return float((unexplained + (projected**2 / (1 + sizes**2 / ridge)).sum()) / freedom)
 
     def doubt(log_ridge: float) -> float:
+
         ridge = np.exp(log_ridge)
         return freedom * np.log(variance(ridge) + 1e-300) + np.log1p(sizes**2 / ridge).sum()
 
@@ -122,6 +121,8 @@ def _shrink(
 
 def _all_pairs(players: int) -> tuple[Bool[np.ndarray, "pairs players"], Float64[np.ndarray, " pairs"]]:
     """One coalition of each pair, those without the last player, and Shapley's kernel of each."""
+    from scipy.special import comb  # noqa: PLC0415 (takes a tenth of a second)
+
     members = (np.arange(1, 2 ** (players - 1))[:, None] >> np.arange(players) & 1).astype(bool)
     sizes = members.sum(axis=1)
     return members, 1 / (comb(players, sizes) * sizes * (players - sizes))

@@ -6,7 +6,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
-from torchvision.transforms.v2 import functional as transforms
 
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import frame_of
@@ -138,6 +137,8 @@ def _background(images: Images) -> Images:
 
 
 def _blurred(images: Images) -> Images:
+    from torchvision.transforms.v2 import functional as transforms  # noqa: PLC0415 (takes a second)
+
     # a standard deviation of 5 % of the width wipes a marker out and keeps the illumination
     sigma = 0.05 * images.shape[-1]
     kernel = 2 * round(2 * sigma) + 1

@@ -6,7 +6,6 @@ from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float, Float64, Int, UInt8
-from scipy.stats import kendalltau
 from torch import Tensor
 
 from sliplens.errors import CheckpointError, InputError, SaliencyError
@@ -378,6 +377,8 @@ def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
 
     Kendall, *A new measure of rank correlation* (1938).
     """
+    from scipy.stats import kendalltau  # noqa: PLC0415 (takes a second)
+
     alarms = []
     for first, second in combinations(scores, 2):
         methods = sorted(set(scores[first]) & set(scores[second]))

@@ -6,8 +6,6 @@ from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 Places: TypeAlias = Float[np.ndarray, "markers 2"]
 Spots: TypeAlias = Float[np.ndarray, "spots 2"]
@@ -194,6 +192,9 @@ class Pattern:
         A part of a grid that moved by most of a pitch is matched wrongly as a whole: no marker in it strays from the
         next. But where it meets the rest, the skin would have to be torn or folded.
         """
+        from scipy.sparse import coo_array  # noqa: PLC0415 (takes a quarter of a second, and predictions need none)
+        from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+
         both = sound[:, None] & sound[self._near]
         apart = np.linalg.norm(self._offset, axis=-1)
         relative = np.linalg.norm(shift_px[self._near] - shift_px[:, None], axis=-1) / self._pitch[:, None]

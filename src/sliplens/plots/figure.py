@@ -185,7 +185,7 @@ def _rows(result: Any, ax: Axes, _: int | None) -> None:
     numbers = [name for name, kind in kinds.items() if COLUMN_KINDS["numbers"](kind)]
     if not (len(table) and numbers):
         raise InputError(f"this {type(result).__name__} holds no number to draw")
-    name = next((name for name in numbers if pa.types.is_floating(kinds[name])), numbers[0])
+    name = next((name for name in numbers if name == "frames" or pa.types.is_floating(kinds[name])), numbers[0])
     values, words = column(table, name), name.replace("_", " ")
     texts = [table[each].to_pylist() for each, kind in kinds.items() if COLUMN_KINDS["texts"](kind)]
     if len(table) > _MOST_BARS or not texts:

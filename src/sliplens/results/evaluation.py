@@ -178,11 +178,14 @@ class RiskCoverage:
 
     def __str__(self) -> str:
         """Describe the gain of withholding a fifth of the frames, in one sentence."""
-        words = {"known": "the least known", "spread": "the widest", "perfect": "the worst, which nobody knows"}
-        parts = ", ".join(f"{100 * self.error_at(name, 0.8):.1f} ({words[name]})" for name in self.error)
-        return (
-            f"mean error {100 * self.error_at('perfect', 1.0):.1f} points; with a fifth of the frames withheld {parts}"
-        )
+        words = {
+            "known": "if those least like its training are",
+            "spread": "if those with the widest interval are",
+            "perfect": "if the largest errors were known",
+        }
+        parts = ", ".join(f"{100 * self.error_at(name, 0.8):.1f} {words[name]}" for name in self.error)
+        error = f"{100 * self.error_at('perfect', 1.0):.1f} points"
+        return f"the mean error is {error}; without the fifth of the frames that the network withholds it is {parts}"
 
 
 @dataclass(frozen=True, kw_only=True)
