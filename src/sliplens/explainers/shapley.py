@@ -101,9 +101,10 @@ def _shrink(
         return float((unexplained + (projected**2 / (1 + sizes**2 / ridge)).sum()) / freedom)
 
     def doubt(log_ridge: float) -> float:
-
         ridge = np.exp(log_ridge)
         return freedom * np.log(variance(ridge) + 1e-300) + np.log1p(sizes**2 / ridge).sum()
+
+    from scipy.optimize import fminbound  # noqa: PLC0415 (takes half a second)
 
     ridge = float(np.exp(fminbound(doubt, -12, 12)))
     # the multiple and the cubic are free, what players differ by from the multiple is drawn (Henderson's equations)
