@@ -11,7 +11,6 @@ import numpy as np
 
 import sliplens as sl
 from sliplens.markers import interpolate_field
-from sliplens.plots.markers import plot_arrows, plot_field
 
 data = sl.simulate(sensor="flat-gel", dry_trials=4, wet_trials=1, days=4, frames_per_trial=40)
 trial = data.load(data.trials[0])
@@ -35,11 +34,16 @@ known = np.isfinite(moved).all(axis=1) & np.isfinite(rest).all(axis=1)
 field = interpolate_field(rest[known], moved[known], size=trial.reference.shape[:2])
 
 figure, (left, right) = plt.subplots(ncols=2, figsize=(10, 4.6), layout="compressed")
-plot_arrows(trial.frames[number], rest, moved, ax=left)
-left.set_title("displacement of each dot")
-scale = plot_field(field, size=trial.reference.shape[:2], ax=right)
+left.imshow(trial.frames[number])
+left.quiver(*rest[known].T, *moved[known].T, angles="xy", scale_units="xy", scale=0.2, color="white")
+left.set(title="displacement of each dot, five times its length", xlabel="x (px)", ylabel="y (px)")
+length = np.where(field.confidence > 0.2, np.linalg.norm(field.displacement_px, axis=-1), np.nan)
+right.set_facecolor("lightgrey")
+scale = right.pcolormesh(field.x_px, field.y_px, length, cmap="cividis")
+right.streamplot(field.x_px, field.y_px, *np.moveaxis(field.displacement_px, -1, 0), color="white", density=0.8)
 figure.colorbar(scale, ax=right, label="Displacement (px)")
-right.set_title("interpolated field")
+right.set(title="interpolated field", xlabel="x (px)", ylabel="y (px)", aspect="equal")
+right.invert_yaxis()
 plt.show()
 
 # %%

@@ -68,16 +68,15 @@ class _Described:
         """
         values = {field.name: getattr(self, field.name) for field in fields(self)}  # pyright: ignore[reportArgumentType]
         if isinstance(self, Sized):
-            kinds = (np.ndarray, tuple)
-            rows = {name: value for name, value in values.items() if isinstance(value, kinds) and np.ndim(value) == 1}
-            return pa.table({name: np.asarray(value) for name, value in rows.items() if len(value) == len(self)})
+            rows = {name: np.asarray(value) for name, value in values.items() if isinstance(value, np.ndarray | tuple)}
+            return pa.table({name: value for name, value in rows.items() if value.shape == (len(self),)})
         if table := next((value for value in values.values() if isinstance(value, Columns)), None):
             return table.to_arrow()
         for value in values.values():
             records = value.values() if isinstance(value, Mapping) else value if isinstance(value, tuple) else ()
             if records and all(map(is_dataclass, records)):
-                return pa.Table.from_pylist(rows_of(value))
-        return pa.Table.from_pylist(rows_of([self]))
+                return pa.Table.from_pylist(table_rows(value))
+        return pa.Table.from_pylist(table_rows([self]))
 
 
 class Result(_Described):
@@ -126,10 +125,10 @@ def _unit(kind: type, name: str) -> str:
 
 def _words(value: object, unit: str = "") -> str:
     """Describe a value in less than a line; the empty text where there is none."""
-    text = str(value)
+    text = ""
     match value:
         case None | pa.Schema():
-            text = ""
+            pass
         case float() | np.floating():
             text = f"{value:.3g} {unit}".rstrip()
         case int() if value is not True and value is not False:
@@ -149,12 +148,12 @@ def _words(value: object, unit: str = "") -> str:
             simple = (part for part in parts if not isinstance(part[1], tuple | Mapping | np.ndarray))
             texts = ((name, _words(part, _unit(type(value), name))) for name, part in simple)
             text = ", ".join(f"{name} {words}" for name, words in islice(texts, 5) if words)
-        case _ if is_dataclass(value):
-            text = f"{value} {unit}".rstrip()
+        case _:
+            text = f"{value} {unit}".rstrip() if is_dataclass(value) else str(value)
     return text
 
 
-def rows_of(records: Mapping[str, Any] | Sequence[Any]) -> list[dict[str, Scalar]]:
+def table_rows(records: Mapping[str, Record] | Sequence[Record]) -> list[dict[str, Scalar]]:
     """Return the numbers and texts of records, a row each, with their names where they have any."""
     if isinstance(records, Mapping):
         return [{"name": name} | _flat(record) for name, record in records.items()]
@@ -164,12 +163,9 @@ def rows_of(records: Mapping[str, Any] | Sequence[Any]) -> list[dict[str, Scalar
 def _flat(record: object, before: str = "") -> dict[str, Scalar]:
     """Return the numbers and texts of a record by name, those of records in it behind the name of their field."""
     cells: dict[str, Scalar] = {}
-    items = record.items() if isinstance(record, Mapping) else vars(record).items()
-    for name, value in items:
-        if value is None or isinstance(value, str | int | float):
-            cells[f"{before}{name}"] = value
-        elif isinstance(value, Path):
-            cells[f"{before}{name}"] = str(value)
+    for name, value in (record if isinstance(record, Mapping) else vars(record)).items():
+        if value is None or isinstance(value, str | int | float | Path):
+            cells[f"{before}{name}"] = str(value) if isinstance(value, Path) else value
         elif (is_dataclass(value) or isinstance(value, Mapping)) and not isinstance(value, Columns):
             cells |= _flat(value, f"{before}{name}_")
     return cells

@@ -233,17 +233,6 @@ def ignore(_done: int, _total: int) -> None:
 
 
 __all__ = [
-    "OnProgress",
-    "Stages",
-    "add_note",
-    "counting",
-    "current_listener",
-    "current_reporter",
-    "fold_equal",
-    "number_of",
-    "open_stage",
-    "report_each",
-    "report_file",
-    "report_progress",
-    "reporting",
-]
+    "OnProgress", "Stages", "add_note", "counting", "current_listener", "current_reporter", "fold_equal", "number_of",
+    "open_stage", "report_each", "report_file", "report_progress", "reporting",
+]  # fmt: skip

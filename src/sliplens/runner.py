@@ -290,8 +290,8 @@ class _Pool:
     workers: int
     submit: Callable[[Path, Part, OnProgress], Future]
     """Takes the folder of the parts, a part, and a callback for its progress."""
-    lost: type[Exception]
-    """Error of a future whose worker ended."""
+    lost: type[Exception] | tuple[()]
+    """Error of a future whose worker ended; none where it cannot."""
 
 
 def cores() -> int:
@@ -323,15 +323,11 @@ def _serial(work: Work, _: str, most: int) -> Iterator[_Pool]:
 
     with ThreadPoolExecutor(threads) as pool:
         try:
-            yield _Pool(workers=threads, submit=submit, lost=_NeverLostError)
+            yield _Pool(workers=threads, submit=submit, lost=())
         except BaseException:
             ended.set()
             pool.shutdown(cancel_futures=True)
             raise
-
-
-class _NeverLostError(Exception):
-    """Error of a lost worker where none can be lost."""
 
 
 @contextmanager

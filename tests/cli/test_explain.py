@@ -60,19 +60,6 @@ def test_without_a_method_the_recommended_one_explains(difference_run: Path, dif
         assert all(re.match(r"[123] of 3 frames \(frame", warning) for warning in others)
 
 
-def test_colours_of_the_thesis(difference_run: Path, difference_folder: Path, tmp_path: Path):
-    output = tmp_path / "maps"
-    run(difference_run, "--frames", difference_folder, "-o", output, "--method", "grad-cam", "--colours", "jet")
-    explained = load_explanation(output)
-    frame, saliency = explained.frames[0], explained.saliency["grad-cam"][0]
-    picture = read_image(output / "overlays" / "grad-cam" / f"{frame.id}.png").astype(int)
-    row, column = np.unravel_index(saliency.argmax(), saliency.shape)
-    red, _, blue = picture[row, column]
-    assert red > blue  # the top of Jet is red, its bottom blue
-    dark = picture[saliency == 0]
-    assert len(dark) == 0 or (dark[:, 2] >= dark[:, 0]).all()
-
-
 def test_a_budget_reaches_poly_cam(difference_run: Path, difference_folder: Path, tmp_path: Path, monkeypatch):
     budgets = []
 

@@ -86,10 +86,9 @@ def test_many_frames_are_told_by_their_lowest(difference_run: Path, small_datase
     for trial in {row["trial"] for row in rows}:
         margins = [row["prediction"] for row in rows if row["trial"] == trial]
         touching = [row["prediction"] for row in rows if row["trial"] == trial and row["touches"]]
-        (line,) = (line for line in lines if line.startswith(f"{trial} "))
+        (line,) = (line for line in lines if line.startswith(f"{trial}: "))
         assert f"lowest {100 * min(touching):.0f} %" in line
         assert f"{len(margins)} frames, {len(touching)} touch" in line
-        assert len([sign for sign in line if "\u2581" <= sign <= "\u2588"]) == min(40, len(margins))
     assert {"normal_force_n", "tangential_force_n", "safety_margin"} <= rows[0].keys()
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
@@ -111,7 +110,7 @@ def test_what_is_withheld_has_no_margin_on_the_terminal(
     counts = [int(line.split()[2]) for line in lines if line.startswith("withheld in ")]
     assert sum(counts) == len(withheld) > 0
     if shown == slice(None):
-        [line] = (line for line in lines if line.startswith("frames "))
+        [line] = (line for line in lines if line.startswith("frames: "))
         assert "lowest none" in line
         assert f"{len(withheld)} withheld" in line
     else:

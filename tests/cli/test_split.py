@@ -38,7 +38,7 @@ def test_the_trials_go_where_the_table_says(folder: Path, table: Path, capsys: p
     splits = {info.trial[-1]: info.split for info in load_dataset(folder).trials}
     assert splits == {**dict.fromkeys("01246", "train"), "5": "validation", **dict.fromkeys("37", "test")}
     out = capsys.readouterr().out
-    assert ["train", "5", "60", "1-3", "-", "dry"] in cells(out)
+    assert ["train", "5", "60", "1, 2, 3", "-", "dry"] in cells(out)
     assert ["test", "2", "24", "4", "-", "dry, wet"] in cells(out)
     assert ["test", "train", "1", "test-dry-6"] in cells(out)
     assert ["train", "test", "1", "train-dry-3"] in cells(out)

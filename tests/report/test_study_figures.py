@@ -38,7 +38,7 @@ def test_every_record_has_a_short_repr_a_table_and_a_figure(results, pristine_wo
     workspace = load_results(pristine_workspace)
     data = sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20)
     untouched = UntrainedMaps(input="raw", source="simulated", maps={"grad-cam": np.ones((1, 8, 8), np.float32)})
-    margins = {name: np.zeros(2) for name in ("time_s", "safety_margin", "prediction", "low", "high")}
+    margins = {name: np.arange(2.0) for name in ("time_s", "safety_margin", "prediction", "low", "high")}
     readings = StripReadings(contact_state=np.array(["contact"] * 2), withheld=np.array(["", ""]), **margins)
     facts = {"trial": "t", "condition": "dry", "source": "real", "input": "pair", "method": "grad-cam"}
     maps = {"pictures": np.zeros((1, 8, 8, 3), np.uint8), "relevance": np.zeros((1, 8, 8), np.float32)}

@@ -109,11 +109,8 @@ def _made(node: ast.stmt | None, module: str, name: str) -> Any:
             return read_name(source, original)
         standard = source.partition(".")[0] in sys.stdlib_module_names
         return getattr(import_module(source), original) if standard else _Anything
-    if (
-        node is None
-        or isinstance(node, ast.Import)
-        or (isinstance(node, ast.ClassDef) and not _is_options(node, module))
-    ):
+    options = isinstance(node, ast.ClassDef) and _is_options(node, module)
+    if node is None or not (options or isinstance(node, ast.FunctionDef | ast.Assign | ast.AnnAssign)):
         return _Anything
     node = deepcopy(node)
     if isinstance(node, ast.FunctionDef):
@@ -184,7 +181,7 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     module, _, name = command.function.partition(":")
     function = read_name(module, name)
     aliases = {**ALIASES, **{name: (alias,) for name, alias in command.aliases}}
-    further = _further(read_name(command.run.__module__, command.run.__name__))
+    further = _options(read_name(command.run.__module__, command.run.__name__), further=True)
     ordered = sorted((*_options(function), *further), key=lambda option: not option.positional)
     options = [replace(option, aliases=aliases.get(option.name, ())) for option in ordered]
     by_name = {option.name: option for option in options}
@@ -205,7 +202,9 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
                 arguments.setdefault(group, {})[name] = value
             else:
                 arguments[name] = constants(value) if _is_constants(function, name) else value
-        _refuse_early(arguments, places=places, suffixes=command.suffixes)
+        typed = {name: value if isinstance(value, tuple) else (value,) for name, value in arguments.items() if value}
+        texts = {name: tuple(map(str, several)) for name, several in typed.items()}
+        _refuse_early(texts, second="".join(places[1:2]), suffixes=command.suffixes)
         for group, kind in groups.items():
             if group in arguments:
                 arguments[group] = getattr(import_module(kind.__module__), kind.__name__)(**arguments[group])
@@ -219,57 +218,47 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     return call, list(by_name)
 
 
-def _refuse_early(arguments: Mapping[str, Any], *, places: Sequence[str], suffixes: Sequence[str]) -> None:
+def _refuse_early(texts: Mapping[str, Sequence[str]], *, second: str, suffixes: Sequence[str]) -> None:
     """Refuse networks, data and files that are not there before the function is imported: that may take seconds."""
-    given = {name: value if isinstance(value, tuple) else (value,) for name, value in arguments.items()}
-    given = {name: values for name, values in given.items() if values != (None,)}
     # `predict FILE` names no network
-    names = ("run",) if given.keys() & {*places[1:]} else ()
-    sources = *given.get("sources", ()), *(given.get("source" if names else "run", ()) if "run" in given else ())
-    for network in (
-        network for name in ("network", "networks", "start_from", *names) for network in given.get(name, ())
-    ):
+    names, source = (("run",), "source") if second in texts else ((), "run")
+    for network in (each for name in ("network", "networks", "start_from", *names) for each in texts.get(name, ())):
         find_run(Path(network))
-    for data in given.get("data", ()):
+    for data in texts.get("data", ()):
         require_folder(Path(data), what="the data set")
-    for source in sources:
-        if not Path(source).exists():
-            raise InputError(f"{source} does not exist; check the path")
-    for out in map(Path, given.get("out", ())):
+    for path in (*texts.get("sources", ()), *(texts.get(source, ()) if "run" in texts else ())):
+        if not Path(path).exists():
+            raise InputError(f"{path} does not exist; check the path")
+    for out in map(Path, texts.get("out", ())):
         if suffixes and out.suffix:
-            require_new_file(out, suffix=suffixes, overwrite="overwrite" in given or partial_folder(out).exists())
+            require_new_file(out, suffix=suffixes, overwrite="overwrite" in texts or partial_folder(out).exists())
 
 
-def _options(function: Callable[..., object]) -> list[_Option]:
-    """Return the parameters of a function that can be typed; fields of dataclasses are options of their own."""
-    helps, hints, options = _parameter_help(function), get_type_hints(function), []
-    for name, parameter in signature(function).parameters.items():
-        hint = hints.get(name, Any)
-        if parameter.kind is Parameter.VAR_KEYWORD:
-            options += _fields_of(get_args(hint)[0] if get_origin(hint) is Unpack else hint)
-            continue
-        group = _options_type(hint)
-        if group is not None:
-            options += [
-                option for option in _fields_of(group, group=name) if option.name not in {o.name for o in options}
-            ]
-            continue
-        kind = typed_kind(hint)
-        if kind is None:
-            if parameter.default is Parameter.empty:
-                raise TypeError(f"{function.__qualname__} needs {name}, which cannot be typed")
-            continue
-        default = parameter.default
-        options.append(
-            _Option(
+def _options(function: Callable[..., object], *, further: bool = False) -> list[_Option]:
+    """Return the parameters of a function that can be typed, if `further` those of `Command.run` besides the call.
+
+    Fields of dataclasses are options of their own.
+    """
+    helps, hints, options = _parameter_help(function), get_type_hints(function), dict[str, _Option]()
+    for name, parameter in list(signature(function).parameters.items())[further:]:
+        hint, default = hints.get(name, Any), parameter.default
+        kind, group = typed_kind(hint), _options_type(hint)
+        if parameter.kind is Parameter.VAR_KEYWORD or group is not None:
+            fields_of = _fields_of(*get_args(hint)) if group is None else _fields_of(group, group=name)
+            for option in fields_of:
+                options.setdefault(option.name, replace(option, further=further))
+        elif kind is not None:
+            options[name] = _Option(
                 name=name,
                 kind=kind,
                 default=(default,) if isinstance(default, str) and get_origin(kind) is tuple else default,
                 help=helps.get(name, ""),
                 positional=parameter.kind is Parameter.POSITIONAL_OR_KEYWORD,
+                further=further,
             )
-        )
-    return options
+        elif default is Parameter.empty:
+            raise TypeError(f"{function.__qualname__} needs {name}, which cannot be typed")
+    return list(options.values())
 
 
 def _fields_of(kind: Any, *, group: str = "") -> list[_Option]:
@@ -284,18 +273,6 @@ def _fields_of(kind: Any, *, group: str = "") -> list[_Option]:
             )
         elif inner is not None and inner.__name__.endswith("Options") and not group:
             options += _fields_of(inner, group=name)
-    return options
-
-
-def _further(run: Callable[..., object]) -> list[_Option]:
-    """Return the options of `Command.run`."""
-    helps, hints, options = _parameter_help(run), get_type_hints(run), []
-    for name, parameter in signature(run).parameters.items():
-        if parameter.kind is Parameter.VAR_KEYWORD:
-            options += [replace(option, further=True) for option in _fields_of(get_args(hints[name])[0])]
-        elif parameter.kind is Parameter.KEYWORD_ONLY:
-            kind, text = typed_kind(hints[name]), helps.get(name, "")
-            options.append(_Option(name=name, kind=kind, default=parameter.default, help=text, further=True))
     return options
 
 

@@ -417,15 +417,15 @@ def call_track(call: Any, *, video: Path | None = None) -> None:
 )
 def call_train(call: Any) -> None:
     """Draw the learning curve."""
-    from sliplens.plots.errors import draw_learning_curve
+    from sliplens.plots.figure import plot
+    from sliplens.plots.style import save_page
 
     if "out" not in call.keywords:
         raise InputError("name the folder of the network with -o FOLDER")
     network, out = call(), Path(call.keywords["out"])
     picture = out / "curves.png"
     if network.training is not None and not picture.is_file():
-        title = f"{out.name}, {network.manifest.input} images of {Path(call.keywords['data']).name}"
-        draw_learning_curve(network.training, picture, title=title)
+        save_page(plot(network), picture)
 
 
 @command(

@@ -5,14 +5,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from textwrap import TextWrapper
 from threading import RLock
-from typing import NamedTuple
 
 from rich import progress as rich_progress
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from sliplens.progress import OnProgress, fold_equal, visible
 
@@ -99,49 +98,21 @@ class Terminal:
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table, numbers to the right; columns that do not fit beside each other are printed below, names again."""
-    columns = [
-        _column(visible(" ".join(name.split())), [visible(row[place]) for row in rows], names=place == 0)
-        for place, name in enumerate(header)
-    ]
-    for number, part in enumerate(_fitting(columns, OUT.width)):
-        table = Table(title=_shown(title) + (", continued" if number else ""), title_justify="left")
-        for column in part:
-            numbers = column is not columns[0] and any(re.match(r"[-+]?\d", cell) for cell in column.cells)
-            table.add_column(column.head, justify="right" if numbers else "left")
-        for cells in zip(*(column.cells for column in part), strict=True):
-            table.add_row(*map(escape, cells))
+    """Print a table, numbers to the right; a terminal too narrow for it shows a line for each cell."""
+    table = Table(title=_shown(title), title_justify="left")
+    widest = 1
+    for place, (name, *cells) in enumerate(zip(header, *rows, strict=True)):
+        words = name.split() if place else " ".join([name, *cells]).split()  # only the names of rows may be broken
+        widest += 3 + max(map(len, [*words, *(cells if place else [])]))
+        numbers = place and any(re.match(r"[-+]?\d", cell) for cell in cells)
+        table.add_column(_shown(name), justify="right" if numbers else "left", no_wrap=place > 0 and " " not in name)
+    for row in rows:
+        table.add_row(_shown(row[0]), *(Text(visible(cell), no_wrap=True) for cell in row[1:]))
+    if widest <= OUT.width:
         OUT.print(table)
-
-
-class _Column(NamedTuple):
-    """Column of a table, its head broken at spaces so that it is hardly wider than what stands below it."""
-
-    head: str
-    cells: list[str]
-    width: int
-
-
-def _column(name: str, cells: Sequence[str], *, names: bool) -> _Column:
-    """Fit a column to its cells; a column of names may be broken at spaces, numbers may not."""
-    longest, widest = (max(map(len, texts), default=0) for texts in (name.split(), cells))
-    width = max(longest, min(widest, 26) if names else widest)  # names: up to a third of 80 columns
-    fit = TextWrapper(width, break_long_words=False, break_on_hyphens=False).wrap
-    head, *broken = map("\n".join, map(fit, (name, *cells)))
-    return _Column(
-        "\n".join(map(_shown, head.split("\n"))),
-        broken,
-        max(longest, *(len(line) for cell in broken for line in cell.split("\n")), 0),
-    )
-
-
-def _fitting(columns: Sequence[_Column], width: int) -> Iterator[list[_Column]]:
-    """Deal columns out to tables no wider than the terminal, the column of names in each."""
-    fitting = [columns[0]]
-    for column in columns[1:]:
-        # two blanks and a rule a column, and one rule more
-        if sum(each.width + 3 for each in (*fitting, column)) + 1 > width and len(fitting) > 1:
-            yield fitting
-            fitting = [columns[0]]
-        fitting.append(column)
-    yield fitting
+        return
+    say(title)
+    for row in rows:
+        say(f"{header[0]}: {row[0]}")
+        for name, cell in zip(header[1:], row[1:], strict=True):
+            say(f"  {' '.join(name.split())}: {cell}")

@@ -3,8 +3,6 @@
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from itertools import groupby
-from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,8 +29,6 @@ _MOST_TRIALS = 40
 """Number of trials with a line each."""
 _MOST_NAMES = 6
 """Number of names in a cell."""
-_GAP = "\u00b7"
-_BARS = "\u2581\u2582\u2583\u2584\u2585\u2586\u2587\u2588"
 _CLIP_FRAMES_PER_S = 30.0
 
 
@@ -58,8 +54,6 @@ def show_predictions(predictions: "Predictions") -> None:
         say(_course(trial))
     if len(trials) > _MOST_TRIALS:
         say(f"and {number_of(len(trials) - _MOST_TRIALS, 'more trial')}; -o margins.csv writes every frame")
-    withheld = f", {_GAP} where it is withheld" if predictions.withheld else ""
-    say(f"bars: safety margin, 0 % to 100 %, the lowest of the frames that share one{withheld}")
 
 
 def _course(trial: "TrialMargins") -> str:
@@ -69,10 +63,7 @@ def _course(trial: "TrialMargins") -> str:
     touching = "" if trial.touching is None else f", {trial.touching:,} touch" if trial.touching else ", none touches"
     lowest = "none" if trial.lowest is None else f"{_percent(float(trial.margin[trial.lowest]))}{interval} at {where}"
     withheld = f", {trial.withheld:,} withheld" if trial.withheld else ""
-    return (
-        f"{trial.trial}  {_sparkline(trial.margin.tolist())}  lowest {lowest}, "
-        f"{number_of(len(trial.margin), 'frame')}{touching}{withheld}"
-    )
+    return f"{trial.trial}: lowest {lowest}, {number_of(len(trial.margin), 'frame')}{touching}{withheld}"
 
 
 def _percent(value: float | None) -> str:
@@ -81,16 +72,6 @@ def _percent(value: float | None) -> str:
 
 def _interval(low: float | None, high: float | None) -> str:
     return "-" if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
-
-
-def _sparkline(shares: Sequence[float], *, width: int = 40) -> str:
-    """Draw shares in [0, 1] as bars of a line, the lowest of the frames that share a bar; NaN has none."""
-    count = min(width, len(shares))
-    parts = (shares[at * len(shares) // count : (at + 1) * len(shares) // count] for at in range(count))
-    lowest = (min((share for share in part if not isnan(share)), default=None) for part in parts)
-    return "".join(
-        _GAP if share is None else _BARS[round(min(max(share, 0.0), 1.0) * (len(_BARS) - 1))] for share in lowest
-    )
 
 
 def draw_simulation(recipe: "SimulationRecipe", *, device: str, preview: Path | None, video: Path | None) -> None:
@@ -178,7 +159,7 @@ def show_splits(trials: "Sequence[TrialInfo]", splits: Sequence[str]) -> None:
                 name,
                 str(len(infos)),
                 f"{sum(info.frames for info in infos):,}",
-                _ranges(info.day for info in infos),
+                _names({str(info.day) for info in infos}),
                 _names({info.object for info in infos} - {""}),
                 _names({info.condition for info in infos}),
             )
@@ -204,13 +185,6 @@ def _names(names: Iterable[str]) -> str:
     ordered = sorted(names, key=natural_key)
     rest = len(ordered) - _MOST_NAMES
     return ", ".join(ordered if rest < 2 else [*ordered[:_MOST_NAMES], f"{rest} more"]) or "-"
-
-
-def _ranges(numbers: Iterable[int]) -> str:
-    """Return numbers with runs drawn together: 1, 3-5."""
-    runs = groupby(enumerate(sorted(set(numbers))), key=lambda pair: pair[1] - pair[0])
-    ends = [(run[0][1], run[-1][1]) for run in (list(run) for _, run in runs)]
-    return ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in ends)
 
 
 def print_known_trials(folder: Path, network: Path) -> None:

@@ -18,7 +18,6 @@ from sliplens.plots.style import (
     GREY,
     INPUT_COLOURS,
     PURPLE,
-    VERMILLION,
     conditions_in_order,
     drawing_style,
     in_order,
@@ -84,12 +83,18 @@ def plot_predictions(predictions: ScoredFrames, *, ax: Axes, colour: str | None 
 
 
 def plot_learning_curves(trainings: Mapping[str, Training], *, ax: Axes) -> Axes:
-    """Draw the error on the training and validation frames by epoch, one colour an input."""
+    """Draw the error on the training and validation frames by epoch, one colour an input; a ring is at the best."""
     for name in inputs_in_order(trainings):
         curve, colour, label = trainings[name].curve, INPUT_COLOURS.get(name, PURPLE), short_input_name(name)
         dot = "." if len(curve.epoch) <= 40 else ""  # one epoch alone makes no line
         ax.plot(curve.epoch, curve.train_mse, color=colour, linestyle=":", marker=dot, label=f"{label}, training")
         ax.plot(curve.epoch, curve.validation_mse, color=colour, marker=dot, label=f"{label}, validation")
+        best = int(np.argmin(curve.validation_mse))
+        points = 100 * np.sqrt(curve.validation_mse[best])
+        words = f"kept: epoch {curve.epoch[best]:.4g}, error {points:.1f} points"
+        ax.plot(curve.epoch[best], curve.validation_mse[best], "o", ms=10, mfc="none", mec=colour, label=words)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.yaxis.set_major_formatter("{x:g}")
     ax.set(xlabel=_EPOCH_LABEL, ylabel=_MSE_LABEL, yscale="log")
     ax.legend()
     return ax
@@ -196,22 +201,3 @@ def _plot_risk(risk: RiskCoverage | None, *, ax: Axes) -> None:
         ax.plot(shares, 100 * np.array(errors), color=colours[name], linestyle=line, label=words[name])
     ax.set_ylim(bottom=0)
     ax.legend(fontsize=8)
-
-
-def draw_learning_curve(training: Training, path: Path, *, title: str) -> None:
-    """Save the errors of a training by epoch, on a logarithmic scale, with the epoch whose weights were kept."""
-    curve, best = training.curve, int(np.argmin(training.curve.validation_mse))
-    error = curve.validation_mse[best]
-    with drawing_style():
-        figure = Figure(figsize=(7.0, 4.4), layout="constrained")
-        ax = plot_learning_curves({training.input: training}, ax=figure.subplots())
-        ring: Any = {"markersize": 10, "markerfacecolor": "none", "markeredgewidth": 1.6, "color": VERMILLION}
-        ax.plot(curve.epoch[best], error, marker="o", linestyle="", label="kept", **ring)
-        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-        ax.yaxis.set_major_formatter("{x:g}")
-        ax.legend()
-        summary = f"kept: epoch {curve.epoch[best]:.4g}, validation MSE {error:.4g}"
-        summary += f", root mean square error {100 * np.sqrt(error):.1f} points of Γ"
-        figure.suptitle(title, x=0.01, ha="left", fontsize=12, fontweight="bold", parse_math=False)
-        ax.set_title(summary, fontsize=9, fontweight="normal", color=GREY)
-        save_page(figure, path)

@@ -4,11 +4,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
@@ -24,7 +23,6 @@ LOWERS, RAISES = ORANGE, SKY
 """Colours of what lowers an answer and of what raises it: bright on dark, and told apart by everyone."""
 SIGN_COLOURS = LinearSegmentedColormap.from_list("sign", [LOWERS, (DIM / 2,) * 3, RAISES])
 """Both over a mid-grey picture, from -1 to 1."""
-SIGN_BAR = ScalarMappable(Normalize(-1, 1), SIGN_COLOURS)
 
 
 def overlay_relevance(picture: FrameU8, share: Float[np.ndarray, "rows columns"]) -> FrameU8:
@@ -40,18 +38,6 @@ def overlay_relevance(picture: FrameU8, share: Float[np.ndarray, "rows columns"]
     return np.round(255 * mixed).astype(np.uint8)
 
 
-def overlay_jet(picture: FrameU8, saliency: Float[np.ndarray, "height width"]) -> FrameU8:
-    """Picture under half of the saliency in Jet, divided by the brightest value, as in the thesis's figures.
-
-    Jet has bright bands where nothing changes; use it to compare with those figures. This is `show_cam_on_image` of the
-    public pytorch-grad-cam, which the thesis's code calls.
-    """
-    mixed = 0.5 * colormaps["jet"](np.clip(saliency, 0, 1))[..., :3] + 0.5 * picture / 255
-    return np.round(255 * mixed / max(mixed.max(), 1e-12)).astype(np.uint8)
-
-
-Colours: TypeAlias = Literal["signed", "jet"]
-"""Colours of overlays: `signed`, what raises and what lowers, on one scale; `jet`, what supports, as in the thesis."""
 POINTS = "points of margin per 1 % of the image"
 """Unit of maps in figures."""
 _BAR_WORDS = f"orange lowers the margin, blue raises it\n(full colour beside each row, in {POINTS})"
@@ -77,36 +63,27 @@ def overlay_points(pictures: Iterable[FrameU8], relevance: Float[np.ndarray, "fr
     ]
 
 
-def draw_explanation(explanation: Explanation, folder: Path, *, colours: Colours = "signed") -> None:
+def draw_explanation(explanation: Explanation, folder: Path) -> None:
     """Write an overlay of every map (`overlays/METHOD/FRAME.png`), and up to 12 frames side by side (`panel.png`)."""
     count = len(explanation.frames)
     columns = np.linspace(0, count - 1, min(count, _WIDEST)).round().astype(int).tolist()
     rows = [PictureRow(name="Network input", pictures=[explanation.pictures[column] for column in columns])]
     for method, relevance in explanation.relevance.items():
         (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
-        scale = None
-        if colours == "jet":
-            pictures = list(map(overlay_jet, explanation.pictures, explanation.saliency[method]))
-        else:
-            pictures = overlay_points(explanation.pictures, relevance)
-            scale = full_points(relevance)
+        pictures = overlay_points(explanation.pictures, relevance)
         for frame, picture in zip(explanation.frames, pictures, strict=True):
             write_png(overlays / f"{frame.id}.png", picture)
         shown = [pictures[column] for column in columns]
-        rows.append(PictureRow(name=method_name(method), pictures=shown, full=scale))
+        rows.append(PictureRow(name=method_name(method), pictures=shown, full=full_points(relevance)))
     titles = []
     for frame in (explanation.frames[column] for column in columns):
         name = frame.id if len(frame.id) <= 22 else f"\N{HORIZONTAL ELLIPSIS}{frame.id[-21:]}"
         true = "" if frame.safety_margin is None else f", true {percent(frame.safety_margin)}"
         titles.append(f"{name}\n{reading_words(frame.prediction, frame.withheld)}{true}")
-    words = _BAR_WORDS
-    if colours == "jet":
-        words = "supports the prediction (share of its own picture's strongest)"
-    words += f"\nagainst {BASELINES[explanation.baseline]}"
+    words = f"{_BAR_WORDS}\nagainst {BASELINES[explanation.baseline]}"
     if len(columns) < count:
         words += f"\n{len(columns)} of {count} frames, evenly spread; overlays/ has them all"
-    bar = ScalarMappable(Normalize(0, 1), "jet") if colours == "jet" else SIGN_BAR
-    figure = draw_pictures(rows, heads=titles, bar=bar, words=words)
+    figure = draw_pictures(rows, heads=titles, bar=True, words=words)
     with drawing_style():
         figure.savefig(folder / "panel.png", dpi=120, bbox_inches="tight")
 
@@ -123,7 +100,7 @@ class PictureRow:
 
 
 def draw_pictures(
-    rows: Sequence[PictureRow], *, heads: Sequence[str], bar: ScalarMappable | None = None, words: str = _BAR_WORDS
+    rows: Sequence[PictureRow], *, heads: Sequence[str], bar: bool = False, words: str = _BAR_WORDS
 ) -> Figure:
     """Draw rows of pictures under heads, and the bar of their colours with words below."""
     step = _CELL_IN + 0.06
@@ -144,11 +121,10 @@ def draw_pictures(
                 place_text(figure, _SIDE_IN + column * step + _CELL_IN / 2, top + _CELL_IN + 0.03, text, **small)
         for column, text in enumerate(heads):
             place_text(figure, _SIDE_IN + column * step + _CELL_IN / 2, _HEAD_IN - 0.05, text, va="bottom", **small)
-        if bar is not None:
+        if bar:
             place = place_axes(figure, _SIDE_IN, bottoms[-1] + 0.1, _BAR_IN, 0.12)
-            colour_bar = figure.colorbar(bar, cax=place, orientation="horizontal")
-            if bar is SIGN_BAR:
-                colour_bar.set_ticks([-1, 0, 1], labels=["\N{MINUS SIGN}full colour", "0", "+full colour"])
-            colour_bar.ax.tick_params(labelsize=7)
+            colours = ScalarMappable(Normalize(-1, 1), SIGN_COLOURS)
+            colour_bar = figure.colorbar(colours, cax=place, orientation="horizontal", ticks=[-1, 0, 1])
+            colour_bar.ax.set_xticklabels(["\N{MINUS SIGN}full colour", "0", "+full colour"], fontsize=7)
             colour_bar.ax.set_xlabel(words, fontsize=8)
     return figure

@@ -4,7 +4,7 @@ import base64
 import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -22,6 +22,7 @@ from PIL import Image
 
 from sliplens.errors import InputError
 from sliplens.explainers.table import EXPLAINERS
+from sliplens.files import whole_file
 from sliplens.intervals import Difference
 from sliplens.progress import visible
 from sliplens.results.faithfulness import CHANCE, NEW_WEIGHTS, is_control
@@ -238,17 +239,12 @@ def _escape_texts(figure: Figure) -> None:
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """Give a temporary file beside the target, renamed to it on success and removed on failure."""
-    part = path.with_name(f".{path.name}.part")
+    """Open a file beside the target (`files.whole_file`); an error is one sentence."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        part.replace(path)
+        with whole_file(path) as part:
+            yield part
     except OSError as error:
         raise InputError(f"cannot write {path} ({error.strerror}); choose another file") from None
-    finally:
-        with suppress(OSError):  # renamed already, or never made
-            part.unlink()
 
 
 def place_axes(figure: Figure, x: float, top: float, width: float, height: float) -> Axes:

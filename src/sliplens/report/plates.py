@@ -16,7 +16,6 @@ from sliplens.grip.records import Grip
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.margins import draw_strip
 from sliplens.plots.saliency import (
-    SIGN_BAR,
     FrameU8,
     PictureRow,
     draw_pictures,
@@ -142,7 +141,7 @@ def plate_states(results: Results, explained: Explanation) -> Plate:
     errors = f" The network is off by at most {100 * max(off):.1f} percentage points on these frames." if off else ""
     return Plate(
         name=f"real-{explained.input}" if explained.source == "real" else name,
-        figure=draw_pictures(lines, heads=heads, bar=SIGN_BAR),
+        figure=draw_pictures(lines, heads=heads, bar=True),
         alt=f"{what}: {listed([method_name(method) for method in methods])} from stick to slip",
         caption=f"{what}, from full stick to full slip.{errors} Orange lowers the margin against that of "
         f"{BASELINES[explained.baseline]}, blue raises it; one scale a method, so that its frames compare and methods "
@@ -215,7 +214,7 @@ def plate_moments(grip: Grip) -> Plate:
     rows += [PictureRow(name="why", pictures=maps, full=full_points(grip.maps))]
     return Plate(
         name="grip-moments",
-        figure=draw_pictures(rows, heads=heads, bar=SIGN_BAR),
+        figure=draw_pictures(rows, heads=heads, bar=True),
         alt=f"Camera frames and maps at {', '.join(heads)}",
         caption="Frames of the first finger, and their relevance: orange lowers the margin against the untouched "
         "sensor, blue raises it. How far to trust such maps: run `sliplens study`.",

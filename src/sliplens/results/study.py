@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import Float32, Float64, Int64, Shaped
 
-from sliplens.codec import UNKNOWN, Columns, Result, rows_of
+from sliplens.codec import UNKNOWN, Columns, Result, table_rows
 from sliplens.intervals import Difference
 from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, PIXEL, Evaluation, OfNetwork
 from sliplens.results.explanation import BASELINES, BaselineName, Explanation
@@ -450,7 +450,9 @@ class Study(Result):
     def to_arrow(self) -> pa.Table:
         """Arrow table of the scores, a row a network, fill, unit and method; gains in margin units."""
         records = self.faithfulness.items()
-        return pa.Table.from_pylist([{"input": name} | row for name, each in records for row in rows_of(each.scores)])
+        return pa.Table.from_pylist(
+            [{"input": name} | row for name, each in records for row in table_rows(each.scores)]
+        )
 
     @property
     def inputs(self) -> set[str]:

@@ -40,7 +40,7 @@ from sliplens.files import output_folder, remove
 from sliplens.images import read_image, write_png
 from sliplens.models import Network
 from sliplens.models.checkpoint import open_run
-from sliplens.plots.saliency import Colours, draw_explanation, overlay_points
+from sliplens.plots.saliency import draw_explanation, overlay_points
 from sliplens.progress import (
     OnProgress,
     add_note,
@@ -86,7 +86,6 @@ def explain(
     sensor: SensorProfile | Path | str | None = None,
     labels_in_names: bool = False,
     out: Path | str | None = None,
-    colours: Colours = "signed",
     **running: Unpack[Running],
 ) -> Explanation:
     """Explain why a network predicts these safety margins rather than that of a baseline.
@@ -119,9 +118,6 @@ def explain(
     out
         Folder to write: the record, overlays of every map, and a panel of them; nothing is written if None. An
         interrupted call continues after its last map.
-    colours
-        Colours of the overlays: `signed`, what raises the prediction and what lowers it, on one scale for all frames;
-        or `jet`, what supports it, each frame on a scale of its own, as in the thesis's figures.
     running
         Options of `Running`.
 
@@ -170,7 +166,7 @@ def explain(
         images.update(chosen.references.numpy().tobytes())
         recipe = {"weights_sha256": network.manifest.weights_sha256, "input": network.manifest.input}
         recipe |= {"source": chosen.source, "ids": chosen.ids, "images_sha256": images.hexdigest()}
-        recipe |= {"method": tuple(explainers), "budget": budget, "colours": colours, "baseline": chosen.baseline}
+        recipe |= {"method": tuple(explainers), "budget": budget, "baseline": chosen.baseline}
         maps = "a map" if len(explainers) == 1 else number_of(len(explainers), "map")
         what = f"{maps} of {frames if len(chosen.ids) == 1 else f'each of {frames}'}, panel.png"
         overwrite = running.get("overwrite", False)
@@ -187,14 +183,14 @@ def explain(
                         output.folder / "parts",
                         on=running.get("on", "serial"),
                         retry_failed=running.get("retry_failed", False),
-                        on_record=_draw_first(output.folder, network, chosen) if colours == "signed" else None,
+                        on_record=_draw_first(output.folder, network, chosen),
                     )
                     notes = explanation.methods
                     # inside the stage: warnings that differ in numbers alone are then shown once
                     for warning in dict.fromkeys(text for each in notes.values() for text in each.warnings):
                         methods = [name for name, each in notes.items() if warning in each.warnings]
                         add_note(f"{', '.join(methods)}: {warning}")
-                draw_explanation(explanation, output.folder, colours=colours)
+                draw_explanation(explanation, output.folder)
                 save_result(explanation, output.folder)
                 remove(output.folder / "parts")  # not before: if drawing or saving fails, the next call continues
         report_file(Path(out), what, kept=output.complete)
