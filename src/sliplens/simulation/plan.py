@@ -3,7 +3,7 @@
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, TypedDict, Unpack, cast
+from typing import TypedDict, Unpack, cast
 
 import numpy as np
 
@@ -125,9 +125,9 @@ class SimulationRecipe:
     @property
     def hash(self) -> str:
         """Hash of the recipe and of the version of sliplens that follows it."""
-        return hash_json({"recipe": self.to_dict(), "sliplens": __version__})
+        return hash_json({"recipe": self.to_json(), "sliplens": __version__})
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_json(self) -> object:
         """Return the recipe as `run.json` holds it; None for `pulls` is left out, so that hashes stay."""
         fields = to_builtins(self)
         return fields if self.pulls else {name: value for name, value in fields.items() if name != "pulls"}

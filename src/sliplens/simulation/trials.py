@@ -124,7 +124,7 @@ def simulate(
                 data = simulate_dataset(folder, recipe, device=device)
             weakref.finalize(data, stack.pop_all().close)
             return data
-        config = {"recipe": recipe.to_dict(), "device": device}
+        config = {"recipe": recipe.to_json(), "device": device}
         with output_folder(Path(out), stage="simulate", config=config, overwrite=overwrite) as output:
             if not output.complete:
                 with open_stage("Simulating frames"):

@@ -351,7 +351,7 @@ class Step:
     shared: bool = False
     """True where one record is of all networks."""
 
-    def config(self, records: Records) -> Mapping[str, object]:
+    def config(self, records: Records) -> object:
         """Return all that the record depends on: a folder with another configuration is not reused."""
         names = self.options if self.shared else ("methods", "budget", "baseline", "seed", *self.options)
         values = vars(records.config) | {"redrawn": records.redrawn}
