@@ -116,7 +116,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     for name, seed in product(sensors, range(options.seeds)):
         recipe = recipe_of(SENSORS[name], most=max(options.trials), seed=seed, selection=options.selection)
         folder = options.cache / f"data-{recipe.hash}"
-        with output_folder(folder, stage="adapt", config={"recipe": recipe.to_dict()}, overwrite=False) as output:
+        with output_folder(folder, stage="adapt", config={"recipe": recipe.to_json()}, overwrite=False) as output:
             if not output.complete:
                 print(f"simulating {name}, seed {seed}", file=sys.stderr)
                 simulate_dataset(output.folder, recipe)

@@ -38,7 +38,7 @@ RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=
 
 
 def simulate(folder: Path, recipe: SimulationRecipe) -> Dataset:
-    with output_folder(folder, stage="simulate", config={"recipe": recipe.to_dict(), "device": "cpu"}) as out:
+    with output_folder(folder, stage="simulate", config={"recipe": recipe.to_json(), "device": "cpu"}) as out:
         simulate_dataset(out.folder, recipe)
     return load_dataset(folder)
 
@@ -141,7 +141,7 @@ def test_outlines_are_the_drawn_circles(trials):
     ],
 )
 def test_a_recipe_comes_back_from_its_folder(recipe: SimulationRecipe, tmp_path: Path):
-    with output_folder(tmp_path / "data", stage="simulate", config={"recipe": recipe.to_dict(), "device": "cpu"}):
+    with output_folder(tmp_path / "data", stage="simulate", config={"recipe": recipe.to_json(), "device": "cpu"}):
         pass
     assert read_recipe(tmp_path / "data") == recipe
 
