@@ -184,8 +184,6 @@ class Occlusion(RegionMethod):
             return torch.cat(list(engine.run(images.split(engine.batch_size))))
 
         def effect(index: int) -> Tensor:
-            from captum import attr  # noqa: PLC0415 (takes half a second)
-
             image, empty = comparison.images[index, None], comparison.reference[index, None]
             regions = self._regions(image[0], empty[0])
             effects = attr.FeatureAblation(predict).attribute(
