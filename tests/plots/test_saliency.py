@@ -69,7 +69,7 @@ def test_a_frame_with_nothing_to_explain_looks_empty(tmp_path: Path):
     relevance[0, 2:4, 2:4] = -0.2  # 80 points of margin; the second frame changes by a hundredth of a point
     relevance[1, 2:4, 2:4] = 0.000025
     explained = of_relevance(relevance)
-    draw_explanation(explained, tmp_path, colours="signed")
+    draw_explanation(explained, tmp_path)
     strong, empty = (read_image(tmp_path / "overlays" / "occlusion" / f"{one.id}.png") for one in explained.frames)
     assert np.ptp(strong[2, 2].astype(int)) > 100
     assert np.ptp(empty.astype(int)) <= 1
@@ -80,7 +80,7 @@ def test_a_frame_with_nothing_to_explain_looks_empty(tmp_path: Path):
 def test_a_panel_of_many_frames_shows_a_few_from_the_first_to_the_last(tmp_path: Path, monkeypatch):
     figures = []
     monkeypatch.setattr("sliplens.plots.saliency.Figure.savefig", lambda figure, *_, **__: figures.append(figure))
-    draw_explanation(of_relevance(np.zeros((40, 8, 8), dtype=np.float32)), tmp_path, colours="signed")
+    draw_explanation(of_relevance(np.zeros((40, 8, 8), dtype=np.float32)), tmp_path)
     [figure] = figures
     heads = [text.get_text().partition("\n")[0] for text in figure.texts]
     columns = [int(head) for head in heads if head.isdigit()]
