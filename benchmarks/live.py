@@ -9,9 +9,9 @@
 headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page shows maps,
 twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
 the end than after the first 10 seconds (or a tenth of a shorter run), `opens_s` the time from the browser's connection
-to the first picture that it has drawn. `of_it_ms` says where the time of the slowest hundredth went, on average:
-`network` is what a frame waits for that after its checks, `waiting` what none of them took, `gc_ms` the longest pause
-of Python's garbage collector.
+to the first picture that it has drawn, `page_ms_a_second` the processor time of the page's threads. `of_it_ms` says
+where the time of the slowest hundredth went, on average: `network` is what a frame waits for that after its checks,
+`waiting` what none of them took, `gc_ms` the longest pause of Python's garbage collector.
 
 `--ratios` compares ways to read, without a page: readers take turns, frame by frame, so that whatever else the machine
 does hits all alike. `p50_ratios` and `p99_ratios` are of `chromatouch-pair` over `chromatouch-difference`, as they come
@@ -25,6 +25,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -73,6 +74,8 @@ class Latencies:
     pictures: int
     """Pictures that the page had drawn."""
     maps: int
+    page_ms_a_second: float
+    """Processor time of the page's threads."""
     opens_s: float
     """Time from the browser's connection to its first picture; infinite without a page."""
 
@@ -89,6 +92,15 @@ class TimedPage(LivePage):
             viewer.shows_map = maps
             if np.isinf(self.opens_s) and viewer.takes_s > 0:
                 self.opens_s = time.monotonic() - self.asked_s
+
+
+def page_s() -> float:
+    """Processor time that the page's threads have taken."""
+    tasks = [
+        f"/proc/self/task/{thread.native_id}/stat" for thread in threading.enumerate() if thread.name[:4] == "page"
+    ]
+    ticks = [int(part) for task in tasks for part in Path(task).read_text().rpartition(")")[2].split()[11:13]]
+    return sum(ticks) / os.sysconf("SC_CLK_TCK")
 
 
 def resident_mb() -> float:
@@ -173,8 +185,7 @@ def measure(
 
     reader = sl.LiveReader(source, network, reference=untouched)  # for hours, as far as it knows
     reader.subscribe(keep)
-    pictures: set[int] = set()
-    explained: set[int] = set()
+    pictures, explained, spent_s = set[int](), set[int](), 0.0
     with ExitStack() as stack:
         stack.enter_context(reader)
         page = stack.enter_context(TimedPage(reader, port=0)) if shown else None
@@ -188,11 +199,13 @@ def measure(
                 explained |= set() if page.feed.map is None else {page.feed.map.facts.number}
             if np.isinf(begins_s[0]) and (page is None or page.feed.picture is not None):
                 begins_s[0] = reading.time_s + WARM_S
+            if reading.time_s < begins_s[0]:
+                spent_s = page_s()
             if np.isinf(begins_s[0]) and reading.time_s > OPENS_S:
                 raise SystemExit(f"no browser opened the page within {OPENS_S:g} s; look after Chromium")
             if reading.time_s >= begins_s[0] + seconds:
                 break
-        engine = reader.engine.name if reader.engine else ""
+        engine, spent_s = reader.engine.name if reader.engine else "", page_s() - spent_s
     rows = table[: kept[0]]
     rows = rows[rows[:, 0] > 0, 1:]
     if not len(rows):
@@ -208,6 +221,7 @@ def measure(
         gc_ms=pauses.longest_ms,
         pictures=len(pictures),
         maps=len(explained),
+        page_ms_a_second=1e3 * spent_s / seconds,
         opens_s=np.inf if page is None else page.opens_s,
     )
 
@@ -327,6 +341,8 @@ def measure_pace(
         "of_it_ms_with_maps": None if beside is None else slowest_parts_ms(beside),
         "drops_with_maps": None if beside is None else beside.drops,
         "gc_ms": round(alone.gc_ms, 1),
+        "page_ms_a_second": round(alone.page_ms_a_second, 1) if shown else None,
+        "page_ms_a_second_with_maps": None if beside is None else round(beside.page_ms_a_second, 1),
         "opens_s": round(alone.opens_s, 2) if shown else None,
         "pictures": alone.pictures,
         "maps": None if beside is None else beside.maps,

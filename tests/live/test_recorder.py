@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -55,6 +55,26 @@ def recording(small_dataset: Dataset) -> Recording:
     return small_dataset.load(small_dataset.trials[0])
 
 
+def journal_of(folder: Path, recording: Recording, frames: list[LiveFrame]) -> tuple[Journal, list[int]]:
+    """Write frames as a recording that was cut off has them; gives the size of the file after each."""
+    lock, _ = begin_recording(folder, simulated=False)
+    header = JournalHeader(facts=FACTS, source="a camera", simulated=False, size=(48, 48))
+    journal, ends = Journal(folder, header, reference=recording.reference), []
+    for frame in frames:
+        journal.append(frame.image, time_s=frame.time_s, safety_margin=frame.safety_margin, forces=frame.forces)
+        ends.append(journal.path.stat().st_size)
+    journal.close()
+    lock.release()
+    return journal, ends
+
+
+def wait_until(condition: Callable[[], object], *, within_s: float = 10.0) -> None:
+    """Wait until something is so, or for long enough."""
+    end_s = time.monotonic() + within_s
+    while not condition() and time.monotonic() < end_s:
+        time.sleep(0.01)
+
+
 def record(folder: Path, frames: list[LiveFrame], recording: Recording) -> Dataset | None:
     recorder = Recorder(folder, facts=FACTS, source="a camera", reference=recording.reference)
     for frame in frames:
@@ -81,14 +101,7 @@ def test_a_recording_is_what_was_seen(recording: Recording, tmp_path: Path):
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.77, 0.999])
 def test_what_is_cut_off_is_whole_up_to_the_cut(recording: Recording, tmp_path: Path, share: float):
-    lock, _ = begin_recording(tmp_path / "data", simulated=False)
-    header = JournalHeader(facts=FACTS, source="a camera", simulated=False, size=(48, 48))
-    journal, ends = Journal(tmp_path / "data", header, reference=recording.reference), []
-    for frame in frames_of(recording):
-        journal.append(frame.image, time_s=frame.time_s, safety_margin=frame.safety_margin, forces=frame.forces)
-        ends.append(journal.path.stat().st_size)
-    journal.close()
-    lock.release()
+    journal, ends = journal_of(tmp_path / "data", recording, frames_of(recording))
     cut = round(share * ends[-1])
     os.truncate(journal.path, cut)
     whole = sum(end <= cut for end in ends)
@@ -160,13 +173,7 @@ def test_a_recording_that_was_killed_before_it_wrote_its_table_is_begun_anew(tmp
 def test_a_damaged_journal_is_whole_frames_or_a_sentence(
     recording: Recording, tmp_path: Path, rng: np.random.Generator
 ):
-    lock, _ = begin_recording(tmp_path / "data", simulated=False)
-    header = JournalHeader(facts=FACTS, source="a camera", simulated=False, size=(48, 48))
-    journal = Journal(tmp_path / "data", header, reference=recording.reference)
-    for frame in frames_of(recording)[:3]:
-        journal.append(frame.image, time_s=frame.time_s, safety_margin=frame.safety_margin, forces=frame.forces)
-    journal.close()
-    lock.release()
+    journal, _ = journal_of(tmp_path / "data", recording, frames_of(recording)[:3])
     whole, outcomes = journal.path.read_bytes(), set()
     for number in range(60):
         damaged = bytearray(whole)
@@ -203,9 +210,7 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_is_there(tmp_path: Path,
     with room_for(50_000):
         for number, image in enumerate(images):
             recorder.add(LiveFrame(image=image, number=number, time_s=float(number), captured_s=0.0))
-        end_s = time.monotonic() + 10
-        while recorder.state.sent + recorder.state.lost < 12 and time.monotonic() < end_s:
-            time.sleep(0.01)
+        wait_until(lambda: recorder.state.sent + recorder.state.lost == 12)
     state = recorder.state
     assert 0 < state.sent < 8
     assert state.lost == 12 - state.sent
@@ -224,9 +229,7 @@ def test_a_disk_that_is_full_at_the_end_keeps_the_journal(recording: Recording, 
     recorder = Recorder(tmp_path / "data", reference=recording.reference)
     for frame in frames_of(recording):
         recorder.add(frame)
-    end_s = time.monotonic() + 10
-    while recorder.state.sent < 12 and time.monotonic() < end_s:
-        time.sleep(0.01)
+    wait_until(lambda: recorder.state.sent == 12)
     with room_for(5_000), pytest.raises(OSError, match="large"):
         recorder.close()
     data = recover_dataset(tmp_path / "data")
@@ -295,9 +298,7 @@ def frame_at(time_s: float, captured_s: float) -> LiveFrame:
 
 def samples_of(stream: ForceStream, count: int, *, time_s: float, captured_s: float) -> Forces:
     """Wait for so many samples, and bring them to the clock of a frame."""
-    end_s = time.monotonic() + 5
-    while len(stream._samples) < count and stream.trouble is None and time.monotonic() < end_s:
-        time.sleep(0.01)
+    wait_until(lambda: len(stream._samples) >= count or stream.trouble)
     forces = stream.attach(frame_at(time_s, captured_s)).forces
     assert forces is not None
     return forces
@@ -306,7 +307,7 @@ def samples_of(stream: ForceStream, count: int, *, time_s: float, captured_s: fl
 def test_samples_keep_their_steps_on_the_clock_of_the_frames(tmp_path: Path):
     path = tmp_path / "forces.csv"
     path.write_text("# a logger\ntime [ms];fx [mN];fy [mN];fz [mN]\n5;1;1;1\n")
-    with ForceStream(path) as stream, path.open("a") as file:
+    with ForceStream(path) as stream, path.open("a", buffering=1) as file:
         begun_s = time.monotonic()
         file.write("7000;0;0;1500\n7010;250;0;1500\n7030;500;0;15")
         file.flush()
@@ -324,10 +325,9 @@ def test_samples_keep_their_steps_on_the_clock_of_the_frames(tmp_path: Path):
 def test_samples_without_times_count_from_when_they_arrive(tmp_path: Path):
     path = tmp_path / "forces.csv"
     path.write_text("fn,ft\n")
-    with ForceStream(path) as stream, path.open("a") as file:
+    with ForceStream(path) as stream, path.open("a", buffering=1) as file:
         begun_s = time.monotonic()
         file.write("2.0,0.5\n")
-        file.flush()
         forces = samples_of(stream, 1, time_s=begun_s, captured_s=begun_s)
     np.testing.assert_array_equal(forces.force_n, [[0.5, 0.0, 2.0]])
     assert begun_s <= forces.time_s[0] <= time.monotonic()
@@ -336,16 +336,13 @@ def test_samples_without_times_count_from_when_they_arrive(tmp_path: Path):
 def test_samples_that_drop_out_or_come_late_are_left_out(tmp_path: Path):
     path = tmp_path / "forces.csv"
     path.write_text("time_s,fx,fy,fz\n")
-    with ForceStream(path) as stream, path.open("a") as file:
+    with ForceStream(path) as stream, path.open("a", buffering=1) as file:
         file.write("1.0,0,0,1\n1.2,nan,0,1\n1.4,0,0,3\n1.1,0,0,9\n1.3,0,0,9\n1.5,0,0,4\n")
-        file.flush()
         forces = samples_of(stream, 6, time_s=0.0, captured_s=0.0)
         np.testing.assert_array_equal(forces.force_n[:, 2], [1, 3, 4])
         file.write("2.0,nan,nan,nan\n")
         file.flush()
-        end_s = time.monotonic() + 5
-        while not stream._samples and time.monotonic() < end_s:
-            time.sleep(0.01)
+        wait_until(lambda: stream._samples)
         assert stream.attach(frame_at(0.0, 0.0)).forces is None
 
 
@@ -371,11 +368,8 @@ def test_lines_that_are_no_forces_are_told(tmp_path: Path, lines: str, words: st
     path = tmp_path / "forces.csv"
     header, *rest = lines.splitlines(keepends=True)
     path.write_text(header)
-    with ForceStream(path) as stream, path.open("a") as file:
+    with ForceStream(path) as stream, path.open("a", buffering=1) as file:
         file.writelines(rest)
-        file.flush()
-        end_s = time.monotonic() + 5
-        while stream.trouble is None and time.monotonic() < end_s:
-            time.sleep(0.01)
+        wait_until(lambda: stream.trouble)
     assert words in str(stream.trouble)
     assert "the forces of" in str(stream.trouble)

@@ -144,11 +144,11 @@ class Feed:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._end_subscription: Callable[[], None] = lambda: None
         self._before: Frame | None = None
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="explain")
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="page-map")
         # explainers hook into the network: a copy, not the one that predicts
         network = reader.network
         self._network: Network | None = None if network is None else replace(network, model=deepcopy(network.model))
-        self._thread = Thread(target=self._run, name="draw", daemon=True)
+        self._thread = Thread(target=self._run, name="page-draw", daemon=True)
 
     def start(self, loop: asyncio.AbstractEventLoop) -> None:
         """Begin; clients are served in this loop, which runs in the thread that calls."""

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Self
 
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 _PORT = 8090
 _PATIENCE_S = 10.0
-_Page = TypeVar("_Page", bound="LivePage")
 
 
 class LivePage:
@@ -86,14 +85,14 @@ class LivePage:
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{port}/" + ("" if self.token is None else f"?token={self.token}")
 
-    def __enter__(self: _Page) -> _Page:
+    def __enter__(self) -> Self:
         from sliplens.app.feed import Feed  # noqa: PLC0415 (explainers, and with them torch)
 
         with ExitStack() as stack:
             self._socket = stack.enter_context(_listen(self._host, self._port))
             self.feed = Feed(self.reader)
             started = Event()
-            thread = Thread(target=lambda: asyncio.run(self._serve(started)), daemon=True)
+            thread = Thread(target=lambda: asyncio.run(self._serve(started)), name="page", daemon=True)
             thread.start()
             while not started.wait(0.01):
                 if not thread.is_alive():
