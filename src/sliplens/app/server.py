@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, TypeVar
 
 from sliplens.errors import InputError
 from sliplens.extras import require_packages
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 _PORT = 8090
 _PATIENCE_S = 10.0
+_Page = TypeVar("_Page", bound="LivePage")
 
 
 class LivePage:
@@ -85,7 +86,7 @@ class LivePage:
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{port}/" + ("" if self.token is None else f"?token={self.token}")
 
-    def __enter__(self) -> Self:
+    def __enter__(self: _Page) -> _Page:
         from sliplens.app.feed import Feed  # noqa: PLC0415 (explainers, and with them torch)
 
         with ExitStack() as stack:
