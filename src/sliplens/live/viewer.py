@@ -343,30 +343,26 @@ def _frame_numbers(trial: Recording) -> dict[str, Float[np.ndarray, " frames"]]:
 
 def _load_readings(trial: Recording, path: Path) -> dict[int, Reading]:
     """Load the predictions of a trial, by frame."""
-    rows = _rows_of(trial, path, _PREDICTION_KINDS, command="sliplens predict").select(list(_PREDICTION_KINDS)[1:])
+    names = "frame", "prediction", "low_90", "high_90"
+    rows = _rows_of(trial, path, names, command="sliplens predict")
     return {
         number: Reading(number=number, time_s=np.nan, captured_s=np.nan, margin=margin, low=low, high=high)
-        for number, margin, low, high in zip(*rows.to_pydict().values(), strict=True)
+        for number, margin, low, high in zip(*(rows[name].to_pylist() for name in names), strict=True)
     }
 
 
 def _load_tracks(trial: Recording, path: Path) -> dict[int, Float[np.ndarray, "markers 2"]]:
     """Load the places of the markers seen in each frame of a trial."""
-    rows = _rows_of(trial, path, _TRACK_KINDS, command="sliplens track")
+    rows = _rows_of(trial, path, ("frame", "x_px", "y_px"), command="sliplens track")
     frames = rows["frame"].to_numpy()
     points = np.stack([rows[name].to_numpy().astype(np.float64) for name in ("x_px", "y_px")], axis=-1) + _HALF_PX
     visible_points = np.isfinite(points).all(axis=1)
     return {int(number): points[(frames == number) & visible_points] for number in np.unique(frames)}
 
 
-_PREDICTION_KINDS = {
-    "trial": "texts", "frame": "whole numbers", "prediction": "numbers", "low_90": "numbers", "high_90": "numbers",
-}  # fmt: skip
-_TRACK_KINDS = {"trial": "texts", "frame": "whole numbers", "x_px": "numbers", "y_px": "numbers"}
-
-
-def _rows_of(trial: Recording, path: Path, kinds: dict[str, str], *, command: str) -> pa.Table:
+def _rows_of(trial: Recording, path: Path, columns: Sequence[str], *, command: str) -> pa.Table:
     """Load the rows of a table that belong to a trial, in the order of its frames."""
+    kinds = dict.fromkeys(columns, "numbers") | {"trial": "texts", "frame": "whole numbers"}
     with open_parquet(path, kinds, cure=f"name a table that {command} wrote") as file:
         table = file.read(columns=list(kinds))
     names = table["trial"].unique().to_pylist()
@@ -405,14 +401,10 @@ def _lay_out(
     rrb, trial = require_rerun().blueprint, viewed.trial
     height, width = trial.reference.shape[:2]
     bounds = rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height))
-    views = {
-        "frame": f"camera T_n{': contact, stick zone, markers' if trial.truth else ''}",
-        "difference": f"difference |T_n \N{MINUS SIGN} T_0| {TIMES} {factor:g}",
-        "reference": "reference T_0",
-    }
-    camera, difference, reference = (
-        rrb.Spatial2DView(origin=origin, name=name, visual_bounds=bounds) for origin, name in views.items()
-    )
+    view = partial(rrb.Spatial2DView, visual_bounds=bounds)
+    camera = view(origin="frame", name=f"camera T_n{': contact, stick zone, markers' if trial.truth else ''}")
+    difference = view(origin="difference", name=f"difference |T_n \N{MINUS SIGN} T_0| {TIMES} {factor:g}")
+    reference = view(origin="reference", name="reference T_0")
 
     def chart(origin: str, name: str, legend: str = "RightBottom", **settings: Any) -> object:
         corner, across = rrb.PlotLegend(corner=legend), rrb.TimeAxis(link="LinkToGlobal")
@@ -426,10 +418,8 @@ def _lay_out(
         span = rrb.ScalarAxis(range=(0.0, end_of_ratio(force_ratio(trial), highest)))
         charts += [chart("force", "forces (N)"), chart("ratio", "F_t / F_n in contact, beside friction", axis_y=span)]
     # a map is as large as the network's image, whatever the camera's
-    maps = [
-        rrb.Spatial2DView(origin=f"map/{method}", name=f"map by {method_name(method)}, at its frame")
-        for method in methods
-    ]
+    named = {f"map/{method}": f"map by {method_name(method)}, at its frame" for method in methods}
+    maps = [rrb.Spatial2DView(origin=origin, name=name) for origin, name in named.items()]
     states = rrb.StateTimelineView(origin="state", name="contact state")
     return rrb.Blueprint(
         rrb.Horizontal(
