@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sliplens.errors import ImageError, RecordingError
-from sliplens.markers import MarkerStatus, Tracker, track_markers
+from sliplens.markers import MarkerStatus, Tracker, detect_markers, track_markers, tracker
 
 KIND = {"chromatouch": "chromatouch", "flat-gel": "gelsight-mini"}
 
@@ -131,6 +131,22 @@ def test_after_a_knock_and_after_two_seconds_of_darkness_every_marker_has_its_na
     shown[1 : 1 + dark] = False
     assert np.all(tracks.status[1 : 1 + dark] == MarkerStatus.LOST)
     shows_again(tracks, truth, shown)
+
+
+def test_windows_around_the_last_places_give_what_a_search_of_every_frame_gives(trials, monkeypatch):
+    trial = trials["chromatouch"]
+    searched = []
+    monkeypatch.setattr(
+        tracker, "detect_markers", lambda *own, **named: searched.append(1) or detect_markers(*own, **named)
+    )
+    windows = track_markers(trial.frames, trial.reference, "chromatouch")
+    assert len(searched) < 0.5 * len(trial.frames)
+    monkeypatch.setattr(tracker, "_WHOLE_EVERY", 1)
+    whole = track_markers(trial.frames, trial.reference, "chromatouch")
+    assert np.mean(windows.status == whole.status) > 0.99
+    both = windows.followed & whole.followed
+    # a window that begins on another pixel weights the noise of 2 grey levels differently
+    assert np.abs(windows.position_px - whole.position_px)[both].max() < 0.3
 
 
 def test_what_cannot_be_followed_is_refused_in_one_sentence(dots, grid):

@@ -178,6 +178,7 @@ _CORE = 0.5  # radii, of what is surely marker
 _REACH = 1.6  # radii, beyond which nothing belongs to the marker
 _LOW, _HIGH = 0.25, 0.75  # of the contrast: below is background, above marker, however it speckles
 _ROUNDS = 3  # of moving the window onto the measured centre
+_FOLLOWED_ROUNDS = 1  # of the same from a place known to a third of a radius: the marker lies within the reach
 _SLOPE_SHARE = 0.5  # of the contrast that the background may change by across a radius
 
 
@@ -222,7 +223,11 @@ def _window(radius_px: float) -> _Window:
 
 
 def measure_spots(
-    signal: Float32[np.ndarray, "height width"], near_px: Float[np.ndarray, "spots 2"], *, radius_px: float
+    signal: Float32[np.ndarray, "height width"],
+    near_px: Float[np.ndarray, "spots 2"],
+    *,
+    radius_px: float,
+    rounds: int = _ROUNDS,
 ) -> Shapes:
     """Measure the spots near places, known to a third of a radius, in a signal that is high on markers.
 
@@ -246,9 +251,9 @@ def measure_spots(
     patches *= (1 / ((_HIGH - _LOW) * np.where(contrast > 1e-3, contrast, 1e-3)))[:, None]
     patches -= np.float32(_LOW / (_HIGH - _LOW))
     share = np.clip(patches, 0, 1, out=patches)
-    offset = np.zeros((len(whole), 2), dtype=np.float32)
+    offset = (near_px - whole).astype(np.float32)
     moments = np.ones((len(whole), 6), dtype=np.float32)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         x, y = window.plane[1] - offset[:, :1], window.plane[2] - offset[:, 1:]
         near = np.sqrt(x * x + y * y)
         part = share * np.clip(np.subtract(_REACH * radius_px + 0.5, near, out=near), 0, 1, out=near)
@@ -291,7 +296,10 @@ class Markers(Shapes):
 
 
 def detect_markers(
-    frame: UInt8[np.ndarray, "height width 3"], kind: str | MarkerKind = "auto", *, appearance: Appearance | None = None
+    frame: UInt8[np.ndarray, "height width 3"],
+    kind: str | MarkerKind = "auto",
+    *,
+    appearance: Appearance | None = None,
 ) -> Markers:
     """Detect the markers of a frame, and measure them to a fraction of a pixel.
 
@@ -352,10 +360,36 @@ def _make_pattern(markers: Markers) -> bool:
     return bool(np.median(first / third) >= _LEAST_RATIO)
 
 
+def measure_markers(
+    frame: UInt8[np.ndarray, "height width 3"], appearance: Appearance, near_px: Float[np.ndarray, "markers 2"]
+) -> tuple[Markers, Int[np.ndarray, " markers"]]:
+    """Measure markers in windows around predicted places; returns them, and which of them each place has, or -1.
+
+    A window is moved once, onto a centre that is more than a third of a radius from its place.
+    """
+    signal, radius = frame.astype(np.float32) @ appearance.weights, appearance.radius_px
+    shapes = measure_spots(signal, near_px, radius_px=radius, rounds=_FOLLOWED_ROUNDS)
+    centre = shapes.centre_px
+    moved = np.linalg.norm(centre - near_px, axis=1) > radius / 3
+    if moved.any():
+        again = measure_spots(signal, centre[moved], radius_px=radius, rounds=_FOLLOWED_ROUNDS)
+        for name, values in vars(again).items():
+            vars(shapes)[name][moved] = values
+    markers, keep = _keep_markers(shapes, near_px, appearance, signal.shape[::-1])
+    return markers, np.where(keep, np.cumsum(keep) - 1, -1)
+
+
 def _detect(frame: UInt8[np.ndarray, "height width 3"], appearance: Appearance) -> Markers:
     signal = frame.astype(np.float32) @ appearance.weights
     near = _find_places(signal, appearance)
     shapes = measure_spots(signal, near, radius_px=appearance.radius_px)
+    return _keep_markers(shapes, near, appearance, signal.shape[::-1])[0]
+
+
+def _keep_markers(
+    shapes: Shapes, near: Float[np.ndarray, "spots 2"], appearance: Appearance, size: tuple[int, ...]
+) -> tuple[Markers, Bool[np.ndarray, " spots"]]:
+    """Keep the spots that look like markers, each once, in a picture of a width and height; returns which they are."""
     low, high = (share * appearance.radius_px for share in _RADII)
     keep = (
         (shapes.contrast > _LEAST_CONTRAST * appearance.contrast)
@@ -369,10 +403,9 @@ def _detect(frame: UInt8[np.ndarray, "height width 3"], appearance: Appearance) 
     centre, radius = shapes.centre_px, shapes.radius_px[:, None]
     apart = np.linalg.norm(centre[keep][:, None] - centre[keep][None], axis=-1)
     keep[keep] = ~np.any((apart < appearance.radius_px) & np.tri(len(apart), k=-1, dtype=bool), axis=1)
-    height, width = signal.shape
     # a pixel beyond the disc: its blurred edge counts too
-    whole = np.all((centre >= radius + 1) & (centre <= np.array([width - 2, height - 2]) - radius), axis=1)
-    return Markers(**vars(shapes), whole=whole, appearance=appearance).only(keep)
+    whole = np.all((centre >= radius + 1) & (centre <= np.array(size) - 2 - radius), axis=1)
+    return Markers(**vars(shapes), whole=whole, appearance=appearance).only(keep), keep
 
 
 def _find_places(signal: Float32[np.ndarray, "height width"], appearance: Appearance) -> Float[np.ndarray, "places 2"]:

@@ -96,23 +96,34 @@ class Pattern:
         unless another fits clearly better, and so is a pattern that after a loss stands at its last place, or at rest,
         even if mostly hidden. Of larger steps the best is accepted only where no other fits nearly as well.
         """
-        pairing = self._link(origins, spots_px, lost=lost)
+        return self._note(self._link(origins, spots_px, lost=lost))
+
+    def accept(self, origin_px: Places, spots_px: Spots, spot: Matches) -> Pairing | None:
+        """Accept spots measured at the last places of the markers, -1 for none, where the step is small and smooth."""
+        pairing = self._judge(origin_px, spots_px, spot, origin_px)
+        return self._note(pairing) if self._is_calm(pairing) else None
+
+    def _note(self, pairing: Pairing | None) -> Pairing | None:
+        """Update the usual spread and support."""
         if pairing is not None:
             spread, first = max(pairing.spread_px, _LEAST_SPREAD_PX / _CALM_SPREAD), not np.isfinite(self._spread_px)
             self._spread_px = spread if first else 0.8 * self._spread_px + 0.2 * spread
             self._support = pairing.support if first else 0.8 * self._support + 0.2 * pairing.support
         return pairing
 
+    def _is_calm(self, step: Pairing) -> bool:
+        moved = np.linalg.norm(step.step_px, axis=1) / self._pitch
+        # the first step has no mean to be compared with
+        spread = self._spread_px if np.isfinite(self._spread_px) else 0.02 * float(np.median(self._pitch))
+        smooth = step.spread_px <= max(_CALM_SPREAD * spread, _LEAST_SPREAD_PX)
+        small = bool(step.paired.any()) and float(np.nanmedian(moved)) <= _CALM_STEP
+        return small and smooth and step.support >= _CALM_SUPPORT * self._support
+
     def _link(self, origins: list[Places], spots_px: Spots, *, lost: bool) -> Pairing | None:
         step = self._pair_twice(origins[0], np.zeros(2), spots_px)
-        moved = np.linalg.norm(step.step_px, axis=1) / self._pitch
-        way = np.inf if lost or not step.paired.any() else float(np.nanmedian(moved))
-        pitch = float(np.median(self._pitch))
-        # the first step has no mean to be compared with
-        spread = self._spread_px if np.isfinite(self._spread_px) else 0.02 * pitch
-        smooth = step.spread_px <= max(_CALM_SPREAD * spread, _LEAST_SPREAD_PX)
-        if way <= _CALM_STEP and smooth and step.support >= _CALM_SUPPORT * self._support:
+        if not lost and self._is_calm(step):
             return step
+        pitch = float(np.median(self._pitch))
         stands = [step, *(self._pair_twice(origin, np.zeros(2), spots_px) for origin in origins[1:])]
         shifts = [(origin, shift) for origin in origins for shift in likely_shifts(origin, spots_px, pitch_px=pitch)]
         tried = [*stands, *(self._pair_twice(origin, shift, spots_px) for origin, shift in shifts)]
@@ -150,7 +161,12 @@ class Pattern:
         Forward, a spot lies less than 0.45 of the pitch from the predicted place. Backward, it lies as near to the
         marker's own last place once it is moved back by the step of the marker's neighbours.
         """
-        spot = _mutual(predicted_px, spots_px, reach_px=GATE * self._pitch)
+        return self._judge(
+            predicted_px, spots_px, _mutual(predicted_px, spots_px, reach_px=GATE * self._pitch), from_px
+        )
+
+    def _judge(self, predicted_px: Places, spots_px: Spots, spot: Matches, from_px: Places) -> Pairing:
+        """Drop spots that do not lead back, and measure how well the others agree."""
         step = np.full(predicted_px.shape, np.nan)
         step[spot >= 0] = spots_px[spot[spot >= 0]] - from_px[spot >= 0]
         expected_step = self.predict(step, np.all(np.isfinite(step), axis=1))

@@ -6,14 +6,15 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 
 from sliplens.errors import ImageError, RecordingError
-from sliplens.markers.detect import MarkerKind, Markers, detect_markers
-from sliplens.markers.linking import Pattern, Places
+from sliplens.markers.detect import MarkerKind, Markers, detect_markers, measure_markers
+from sliplens.markers.linking import Pairing, Pattern, Places
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame, Tracks
 
 _FEWEST = 4
 _RADIUS_CHANGE = (0.6, 1.6)  # of the radius at rest, over the median change of all markers
 _CONTRAST_LEFT = 0.45
 _ROUNDNESS_LEFT, _ROUND = 0.75, 0.7
+_WHOLE_EVERY = 10  # frames, of which one is searched as a whole
 
 
 class Tracker:
@@ -30,20 +31,24 @@ class Tracker:
         self._size = height, width
         self._pattern = Pattern(self.rest.centre_px, size=self._size)
         self._shift, self._lost = np.zeros_like(self.rest.centre_px), False
+        self._followed, self._since_whole = np.zeros(len(self.rest), dtype=bool), _WHOLE_EVERY
 
     def update(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> TrackedFrame:
-        """Follow the markers into the next frame T_n, of the reference's size."""
+        """Follow the markers into the next frame T_n, of the reference's size.
+
+        Markers are measured around their last places. The whole frame is searched every tenth time, and at once where
+        a marker that was followed is not found there or the step is not small and smooth.
+        """
         if frame.shape[:2] != self._size:
             raise ImageError(
                 f"frame of {frame.shape[0]} x {frame.shape[1]} pixels against a reference of {self._size[0]} x "
                 f"{self._size[1]}; record the reference with the same camera settings"
             )
-        detected = detect_markers(frame, appearance=self.rest.appearance)
         rest, count = self.rest.centre_px, len(self.rest)
-        origins = [rest + self._shift, rest] if self._lost else [rest + self._shift]
-        pairing = self._pattern.link(origins, detected.centre_px, lost=self._lost)
+        detected, pairing = self._measure_near(frame) or self._search(frame)
         self._lost = pairing is None
         if pairing is None:
+            self._since_whole = _WHOLE_EVERY
             place = np.full((count, 2), np.nan)
             return self._tracked(place, place[:, 0], place[:, 0], np.full(count, MarkerStatus.LOST, dtype=np.uint8))
         spot = pairing.spot
@@ -54,7 +59,7 @@ class Tracker:
             shift, _, cut, sound, predicted = self._select_sound(detected, spot)
         status = np.full(count, MarkerStatus.MISSING, dtype=np.uint8)
         status[spot >= 0] = MarkerStatus.BROKEN
-        status[sound] = MarkerStatus.FOLLOWED
+        status[sound], self._followed = MarkerStatus.FOLLOWED, sound
         # undetected markers move on with their neighbours, so that they are identified when they come back
         self._shift = np.where(sound[:, None], shift, np.where(np.isfinite(predicted), predicted, self._shift))
         last, edge = rest + self._shift, (self.rest.radius_px + 1.5)[:, None]
@@ -65,6 +70,26 @@ class Tracker:
         radius = _at_spots(detected.radius_px, spot)
         place[hidden], radius[hidden], deviation[hidden] = np.nan, np.nan, np.nan
         return self._tracked(place, radius, deviation, status)
+
+    def _measure_near(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[Markers, Pairing] | None:
+        """Measure the markers around their last places; None where the whole frame must be searched."""
+        if self._since_whole >= _WHOLE_EVERY - 1:
+            return None
+        places = self.rest.centre_px + self._shift
+        detected, spot = measure_markers(frame, self.rest.appearance, places)
+        pairing = self._pattern.accept(places, detected.centre_px, spot)
+        if pairing is None or not pairing.paired[self._followed].all():
+            return None
+        self._since_whole += 1
+        return detected, pairing
+
+    def _search(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> tuple[Markers, Pairing | None]:
+        """Detect the markers of the whole frame, and identify them."""
+        rest = self.rest.centre_px
+        self._since_whole = 0
+        detected = detect_markers(frame, appearance=self.rest.appearance)
+        origins = [rest + self._shift, rest] if self._lost else [rest + self._shift]
+        return detected, self._pattern.link(origins, detected.centre_px, lost=self._lost)
 
     def _tracked(self, place: Places, radius: np.ndarray, deviation: np.ndarray, status: np.ndarray) -> TrackedFrame:
         return TrackedFrame(
