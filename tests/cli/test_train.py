@@ -20,8 +20,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from sliplens.cli import main
 from sliplens.models import load
 from sliplens.recordings import Dataset
-from sliplens.recordings.dataset import trial_path, write_dataset_table
-from sliplens.recordings.store import save_recording
+from sliplens.recordings.dataset import write_dataset_table
 
 SMALL = ("--image-size", "32", "--epochs", "3", "--batch-size", "11", "--head", "point", "--untouched-share", "0")
 
@@ -175,29 +174,26 @@ def test_one_condition_alone(small_dataset: Dataset, tmp_path: Path, capsys):
     assert "other settings" in capsys.readouterr().err
 
 
-def test_no_validation_split(small_dataset: Dataset, tmp_path: Path, capsys):
-    data = divided(small_dataset, tmp_path / "data", validation={"split": ""})
-    line = refused(capsys, data, tmp_path / "run")
-    assert "has no trial with split validation and condition any" in line
-    assert line.endswith("divide it with `sliplens split`")
+def with_margin(data: Dataset, folder: Path, margin: float) -> Path:
+    """The small data set with one margin for all labelled frames."""
+    whole = [data.load(info) for info in data.trials]
+    same = [replace(one, safety_margin=np.where(one.labelled, margin, np.nan)) for one in whole]
+    save_dataset(folder, *same, split=[info.split for info in data.trials])
+    return folder
 
 
-def test_frames_of_two_sizes(small_dataset: Dataset, tmp_path: Path, capsys):
-    data = divided(small_dataset, tmp_path / "data", validation={"height": 60, "width": 80})
-    line = refused(capsys, data, tmp_path / "run")
-    assert "mixes frames of several sizes; train on one sensor at a time" in line
-
-
-def test_no_label(small_dataset: Dataset, tmp_path: Path, capsys):
-
-    (tmp_path / "data").mkdir()
-    for info in small_dataset.trials:
-        recording = small_dataset.load(info)
-        unknown = replace(recording, safety_margin=np.full(len(recording.time_s), np.nan))
-        save_recording(unknown, trial_path(tmp_path / "data", info.trial))
-    write_dataset_table(tmp_path / "data", small_dataset.trials, simulated=True)
-    line = refused(capsys, tmp_path / "data", tmp_path / "run")
-    assert "no frame of the 4 trials has a label; label them first" in line
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda data, folder: divided(data, folder, validation={"split": ""}), "has no trial with split validation"),
+        (lambda data, folder: divided(data, folder, validation={"height": 60, "width": 80}), "frames of several sizes"),
+        (lambda data, folder: with_margin(data, folder, np.nan), "no frame of the 4 trials has a label"),
+        (lambda data, folder: with_margin(data, folder, 1.0), "all 44 labels that"),
+    ],
+    ids=["no validation split", "two sizes", "no label", "one margin"],
+)
+def test_data_that_cannot_train_are_refused(small_dataset: Dataset, tmp_path: Path, capsys, make, message: str):
+    assert message in refused(capsys, make(small_dataset, tmp_path / "data"), tmp_path / "run")
     assert not (tmp_path / ".run.partial").exists()
 
 
@@ -208,14 +204,3 @@ def test_it_goes_on_from_a_network_at_another_size(finished: Path, small_dataset
     assert more.image_size == 48
     recipe = json.loads((tmp_path / "more" / "run.json").read_text())["config"]
     assert recipe["started_from"] == start.weights_sha256
-
-
-def test_labels_that_are_all_the_same_are_refused(
-    tmp_path: Path, small_dataset: Dataset, capsys: pytest.CaptureFixture[str]
-):
-    whole = [small_dataset.load(info) for info in small_dataset.trials]
-    stuck = [replace(one, safety_margin=np.where(one.labelled, 1.0, np.nan)) for one in whole]
-    save_dataset(tmp_path / "data", *stuck, split=[info.split for info in small_dataset.trials])
-    line = refused(capsys, tmp_path / "data", tmp_path / "run")
-    assert "all 44 labels that" in line
-    assert "has to train on are 100 %, and of a constant there is nothing to learn" in line

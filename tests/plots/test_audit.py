@@ -178,11 +178,10 @@ def test_what_may_put_the_labels_in_doubt_is_marked(changes, head):
     assert head is None or f"▲ {head}" in words
 
 
-def test_charts_draw_forces_ratio_and_margin_of_the_frames():
+def test_charts_draw_forces_ratio_margin_and_its_sigma_at_the_frames():
     trial = make_trial()
-    forces, ratio, margin = charts(draw_audit(trial, make_labelling()))
-
-    lines = {str(line.get_label()): np.asarray(line.get_ydata()) for ax in (forces, ratio, margin) for line in ax.lines}
+    figure = draw_audit(trial, make_labelling())
+    lines = {str(line.get_label()): np.asarray(line.get_ydata()) for ax in charts(figure) for line in ax.lines}
     touches = trial.normal_force_n > 0
     np.testing.assert_array_equal(lines["$F_n$"], trial.normal_force_n)
     np.testing.assert_array_equal(lines["$F_t$"], trial.tangential_force_n)
@@ -192,27 +191,20 @@ def test_charts_draw_forces_ratio_and_margin_of_the_frames():
     np.testing.assert_allclose(lines["$F_t/F_n$ in contact"][touches], MU * (1 - trial.safety_margin[touches]))
     assert np.isnan(lines["$F_t/F_n$ in contact"][~touches]).all()
     np.testing.assert_array_equal(lines["Γ"][trial.labelled], 100 * trial.safety_margin[trial.labelled])
-
-
-def test_frames_without_a_valid_label_are_drawn_apart():
-    trial = make_trial()
-    margin = charts(draw_audit(trial, make_labelling()))[2]
-
-    lines = {str(line.get_label()): np.asarray(line.get_ydata()) for line in margin.lines}
+    # frames without a valid label are drawn apart
     assert trial.valid is not None
     np.testing.assert_array_equal(np.isfinite(lines["Γ"]), trial.valid)
     np.testing.assert_array_equal(np.isfinite(lines["no valid label"]), ~trial.valid)
-
-
-def test_band_is_one_sigma_either_way():
-    trial = make_trial()
-    (band,) = bands(charts(draw_audit(trial, make_labelling()))[2])
-
+    # the band is one sigma either way
+    (band,) = bands(charts(figure)[2])
     corners = np.concatenate([path.vertices for path in band.get_paths()])
-    assert corners[:, 1].max() == pytest.approx(103.1)
-    assert corners[:, 1].min() == pytest.approx(-3.1)
-    assert corners[:, 0].min() == trial.time_s[4]
-    assert corners[:, 0].max() == trial.time_s[-4]
+    ends = [*corners.min(axis=0), *corners.max(axis=0)]
+    assert ends == [trial.time_s[4], pytest.approx(-3.1), trial.time_s[-4], pytest.approx(103.1)]
+    # marks stand where the frames were taken
+    taken = trial.time_s[[2, *spread_audit_frames(trial)]]
+    for ax in charts(figure):
+        marks = [np.asarray(line.get_xdata())[0] for line in ax.lines if line.get_label() == "_frame"]
+        np.testing.assert_array_equal(marks, taken)
 
 
 @pytest.mark.parametrize(("applied", "seen"), [(False, 1.97), (True, 1.985)])
@@ -276,16 +268,6 @@ def test_a_trial_without_its_pixels_has_those_read_that_are_shown():
             np.testing.assert_array_equal(ax.images[0].get_array(), whole.images[0].get_array())
     # the six frames, and an untouched one to tell the drift
     assert len(asked) == 7
-
-
-def test_marks_stand_where_the_frames_were_taken():
-    trial = make_trial()
-    figure = draw_audit(trial, make_labelling())
-
-    taken = trial.time_s[[2, *spread_audit_frames(trial)]]
-    for ax in charts(figure):
-        marks = [np.asarray(line.get_xdata())[0] for line in ax.lines if line.get_label() == "_frame"]
-        np.testing.assert_array_equal(marks, taken)
 
 
 @pytest.mark.parametrize("size", [(24, 32), (90, 16)])
