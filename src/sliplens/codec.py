@@ -596,6 +596,6 @@ def one_line(error: Exception) -> str:
 
 
 __all__ = [
-    "Columns", "Result", "from_builtins", "keep_part", "load_record", "load_result", "save_record", "save_result", "to_builtins",
-    "write_tables",
+    "Columns", "Result", "from_builtins", "keep_part", "load_record", "load_result", "save_record", "save_result",
+    "to_builtins", "write_tables",
 ]  # fmt: skip

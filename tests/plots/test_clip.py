@@ -144,7 +144,7 @@ def test_outlines_do_not_hide_each_other_or_leave_their_side():
 
 @pytest.mark.parametrize(
     ("name", "rate", "message"),
-    [("trial", 30, "name a clip"), ("trial.mp4.mkv", 30, "name a clip")]
+    [("trial", 30.0, "name a clip"), ("trial.mp4.mkv", 30.0, "name a clip")]
     + [("trial.mp4", rate, "cannot be watched; ask for 25 to 30") for rate in (0.0, 1e6, float("nan"))],
 )
 def test_another_suffix_or_rate_is_refused_and_nothing_written(trial, tmp_path, name, rate, message):
