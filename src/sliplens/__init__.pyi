@@ -14,6 +14,7 @@ from .markers.tracking import track as track
 from .models.checkpoint import load as load
 from .models.onnx import export_onnx as export_onnx
 from .models.predictions import predict as predict
+from .models.wrapping import wrap as wrap
 from .plots.figure import make_profile as make_profile
 from .plots.figure import plot as plot
 from .recordings.check import check_dataset as check_dataset

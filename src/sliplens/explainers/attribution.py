@@ -238,17 +238,19 @@ def check_maps(
     prediction: Float[Tensor, " batch"],
     reference_prediction: Float[Tensor, " batch"],
     completeness_gap: Float[Tensor, " batch"] | None,
+    close: float = CLOSE,
+    of_margin: bool = True,
 ) -> Iterator[str]:
-    """Describe the faults of each map, a sentence a fault, in the order of the images; all in margin units."""
+    """Describe the faults of each map, a sentence a fault, in the order of the images; all in the output's unit."""
     gaps = torch.zeros_like(prediction) if completeness_gap is None else completeness_gap
     numbers = (values.tolist() for values in (prediction, reference_prediction, gaps))
     for index, (image_map, high, low, gap) in enumerate(zip(relevance, *numbers, strict=True)):
         change, finite = high - low, bool(torch.isfinite(image_map).all())
         findings = {
-            f"f(x) = {high:.3g} is within {CLOSE} of f(reference) = {low:.3g}, so there is next to nothing to "
-            "explain": abs(change) < CLOSE,
+            f"f(x) = {high:.3g} is within {close:.2g} of f(reference) = {low:.3g}, so there is next to nothing to "
+            "explain": abs(change) < close,
             f"f(reference) = {low:.3g} is no safety margin, so the reference lies far from the data and the map shows "
-            "the way from there": not LOWEST <= low <= HIGHEST,
+            "the way from there": of_margin and not LOWEST <= low <= HIGHEST,
             "the map holds NaN or infinity and must not be shown or scored": not finite,
             "the map is zero everywhere and says nothing about the image": finite and not image_map.any(),
             f"the map leaves {gap:.2g} of f(x) - f(reference) = {change:.2g} unexplained, more than {GAP:.0%}": (
@@ -289,10 +291,10 @@ def check_approximations(approximations: Sequence[Approximation]) -> Iterator[st
             )
 
 
-def check_slopes(sizes: Sequence[float], *, change: Sequence[float]) -> Iterator[str]:
+def check_slopes(sizes: Sequence[float], *, change: Sequence[float], close: float = CLOSE) -> Iterator[str]:
     """Warn of images at which the gradients, even if all of one sign, make up next to none of the change."""
     for index, (size, difference) in enumerate(zip(sizes, change, strict=True)):
-        if abs(difference) >= CLOSE and size < FLAT * abs(difference):
+        if abs(difference) >= close and size < FLAT * abs(difference):
             yield (
                 f"image {index}: the gradients at the image make up {size / abs(difference):.2g} of "
                 f"f(x) - f(reference) = {difference:.2g}, less than {FLAT:g}: the network is saturated there, so "

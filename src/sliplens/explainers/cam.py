@@ -82,10 +82,17 @@ def find_layers(
     Raises
     ------
     ModelError
-        If a name is unknown or its module gives no map, or if the network has no layer with a map.
+        If a name is unknown or its module gives no map, or if the network has no layer with a map, or maps with the
+        channels last, such as a Swin transformer.
     """
     root = _record(model, images)
-    layers = _distinct(_main_path(root))
+    path = _main_path(root)
+    layers = _distinct(path)
+    if names is None and any(_is_channels_last(step) for step in path):
+        raise ModelError(
+            f"{type(model).__name__} has maps with their channels last, which methods of the CAM family do not take; use "
+            "integrated-gradients, smooth-grad, occlusion or shapley"
+        )
     if names is not None:
         return _named(model, root, names, others=layers)
     if not layers:
@@ -165,6 +172,17 @@ def _map_shape(value: object) -> Shape | None:
 
 def _is_spatial(shape: Shape | None) -> bool:
     return shape is not None and shape[1] * shape[2] > 1
+
+
+def _is_channels_last(call: _Call) -> bool:
+    """Return True if the layer that made a map, the last one with weights, works along its last axis."""
+    makers = [
+        type(step.module)
+        for step in _finished(call)
+        if step.output_shape is not None
+        and (type(step.module).__name__ == "Permute" or next(step.module.parameters(recurse=False), None) is not None)
+    ]
+    return bool(makers) and makers[-1] in {nn.LayerNorm, nn.Linear}
 
 
 def _main_path(call: _Call) -> list[_Call]:
@@ -287,7 +305,9 @@ class _Cam(Method):
             relevance,
             complete=self.contrast and not self.one_sided and not self.relu,
             target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
-            warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist()),
+            warnings=check_slopes(
+                relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist(), close=comparison.close
+            ),
         )
         return replace(attribution, raises_only=self.relu)
 

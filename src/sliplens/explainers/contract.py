@@ -13,8 +13,9 @@ from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
 from sliplens.errors import ImageError, InputError, ModelError
-from sliplens.explainers.attribution import Attribution, check_maps, frame_of
+from sliplens.explainers.attribution import CLOSE, Attribution, check_maps, frame_of
 from sliplens.models.engines import Engine, prepare
+from sliplens.models.wrapping import OneOutput
 from sliplens.progress import report_each
 
 Batch: TypeAlias = Shaped[Tensor, "..."]
@@ -93,6 +94,16 @@ class Comparison:
         return comparison
 
     @property
+    def close(self) -> float:
+        """Change of the prediction below which there is next to nothing to explain."""
+        return CLOSE if self.of_margin else CLOSE * float(self.change.abs().max())
+
+    @property
+    def of_margin(self) -> bool:
+        """True if the network predicts safety margins, False for a wrapped module of another output."""
+        return not isinstance(self.model, OneOutput)
+
+    @property
     def reference(self) -> Float[Tensor, "batch colours height width"]:
         """Reference b of each image."""
         return self.references.expand_as(self.images)
@@ -130,6 +141,8 @@ class Comparison:
             prediction=self.prediction,
             reference_prediction=self.reference_prediction,
             completeness_gap=gap,
+            close=self.close,
+            of_margin=self.of_margin,
         )
         return Attribution(
             images=self.images.float(),

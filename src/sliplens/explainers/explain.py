@@ -124,8 +124,9 @@ def explain_rows(
     # the first of few maps is waited for: each then takes the engine that its passes pay for
     passes = _PASSES_A_MAP * maps if maps > _FEW_MAPS else 0
     with nullcontext() if chosen.together else expecting(passes):
-        # the baseline of one call is the same for all its frames
-        attribution = explainer(network.model, inputs, reference=references[0])
+        # one reference for all where it is the same, so that it is predicted once
+        shared = references[0] if bool((references == references[:1]).all()) else references
+        attribution = explainer(network.model, inputs, reference=shared)
     relevance = attribution.relevance.cpu().numpy()
     for row, values in zip(rows, relevance, strict=True):
         require_saliency(values, inputs.shape[-2:], where=f"the map of {chosen.ids[row]} by {attribution.method}")
@@ -167,6 +168,7 @@ def join_maps(
     return Explanation(
         input=network.encoding.name,
         source=chosen.source,
+        unit=network.manifest.unit,
         weights_sha256=network.manifest.weights_sha256,
         frames=tuple(
             ExplainedFrame(

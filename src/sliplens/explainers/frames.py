@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from sliplens.errors import ImageError, InputError, RecordingError, SliplensError
@@ -29,8 +30,11 @@ _LEAST_SPREAD = 1e-3  # divergence of a press, in pixels per pixel
 _LABEL = re.compile(r"_(0|[1-9]\d?|100)$")
 FindMarkers: TypeAlias = Callable[[], Sequence[Float[Tensor, "_markers 2"]]]
 """Function that finds the markers of all frames, x and y in the network's input."""
-Baseline: TypeAlias = Literal["untouched", "stick"] | UInt8[np.ndarray, "_ _ 3"]
-"""Baseline of predictions: the untouched sensor, the last frame before the pull, or a frame."""
+Baseline: TypeAlias = Literal["untouched", "stick", "black", "mean", "blurred"] | UInt8[np.ndarray, "_ _ 3"]
+"""Baseline of predictions: the untouched sensor, the last frame before the pull, an image that shows nothing, or a
+frame."""
+_BLUR_SHARE = 0.05
+"""Standard deviation of the blur of a baseline, as a share of the image's height."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +153,7 @@ def frames_from_arrays(
         raise ImageError("there is no frame to explain; give one at least")
     network.require_frame_size(frames.shape[1:3])
     encoding, image_size = network.encoding, network.manifest.image_size
-    if reference is None and not encoding.empty_is_black:
+    if reference is None and encoding.compares and not encoding.empty_is_black:
         raise InputError(
             f"a network on {encoding.name} images needs the untouched sensor; give it as reference, on the command "
             "line with --reference IMAGE"
@@ -160,17 +164,19 @@ def frames_from_arrays(
             return encoding.resize(images, image_size=image_size)
         return encoding.compare_small(images, reference, image_size=image_size)
 
-    stick, warnings = None, ()
-    if isinstance(baseline, str):
+    stick, warnings, images = None, (), small(frames)
+    if not isinstance(baseline, str):
+        network.require_frame_size(baseline.shape[:2], what="the baseline's frame")
+        references, name = small(baseline[None]), "given"
+    elif baseline in {"black", "mean", "blurred"}:
+        references, name = small(_hide(frames, baseline)), baseline
+    else:
         if baseline == "stick":
             stick, warnings = try_stick_frame("frames", frames, reference)
-        compared = reference if stick is None else frames[stick]
-        name = "untouched" if stick is None else "stick"
-    else:
-        network.require_frame_size(baseline.shape[:2], what="the baseline's frame")
-        compared, name = baseline, "given"
-    images = small(frames)
-    references = torch.zeros_like(images[0]) if compared is None else small(compared[None])[0]
+        compared, name = (reference, "untouched") if stick is None else (frames[stick], "stick")
+        if compared is None and not encoding.compares:
+            name = "black"
+        references = torch.zeros_like(images[:1]) if compared is None else small(compared[None])
 
     def find_markers() -> list[Float[Tensor, "_markers 2"]]:
         return [markers_in_frame(frame, image_size=image_size) for frame in frames]
@@ -182,7 +188,7 @@ def frames_from_arrays(
         condition=("unknown",) * len(frames),
         safety_margin=np.full(len(frames), np.nan, dtype=np.float32),
         images=images,
-        references=references.expand(len(frames), -1, -1, -1),
+        references=references.expand_as(images),
         source="real",
         together=True,
         find_markers=None if reference is None else find_markers,
@@ -190,6 +196,15 @@ def frames_from_arrays(
         baseline_frame=(stick,) * len(frames),
         warnings=warnings,
     )
+
+
+def _hide(frames: UInt8[np.ndarray, "batch height width 3"], how: str) -> UInt8[np.ndarray, "batch height width 3"]:
+    """Return images that show nothing of the frames: black, their mean colour, or each frame blurred."""
+    if how == "blurred":
+        sigma = _BLUR_SHARE * frames.shape[1]
+        return np.round(gaussian_filter(frames.astype(np.float32), (0, sigma, sigma, 0))).astype(np.uint8)
+    colour = frames.mean(axis=(0, 1, 2)).round() if how == "mean" else 0
+    return np.broadcast_to(np.asarray(colour, np.uint8), frames.shape)
 
 
 def frames_from_dataset(
@@ -336,7 +351,9 @@ def _join(parts: Sequence[ChosenFrames]) -> ChosenFrames:
         safety_margin=np.concatenate([part.safety_margin for part in parts]),
         images=torch.cat([part.images for part in parts]),
         references=torch.cat([part.references for part in parts]),
-        baseline=max((part.baseline for part in parts), key=("untouched", "given", "stick").index),
+        baseline=max(
+            (part.baseline for part in parts), key=("black", "mean", "blurred", "untouched", "given", "stick").index
+        ),
     )
 
 

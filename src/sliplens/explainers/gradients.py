@@ -90,7 +90,7 @@ class IntegratedGradients(Method):
             comparison.map_each(integral),
             complete=not self.black,
             target=f"f(x) - f({'black' if self.black else 'reference'})",
-            warnings=check_slopes(slopes, change=black.change.tolist()),
+            warnings=check_slopes(slopes, change=black.change.tolist(), close=black.close),
         )
 
     def integrate(
@@ -254,5 +254,5 @@ class SmoothGrad(Method):
             relevance,
             complete=False,
             target="the linear model of f at x",
-            warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=change),
+            warnings=check_slopes(relevance.abs().sum(dim=(1, 2)).tolist(), change=change, close=comparison.close),
         )

@@ -152,12 +152,14 @@ def score_curves(
                     random=curve.random.ravel(),
                 )
             )
-    whole = next(iter(curves.values())).whole
-    change = np.array([frame.prediction - frame.reference_prediction for frame in frames])
-    blank = {setting.fill: part.blank for setting, part in curves.items() if np.isfinite(part.blank).all()}
+    scale = explanation.scale
+    whole = next(iter(curves.values())).whole / scale
+    change = np.array([frame.prediction - frame.reference_prediction for frame in frames]) / scale
+    blank = {setting.fill: part.blank / scale for setting, part in curves.items() if np.isfinite(part.blank).all()}
     return Faithfulness(
         input=explanation.input,
         source=explanation.source,
+        unit=explanation.unit,
         frames=len(frames),
         trials=len(explanation.trials),
         random_orders=random_orders,
@@ -165,7 +167,7 @@ def score_curves(
         comparisons=tuple(comparisons),
         alarms=(
             *little_to_explain(change, baseline=BASELINES[explanation.baseline]),
-            *saturated(whole),
+            *(saturated(whole) if explanation.unit == "margin" else ()),
             *flat_maps({name: explanation.influence(name) for name in explanation.relevance}),
             *(alarm for fill, gone in blank.items() for alarm in fill_decides(whole, gone, fill=fill)),
             *ranking_alarms(by_method),
@@ -190,7 +192,7 @@ def deletion_score(
     >>> deletion_score(np.array(0.9), np.array([0.9, 0.4])).round(2)  # nothing destroyed; half of the range
     array([1.  , 0.25])
     """
-    return (1 - np.abs(base - masked)) ** 2
+    return (1 - np.minimum(np.abs(base - masked), 1)) ** 2
 
 
 def deletion_order(saliency: Float[np.ndarray, "height width"]) -> Int[np.ndarray, " pixels"]:
@@ -260,6 +262,7 @@ def score_deletion(
     explanation: Explanation, answers: Mapping[str, Float64[np.ndarray, "frames answers"]], *, fill: str
 ) -> DeletionScores:
     """Make the thesis's deletion scores of the predictions of all frames by method (`delete_pixels`)."""
+    answers = {name: values / explanation.scale for name, values in answers.items()}
     frames, chance = explanation.frames, answers[CHANCE]
     removed = deletion_steps((explanation.image_size, explanation.image_size), steps=chance.shape[1] - 1)
     scores = {name: deletion_score(values[:, :1], values[:, 1:]) for name, values in answers.items()}
@@ -272,7 +275,7 @@ def score_deletion(
             trial=np.repeat([frame.trial for frame in frames], steps),
             step=np.tile(np.arange(steps), len(frames)),
             pixels_removed=np.tile(removed, len(frames)),
-            prediction=answers[name][:, 1:].ravel(),
+            prediction=explanation.scale * answers[name][:, 1:].ravel(),
             score=values.ravel(),
         )
         for name, values in scores.items()
@@ -296,7 +299,7 @@ def score_deletion(
             *flat_maps(explanation.saliency),
             # the fill decides where the filled image is predicted like the whole one
             *fill_decides(chance[:, 0], chance[:, -1], fill=fill),
-            *saturated(chance[:, 0]),
+            *(saturated(chance[:, 0]) if explanation.unit == "margin" else ()),
             *deletion_alarms(scores),
         ),
         table=DeletionTable.joined(tables),

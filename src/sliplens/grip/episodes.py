@@ -27,7 +27,7 @@ from sliplens.grip.records import EpisodeTable, Grip, GripSetup, GripTrace
 from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion
 from sliplens.mechanics import stick_ratio
 from sliplens.models import Network
-from sliplens.models.checkpoint import open_run
+from sliplens.models.wrapping import open_run
 from sliplens.plots.clip import write_clip
 from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_file, reporting
 from sliplens.recordings import Recording

@@ -26,8 +26,9 @@ from sliplens.live.reading import LiveFrame, Reading
 from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.sinks import Sender
 from sliplens.live.sources import Images, open_live
-from sliplens.models.checkpoint import Network, open_run
+from sliplens.models.checkpoint import Network
 from sliplens.models.engines import Engine, make_engine
+from sliplens.models.wrapping import open_run
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import Dataset, save_profile

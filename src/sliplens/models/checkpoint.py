@@ -58,6 +58,8 @@ class Manifest:
     head: str = "point"
     recipe: str = ""
     target: str = "safety_margin"
+    unit: str = "margin"
+    """Unit of the prediction; `margin` for a safety margin in [0, 1]."""
     weights_sha256: str = ""
     schema_version: int = SCHEMA_VERSION
     metrics: dict[str, float] = field(default_factory=dict)
@@ -545,10 +547,3 @@ def load(run: str | Path, *, device: str = "cpu") -> Network:
     has_curve = (folder / "curve.parquet").is_file()
     training = load_result(folder, Training, command="sliplens train") if has_curve else None
     return Network(model=model, manifest=manifest, training=training, sequence=sequence)
-
-
-def open_run(run: object, *, device: str = "cpu") -> Network:
-    """Return a network, or load it from its folder or by the name of one that comes with sliplens."""
-    if not isinstance(run, Network | Path | str):
-        raise InputError(f"{type(run).__name__} is no network; give a network, its folder or its name first")
-    return run if isinstance(run, Network) else load(run, device=device)

@@ -37,6 +37,11 @@ class Encoding:
     """If True, the input holds the reference beside the frame."""
 
     @property
+    def compares(self) -> bool:
+        """True if the input depends on the reference frame."""
+        return self.beside or self.compare is not _keep
+
+    @property
     def colours(self) -> int:
         """Number of channels of the input: those of the frame, then those of the reference where it stands beside."""
         return 6 if self.beside else 3
@@ -99,10 +104,11 @@ def _keep(frames: Frames, reference: Reference) -> Frames:
 
 
 ENCODINGS = {
-    # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; T_n - T_0; |T_n - T_0| with its amplitude;
-    # T_n and T_0, on one scale
+    # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; T_n by 255; T_n - T_0; |T_n - T_0| with its
+    # amplitude; T_n and T_0, on one scale
     "difference": Encoding(name="difference", compare=absolute_difference, empty_is_black=True),
     "raw": Encoding(name="raw", compare=_keep, empty_is_black=False),
+    "rgb": Encoding(name="rgb", compare=_keep, empty_is_black=False, own_maximum=False),
     "signed": Encoding(
         name="signed", compare=signed_difference, empty_is_black=False, own_maximum=False, neutral=128 / 255
     ),

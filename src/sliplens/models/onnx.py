@@ -18,7 +18,8 @@ from sliplens.errors import ModelError
 from sliplens.extras import ONNX_PACKAGES, import_onnxruntime, require_packages
 from sliplens.files import require_new_file, to_builtins, whole_file
 from sliplens.models.backbones import Answers, answer_names, bin_edges, ratio_edges
-from sliplens.models.checkpoint import Network, open_run
+from sliplens.models.checkpoint import Network
+from sliplens.models.wrapping import open_run
 
 if TYPE_CHECKING:
     from onnx import ModelProto

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from sliplens._version import __version__
 from sliplens.codec import TABLE_SUFFIXES, Result, read_written, write_tables
@@ -21,9 +21,10 @@ from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.images import LEAST_TOUCH, picture_change, soften
 from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
-from sliplens.models.checkpoint import Estimate, Network, open_run
+from sliplens.models.checkpoint import Estimate, Network
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
+from sliplens.models.wrapping import Preprocess, open_run
 from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_progress, reporting
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
@@ -184,10 +185,11 @@ class _Options(SourceOptions, total=False):
 
     on: str
     retry_failed: bool
+    preprocess: Preprocess | None
 
 
 def predict(
-    run: Network | Path | str | Frames | Dataset | Sequence[Capture],
+    run: Network | nn.Module | Path | str | Frames | Dataset | Sequence[Capture],
     source: Path | str | Frames | Dataset | Sequence[Capture] | None = None,
     *,
     friction: FrictionLike | None = None,
@@ -205,9 +207,9 @@ def predict(
     Parameters
     ----------
     run
-        Network, its folder, or the name of one that comes with sliplens. It may be left out: `predict("cup.mp4")` uses
-        the network that the sensor's profile names, else `chromatouch-pair`, or `chromatouch-difference` for difference
-        images.
+        Network, its folder, the name of one that comes with sliplens, or a module that `wrap` takes. It may be left
+        out: `predict("cup.mp4")` uses the network that the sensor's profile names, else `chromatouch-pair`, or
+        `chromatouch-difference` for difference images.
     source
         Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or captures of
         `open_source`. Images without a reference are taken for difference images, compared before.
@@ -234,7 +236,7 @@ def predict(
         `reference`, the untouched sensor as an image, or `reference_frame`, the number of the frame that shows it; for
         a recording without either, its first frame is assumed, with a note. `split`, `format`, `options` and `sensor`
         as `open_source` takes them. `on`, the executor: `serial`, `processes`, `processes=4` or `ray`; `retry_failed`,
-        if True, tries trials again that failed three times before.
+        if True, tries trials again that failed three times before. `preprocess`, for a module, as `wrap` takes it.
 
     Raises
     ------
@@ -263,7 +265,7 @@ def predict(
         require_new_table(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
     if batch_size < 1:
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
-    network = None if source is None else open_run(run, device=device)
+    network = None if source is None else open_run(run, device=device, preprocess=options.pop("preprocess", None))
     recordings = run if source is None else source
     if isinstance(recordings, Network):
         raise InputError("there is no source; name a data set, a folder of images, a video, or frames")
@@ -373,7 +375,7 @@ def _choose_network(trials: Trials, profile: SensorProfile | None) -> tuple[str,
 
 def _assume_reference(network: Network, trial: Capture) -> Capture:
     """Assume that the first frame of a recording shows the untouched sensor, if a network needs a reference."""
-    if trial.read_reference is not None or not _is_recorded(trial) or network.encoding.name == "raw":
+    if trial.read_reference is not None or not _is_recorded(trial) or not network.encoding.compares:
         return trial
     words = (
         f"{trial.name}: its first frame was taken for the untouched sensor; if that touches, name another with "
@@ -391,14 +393,14 @@ def _require_comparable(network: Network, trial: Capture) -> Iterator[str]:
     network.require_frame_size(trial.frame_size)
     yield from network.doubts(sensor=trial.sensor)
     untouched, encoding = trial.read_reference, network.encoding
-    if untouched is not None or encoding.name == "raw":  # difference images are black where nothing moved
+    if untouched is not None or not encoding.compares:  # difference images are black where nothing moved
         yield from network.doubts(frame=next(trial.read_frames()) if untouched is None else untouched())
     if untouched is not None:
         return
     if not _is_recorded(trial):
         network.require_kind(next(trial.read_frames()), what=trial.files[0] if trial.files else "the first frame")
     directions = network.manifest.pull_direction_deg or FULL_CIRCLE
-    if encoding.name == "raw":
+    if not encoding.compares:
         if directions != FULL_CIRCLE:
             yield (
                 f"{trial.name}: no reference was given, so neither the direction of the pull nor a motion of the "

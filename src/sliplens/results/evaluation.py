@@ -47,6 +47,8 @@ class OfNetwork(Result):
     """Name of the encoding that the network sees."""
     source: str
     """Where the frames come from: "simulated" or "real"."""
+    unit: str = "margin"
+    """Unit of the predictions; `margin` for safety margins in [0, 1], empty if unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)

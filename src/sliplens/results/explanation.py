@@ -18,12 +18,15 @@ from sliplens.results.evaluation import ANSWER, MARGIN, TIME, OfNetwork
 
 MARGIN_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 """Safety margins at which the thesis explains frames (section 4)."""
-BaselineName: TypeAlias = Literal["untouched", "stick", "given"]
+BaselineName: TypeAlias = Literal["untouched", "stick", "given", "black", "mean", "blurred"]
 """Kind of a baseline."""
 BASELINES: dict[BaselineName, str] = {
     "untouched": "the untouched sensor",
     "stick": "the last frame before the pull",
     "given": "the given frame",
+    "black": "a black image",
+    "mean": "an image of the mean colour of the frames",
+    "blurred": "the blurred image",
 }
 """Baselines in words."""
 CLOSE = 0.02
@@ -138,6 +141,12 @@ class Explanation(OfNetwork):
         """Return the baseline of a frame in words."""
         lacks_stick = self.baseline == "stick" and self.frames[row].baseline_frame is None
         return BASELINES["untouched" if lacks_stick else self.baseline]
+
+    @property
+    def scale(self) -> float:
+        """Difference of predictions that counts as all: 1 for margins, the largest explained change for other units."""
+        largest = max(abs(frame.prediction - frame.reference_prediction) for frame in self.frames)
+        return 1.0 if self.unit == "margin" or largest == 0 else largest
 
     @property
     def method(self) -> str:

@@ -13,7 +13,7 @@ from sliplens.extras import require_packages
 from sliplens.files import output_folder
 from sliplens.intervals import FEWEST_UNITS, Difference, mean_interval, paired_difference
 from sliplens.models import Network
-from sliplens.models.checkpoint import open_run
+from sliplens.models.wrapping import open_run
 from sliplens.plots.style import decimals, listed, signed, tell_ends
 from sliplens.progress import OnProgress, current_listener, number_of, open_stage, report_each, report_file, reporting
 from sliplens.recordings import Dataset

@@ -4,10 +4,11 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypedDict, Unpack
+from typing import Literal, TypedDict, Unpack, cast
 
 import numpy as np
 from jaxtyping import UInt8
+from torch import nn
 
 from sliplens.codec import save_result
 from sliplens.errors import InputError, SliplensError
@@ -39,7 +40,7 @@ from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
 from sliplens.files import output_folder, remove
 from sliplens.images import read_image, write_png
 from sliplens.models import Network
-from sliplens.models.checkpoint import open_run
+from sliplens.models.wrapping import Preprocess, open_run
 from sliplens.plots.saliency import draw_explanation, overlay_points
 from sliplens.progress import (
     OnProgress,
@@ -53,7 +54,7 @@ from sliplens.progress import (
 from sliplens.recordings import Dataset, Recording, load_dataset
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.sensor import SensorProfile, load_profile
-from sliplens.results.explanation import Explanation, Strip, StripReadings, load_explanation
+from sliplens.results.explanation import BASELINES, Explanation, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, part
 from sliplens.study.choice import study_explainers, without_markers
 from sliplens.study.stages import MakeRecord, Stage
@@ -70,12 +71,14 @@ class Running(TypedDict, total=False):
     """If True, parts that failed three times before are tried again."""
     overwrite: bool
     """If True, replace the folder `out`."""
+    preprocess: Preprocess | None
+    """Preprocessing of a PyTorch module, as `wrap` takes it."""
     on_progress: OnProgress | None
     """Callback for progress: number of items done, and of all items."""
 
 
 def explain(
-    run: Network | Path | str,
+    run: Network | nn.Module | Path | str,
     source: UInt8[np.ndarray, "batch height width 3"] | Dataset | Path | str,
     *,
     reference: UInt8[np.ndarray, "height width 3"] | Path | str | None = None,
@@ -93,16 +96,17 @@ def explain(
     Parameters
     ----------
     run
-        The network, its folder, or the name of one that comes with sliplens.
+        The network, its folder, the name of one that comes with sliplens, or a PyTorch module that `wrap` takes.
     source, reference
         Camera frames T_n, 8-bit RGB, with the frame of the untouched sensor T_0; or a folder of images or a recording
         with the image of the untouched sensor, where it holds none. Without a reference they are absolute difference
         images |T_n - T_0|. Or a data set, of which frames along the safety margin are taken.
     baseline
         What predictions are compared with: `untouched`, the untouched sensor; `stick`, the last frame before the pull
-        of the same trial; or a frame of the sensor, or the path of its image. If None, `stick` for data sets and
-        recordings, `untouched` for arrays and folders of images. Where no stick frame is found, the untouched sensor
-        takes its place, with a warning.
+        of the same trial; `black`, `mean` (the mean colour of the frames) or `blurred` (each frame blurred), for
+        networks without a reference; or a frame of the sensor, or the path of its image. If None, `stick` for data sets
+        and recordings, `untouched` for arrays and folders of images, or `black` where there is no reference. Where no
+        stick frame is found, the untouched sensor takes its place, with a warning.
     method
         Row of `EXPLAINERS`, an explainer such as `get_explainer("occlusion", tile_px=8)`, or several of them. If None,
         Shapley values of the markers (`RECOMMENDED_METHOD`), or of tiles where no markers are found.
@@ -144,7 +148,7 @@ def explain(
     for name in [method] if isinstance(method, str) else method if isinstance(method, Sequence) else ():
         if isinstance(name, str):
             EXPLAINERS.pick(name)
-    network = open_run(run, device=running.get("device", "cpu"))
+    network = open_run(run, device=running.get("device", "cpu"), preprocess=running.get("preprocess"))
     profile = None if sensor is None else load_profile(sensor)
     chosen = _choose(
         network,
@@ -231,11 +235,14 @@ def _choose(
 
 def _open_baseline(baseline: Baseline | Path | str | None, profile: SensorProfile | None) -> Baseline | None:
     """Read the image of a baseline, and fit it to the network's sensor by its profile."""
-    if baseline is None or (isinstance(baseline, str) and baseline in ("untouched", "stick")):
-        return baseline
+    if baseline is None or (isinstance(baseline, str) and baseline in BASELINES and baseline != "given"):
+        return cast("Baseline | None", baseline)
     if not isinstance(baseline, np.ndarray):
         if not Path(baseline).is_file():
-            raise InputError(f"the baseline {baseline} is no image; give untouched, stick, or the path of an image")
+            raise InputError(
+                f"the baseline {baseline} is no image; give untouched, stick, black, mean, blurred, or the path of an "
+                "image"
+            )
         baseline = read_image(Path(baseline))
     return baseline if profile is None else profile.apply(baseline)
 

@@ -17,7 +17,7 @@ from sliplens.faithfulness.scoring import influences
 from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Network
-from sliplens.models.checkpoint import open_run
+from sliplens.models.wrapping import open_run
 from sliplens.progress import (
     OnProgress,
     add_note,

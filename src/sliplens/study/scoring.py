@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias, Unpack
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, UInt8
+from torch import nn
 
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, SaliencyError
@@ -29,7 +30,7 @@ from sliplens.faithfulness.scoring import (
 )
 from sliplens.files import output_folder, remove
 from sliplens.models import Network
-from sliplens.models.checkpoint import open_run
+from sliplens.models.wrapping import open_run
 from sliplens.progress import open_stage, report_each, report_file, reporting
 from sliplens.results.explanation import Explanation, load_explanation
 from sliplens.results.faithfulness import Deletion, DeletionScores, Faithfulness, RemovalCurve
@@ -51,7 +52,7 @@ Scoring: TypeAlias = Callable[[Explanation, Influence, int], Mapping[str, Remova
 
 
 def score(
-    run: Network | Path | str,
+    run: Network | nn.Module | Path | str,
     frames: UInt8[np.ndarray, "images height width 3"] | Explanation | Path | str,
     maps: Explanation | Float[np.ndarray, "maps rows columns"] | None = None,
     *,
@@ -76,7 +77,7 @@ def score(
     Parameters
     ----------
     run
-        The network that was explained, its folder, or the name of one that comes with sliplens.
+        The network that was explained, its folder, the name of one that comes with sliplens, or the PyTorch module.
     frames, reference
         Explanation, or the folder of one, which holds its frames; or the frames and the reference of `explain`.
     maps
@@ -118,7 +119,7 @@ def score(
     get_fill(fill)
     if random_orders < 1:
         raise InputError(f"{random_orders} random orders are too few; --random-orders must be at least 1")
-    network = open_run(run, device=running.get("device", "cpu"))
+    network = open_run(run, device=running.get("device", "cpu"), preprocess=running.get("preprocess"))
     explanation = _to_score(network, frames, maps, reference, signed=signed)
     require_same_network(network, explanation)
     shape = (explanation.image_size, explanation.image_size)

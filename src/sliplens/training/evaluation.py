@@ -12,8 +12,9 @@ from sliplens.errors import RecordingError
 from sliplens.files import output_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models import Network
-from sliplens.models.checkpoint import Estimate, condition_each, open_run
+from sliplens.models.checkpoint import Estimate, condition_each
 from sliplens.models.sequence import require_frequent
+from sliplens.models.wrapping import open_run
 from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.recordings.dataset import load_dataset

@@ -1,0 +1,171 @@
+"""Networks of others: any PyTorch module with one number an image as its output."""
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from sliplens.errors import InputError, ModelError
+from sliplens.extras import pick
+from sliplens.models.checkpoint import Manifest, Network, load
+from sliplens.models.encodings import ENCODINGS
+
+Preprocess: TypeAlias = Callable[[Tensor], Tensor]
+"""Differentiable function from images (batch, 3, size, size) in [0, 1] to the input of a module."""
+Output: TypeAlias = int | str | Callable[[Any], Tensor]
+"""Place of the output in a tuple or along the columns, its key in a dict, or a function that returns it."""
+_NEEDS_EVAL = (nn.modules.batchnorm._BatchNorm, nn.modules.dropout._DropoutNd)
+
+
+class OneOutput(nn.Module):
+    """Module with its preprocessing before it and one of its outputs after it, shape (batch,)."""
+
+    def __init__(self, module: nn.Module, preprocess: Preprocess | None = None, output: Output | None = None) -> None:
+        super().__init__()
+        self.module, self.preprocess, self.output = module, preprocess, output
+
+    def forward(self, images: Float[Tensor, "batch colours height width"]) -> Float[Tensor, " batch"]:
+        """Compute one number an image."""
+        weights = next((weight for weight in self.module.parameters() if weight.is_floating_point()), images)
+        inputs = images.to(weights.dtype)
+        if self.preprocess is not None:
+            inputs = self.preprocess(inputs)
+        values = self.module(inputs.contiguous())
+        if callable(self.output):
+            values = self.output(values)
+        elif isinstance(values, Mapping) and self.output is not None:
+            values = values[self.output]
+        elif isinstance(values, tuple | list):
+            if self.output is None and len(values) != 1:
+                raise ModelError(f"the module returns {len(values)} outputs; choose one with output=0")
+            values = values[self.output or 0]
+        elif isinstance(values, Tensor) and isinstance(self.output, int) and values.ndim > 1:
+            values = values[:, self.output]
+        if not isinstance(values, Tensor):
+            raise ModelError(f"the module returns {type(values).__name__}, no tensor; choose its output with output=")
+        if tuple(values.shape) not in {(len(images),), (len(images), 1)}:
+            raise ModelError(
+                f"the module's output has shape {tuple(values.shape)} for {len(images)} images; choose one number an "
+                "image with output=, such as output=0"
+            )
+        return values.reshape(len(images))
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class WrappedNetwork(Network):
+    """Network of others, which takes frames of any size and has no intervals."""
+
+    def require_frame_size(self, size: tuple[int, ...], *, what: str = "frames") -> None:
+        """Accept frames of any size; they are resized."""
+
+    def require_kind(self, frame: object, *, what: str) -> None:
+        """Accept images of any brightness."""
+
+
+def wrap(
+    module: nn.Module,
+    *,
+    size: int = 224,
+    encoding: str = "rgb",
+    preprocess: Preprocess | None = None,
+    output: Output | None = None,
+    unit: str = "",
+) -> Network:
+    """Make a network of any PyTorch module, for `predict`, `explain`, `score`, `run_study` and `read_live`.
+
+    Parameters
+    ----------
+    module
+        Module in evaluation mode that returns one number an image: (batch,) or (batch, 1).
+    size
+        Height and width of its input, in pixels; frames are resized to it.
+    encoding
+        Way to make images of frames: `rgb`, the frame divided by 255, or another row of `ENCODINGS`, such as
+        `difference`.
+    preprocess
+        Differentiable function from images (batch, 3, size, size) in [0, 1] to the module's input, such as
+        `torchvision.transforms.Normalize(mean, std)`.
+    output
+        For a module with several outputs: the place in a tuple or along the columns, such as 0 for the x force of
+        (fx, fy, fz), the key in a dict, or a function of what the module returns.
+    unit
+        Unit of the output, such as "N", for figures and tables.
+
+    Raises
+    ------
+    ModelError
+        If the module is in training mode and has batch normalisation or dropout, does not run on an image, or does not
+        return one number an image.
+
+    Examples
+    --------
+    >>> import numpy as np, torch
+    >>> import sliplens as sl
+    >>> module = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 32 * 32, 3)).eval()
+    >>> network = sl.wrap(module, size=32, output=0, unit="N")
+    >>> frames = np.random.default_rng(0).integers(256, size=(2, 32, 32, 3), dtype=np.uint8)
+    >>> sl.explain(network, frames, method="integrated-gradients").relevance["integrated-gradients"].shape
+    (2, 32, 32)
+    """
+    if not isinstance(module, nn.Module):
+        raise ModelError(f"{type(module).__name__} is no torch.nn.Module; give the module itself")
+    trains = [type(part).__name__ for part in module.modules() if part.training and isinstance(part, _NEEDS_EVAL)]
+    if trains:
+        raise ModelError(
+            f"the module is in training mode, in which {trains[0]} makes predictions depend on the batch; call "
+            "module.eval() first"
+        )
+    row, model = pick(ENCODINGS, encoding, noun="encoding"), OneOutput(module, preprocess, output)
+    device = next(module.parameters(), torch.empty(0)).device
+    try:
+        with torch.no_grad():
+            answers = model(torch.zeros(2, row.colours, size, size, device=device))
+    except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError) as error:
+        raise ModelError(
+            f"the module does not run on images of shape (2, {row.colours}, {size}, {size}): {error}; set size=, or "
+            "preprocess= for what it needs before it"
+        ) from error
+    del answers
+    return WrappedNetwork(
+        model=model,
+        manifest=Manifest(
+            backbone=type(module).__name__,
+            input=encoding,
+            image_size=size,
+            frame_size=(size, size),
+            sensor="",
+            data_hash="",
+            head="module",
+            target="output",
+            unit=unit,
+            weights_sha256=_hash_weights(module),
+        ),
+    )
+
+
+def open_run(run: object, *, device: str = "cpu", preprocess: Preprocess | None = None) -> Network:
+    """Return a network, load it from its folder or by the name of one that comes with sliplens, or wrap a module."""
+    if isinstance(run, nn.Module):
+        return wrap(run, preprocess=preprocess)
+    if preprocess is not None:
+        raise InputError("preprocess is for a PyTorch module; networks of sliplens have their own, so leave it out")
+    if not isinstance(run, Network | Path | str):
+        raise InputError(
+            f"{type(run).__name__} is no network; give a network, its folder, its name or a PyTorch module first"
+        )
+    return run if isinstance(run, Network) else load(run, device=device)
+
+
+def _hash_weights(module: nn.Module) -> str:
+    """Return the SHA-256 of all parameters and buffers, by which an explanation names its network."""
+    digest = hashlib.sha256()
+    for name, value in module.state_dict().items():
+        digest.update(name.encode())
+        if isinstance(value, Tensor):
+            digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
