@@ -90,8 +90,8 @@ def find_layers(
     layers = _distinct(path)
     if names is None and any(_is_channels_last(step) for step in path):
         raise ModelError(
-            f"{type(model).__name__} has maps with their channels last, which methods of the CAM family do not take; use "
-            "integrated-gradients, smooth-grad, occlusion or shapley"
+            f"{type(model).__name__} has maps with their channels last, which methods of the CAM family do not take; "
+            "use integrated-gradients, smooth-grad, occlusion or shapley"
         )
     if names is not None:
         return _named(model, root, names, others=layers)

@@ -259,13 +259,14 @@ def predict(
     ['trial', 'frame', 'time_s', 'prediction']
     """
     on, retry_failed = options.pop("on", "serial"), options.pop("retry_failed", False)
+    preprocess = options.pop("preprocess", None)
     source_options: SourceOptions = {**options}  # pyright: ignore[reportAssignmentType]
     path = None if out is None else Path(out)
     if path is not None and path.suffix:
         require_new_table(path, suffix=TABLE_SUFFIXES, overwrite=overwrite)
     if batch_size < 1:
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
-    network = None if source is None else open_run(run, device=device, preprocess=options.pop("preprocess", None))
+    network = None if source is None else open_run(run, device=device, preprocess=preprocess)
     recordings = run if source is None else source
     if isinstance(recordings, Network):
         raise InputError("there is no source; name a data set, a folder of images, a video, or frames")

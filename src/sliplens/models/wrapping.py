@@ -43,7 +43,7 @@ class OneOutput(nn.Module):
         elif isinstance(values, tuple | list):
             if self.output is None and len(values) != 1:
                 raise ModelError(f"the module returns {len(values)} outputs; choose one with output=0")
-            values = values[self.output or 0]
+            values = values[self.output if isinstance(self.output, int) else 0]
         elif isinstance(values, Tensor) and isinstance(self.output, int) and values.ndim > 1:
             values = values[:, self.output]
         if not isinstance(values, Tensor):
@@ -112,8 +112,6 @@ def wrap(
     >>> sl.explain(network, frames, method="integrated-gradients").relevance["integrated-gradients"].shape
     (2, 32, 32)
     """
-    if not isinstance(module, nn.Module):
-        raise ModelError(f"{type(module).__name__} is no torch.nn.Module; give the module itself")
     trains = [type(part).__name__ for part in module.modules() if part.training and isinstance(part, _NEEDS_EVAL)]
     if trains:
         raise ModelError(

@@ -29,13 +29,13 @@ from sliplens.plots.style import (
     BLUE,
     GREY,
     VERMILLION,
+    amount,
     drawing_style,
     fill_name,
     input_name,
     method_colour,
     method_name,
     methods_in_order,
-    percent,
     written_whole,
 )
 from sliplens.recordings.sensor import profile_text
@@ -102,25 +102,36 @@ def _explanation(explanation: Explanation, ax: Axes, index: int | None) -> None:
     changes = [frame.prediction - frame.reference_prediction for frame in explanation.frames]
     row = _of(len(changes), int(np.argmax(np.abs(changes))) if index is None else index)
     frame, method, baseline = explanation.frames[row], explanation.method, explanation.baseline_words(row)
-    _draw_map(explanation.pictures[row], explanation.relevance[method][row], ax=ax)
-    predicted = "withheld" if frame.withheld else percent(frame.prediction)
-    why = f"{frame.id}: why {predicted} rather than {percent(frame.reference_prediction)}, that of {baseline}"
-    if abs(changes[row]) < CLOSE:
-        why = f"{frame.id}: nothing to explain, for {predicted} is within {percent(CLOSE)} of that of {baseline}"
+    scale, of_margin = explanation.scale, explanation.unit == "margin"
+    unit = POINTS if of_margin else f"{explanation.unit_words} per 1 % of the image"
+    _draw_map(explanation.pictures[row], explanation.relevance[method][row], scale=scale, unit=unit, ax=ax)
+    predicted = "withheld" if frame.withheld else amount(frame.prediction, explanation.unit)
+    compared, close = amount(frame.reference_prediction, explanation.unit), CLOSE * explanation.scale
+    why = f"{frame.id}: why {predicted} rather than {compared}, that of {baseline}"
+    if abs(changes[row]) <= close:
+        near = amount(close, explanation.unit)
+        why = f"{frame.id}: nothing to explain, for {predicted} is within {near} of that of {baseline}"
     ax.set_title(f"{method_name(method)}\n{wrap(why, 46)}", fontsize=9, parse_math=False)
     ax.set_xlabel(wrap("; ".join(explanation.methods[method].warnings), 62), fontsize=7.5, loc="left", color=VERMILLION)
 
 
-def _draw_map(picture: FrameU8, relevance: Float[np.ndarray, "rows columns"], *, ax: Axes) -> None:
+def _draw_map(
+    picture: FrameU8,
+    relevance: Float[np.ndarray, "rows columns"],
+    *,
+    ax: Axes,
+    scale: float = 1.0,
+    unit: str = POINTS,
+) -> None:
     """Draw a signed map over its picture, with a bar of its colours."""
-    full = full_points(relevance[None])
-    ax.imshow(overlay_points([picture], relevance[None])[0])
+    full = full_points(relevance[None], scale=scale) / (1 if unit == POINTS else 100)
+    ax.imshow(overlay_points([picture], relevance[None], scale=scale)[0])
     ax.set(xticks=[], yticks=[])
     ax.spines[:].set_visible(False)
     figure = ax.get_figure(root=True)
     assert figure is not None
     bar = figure.colorbar(ScalarMappable(Normalize(-full, full), SIGN_COLOURS), ax=ax, shrink=0.9)
-    bar.set_label(f"orange lowers the margin, blue raises it\n({POINTS})", fontsize=8)
+    bar.set_label(f"orange lowers the prediction, blue raises it\n({unit})", fontsize=8)
     bar.ax.tick_params(labelsize=8)
 
 
@@ -132,12 +143,12 @@ def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int | None) -> None:
     methods = [name for name in gains if not is_control(name)]
     if len(methods) == 1:
         plot_removal(faithfulness.curves[fill, unit, methods[0]], colour=BLUE, ax=ax)
-        ax.set(xlabel="Removed (% of the image)", ylabel="Evidence lost (margin units)", xlim=(0, 100))
+        ax.set(xlabel="Removed (% of the image)", ylabel=f"Evidence lost ({faithfulness.unit_words})", xlim=(0, 100))
         ax.set_title(f"{method_name(methods[0])} ({fill_name(fill, unit)})")
         ax.legend()
         return
     _plot_methods(gains, ax)
-    ax.set(xlabel=f"Symmetric gain, {fill_name(fill, unit)} (margin units, 95 % interval)")
+    ax.set(xlabel=f"Symmetric gain, {fill_name(fill, unit)} ({faithfulness.unit_words}, 95 % interval)")
     ax.set_title(input_name(faithfulness.input))
 
 

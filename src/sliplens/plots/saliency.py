@@ -40,7 +40,7 @@ def overlay_relevance(picture: FrameU8, share: Float[np.ndarray, "rows columns"]
 
 POINTS = "points of margin per 1 % of the image"
 """Unit of maps in figures."""
-_BAR_WORDS = f"orange lowers the margin, blue raises it\n(full colour beside each row, in {POINTS})"
+_BAR_WORDS = f"orange lowers the prediction, blue raises it\n(full colour beside each row, in {POINTS})"
 _CELL_IN, _SIDE_IN, _HEAD_IN = 1.5, 1.35, 0.45
 _BAR_IN = 4.0  # as wide as the label of the colour bar
 _WIDEST = 12
@@ -49,14 +49,16 @@ _LEAST = 0.2
 """Least full colour, in points of margin per 1 % of the image: 2 points, which is nothing to explain, on a tenth."""
 
 
-def full_points(relevance: Float[np.ndarray, "frames height width"]) -> float:
+def full_points(relevance: Float[np.ndarray, "frames height width"], *, scale: float = 1.0) -> float:
     """Return the relevance that gets the full colour in all frames, in points of margin per 1 % of the image."""
-    return max(full_colour(relevance * relevance[0].size), _LEAST)
+    return max(full_colour(relevance * relevance[0].size), _LEAST * scale)
 
 
-def overlay_points(pictures: Iterable[FrameU8], relevance: Float[np.ndarray, "frames height width"]) -> list[FrameU8]:
+def overlay_points(
+    pictures: Iterable[FrameU8], relevance: Float[np.ndarray, "frames height width"], *, scale: float = 1.0
+) -> list[FrameU8]:
     """Overlay pictures with signed maps on one scale (`full_points`)."""
-    limit = full_points(relevance)
+    limit = full_points(relevance, scale=scale)
     return [
         overlay_relevance(picture, values * values.size / limit)
         for picture, values in zip(pictures, relevance, strict=True)
@@ -67,20 +69,26 @@ def draw_explanation(explanation: Explanation, folder: Path) -> None:
     """Write an overlay of every map (`overlays/METHOD/FRAME.png`), and up to 12 frames side by side (`panel.png`)."""
     count = len(explanation.frames)
     columns = np.linspace(0, count - 1, min(count, _WIDEST)).round().astype(int).tolist()
+    per = 1 if explanation.unit == "margin" else 100
     rows = [PictureRow(name="Network input", pictures=[explanation.pictures[column] for column in columns])]
     for method, relevance in explanation.relevance.items():
         (overlays := folder / "overlays" / method).mkdir(parents=True, exist_ok=True)
-        pictures = overlay_points(explanation.pictures, relevance)
+        pictures = overlay_points(explanation.pictures, relevance, scale=explanation.scale)
         for frame, picture in zip(explanation.frames, pictures, strict=True):
             write_png(overlays / f"{frame.id}.png", picture)
         shown = [pictures[column] for column in columns]
-        rows.append(PictureRow(name=method_name(method), pictures=shown, full=full_points(relevance)))
+        rows.append(
+            PictureRow(
+                name=method_name(method), pictures=shown, full=full_points(relevance, scale=explanation.scale) / per
+            )
+        )
     titles = []
     for frame in (explanation.frames[column] for column in columns):
         name = frame.id if len(frame.id) <= 22 else f"\N{HORIZONTAL ELLIPSIS}{frame.id[-21:]}"
         true = "" if frame.safety_margin is None else f", true {percent(frame.safety_margin)}"
-        titles.append(f"{name}\n{reading_words(frame.prediction, frame.withheld)}{true}")
-    words = f"{_BAR_WORDS}\nagainst {BASELINES[explanation.baseline]}"
+        titles.append(f"{name}\n{reading_words(frame.prediction, frame.withheld, explanation.unit)}{true}")
+    words = _BAR_WORDS if per == 1 else _BAR_WORDS.replace(POINTS, f"{explanation.unit_words} per 1 % of the image")
+    words = f"{words}\nagainst {BASELINES[explanation.baseline]}"
     if len(columns) < count:
         words += f"\n{len(columns)} of {count} frames, evenly spread; overlays/ has them all"
     figure = draw_pictures(rows, heads=titles, bar=True, words=words)

@@ -186,9 +186,14 @@ def percent(value: float | None, *, digits: int = 0) -> str:
     return UNKNOWN if value is None or np.isnan(value) else f"{decimals(100 * value, digits)}\N{NO-BREAK SPACE}%"
 
 
-def reading_words(prediction: float, withheld: str | None) -> str:
+def amount(value: float, unit: str) -> str:
+    """Write a prediction in its unit; a safety margin in percent."""
+    return percent(value) if unit == "margin" else f"{value:.3g} {unit}".rstrip()
+
+
+def reading_words(prediction: float, withheld: str | None, unit: str = "margin") -> str:
     """Write the prediction of a frame, or that it is withheld."""
-    return "withheld" if withheld else f"predicted {percent(prediction)}"
+    return "withheld" if withheld else f"predicted {amount(prediction, unit)}"
 
 
 def signed(value: float, digits: int) -> str:

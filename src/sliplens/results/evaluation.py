@@ -47,8 +47,19 @@ class OfNetwork(Result):
     """Name of the encoding that the network sees."""
     source: str
     """Where the frames come from: "simulated" or "real"."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class OfOutput(OfNetwork):
+    """Result whose numbers are in the unit of the network's output."""
+
     unit: str = "margin"
     """Unit of the predictions; `margin` for safety margins in [0, 1], empty if unknown."""
+
+    @property
+    def unit_words(self) -> str:
+        """Unit of differences of predictions, in words."""
+        return "margin units" if self.unit == "margin" else self.unit or "units of the output"
 
 
 @dataclass(frozen=True, kw_only=True)

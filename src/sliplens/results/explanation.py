@@ -14,7 +14,7 @@ from sliplens.codec import UNKNOWN, Columns, Result, load_record, load_result
 from sliplens.errors import InputError, SaliencyError
 from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.progress import number_of
-from sliplens.results.evaluation import ANSWER, MARGIN, TIME, OfNetwork
+from sliplens.results.evaluation import ANSWER, MARGIN, TIME, OfOutput
 
 MARGIN_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 """Safety margins at which the thesis explains frames (section 4)."""
@@ -65,7 +65,7 @@ class MethodNotes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explanation(OfNetwork):
+class Explanation(OfOutput):
     """Explanations of some frames by one or several methods: why the network predicts f(x) rather than f(baseline)."""
 
     weights_sha256: str
@@ -118,7 +118,7 @@ class Explanation(OfNetwork):
         frames = f"{number_of(len(self.frames), 'frame')} of {number_of(len(self.trials), 'trial')}"
         return (
             f"maps of {', '.join(self.methods) or 'no method'} for {frames}; the prediction changes "
-            f"by up to {change:+.2f} margin units from that of {BASELINES[self.baseline]}"
+            f"by up to {change:+.3g} {self.unit_words} from that of {BASELINES[self.baseline]}"
         )
 
     def to_arrow(self) -> pa.Table:

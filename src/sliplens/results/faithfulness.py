@@ -12,7 +12,7 @@ from sliplens.codec import UNKNOWN, Columns, Result
 from sliplens.errors import InputError
 from sliplens.intervals import Difference
 from sliplens.progress import number_of
-from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, SHARE, UNIT, OfNetwork
+from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, SHARE, UNIT, OfNetwork, OfOutput
 
 _Rows = TypeVar("_Rows", "DeletionTable", "RemovalTable")
 Key = tuple[str, str, str]
@@ -205,7 +205,7 @@ class RemovalTable(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Faithfulness(OfNetwork):
+class Faithfulness(OfOutput):
     """Scores of one network's explanations: removal of parts against controls, and the thesis's deletion score."""
 
     frames: int
@@ -264,7 +264,7 @@ class Faithfulness(OfNetwork):
         best = max(methods, key=lambda score: score.srg.estimate)
         lead = best.lead_over_controls
         over = "" if lead is None else f", {lead.gap} over the best control ({lead.control})"
-        return f"symmetric relevance gain of {best.method} {best.srg} margin units{over}; {counts}"
+        return f"symmetric relevance gain of {best.method} {best.srg} {self.unit_words}{over}; {counts}"
 
 
 def _sort_by_frame(
