@@ -1,7 +1,7 @@
 """Maps and scores of eight architectures with random weights at 64 px; Integrated Gradients beside Captum's.
 
 Each TorchVision architecture is a regressor with one output, wrapped by `sliplens.wrap`. `explained` lists the methods
-that made maps, `refused` the others with their reasons; `parity_with_captum` is the largest difference of Integrated Gradients
+that made maps, `refused` the others and why; `parity_with_captum` is the largest difference of Integrated Gradients
 from Captum's with the same 32 steps, as a share of the largest value; `seconds` is the time of all.
 """
 
