@@ -58,7 +58,8 @@ class _Described:
         lines = [*wrap(", ".join(short), 110, max_lines=3), *long]
         if (over := len(lines) - _MOST_LINES + 2) > 1:
             lines[-over:] = [f"and {over} more"]
-        return "\n  ".join([f"{type(self).__name__}: {shorten(head, 240, placeholder=' ...')}", *lines])
+        text = "\n  ".join([f"{type(self).__name__}: {shorten(head, 240, placeholder=' ...')}", *lines])
+        return text.replace("margin units", getattr(self, "unit_words", "margin units"))
 
     def to_arrow(self) -> pa.Table:
         """Convert the main rows to an Arrow table.

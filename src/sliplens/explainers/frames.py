@@ -18,6 +18,7 @@ from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.markers import track_markers
 from sliplens.markers.estimators import affine_parts, find_hold
 from sliplens.models import Network
+from sliplens.models.wrapping import WrappedNetwork
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile
@@ -181,10 +182,13 @@ def frames_from_arrays(
     def find_markers() -> list[Float[Tensor, "_markers 2"]]:
         return [markers_in_frame(frame, image_size=image_size) for frame in frames]
 
+    ids = tuple(f"frame-{number:04d}" for number in range(len(frames)))
+    # images of other sources than a sensor are independent, frames of a sensor are of one trial
+    independent = isinstance(network, WrappedNetwork) and reference is None
     return ChosenFrames(
-        ids=tuple(f"frame-{number:04d}" for number in range(len(frames))),
+        ids=ids,
         day=(1,) * len(frames),
-        trial=("frames",) * len(frames),
+        trial=ids if independent else ("frames",) * len(frames),
         condition=("unknown",) * len(frames),
         safety_margin=np.full(len(frames), np.nan, dtype=np.float32),
         images=images,
