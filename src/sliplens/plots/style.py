@@ -35,7 +35,7 @@ GREY = "#6B7280"
 
 UNKNOWN = "\N{EN DASH}"
 """Stands for a missing number."""
-INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images", "pair": "Image pairs"}
+INPUT_NAMES = {"raw": "Raw images", "difference": "Difference images", "pair": "Image pairs", "rgb": "Images"}
 INPUT_COLOURS = {"raw": ORANGE, "difference": BLUE, "pair": GREEN}
 CONDITION_COLOURS = {"dry": ORANGE, "wet": BLUE}
 SOURCE_NAMES = {"simulated": "simulated touch", "real": "real touch"}
