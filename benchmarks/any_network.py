@@ -24,15 +24,9 @@ from sliplens.explainers.gradients import IntegratedGradients as OurIntegratedGr
 from sliplens.explainers.table import get_explainer
 
 ARCHITECTURES = (
-    "resnet18",
-    "efficientnet_b0",
-    "convnext_tiny",
-    "vit_b_16",
-    "swin_t",
-    "mobilenet_v3_small",
-    "densenet121",
+    "resnet18", "efficientnet_b0", "convnext_tiny", "vit_b_16", "swin_t", "mobilenet_v3_small", "densenet121",
     "regnet_y_400mf",
-)
+)  # fmt: skip
 SIZE_PX, STEPS = 64, 32
 METHODS: dict[str, dict[str, Any]] = {
     "grad-cam": {},

@@ -31,7 +31,6 @@ from .results.study import StudyConfig as StudyConfig
 from .runner import read_status as read_status
 from .simulation.sharing import compare_datasets as compare_datasets
 from .simulation.trials import simulate as simulate
-from .study.diagnose import diagnose as diagnose
 from .study.explaining import explain as explain
 from .study.run import run_study as run_study
 from .study.scoring import score as score

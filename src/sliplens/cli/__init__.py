@@ -20,7 +20,7 @@ TASKS = {
     "predict": ("Predict the safety margin from images, a video or a bag", ("sensor new", "predict", "view")),
     "explain": ("See which parts of an image a margin comes from", ("explain", "score")),
     "train": ("Train a network for your own sensor", ("sensor new", "import", "check", "label", "train", "evaluate")),
-    "judge": ("Find out where a network fails, and which explanation can be trusted", ("diagnose", "study")),
+    "judge": ("Find out which explanation can be trusted", ("study",)),
     "live": ("Predict from a running camera, and hold a grip", ("live", "grip", "hold")),
 }
 """Tasks of users, and the commands of each in their order."""

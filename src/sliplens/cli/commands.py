@@ -537,16 +537,6 @@ def call_score(call: Any) -> None:
     output.print_faithfulness(call())
 
 
-@command("diagnose", "study.diagnose:diagnose", "sliplens diagnose runs/mine/train runs/mine/data -o runs/mine/why")
-def call_diagnose(call: Any) -> None:
-    """Print the findings, and draw the page."""
-    diagnosis = call()
-    for sentence in diagnosis.sentences:
-        say(f"- {sentence}")
-    if "out" in call.keywords:
-        output.draw_report(Path(call.keywords["out"]))
-
-
 @command(
     "study",
     "study.run:run_study",

@@ -31,7 +31,7 @@ class SensorProposal(Result):
     """A sensor profile proposed from a recording, with its evidence."""
 
     profile: SensorProfile
-    frame: UInt8[np.ndarray, "height width 3"]
+    picture: UInt8[np.ndarray, "height width 3"]
     """Frame of the camera, from the still beginning."""
     gel_px: tuple[int, int, int, int]
     """Left, top, width and height of the lit part with markers, in the camera's frame."""
@@ -117,7 +117,7 @@ def propose_profile(
         network=network,
     )
     return SensorProposal(
-        profile=profile, frame=frame, gel_px=gel, markers_px=places, spacing_px=factor * spacing, notes=tuple(notes)
+        profile=profile, picture=frame, gel_px=gel, markers_px=places, spacing_px=factor * spacing, notes=tuple(notes)
     )
 
 

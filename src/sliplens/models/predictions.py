@@ -268,7 +268,7 @@ def predict(
         raise InputError(f"--batch-size must be at least 1, got {batch_size}")
     network = None if source is None else open_run(run, device=device, preprocess=preprocess)
     recordings = run if source is None else source
-    if isinstance(recordings, Network):
+    if isinstance(recordings, Network | nn.Module):
         raise InputError("there is no source; name a data set, a folder of images, a video, or frames")
     prior = None if friction is None else as_friction(friction)
     sensor = options.get("sensor")

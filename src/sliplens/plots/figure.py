@@ -40,7 +40,6 @@ from sliplens.plots.style import (
 )
 from sliplens.recordings.sensor import profile_text
 from sliplens.recordings.source import Frames
-from sliplens.results.evaluation import Diagnosis
 from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.faithfulness import Faithfulness, is_control
 from sliplens.results.study import Randomisation, States, Study, Truth, UntrainedMaps
@@ -51,15 +50,13 @@ def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Fi
 
     An evaluation shows predictions against labels; a training or a network its learning curve; an explanation the map
     over the image, with its warnings; scores of explanations their curves or gains; predictions the margin over time;
-    tracked markers their displacement; a study the gain of each method with its 95 % interval; a diagnosis the slices
-    with a larger error; a grip the force over the least that holds; a hold the commanded force; any other result the
-    first number of its table. Margins are in percent, gains in margin units.
+    tracked markers their displacement; a study the gain of each method with its 95 % interval; a grip the force over
+    the least that holds; a hold the commanded force; any other result the first number of its table. Margins are in percent, gains in margin units.
 
     Parameters
     ----------
     result
-        Result of `evaluate`, `train`, `explain`, `score`, `predict`, `track`, `run_study` or `diagnose`, or a record
-        of `sliplens.results`.
+        Result of `evaluate`, `train`, `explain`, `score`, `predict`, `track` or `run_study`, or a record of `sliplens.results`.
     ax
         Axes to draw on; a new figure if None.
     index
@@ -208,15 +205,6 @@ def _rows(result: Any, ax: Axes, _: int | None) -> None:
     ax.set(xlabel=words)
 
 
-def _diagnosis(diagnosis: Diagnosis, ax: Axes, _: int | None) -> None:
-    if not diagnosis.slices:
-        raise InputError("this diagnosis tested no slice of the trials; diagnose a network on more trials")
-    rows = [(wrap(part.name, 32), part.excess, BLUE if part.holds else GREY) for part in diagnosis.slices]
-    _plot_gaps(rows, ax, scale=100.0)
-    ax.set(xlabel="Mean |error| less elsewhere (points of Γ, 95 % interval)")
-    ax.set_title(f"{input_name(diagnosis.input)}: where the error is")
-
-
 def _plot_methods(values: Mapping[str, Difference], ax: Axes) -> None:
     """Draw a value of each method with its interval, controls in grey."""
     names = methods_in_order(values)
@@ -287,7 +275,6 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "Faithfulness": _faithfulness,
     "Study": _study,
     "Truth": _truth,
-    "Diagnosis": _diagnosis,
     "Predictions": lambda result, ax, index: plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
     "ScoredFrames": lambda result, ax, index: plot_margins(_rows_of_trial(result.to_arrow(), index), ax=ax),
     "Tracking": _tracking,
@@ -301,7 +288,7 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
 
 def write_proposal(proposal: SensorProposal, path: Path) -> None:
     """Save the camera's frame with gel, crop and markers beside the frame that the profile makes of it, as PNG."""
-    profile, frame, markers = proposal.profile, proposal.frame, proposal.markers_px
+    profile, frame, markers = proposal.profile, proposal.picture, proposal.markers_px
     with drawing_style(), written_whole(path) as part:
         figure = Figure(figsize=(9.6, 4.6), layout="constrained")
         camera, made = figure.subplots(1, 2, width_ratios=(frame.shape[1] / frame.shape[0], 1.0))

@@ -8,7 +8,7 @@ from sliplens.codec import load_record, load_result
 from sliplens.errors import InputError
 from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.grip.records import Grip
-from sliplens.results.evaluation import Diagnosis, Evaluation, Training
+from sliplens.results.evaluation import Evaluation, Training
 from sliplens.results.explanation import Explanation, Strip
 from sliplens.results.faithfulness import DeletionScores, Faithfulness
 from sliplens.results.study import (
@@ -28,7 +28,6 @@ Record = TypeVar("Record")
 _COMMANDS: dict[str, type] = {
     "train": Training,
     "evaluate": Evaluation,
-    "diagnose": Diagnosis,
     "explain": Explanation,
     "score": DeletionScores,
     "grip": Grip,
@@ -49,7 +48,6 @@ class Results:
     trainings: dict[str, Training] = field(default_factory=dict)
     evaluations: dict[str, Evaluation] = field(default_factory=dict)
     """By input ("raw", "difference")."""
-    diagnoses: dict[str, Diagnosis] = field(default_factory=dict)
     explanations: dict[tuple[str, str], Explanation] = field(default_factory=dict)
     scores: dict[tuple[str, str], DeletionScores] = field(default_factory=dict)
     """By input and source ("simulated", "real")."""
@@ -65,7 +63,7 @@ class Results:
     @property
     def inputs(self) -> set[str]:
         """Inputs of all results."""
-        names = {*self.trainings, *self.evaluations, *self.diagnoses}
+        names = {*self.trainings, *self.evaluations}
         names |= {name for name, _ in (*self.explanations, *self.scores)}
         return names | self.study.inputs if self.study or not names else names
 
@@ -127,7 +125,6 @@ def load_results(workspace: Path) -> Results:
         runs={folder.name: run for folder, run in runs},
         trainings=by_input(Training),
         evaluations=by_input(Evaluation),
-        diagnoses=by_input(Diagnosis),
         grip=of_kind(Grip).get(("", "")),
         explanations=of_kind(Explanation),
         scores=deletion | of_kind(DeletionScores),

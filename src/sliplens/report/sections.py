@@ -164,13 +164,6 @@ def _truth(results: Results, _: np.random.Generator) -> Blocks:
         yield _notes(f"How this was measured, {input_name(name).lower()}", [truth.summary], tone="plain")
 
 
-def _diagnosis(results: Results, _: np.random.Generator) -> Blocks:
-    for name in _names(results.diagnoses):
-        diagnosis = results.diagnoses[name]
-        yield _notes(f"Findings, {input_name(name).lower()}", diagnosis.sentences, tone="plain")
-        yield tables.table_slices(diagnosis)
-
-
 def _grip(results: Results, _: np.random.Generator) -> Blocks:
     if results.grip is not None:
         yield charts.plate_trace(results.grip)
@@ -203,13 +196,6 @@ SECTIONS: tuple[Section, ...] = (
         "in an image pair both stand side by side.",
         build=_accuracy,
         step="evaluate",
-    ),
-    Section(
-        id="diagnosis",
-        title="Where the network fails, and why",
-        short_title="Why it fails",
-        intro="Slices of the trials in which the error is large, tested on trials they were not found on.",
-        build=_diagnosis,
     ),
     Section(
         id="grip",

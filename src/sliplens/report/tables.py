@@ -19,7 +19,6 @@ from sliplens.plots.style import (
     methods_in_order,
     percent,
     signed,
-    tell_ends,
 )
 from sliplens.progress import number_of
 from sliplens.report.comparisons import (
@@ -35,7 +34,6 @@ from sliplens.report.comparisons import (
     write_units,
 )
 from sliplens.report.results import Results
-from sliplens.results.evaluation import Diagnosis
 from sliplens.results.faithfulness import (
     CHANCE,
     DeletionScores,
@@ -263,29 +261,6 @@ def table_localisation(truth: Truth) -> CellTable:
             **masses,
         },
         [*methods_in_order(set(truth.methods) - set(perfect)), *perfect],
-    )
-
-
-def table_slices(diagnosis: Diagnosis) -> CellTable:
-    """Tabulate slices with their error on held-out trials, and whether it is larger than elsewhere."""
-
-    def points(margin: float) -> str:
-        return signed(100 * margin, 1)
-
-    return make_table(
-        f"Where the error is, {input_name(diagnosis.input).lower()}, in percentage points of Γ: slices that a tree "
-        "found on half of the trials, tested on the other half. Larger: beyond the 95 % interval, on five trials.",
-        {
-            "Slice": lambda part: part.name.replace(", ", ",\n"),
-            "Frames": lambda part: f"{part.frames:,}",
-            "Trials": lambda part: str(part.trials),
-            "Mean |error|": lambda part: f"{100 * part.error:.1f}",
-            "Mean error": lambda part: points(part.bias),
-            "Less elsewhere (95 %)": lambda part: (
-                f"{points(part.excess.estimate)} ({tell_ends(part.excess, points)}){', larger' if part.holds else ''}"
-            ),
-        },
-        diagnosis.slices,
     )
 
 

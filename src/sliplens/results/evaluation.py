@@ -1,4 +1,4 @@
-"""Records of trainings, evaluations and diagnoses; none needs torch."""
+"""Records of trainings and evaluations; none needs torch."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -9,7 +9,6 @@ from msgspec import Meta
 
 from sliplens.codec import UNKNOWN, Columns, Result
 from sliplens.friction import MOST_FRICTION
-from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.recordings.trial import CLOCK_S, LABEL_BOUNDS
 
 
@@ -237,54 +236,3 @@ class Evaluation(Result):
             for name, each in self.conditions.items()
         )
         return f"R2 {scores}; {len(self.predictions):,} frames of {len(self.trials)} {self.split} trials"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ErrorTable(ScoredFrames):
-    """Label and answer of frames, and what may have made the answer wrong; NaN where not known."""
-
-    sensor: Shaped[np.ndarray, " frames"]
-    friction: Annotated[Float64[np.ndarray, " frames"], RATIO, UNKNOWN]
-    """Coefficient of friction that holds."""
-    normal_force_n: Annotated[Float64[np.ndarray, " frames"], FORCE, UNKNOWN]
-    contact_x: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
-    contact_y: Annotated[Float64[np.ndarray, " frames"], SHARE, UNKNOWN]
-    """Middle of the contact, right and down, as shares of the image's width and height."""
-    slice: Annotated[Int64[np.ndarray, " frames"], PLACE]
-    """Place in `Diagnosis.slices`; -1 where no held-out frame is."""
-
-    @property
-    def error(self) -> Float64[np.ndarray, " frames"]:
-        """Answer less label: above 0 where the margin is read too high."""
-        return self.prediction - self.safety_margin
-
-
-@dataclass(frozen=True, kw_only=True)
-class ErrorSlice:
-    """Frames of one leaf of the tree, and their error on trials that the tree has not seen."""
-
-    name: str
-    """Common property of the frames, in words."""
-    frames: int
-    trials: int
-    error: float
-    bias: float
-    """Mean size of the error, and mean error, in margin units."""
-    excess: Difference
-    """Size of the error less that on all other held-out frames."""
-
-    @property
-    def holds(self) -> bool:
-        """True where the error is larger beyond the interval, on enough held-out trials."""
-        return self.trials >= FEWEST_UNITS and self.excess.above_zero
-
-
-@dataclass(frozen=True, kw_only=True)
-class Diagnosis(OfNetwork):
-    """Where a network fails: slices of its errors."""
-
-    sentences: tuple[str, ...]
-    """Findings, with figures."""
-    slices: tuple[ErrorSlice, ...]
-    """Leaves of the tree, the largest error first."""
-    errors: ErrorTable
