@@ -31,7 +31,6 @@ _COMMANDS: dict[str, type] = {
     "explain": Explanation,
     "score": DeletionScores,
     "grip": Grip,
-    "strip": Strip,
 }
 """Record of each command by its stage; other stages are steps of a study."""
 _BY_SOURCE = ("explain", "score", "faithfulness")

@@ -14,7 +14,7 @@ from sliplens.codec import UNKNOWN, Columns, Result, load_record, load_result
 from sliplens.errors import InputError, SaliencyError
 from sliplens.files import RUN_FILE, Provenance, require_folder
 from sliplens.progress import number_of
-from sliplens.results.evaluation import ANSWER, MARGIN, TIME, OfOutput
+from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, TIME, OfOutput
 
 MARGIN_LEVELS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
 """Safety margins at which the thesis explains frames (section 4)."""
@@ -275,6 +275,32 @@ class StripReadings(Columns):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MovedMarkers:
+    """Proof of a map: the frame drawn anew with the markers that it ranks first moved back to the stick frame.
+
+    Changes are predictions of the frame less those of the frame drawn anew, in margin units.
+    """
+
+    frame: Annotated[int, AMOUNT]
+    """Number of the frame in its trial."""
+    prediction: Annotated[float, ANSWER]
+    change: Annotated[float, ANSWER]
+    """By the moved markers."""
+    change_all: Annotated[float, ANSWER]
+    """By all markers."""
+    change_random: Annotated[float, ANSWER]
+    """Mean over random sets of as many markers."""
+    random_sets: Annotated[int, AMOUNT]
+    markers: Annotated[int, AMOUNT]
+    """Markers that lie wholly in the image."""
+    from_px: Float64[np.ndarray, "moved 2"]
+    to_px: Float64[np.ndarray, "moved 2"]
+    """Places of the moved markers, x and y in camera pixels."""
+    pictures: UInt8[np.ndarray, "2 height width 3"]
+    """The frame, and that drawn anew."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Strip(Result):
     """One trial from stick to slip: true and predicted margin, and the maps of a few frames."""
 
@@ -290,3 +316,5 @@ class Strip(Result):
     relevance: Annotated[Float32[np.ndarray, "shown rows columns"], ANSWER]
     """Signed contribution of each pixel to f(x) - f(baseline), in margin units."""
     baseline: BaselineName = "untouched"
+    moved: MovedMarkers | None = None
+    """Of the last frame that is shown; None where no stick frame was found or the trial cannot be drawn anew."""

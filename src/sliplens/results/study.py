@@ -13,13 +13,17 @@ from jaxtyping import Float32, Float64, Int64, Shaped
 from sliplens.codec import UNKNOWN, Columns, Result, table_rows
 from sliplens.intervals import Difference
 from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, PIXEL, Evaluation, OfNetwork
-from sliplens.results.explanation import BASELINES, BaselineName, Explanation
+from sliplens.results.explanation import BASELINES, BaselineName, Explanation, Strip
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, Lead, MethodGap
 
 REGIONS = ("markers", "slip_annulus", "edges")
 """Areas in which a map may lie."""
 MAP_MEASURES = ("resolution", "total_variation")
 """Measures of how a map looks."""
+
+
+CLOSE_TO_LABELS = 0.05
+"""Largest error of a trial that is taken where too few qualify, in margin units; five such are needed for a verdict."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +75,7 @@ class Choice(Result):
     summary: str
     """Description of the choice in a sentence or two."""
     source: str
+    split: str = "test"
     condition: str
     inputs: tuple[str, ...]
     levels: tuple[float, ...]
@@ -82,6 +87,11 @@ class Choice(Result):
     def sound(self) -> bool:
         """True where every trial that was taken qualifies; otherwise errors are explained too."""
         return all(trial.qualified for trial in self.trials)
+
+    @property
+    def close(self) -> int:
+        """Trials that were taken and are predicted within `CLOSE_TO_LABELS`, or within the tolerance."""
+        return sum(trial.worst <= max(self.tolerance, CLOSE_TO_LABELS) for trial in self.trials)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -324,6 +334,7 @@ _Test = Faithfulness | Randomisation | MapQuality | Timing | Truth
 RECORDS: dict[str, type] = {
     "choice": Choice,
     "states": States,
+    "strip": Strip,
     "explain": Explanation,
     "score": DeletionScores,
     "control": UntrainedMaps,
@@ -349,6 +360,8 @@ CONFIG_FILE = "study.json"
 """File of a study's folder that holds its `StudyConfig`."""
 TESTS = ("score", "faithfulness", "randomisation", "map-quality", "truth", "timing")
 """Steps that a study may leave out: the thesis's score, removal curves, new weights, ..."""
+DEFAULT_TESTS = ("score", "faithfulness", "map-quality", "truth")
+"""Steps of a study that asks for none: new weights and exact timing take long and change no verdict."""
 STUDY_METHODS = (
     "grad-cam-thesis",
     "integrated-gradients-thesis",
@@ -363,6 +376,8 @@ STUDY_METHODS = (
 """The thesis's three as published, the same against the baseline, occlusion, Shapley values of the markers."""
 RIVALS = ("integrated-gradients", "occlusion-marker")
 """Methods beside which the recommended one is always judged."""
+QUICK_METHODS = ("shapley-marker", *RIVALS)
+"""Methods of a quick study."""
 STUDY_BUDGET = 0.15
 """Share of the channels that Poly-CAM measures at first: more where the map asks for it."""
 
@@ -395,15 +410,17 @@ class StudyConfig:
     """Share of the channels that Poly-CAM measures at first."""
     baseline: Literal["untouched", "stick"] = "stick"
     """Baseline of the predictions: the last frame before the pull of the trial, or the untouched sensor."""
-    split: str = "test"
+    split: str = "train"
+    """Split of the trials to choose from: maps show what a network learned on trials it knows, as in the thesis; `test`
+    where a data set has none to train on."""
     condition: str = "dry"
-    """Split and condition of the trials to choose from."""
+    """Condition of the trials to choose from."""
     trials: int = 14
-    """Number of trials; where too few qualify, the next best are taken."""
+    """Number of trials; where too few qualify, those within 5 points are taken too."""
     tolerance: float = 0.03
     """Largest error of a prediction in a trial that qualifies, in margin units."""
-    tests: tuple[str, ...] = TESTS
-    """Some of `TESTS`."""
+    tests: tuple[str, ...] = DEFAULT_TESTS
+    """Some of `TESTS`; `randomisation` and `timing` only where they are named."""
     settings: tuple[Setting, ...] = SETTINGS
     """Fills and units of the removal curves."""
     random_orders: int = 10
@@ -412,6 +429,8 @@ class StudyConfig:
     """Steps of the thesis's deletion score; the rows of pixels, as in the thesis, if None."""
     seed: int = 0
     """Seed of random orders, new weights and noise."""
+    quick: bool = False
+    """If True, six trials, three methods and the judge that decides: about five minutes on two cores."""
 
 
 def say_left_out(dropped: int, chosen: int, name: str, baseline: BaselineName) -> str:

@@ -17,6 +17,7 @@ from sliplens.explainers.occlusion import RegionMethod, to_network_px
 from sliplens.explainers.poly_cam import Likeness
 from sliplens.explainers.table import EXPLAINERS, get_explainer
 from sliplens.faithfulness.removal import Units, marker_units, tile_units
+from sliplens.intervals import FEWEST_UNITS
 from sliplens.markers import track_markers
 from sliplens.models import Network
 from sliplens.plots.style import input_name, listed
@@ -24,6 +25,7 @@ from sliplens.progress import number_of, report_each
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.study import (
+    CLOSE_TO_LABELS,
     STUDY_BUDGET,
     STUDY_METHODS,
     Choice,
@@ -40,22 +42,29 @@ _REACH = 0.05
 """How far the frame nearest to a level may lie from it, in margin units."""
 
 
+def sample_trials(data: Dataset, *, split: str, condition: str) -> tuple[TrialInfo, ...]:
+    """Trials of a split and condition; those of the split `test` where a data set has none to train on."""
+    has_split = any(info.split == split and info.condition == condition for info in data.trials)
+    return data.select(split="test" if split == "train" and not has_split else split, condition=condition)
+
+
 def choose_frames(
     networks: Mapping[str, Network],
     data: Dataset,
     *,
-    split: str = "test",
+    split: str = "train",
     condition: str = "dry",
     trials: int = 14,
     tolerance: float = 0.03,
 ) -> Choice:
     """Choose trials in which every network predicts the frames along the margin within a tolerance, in margin units.
 
-    Where fewer trials qualify than are wanted, those whose worst error is smallest are taken too; where more do, the
-    first in the data set's order. In each the frames nearest to `SCORED_LEVELS` are taken, and those nearest to all
-    `LEVELS` in the trial that the panels show, the one predicted best.
+    Where more trials qualify than are wanted, the first in the data set's order are taken; where fewer do, those within
+    `CLOSE_TO_LABELS` are taken too, the best first. Where even these are fewer than five, five are taken, from which no
+    verdict follows. Each trial has a frame nearest to each of `LEVELS` to look at; those nearest to `SCORED_LEVELS` are
+    scored.
 
-    Polak, section 4: 14 trials read within 3 %, 6 levels, 42 frames to score.
+    Polak, section 4: 14 training trials predicted within 3 %, 84 frames to look at, 42 to score.
     """
     if not networks:
         raise InputError("a study needs a network; name one at least")
@@ -63,7 +72,7 @@ def choose_frames(
         raise InputError(f"a study of {trials} trials is impossible; ask for 1 or more")
     if not 0 <= tolerance <= 1:
         raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
-    infos = data.select(split=split, condition=condition)
+    infos = sample_trials(data, split=split, condition=condition)
     candidates = [
         candidate
         for info in report_each(infos)
@@ -71,12 +80,14 @@ def choose_frames(
     ]
     if not candidates:
         raise RecordingError(
-            f"none of the {number_of(len(infos), f'{condition} trial')} of split {split!r} has a labelled frame "
-            f"within {_REACH:.0%} of each of {', '.join(f'{level:.0%}' for level in LEVELS)}; choose another split "
-            "or condition, or trials with more frames from full stick to full slip"
+            f"none of the {number_of(len(infos), f'{condition} trial')} of split {infos[0].split!r} has a labelled "
+            f"frame within {_REACH:.0%} of each of {', '.join(f'{level:.0%}' for level in LEVELS)}; choose another "
+            "split or condition, or trials with more frames from full stick to full slip"
         )
     # sorting is stable: those that qualify keep the data set's order, so that none is picked for its looks
-    taken = sorted(candidates, key=lambda each: 0.0 if each.trial.qualified else each.trial.worst)[:trials]
+    ranked = sorted(candidates, key=lambda each: 0.0 if each.trial.qualified else each.trial.worst)
+    close = sum(each.trial.worst <= max(tolerance, CLOSE_TO_LABELS) for each in ranked)
+    taken = ranked[: min(trials, max(close, FEWEST_UNITS))]
     best = min((candidate.trial for candidate in taken), key=lambda trial: trial.worst).trial
     scored = [level in SCORED_LEVELS for level in LEVELS]
     choice = Choice(
@@ -90,16 +101,14 @@ def choose_frames(
         mean_error={name: float(np.mean([candidate.errors[name][scored] for candidate in taken])) for name in networks},
         summary="",
         source=data.source,
+        split=infos[0].split,
         condition=condition,
         inputs=tuple(networks),
         levels=LEVELS,
         scored_levels=SCORED_LEVELS,
         trials=tuple(candidate.trial for candidate in taken),
         frames=tuple(
-            replace(frame, shown=frame.trial == best)
-            for candidate in taken
-            for frame in candidate.frames
-            if frame.scored or frame.trial == best
+            replace(frame, shown=frame.trial == best) for candidate in taken for frame in candidate.frames
         ),
     )
     return replace(choice, summary=_summarise(choice, len(infos)))
@@ -151,22 +160,23 @@ def _measure_trial(
 
 def _summarise(choice: Choice, trials: int) -> str:
     networks, taken, wanted = len(choice.inputs), choice.trials, choice.trials_wanted
-    who = "the network reads" if networks == 1 else f"{'both' if networks == 2 else 'all'} networks read"
+    who = "the network predicts" if networks == 1 else f"{'both' if networks == 2 else 'all'} networks predict"
     summary = (
-        f"Of {number_of(trials, f'{choice.condition} trial')} {choice.considered} had a frame near every "
-        f"level, and in {choice.qualified} of those {who} every such frame within {choice.tolerance:.0%}."
+        f"Of {number_of(trials, f'{choice.condition} {choice.split} trial')} {choice.considered} have a frame near "
+        f"every level, and in {choice.qualified} of those {who} every such frame within "
+        f"{100 * choice.tolerance:g} points."
     )
     others = [trial for trial in taken if not trial.qualified]
     if others:
-        worst = max(trial.worst for trial in others)
         summary += (
-            f" {wanted} were wanted, so the {len(others)} read best among the others were taken too; the worst of "
-            f"their answers is off by {worst:.0%}."
+            f" {wanted} were wanted, so the {len(others)} next best were taken too: {choice.close} of the {len(taken)} "
+            f"are within {100 * CLOSE_TO_LABELS:g} points, and the worst prediction is off by "
+            f"{100 * max(trial.worst for trial in others):.0f}."
         )
     elif choice.qualified > wanted:
         summary += f" The first {wanted} were taken."
     errors = [f"{100 * error:.0f} points ({input_name(name).lower()})" for name, error in choice.mean_error.items()]
-    summary += f" The answers on the frames to score are off by {listed(errors)} on average."
+    summary += f" The predictions on the frames to score are off by {listed(errors)} on average."
     return summary + (f" There were no more: {len(taken)} instead of {wanted}." if len(taken) < wanted else "")
 
 

@@ -57,6 +57,7 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.results.explanation import BASELINES, Explanation, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, part
 from sliplens.study.choice import study_explainers, without_markers
+from sliplens.study.moved import move_markers
 from sliplens.study.stages import MakeRecord, Stage
 
 
@@ -326,11 +327,13 @@ def make_strip(
     method: str = RECOMMENDED_METHOD,
     levels: Sequence[float] = MARGIN_LEVELS,
     baseline: Literal["untouched", "stick"] = "stick",
+    folder: Path | None = None,
 ) -> Strip:
     """Predict every frame of a trial, and explain those nearest to some safety margins in [0, 1].
 
     `source` is `simulated` or `real`. Without a stick frame the baseline is the untouched sensor. A method by
-    marker becomes one by tile where no markers are found.
+    marker becomes one by tile where no markers are found. `folder` is that of the simulated data set whose trial it is:
+    the last of the frames is then drawn anew with markers moved back to the stick frame (`move_markers`).
     """
     margin = require_labels(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
     rows = tuple(sorted({nearest_frame(margin, level) for level in levels}))
@@ -374,4 +377,7 @@ def make_strip(
         pictures=pictures,
         relevance=maps,
         baseline="untouched" if stick is None else "stick",
+        moved=None
+        if folder is None or stick is None
+        else move_markers(network, folder, recording, frame=rows[-1], stick=stick, relevance=maps[-1]),
     )

@@ -1,5 +1,6 @@
 """A study as a table of steps, each from records to a record, and the loop that keeps them in folders."""
 
+import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -8,11 +9,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import torch
+
 from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import with_markers
 from sliplens.explainers.frames import frames_at
+from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.faithfulness.scoring import influences
 from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
@@ -28,10 +32,11 @@ from sliplens.progress import (
     reporting,
 )
 from sliplens.recordings import Dataset, load_dataset
-from sliplens.results.explanation import Explanation
+from sliplens.results.explanation import Explanation, Strip
 from sliplens.results.faithfulness import NEW_WEIGHTS, RemovalCurve
 from sliplens.results.study import (
     CONFIG_FILE,
+    QUICK_METHODS,
     RECORDS,
     SETTINGS,
     TABLES,
@@ -46,16 +51,19 @@ from sliplens.runner import MakePart, Work, require_executor
 from sliplens.simulation.intervention import rebuild_trial
 from sliplens.study.checks import Randomising, Untrained, measure_maps, time_explainers
 from sliplens.study.choice import (
+    LEVELS,
+    SCORED_LEVELS,
     Material,
     choose_frames,
     gather,
     marker_places,
+    sample_trials,
     show_states,
     study_explainers,
     without_markers,
     worth_scoring,
 )
-from sliplens.study.explaining import Explaining
+from sliplens.study.explaining import Explaining, make_strip
 from sliplens.study.scoring import Influence, PixelDeletion, Removal
 from sliplens.study.stages import Stage
 from sliplens.study.truth import TRUE_FILL, JudgingByTruth, true_curves
@@ -124,16 +132,20 @@ def run_study(
     if unknown := sorted(set(config.tests) - set(TESTS)):
         raise InputError(f"a study has no test named {unknown[0]!r}; choose from {', '.join(TESTS)}")
     require_executor(on)
-    study_explainers(config.methods, budget=config.budget)
     data = data if isinstance(data, Dataset) else load_dataset(data)
+    config = _quick(config, data) if config.quick else config
+    study_explainers(config.methods, budget=config.budget)
     with reporting(on_progress), ExitStack() as stack:
-        _warn_of_few_trials(data, config)
+        _require_trials(data, config)
         records = Records(
             folder=stack.enter_context(scratch_folder()) if out is None else Path(out),
             data=data,
             networks=load_networks(networks, device=device),
             config=config,
         )
+        if not (records.folder / CONFIG_FILE).exists():
+            minutes = estimate_minutes(records)
+            add_note(f"this study takes about {max(1, round(minutes))} minutes of one core; --quick takes about five")
         evaluations = {
             name: evaluate(
                 run, data, records.folder / f"evaluate-{name}", overwrite=overwrite, on_progress=current_listener()
@@ -230,13 +242,58 @@ class Records:
         return {**influences(self.run, self.material.explained), **self["control"].maps}
 
 
-def _warn_of_few_trials(data: Dataset, config: StudyConfig) -> None:
-    count = min(config.trials, len(data.select(split=config.split, condition=config.condition)))
-    if count < FEWEST_UNITS:
-        trials = f"{number_of(count, f'{config.split} trial')} of condition {config.condition}"
-        wanted = config.trials == count
-        cure = f"--trials is {count}" if wanted else "record more, or name another --split or --condition"
-        add_note(f"{trials}: fewer than {FEWEST_UNITS} decide nothing, whatever the page then shows; {cure}")
+def _quick(config: StudyConfig, data: Dataset) -> StudyConfig:
+    """Shorten a study to the judge that decides; what differs from the defaults stays as it was asked for."""
+    default, test = StudyConfig(), "truth" if data.simulated else "faithfulness"
+    short = replace(default, methods=QUICK_METHODS, trials=6, tests=(test,), settings=SETTINGS[:1])
+    changed = {name for name, value in vars(config).items() if value != getattr(default, name)}
+    return replace(config, **{name: value for name, value in vars(short).items() if name not in changed})
+
+
+def _require_trials(data: Dataset, config: StudyConfig) -> None:
+    """Refuse data of too few trials to decide anything; they can be asked for."""
+    infos = sample_trials(data, split=config.split, condition=config.condition)
+    trials = f"{number_of(len(infos), f'{infos[0].split} trial')} of condition {config.condition}"
+    if len(infos) < min(FEWEST_UNITS, config.trials):
+        raise InputError(
+            f"{data.folder} has {trials}, and fewer than {FEWEST_UNITS} decide nothing; record more, name another "
+            f"--split or --condition, or look at the maps without a verdict with --trials {len(infos)}"
+        )
+    if config.trials < FEWEST_UNITS:
+        add_note(f"fewer than {FEWEST_UNITS} trials decide nothing: the page shows maps and no verdict; raise --trials")
+
+
+_EXPLAINED_AS_PASSES = {"grad-cam": 8, "integrated-gradients": 250, "poly-cam": 500, "occlusion": 200, "shapley": 300}
+"""Forward passes that a map takes about as long as, by the beginning of the method's name."""
+
+
+def estimate_minutes(records: Records) -> float:
+    """Estimate the minutes that the steps take on one core, from a few forward passes on this machine.
+
+    The estimate is rough: half or twice of it is usual.
+    """
+    config, total = records.config, 0.0
+    trials = min(config.trials, len(sample_trials(records.data, split=config.split, condition=config.condition)))
+    scored, methods = len(SCORED_LEVELS) * trials, len(config.methods)
+    for run in records.networks.values():
+        size = run.manifest.image_size
+        images = torch.zeros(32, run.encoding.colours, size, size, device=run.device)
+        run.predict(images)
+        started = time.perf_counter()
+        run.predict(images)
+        pass_s = (time.perf_counter() - started) / len(images)
+        explained = sum(
+            next((passes for start, passes in _EXPLAINED_AS_PASSES.items() if name.startswith(start)), 100)
+            for name in config.methods
+        )
+        passes = len(LEVELS) * trials * explained
+        passes += scored * explained / 2 if {"faithfulness", "truth"} & set(config.tests) else 0
+        passes += scored * (methods + 1) * (config.steps or size) if "score" in config.tests else 0
+        if "faithfulness" in config.tests:
+            passes += scored * len(config.settings) * (4 * methods + 10 + config.random_orders) * 7
+        passes += scored * 3000 if "truth" in config.tests and records.data.simulated else 0
+        total += passes * pass_s / 60
+    return total
 
 
 def _can_redraw(records: Records) -> bool:
@@ -271,6 +328,20 @@ def _note_markers(records: Records) -> Iterator[str]:
     missing = records.frames_without_markers
     if missing and list(records.explainers) != list(study_explainers(records.config.methods)):
         yield f"the markers of {number_of(len(missing), 'frame')} are not known, so that tiles are asked instead"
+
+
+def _show_trial(records: Records) -> Strip:
+    """Explain the trial of the panels from stick to slip, with the first network."""
+    trial = next(frame.trial for frame in records["choice"].frames if frame.shown)
+    method = RECOMMENDED_METHOD if RECOMMENDED_METHOD in records.config.methods else records.config.methods[0]
+    return make_strip(
+        next(iter(records.networks.values())),
+        records.data.load(records.data.find(trial)),
+        source=records.data.source,
+        method=method,
+        baseline=records.config.baseline,
+        folder=records.data.folder if records.data.simulated else None,
+    )
 
 
 def _explain(records: Records) -> Explaining:
@@ -383,6 +454,14 @@ STUDY = (
         shared=True,
     ),
     Step(
+        name="strip",
+        title="Explaining a trial from stick to slip",
+        make=_show_trial,
+        needs=("choice",),
+        options=(*_SAMPLE, "methods", "baseline"),
+        shared=True,
+    ),
+    Step(
         name="explain",
         title=Explaining.title,
         make=_explain,
@@ -423,13 +502,21 @@ STUDY = (
 """Steps of a study in their order."""
 
 
+ALARMS = {
+    "score": "Consequence: the deletion score does not rank these methods",
+    "faithfulness": "Consequence: believe no map under a fill where it has an alarm",
+    "randomisation": "Consequence: such a map shows the image, not what was learned",
+}
+"""Consequence of the alarms of a step."""
+
+
 def _find_step(name: str) -> Step:
     return next(step for step in STUDY if step.name == name)
 
 
 def _required_steps(tests: Sequence[str]) -> list[Step]:
     """Return the steps of some tests, those that they need among them; frames are explained in any case."""
-    needed = {"explain", *tests}
+    needed = {"strip", "explain", *tests}
     for step in reversed(STUDY):
         needed |= set(step.needs) if step.name in needed else set()
     return [step for step in STUDY if step.name in needed]
@@ -469,8 +556,9 @@ def _run_step(
                     record = record.make(output.folder / "parts", work=work, on=on, retry_failed=retry_failed)
             save_result(record, output.folder)
             remove(output.folder / "parts")  # not before: what fails above goes on from them
-            for alarm in getattr(record, "alarms", ()):
-                add_note(f"{folder.name}: {alarm}")
+            if alarms := getattr(record, "alarms", ()):
+                # the page has them beside their table; here their consequence is enough
+                add_note(f"{folder.name}: {number_of(len(alarms), 'alarm')}, such as: {alarms[0]}. {ALARMS[step.name]}")
     report_file(folder, title[0].lower() + title[1:], kept=output.complete)
     for sentence in step.notes(records):
         add_note(sentence)
