@@ -1,4 +1,4 @@
-"""A first look: simulated grips, read, explained and judged, on one page that grows while the rest is still made."""
+"""A first look: a simulated grip, predicted, explained and proved, on one page that grows while the rest is made."""
 
 import os
 from collections.abc import Callable
@@ -16,39 +16,24 @@ from sliplens.progress import OnProgress, open_stage, report_file, reporting
 from sliplens.recordings import Dataset
 from sliplens.report import write_report
 from sliplens.results.explanation import Strip
-from sliplens.results.study import Setting, StudyConfig
 from sliplens.simulation.trials import simulate
 from sliplens.study.explaining import explain, make_strip
-from sliplens.study.run import run_study
-from sliplens.study.scoring import STEPS, score
 from sliplens.training import evaluate, train
 
 NETWORKS = {"difference": "thesis-difference", "raw": "thesis-raw"}
 """Networks of the package for the sensor of the demo, by input."""
 INPUTS = tuple(NETWORKS)
-METHODS = ("grad-cam-thesis", "integrated-gradients-thesis", "poly-cam-thesis", RECOMMENDED_METHOD)
-"""The three methods of the thesis as they were run there, and the one to look at."""
 STRIP_METHOD = RECOMMENDED_METHOD
 """Method of the first picture."""
-DEMO_STUDY = StudyConfig(
-    methods=METHODS,
-    trials=2,
-    budget=0.1,
-    tests=("score", "faithfulness"),
-    settings=(Setting(fill="reference", unit="pixel"), Setting(fill="noisy-linear", unit="pixel")),
-    random_orders=3,
-    steps=STEPS,
-)
-"""The study of a first look: too few trials to decide anything, as the page says, but there within minutes."""
 DEMO_SEED = 20261122
-"""Seed of the study, and of the data of networks that are trained here."""
+"""Seed of the data of networks that are trained here."""
 SHOWN_DATA: dict[str, Any] = {
     "preset": "thesis",
     "seed": 0,
     "days": 12,
     "test_days": 3,
-    "dry_trials": (2, 1, 1, *[0] * 6, 3, 3, 2),
-    "wet_trials": 4,
+    "dry_trials": (2, 1, 1, *[0] * 6, 2, 2, 2),
+    "wet_trials": 2,
     "frames_per_trial": 40,
 }
 """Trials of the sensor that the networks of the package were trained for, on three days that none of them met."""
@@ -67,14 +52,14 @@ def run_demo(
     image_size: int = 96,
     real_frames: Path | str | None = None,
     seed: int = DEMO_SEED,
-    on: str = "serial",
     on_page: Callable[[Path], None] | None = None,
     on_progress: OnProgress | None = None,
 ) -> Path:
-    """Simulate a few grips, predict, explain and judge them, and write a page of the results.
+    """Simulate a few grips, predict and explain them, and write a page of the results.
 
-    The page is written as soon as the first grip is explained, and again after each further stage; it opens with that
-    grip, from stick to slip. After an interruption the same call continues.
+    The page is written as soon as the first grip is explained, and again after each further stage. It says whether
+    such maps can be trusted, by the study that comes with the package, and proves one of them: the simulator moves the
+    markers that it ranks first. After an interruption the same call continues.
 
     Parameters
     ----------
@@ -88,8 +73,6 @@ def run_demo(
     real_frames
         Folder of real difference images named ..._GG.png with the safety margin in percent. The public ChromaTouch
         images where `SLIPLENS_REFERENCE` (or ../shared/reference) holds them, if None.
-    on
-        Where maps are made and judged (`run_study`).
     on_page
         Called with the page each time it was written.
 
@@ -111,9 +94,7 @@ def run_demo(
             on_page(page)
         return page
 
-    later = ("how well both networks predict", "which explanation can be believed") + (
-        ("what the network predicts from real frames",) if real is not None else ()
-    )
+    real_title = "what a network predicts from real frames"
     trials = SHOWN_DATA if train_minutes is None else TRAINING_DATA
     settings: dict[str, Any] = {"seed": seed} | trials
     data = simulate(folder / "data", on_progress=on_progress, **settings)
@@ -126,18 +107,14 @@ def run_demo(
             trained(data, networks[name], input=name, on_progress=on_progress)
     with reporting(on_progress):
         _make_strip(folder / "strip", data, networks["difference"])
-    show(*later)
+    show("how well both networks predict", *([real_title] if real is not None else []))
     for name in INPUTS:
         evaluate(networks[name], data, folder / f"evaluate-{name}", on_progress=on_progress)
-    show(*later[1:])
-    config = replace(DEMO_STUDY, seed=seed)
-    run_study(data, tuple(networks.values()), config, out=folder, on=on, on_progress=on_progress)
     if real is not None:
-        maps = folder / "explain-real"
+        show(real_title)
         # the networks of the thesis are for one simulated sensor
         network = networks["difference"] if train_minutes is not None else DIFFERENCE_NETWORK
-        explain(network, real, labels_in_names=True, out=maps, on_progress=on_progress)
-        score(network, maps, out=folder / "score-real", steps=STEPS, seed=seed, on_progress=on_progress)
+        explain(network, real, labels_in_names=True, out=folder / "explain-real", on_progress=on_progress)
     return show()
 
 
@@ -183,7 +160,7 @@ def _make_strip(folder: Path, data: Dataset, network: str) -> Strip:
     with output_folder(folder, stage="strip", config=config) as output:
         if not output.complete:
             with open_stage("Explaining a grip from stick to slip"):
-                strip = make_strip(run, data.load(info), source=data.source, method=STRIP_METHOD)
+                strip = make_strip(run, data.load(info), source=data.source, method=STRIP_METHOD, folder=data.folder)
             save_result(strip, output.folder)
     report_file(folder, "a grip from stick to slip", kept=output.complete)
     return load_result(folder, Strip, command="sliplens demo")

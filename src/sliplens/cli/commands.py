@@ -39,7 +39,7 @@ def command(
     return register
 
 
-@command("demo", "demo:run_demo", "sliplens demo runs/demo --on processes=2")
+@command("demo", "demo:run_demo", "sliplens demo runs/demo")
 def call_demo(call: Any) -> None:
     """Print where the page is as soon as it exists; its notes are on the page."""
     started = time.perf_counter()

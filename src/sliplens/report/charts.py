@@ -13,6 +13,7 @@ from sliplens.grip.records import Grip
 from sliplens.plots import errors, style
 from sliplens.plots.margins import plot_grip
 from sliplens.progress import number_of
+from sliplens.report.claims import ThesisRecord
 from sliplens.report.comparisons import settings
 from sliplens.report.plates import Plate, rows_of
 from sliplens.report.results import Results
@@ -62,6 +63,37 @@ def plate_bins(results: Results) -> Plate:
         alt=f"Bars of the mean squared error in bins of the safety margin: {style.listed(list(bins))}",
         caption="Mean squared error by bins of the true safety margin. A bin without bars holds no test frame.",
         columns=("condition", "input", "low", "high", "frames", "mse"),
+        rows=rows,
+    )
+
+
+def plate_shift(record: ThesisRecord) -> Plate:
+    """Draw R2 of the shipped networks against a shift of the camera."""
+    figure, (ax,) = _make_charts(1, each=(5.6, 3.2))
+    shifts = [point.shift_px for point in record.shift]
+    rows = [(name, point.shift_px, *point.r2[name]) for name in record.shift[0].r2 for point in record.shift]
+    with style.drawing_style():
+        for name in record.shift[0].r2:
+            values, low, high = np.array([point.r2[name] for point in record.shift]).T
+            ax.plot(shifts, values, "o-", color=style.INPUT_COLOURS[name], label=style.short_input_name(name))
+            ax.fill_between(shifts, low, high, color=style.INPUT_COLOURS[name], alpha=0.15, linewidth=0)
+        ax.axhline(0, color=style.BLACK, linewidth=0.8)
+        ax.set(
+            xlabel="Camera shift (px)", ylabel="R² on dry test trials", ylim=(min(-0.1, *(row[3] for row in rows)), 1)
+        )
+        ax.legend()
+    first, last = record.shift[0], record.shift[-1]
+    text = "; ".join(
+        f"{style.input_name(name).lower()} {first.r2[name][0]:.2f} unmoved, {last.r2[name][0]:.2f} at the end"
+        for name in first.r2
+    )
+    return Plate(
+        name="camera-shift",
+        figure=figure,
+        alt=f"R² against the shift of the camera: {text}",
+        caption="What a moved camera does to each network: R² on test trials, all frames and the reference frame "
+        f"shifted alike; bands are 95 % intervals over trials ({record.shift_frames}). {text[:1].upper()}{text[1:]}.",
+        columns=("input", "shift_px", "r2", "low", "high"),
         rows=rows,
     )
 

@@ -13,12 +13,12 @@ from functools import partial
 
 import numpy as np
 
-from sliplens.intervals import Difference, mean_interval, paired_difference
+from sliplens.intervals import Difference, paired_difference
 from sliplens.plots import style
 from sliplens.progress import number_of
 from sliplens.results.evaluation import ScoredFrames
-from sliplens.results.faithfulness import Faithfulness, RemovalCurve
-from sliplens.results.study import Choice, MarkerEffects, Truth
+from sliplens.results.faithfulness import Faithfulness
+from sliplens.results.study import Choice, Truth
 
 CITATION = (
     "Max Polak, Explainable Neural Networks for Incipient Slip Sensing in Robot Tactile Learning, Master's thesis, "
@@ -68,36 +68,6 @@ def compare_errors(first: ScoredFrames, second: ScoredFrames, *, rng: np.random.
         return None
     errors = [(rows.prediction - rows.safety_margin) ** 2 for rows in (first, second)]
     return paired_difference(errors[0], errors[1], clusters=[first.day, first.trial], rng=rng)
-
-
-def compare_gain(*pairs: tuple[RemovalCurve, RemovalCurve], rng: np.random.Generator) -> Difference | None:
-    """Symmetric relevance gain of the first less that of the second, over the frames all have; None without any.
-
-    Of several pairs, such as those of several methods, the gains of each frame are averaged first.
-    """
-    shared = sorted(set.intersection(*(set(curve.frame_ids) for pair in pairs for curve in pair)))
-    if not shared:
-        return None
-    first, second = (
-        np.mean([curve.symmetric_gain[np.searchsorted(curve.frame_ids, shared)] for curve in curves], axis=0)
-        for curves in zip(*pairs, strict=True)
-    )
-    assert pairs[0][0].clusters is not None  # of a saved table
-    clusters = pairs[0][0].clusters[:, np.searchsorted(pairs[0][0].frame_ids, shared)]
-    return paired_difference(first, second, clusters=clusters, rng=rng)
-
-
-def share_of_strongest(effects: MarkerEffects, *, count: int, rng: np.random.Generator) -> Difference | None:
-    """Share of a network's effects, in size, that its strongest markers hold; None where no marker has any effect."""
-    shares, clusters = [], []
-    for frame in effects.groups("frame_id").values():
-        sizes = np.sort(np.abs(frame.network))[::-1]
-        if sizes.sum() > 0:
-            shares.append(sizes[:count].sum() / sizes.sum())
-            clusters.append((str(frame.day[0]), frame.trial[0]))
-    if not shares:
-        return None
-    return mean_interval(np.array(shares), clusters=np.array(clusters).T, rng=rng, limits=(0.0, 1.0))
 
 
 def settings(faithful: Faithfulness) -> list[tuple[str, str]]:

@@ -17,11 +17,12 @@ from markupsafe import Markup, escape
 from sliplens.codec import Result
 from sliplens.errors import InputError
 from sliplens.plots.style import written_whole
-from sliplens.report.comparisons import CITATION, write_gap
-from sliplens.report.plates import FOLDER, Plate, plate_strip, write_plates
+from sliplens.report.comparisons import CITATION
+from sliplens.report.opening import build_opening, without_weak
+from sliplens.report.plates import FOLDER, Plate, write_plates
 from sliplens.report.results import load_results
 from sliplens.report.sections import Notes, build_sections
-from sliplens.report.verdict import Verdict, cautions, judge_results
+from sliplens.report.verdict import cautions, judge_results, judge_study
 from sliplens.results.study import Study
 
 PAGE = "report.html"
@@ -70,10 +71,11 @@ def write_report(
     results = load_results(folder)
     # one stream, seeded: the same results give the same intervals
     rng = np.random.default_rng(0)
-    sections = build_sections(results, rng=rng)
-    blocks = [block for section in sections for block in section.blocks]
-    verdict = judge_results(results, claims=[block for block in blocks if isinstance(block, Verdict)], rng=rng)
-    opening = [] if results.strip is None else [plate_strip(results.strip)]
+    results, weak = without_weak(results)
+    sections = build_sections(results)
+    rows = judge_study(results)
+    opening = build_opening(results, rows)
+    blocks = [*opening.blocks, *(block for section in sections for block in section.blocks)]
     runs = list(results.runs.values())
     alarms = [*results.notes]
     if len({tuple(sorted(run.versions.items())) for run in runs}) > 1:
@@ -90,20 +92,20 @@ def write_report(
         finished=runs[-1].finished[:16].replace("T", " at "),
         thesis=CITATION,
         waiting_for=waiting_for,
-        opening=opening,
-        verdict=verdict,
-        cautions=cautions(results),
+        answer=opening.answer,
+        opening=opening.blocks,
+        next_step=opening.next_step,
+        verdict=judge_results(results, rng=rng),
+        cautions=[*weak, *cautions(results)],
         alarms=alarms,
         sections=sections,
         study=bool(results.study),
         runs=results.runs,
         recipes=[json.dumps(run.config, indent=2, ensure_ascii=False) for run in runs],
         facts={**runs[-1].versions, **vars(runs[-1].machine)},
-        interval=write_gap,
     )
     # the figures first: a page that is there has all that it names
-    plates = [*opening, *(block for block in blocks if isinstance(block, Plate))]
-    figures = write_plates(plates, page.parent / FOLDER)
+    figures = write_plates([block for block in blocks if isinstance(block, Plate)], page.parent / FOLDER)
     write_page(page, text)
     return Written(page=page, figures=figures)
 

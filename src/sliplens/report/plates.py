@@ -38,7 +38,7 @@ from sliplens.plots.style import (
     written_whole,
 )
 from sliplens.report.results import Results
-from sliplens.results.explanation import BASELINES, Explanation, Strip
+from sliplens.results.explanation import BASELINES, Explanation, MovedMarkers, Strip
 from sliplens.results.faithfulness import is_control
 
 FOLDER = "figures"
@@ -120,6 +120,35 @@ def plate_strip(strip: Strip) -> Plate:
         rows=rows_of(*vars(readings).values()),
         pixels=True,
     )
+
+
+def plate_moved(moved: MovedMarkers, method: str) -> Plate:
+    """Draw a frame, and the same drawn anew with the markers that a map ranks first moved back to stick."""
+    count = len(moved.from_px)
+    few = f"{count} of {moved.markers} markers"
+    figure = draw_pictures(
+        [PictureRow(name="camera", pictures=list(moved.pictures))],
+        heads=[f"predicted {percent(moved.prediction)}", f"drawn anew:\n{percent(moved.prediction - moved.change)}"],
+    )
+    for ax in figure.axes:
+        ax.plot(*moved.from_px.T, "o", markersize=5, fillstyle="none", color="white", markeredgewidth=0.8)
+    return Plate(
+        name="moved-markers",
+        figure=figure,
+        alt=f"A frame with {few} circled, and the frame drawn anew with these moved back",
+        caption=f"Moving just these {few} back to where they stuck changes the prediction by {_opposite(moved.change)} "
+        f"points; moving all of them, by {_opposite(moved.change_all)}; {count} random ones, by "
+        f"{_opposite(moved.change_random)} (mean of {moved.random_sets} draws). The simulator drew the second picture "
+        "anew, and the network predicted it. The circled markers are the fewest that hold half of the evidence in the "
+        f"map of {method}.",
+        columns=("from_x_px", "from_y_px", "to_x_px", "to_y_px"),
+        rows=rows_of(*moved.from_px.T, *moved.to_px.T),
+        pixels=True,
+    )
+
+
+def _opposite(change: float) -> str:
+    return f"{-100 * change:+.0f}".replace("-", "\N{MINUS SIGN}")
 
 
 def plate_states(results: Results, explained: Explanation) -> Plate:

@@ -4,15 +4,12 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
-import numpy as np
-
 from sliplens.plots.style import fill_name, input_name, inputs_in_order, listed, method_name, name_methods
 from sliplens.progress import number_of
 from sliplens.report import charts, plates, tables
-from sliplens.report.claims import judge_claims
+from sliplens.report.claims import load_thesis
 from sliplens.report.comparisons import write_sample
 from sliplens.report.results import Results
-from sliplens.report.verdict import Verdict
 from sliplens.results.explanation import BASELINES
 from sliplens.results.study import TESTS
 
@@ -28,7 +25,7 @@ class Notes:
     tone: Literal["plain", "caution"] = "plain"
 
 
-Block = tables.CellTable | plates.Plate | Verdict | Notes
+Block = tables.CellTable | plates.Plate | Notes
 """Laid out by the template's macro of the name `layout`."""
 Blocks = Iterator[Block | None]
 """None stands for a block that is not there."""
@@ -42,7 +39,7 @@ class Section:
     title: str
     short_title: str
     intro: str
-    build: Callable[[Results, np.random.Generator], Blocks]
+    build: Callable[[Results], Blocks]
     step: str = ""
     """Step of a study that makes its results; the page names it where it was not run. Empty where no study has it."""
     of_sample: bool = False
@@ -51,12 +48,12 @@ class Section:
     """In the order they are read, once it is built."""
 
 
-def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Section, ...]:
+def build_sections(results: Results) -> tuple[Section, ...]:
     """Build the sections whose results are there, in the order they are read; the last says what was not run."""
     built, absent, study = [], [], results.study
     baseline = next((BASELINES[each.baseline] for each in results.explanations.values()), BASELINES["untouched"])
     for section in SECTIONS:
-        blocks = tuple(block for block in section.build(results, rng) if block is not None)
+        blocks = tuple(block for block in section.build(results) if block is not None)
         if blocks:
             sample = f" {write_sample(study.choice)}" if study.choice is not None and section.of_sample else ""
             intro = f"{section.intro}{sample}".replace("{baseline}", baseline)
@@ -64,7 +61,7 @@ def build_sections(results: Results, *, rng: np.random.Generator) -> tuple[Secti
         elif study and section.step and not (section.step == "truth" and study.source == "real"):
             left_out = study.config is not None and section.step in set(TESTS) - set(study.config.tests)
             absent += [] if left_out else [section.short_title]
-    blocks = tuple(block for block in RECIPE.build(results, rng) if block is not None)
+    blocks = tuple(block for block in RECIPE.build(results) if block is not None)
     missing = f" {', '.join(absent)}: not run yet; `sliplens study` makes it." if absent else ""
     return *built, replace(RECIPE, intro=f"{RECIPE.intro}{missing}", blocks=blocks)
 
@@ -85,14 +82,14 @@ def _alarms(name: str, sentences: Iterable[str]) -> Notes | None:
     return _notes(f"Alarms, {input_name(name).lower()}", sentences)
 
 
-def _accuracy(results: Results, _: np.random.Generator) -> Blocks:
+def _accuracy(results: Results) -> Blocks:
     if results.evaluations:
         yield tables.table_accuracy(results)
         yield charts.plate_bins(results)
         yield charts.plate_predictions(results)
 
 
-def _faithfulness(results: Results, _: np.random.Generator) -> Blocks:
+def _faithfulness(results: Results) -> Blocks:
     for name in _names(results.study.faithfulness):
         faithful = results.study.faithfulness[name]
         yield tables.table_scores(name, faithful, results.scores.get((name, results.study.source)))
@@ -100,7 +97,7 @@ def _faithfulness(results: Results, _: np.random.Generator) -> Blocks:
         yield charts.plate_removal_curves(faithful)
 
 
-def _deletion(results: Results, _: np.random.Generator) -> Blocks:
+def _deletion(results: Results) -> Blocks:
     study = results.study
     for source in ("simulated", "real"):
         scores = {
@@ -114,7 +111,7 @@ def _deletion(results: Results, _: np.random.Generator) -> Blocks:
             yield _alarms(name, scored.alarms)
 
 
-def _randomisation(results: Results, _: np.random.Generator) -> Blocks:
+def _randomisation(results: Results) -> Blocks:
     if records := results.study.randomisation:
         yield tables.table_randomisation(records)
         yield from (_alarms(name, records[name].alarms) for name in _names(records))
@@ -128,7 +125,7 @@ def _maps(results: Results, source: str) -> Blocks:
         yield _alarms(name, (f"{method}: {text}" for method, texts in warnings.items() for text in texts))
 
 
-def _study_maps(results: Results, _: np.random.Generator) -> Blocks:
+def _study_maps(results: Results) -> Blocks:
     study = results.study
     if study.states is not None:
         yield _notes("Markers that could not be followed", study.states.untracked)
@@ -136,23 +133,23 @@ def _study_maps(results: Results, _: np.random.Generator) -> Blocks:
     yield tables.table_looks(study.map_quality) if study.map_quality else None
 
 
-def _real_maps(results: Results, _: np.random.Generator) -> Blocks:
+def _real_maps(results: Results) -> Blocks:
     if results.study.source != "real":
         yield from _maps(results, "real")
 
 
-def _timing(results: Results, _: np.random.Generator) -> Blocks:
+def _timing(results: Results) -> Blocks:
     if results.study.timing:
         yield tables.table_times(results.study.timing)
 
 
-def _choice(results: Results, _: np.random.Generator) -> Blocks:
+def _choice(results: Results) -> Blocks:
     if (choice := results.study.choice) is not None:
         sentences = [choice.summary, write_sample(choice), *results.study.left_out.values()]
         yield _notes(f"{number_of(len(choice.trials), 'trial')} of {choice.condition} objects", sentences, tone="plain")
 
 
-def _truth(results: Results, _: np.random.Generator) -> Blocks:
+def _truth(results: Results) -> Blocks:
     for name in _names(results.study.truth):
         truth = results.study.truth[name]
         yield plates.plate_truth(results, name)
@@ -164,28 +161,30 @@ def _truth(results: Results, _: np.random.Generator) -> Blocks:
         yield _notes(f"How this was measured, {input_name(name).lower()}", [truth.summary], tone="plain")
 
 
-def _grip(results: Results, _: np.random.Generator) -> Blocks:
+def _grip(results: Results) -> Blocks:
     if results.grip is not None:
         yield charts.plate_trace(results.grip)
         yield plates.plate_moments(results.grip) if len(results.grip.maps) else None
         yield tables.table_episodes(results.grip)
 
 
-def _learning(results: Results, _: np.random.Generator) -> Blocks:
+def _claims(results: Results) -> Blocks:
+    if results.study or results.strip is not None:
+        yield tables.table_claims(load_thesis())
+
+
+def _learning(results: Results) -> Blocks:
     if results.trainings:
         yield charts.plate_learning(results)
 
 
 SECTIONS: tuple[Section, ...] = (
     Section(
-        id="claims",
-        title="The claims of the thesis, tested here",
-        short_title="Claims",
-        intro="Each claim holds, does not hold, or stays undecided. A fill is what removed parts become; intervals (95 "
-        "%) are over days and trials; fewer than five trials decide nothing. A claim holds for a network where it "
-        "holds under more than half of the fills and the opposite is sure under none.",
-        build=lambda results, rng: iter(judge_claims(results, rng=rng) if results.study else ()),
-        of_sample=True,
+        id="real",
+        title="Real touch",
+        short_title="Real touch",
+        intro="Frames of a real sensor, shown to each network.",
+        build=_real_maps,
     ),
     Section(
         id="accuracy",
@@ -248,13 +247,6 @@ SECTIONS: tuple[Section, ...] = (
         of_sample=True,
     ),
     Section(
-        id="real",
-        title="Real touch",
-        short_title="Real touch",
-        intro="Frames of a real sensor, shown to each network.",
-        build=_real_maps,
-    ),
-    Section(
         id="timing",
         title="What an explanation costs",
         short_title="Cost",
@@ -282,6 +274,14 @@ SECTIONS: tuple[Section, ...] = (
         build=_truth,
         step="truth",
         of_sample=True,
+    ),
+    Section(
+        id="claims",
+        title="The claims of the thesis",
+        short_title="Claims",
+        intro="From a study of the two networks that come with sliplens, one an input, on simulated trials of their "
+        "sensor: not of this workspace. A claim holds or does not hold beyond the interval; otherwise it is open.",
+        build=_claims,
     ),
 )
 """Sections in the order they are read."""

@@ -1,6 +1,6 @@
 """Tables of the page: cells as text, so that the template only lays them out."""
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, TypeVar
 
@@ -21,6 +21,7 @@ from sliplens.plots.style import (
     signed,
 )
 from sliplens.progress import number_of
+from sliplens.report.claims import ThesisRecord
 from sliplens.report.comparisons import (
     ACCURACY,
     DELETION,
@@ -34,6 +35,7 @@ from sliplens.report.comparisons import (
     write_units,
 )
 from sliplens.report.results import Results
+from sliplens.report.verdict import MethodRow
 from sliplens.results.faithfulness import (
     CHANCE,
     DeletionScores,
@@ -44,7 +46,7 @@ from sliplens.results.faithfulness import (
 )
 from sliplens.results.study import MAP_MEASURES, REGIONS, MapQuality, Randomisation, Timing, Truth
 
-Kind = Literal["name", "number", "best", "thesis"]
+Kind = Literal["name", "number", "best", "thesis", "badge"]
 Record = TypeVar("Record")
 _LOOK_NAMES = ("Resolution", "Total variation")
 _TRUTHS = ("oracle", "degraded-oracle")
@@ -67,10 +69,17 @@ class CellTable:
     caption: str
     head: tuple[Cell, ...]
     rows: tuple[tuple[Cell, ...], ...]
+    wrap: bool = False
+    """True where the cells hold sentences."""
 
 
 def make_table(
-    caption: str, columns: Mapping[str, Callable[[Record], str | Cell]], records: Iterable[Record], *, names: int = 1
+    caption: str,
+    columns: Mapping[str, Callable[[Record], str | Cell]],
+    records: Iterable[Record],
+    *,
+    names: int = 1,
+    wrap: bool = False,
 ) -> CellTable:
     """Make a table of records from its columns: a head, and what each record has there.
 
@@ -88,7 +97,7 @@ def make_table(
         for record in records
     ]
     head = tuple(Cell(text=text, kind="thesis" if "thesis" in text.lower() else "name") for text in columns)
-    return CellTable(caption=caption, head=head, rows=tuple(rows))
+    return CellTable(caption=caption, head=head, rows=tuple(rows), wrap=wrap)
 
 
 def _each_method(
@@ -102,6 +111,45 @@ def _each_method(
 
 def _best(text: str, best: bool) -> Cell:
     return Cell(text=text, kind="best" if best else "number")
+
+
+def table_methods(rows: Sequence[MethodRow]) -> CellTable:
+    """Tabulate every method beside the best control."""
+    return make_table(
+        "Every method beside the best control, a map that uses nothing the network learned. Truth: correlation of a "
+        "map's sums over groups of markers with the change of this network's prediction as a group is moved to another "
+        "margin of the trial; on recordings, the symmetric gain of removal in margin units. Ahead or behind: beyond the "
+        "95 % interval over days and trials of one network; tied: neither.",
+        {
+            "Input": lambda row: input_name(row.input),
+            "Method": lambda row: method_name(row.method),
+            "Truth": lambda row: row.score,
+            "Best control": lambda row: row.control,
+            "Lead": lambda row: row.lead,
+            "Status": lambda row: Cell(text=row.status, kind="badge"),
+        },
+        rows,
+        names=2,
+    )
+
+
+def table_claims(record: ThesisRecord) -> CellTable:
+    """Tabulate the claims of the thesis, each beside its number."""
+    return make_table(
+        f"Claims of the thesis, its numbers, and ours with 95 % intervals over days and trials. {record.sample}",
+        {
+            "Claim": lambda row: row.claim,
+            "Where": lambda row: row.source,
+            "Network": lambda row: row.subject,
+            "Its number": lambda row: Cell(text=row.thesis, kind="thesis"),
+            "Ours": lambda row: row.ours,
+            "Outcome": lambda row: Cell(text="open" if row.outcome == "undecided" else row.outcome, kind="badge"),
+            "Why": lambda row: Cell(text=row.why, kind="name"),
+        },
+        record.claims,
+        names=3,
+        wrap=True,
+    )
 
 
 def table_accuracy(results: Results) -> CellTable:

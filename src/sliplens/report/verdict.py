@@ -1,6 +1,6 @@
-"""The verdict: tables of claims about methods and networks, each with its number, interval and outcome."""
+"""The verdict: can the maps be trusted, which method is ahead of the controls, how well do the networks predict."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -11,6 +11,7 @@ from scipy.stats import binomtest
 
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.plots.style import (
+    UNKNOWN,
     conditions_in_order,
     decimals,
     fill_name,
@@ -23,55 +24,51 @@ from sliplens.plots.style import (
     signed,
 )
 from sliplens.progress import number_of
-from sliplens.report.comparisons import (
-    compare_errors,
-    voting_settings,
-    write_ends,
-    write_gap,
-    write_sample,
-)
+from sliplens.report.comparisons import compare_errors, voting_settings, write_ends, write_gap, write_sample
 from sliplens.report.results import Results
-from sliplens.results.faithfulness import Faithfulness, Lead
-from sliplens.results.study import Truth
+from sliplens.results.faithfulness import Faithfulness
+from sliplens.results.study import CLOSE_TO_LABELS, Truth
 
 Outcome = Literal["holds", "does not hold", "undecided"]
-OPPOSITE: dict[Outcome, Outcome] = {"holds": "does not hold", "does not hold": "holds"}
-"""Outcome of the opposite claim, where one is decided."""
+Status = Literal["ahead", "tied", "behind", "no verdict"]
+LEAST_R2 = 0.7
+"""R2 on test trials below which a network's maps get no verdict."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
-    """Comparison behind a row of the verdict."""
+class MethodRow:
+    """A method beside the best control."""
 
-    where: str
-    """Fill and unit, or the score."""
-    compared: str
-    gap: Difference | None = None
-    outcome: Outcome | None = None
-    """None where the comparison does not decide."""
+    input: str
+    method: str
+    score: str
+    """Agreement with the neutral truth, or the symmetric gain where the scene cannot be drawn anew."""
+    control: str
+    lead: str
+    """Score less that of the strongest control, with its 95 % interval."""
+    status: Status
+    """Lead above zero for sure, neither, or below zero for sure."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """Claim about a method or network with its evidence."""
+    """Claim about a network or grip with its evidence."""
 
     claim: str
     subject: str
-    """Network, or networks, by their inputs."""
     outcome: Outcome | None
     """None where the number is reported but nothing is claimed."""
     sentence: str
     number: str = ""
     interval: str = ""
     """Ends of the 95 % interval."""
-    findings: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
     """Table of claims that were tested alike."""
 
-    layout: ClassVar[str] = "claim"
+    layout: ClassVar[str] = "verdict"
 
     id: str
     title: str
@@ -80,27 +77,9 @@ class Verdict:
     rows: tuple[Row, ...]
 
 
-def judge_results(results: Results, *, claims: Sequence[Verdict] = (), rng: np.random.Generator) -> tuple[Verdict, ...]:
-    """Judge everything that a workspace holds, with the claims of the thesis; tables without a row are left out."""
-    thesis = [row for claim in claims for row in claim.rows]
+def judge_results(results: Results, *, rng: np.random.Generator) -> tuple[Verdict, ...]:
+    """Judge networks, real touch and grip of a workspace; tables without a row are left out."""
     tables: tuple[tuple[str, str, str, Iterable[Row]], ...] = (
-        (
-            "believe",
-            "Which explanation to believe",
-            "Number, where the scene can be drawn anew: correlation of a map's sums over groups of markers with the "
-            "change of this network's prediction as the group is moved to another margin of the trial; else the mean "
-            "symmetric gain of removal, in margin units. A method holds where it beats every map that knows nothing of "
-            "what the network learned, "
-            f"beyond the 95 % interval over days and trials, of which {FEWEST_UNITS} trials or more are needed.",
-            _judge_methods(results) if results.study else (),
-        ),
-        (
-            "thesis",
-            "The claims of the thesis",
-            "Tested with its methods as published, on networks and data of our own: its network and most of its "
-            "data are not here, so that a claim may fail for those reasons too. All comparisons stand below.",
-            thesis,
-        ),
         (
             "networks",
             "How well each network predicts the margin",
@@ -125,19 +104,6 @@ def judge_results(results: Results, *, claims: Sequence[Verdict] = (), rng: np.r
     return tuple(table for table in judged if table.rows)
 
 
-def cautions(results: Results) -> tuple[str, ...]:
-    """Return what limits every row of the verdict: few trials, an unsound sample."""
-    choice, sentences = results.study.choice, []
-    if choice is not None and len(choice.trials) < FEWEST_UNITS:
-        sentences.append(
-            f"This study explains {number_of(len(choice.trials), 'trial')}, and fewer than {FEWEST_UNITS} decide "
-            "nothing: below is how explanations are judged, not yet which one to believe."
-        )
-    if choice is not None and not choice.sound:
-        sentences.append(f"{write_sample(choice)} An explanation of a wrong prediction explains the error.")
-    return tuple(sentences)
-
-
 def judge_gap(gap: Difference | None) -> Outcome:
     """Judge a difference: above zero for sure, below zero for sure, or neither."""
     if gap is None or not gap.sure:
@@ -153,121 +119,73 @@ def all_of(outcomes: Iterable[Outcome]) -> Outcome:
     return "holds" if distinct == {"holds"} else "undecided"
 
 
-def most_of(outcomes: Sequence[Outcome]) -> Outcome:
-    """Join settings: more than half of them agree, and none says the opposite."""
-    for outcome, opposite in OPPOSITE.items():
-        if 2 * outcomes.count(outcome) > len(outcomes) and opposite not in outcomes:
-            return outcome
-    return "undecided"
+# can these maps be trusted?
 
 
-# which explanation to believe
+def test_r2(results: Results, name: str) -> float | None:
+    """R2 of a network on test trials of the study's condition; None where it was not evaluated."""
+    evaluation, choice = results.evaluations.get(name), results.study.choice
+    score = evaluation and evaluation.conditions.get(choice.condition if choice else "dry")
+    return score.r2 if score else None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recommended:
-    """Method whose map agrees best with the neutral judge, and whether it may be recommended."""
-
-    method: str
-    lead: Lead
-    """Over the strongest control."""
-    lead_over_methods: Mapping[str, Difference]
-    tied: tuple[str, ...]
-    """Other methods that it does not lead for sure, the nearest first."""
-
-    @property
-    def shown(self) -> bool:
-        """True where its lead over every control and over every other method is off zero."""
-        return self.lead.shows_something and not self.tied
+def why_no_verdict(results: Results, name: str) -> str | None:
+    """Reason why the maps of a network get no verdict; None where they may."""
+    r2, choice = test_r2(results, name), results.study.choice
+    if r2 is not None and r2 < LEAST_R2:
+        return f"the network has R² {r2:.2f} on test trials, and its maps need {LEAST_R2:g}"
+    if choice is not None and choice.close < FEWEST_UNITS:
+        return (
+            f"{number_of(choice.close, 'trial')} of {len(choice.trials)} are predicted within "
+            f"{100 * max(choice.tolerance, CLOSE_TO_LABELS):g} points, and {FEWEST_UNITS} are needed: a map of a wrong "
+            "prediction explains the error"
+        )
+    return None
 
 
-def recommend(truth: Truth) -> Recommended | None:
-    """Return the method with the best correlation under the neutral judge; None where there is none."""
-    compared = _compared(truth)
-    if not compared:
-        return None
-    name, _, lead = compared[0]
-    over = truth.methods[name].lead_over_methods
-    tied = sorted((other for other, gap in over.items() if not gap.above_zero), key=lambda other: over[other].estimate)
-    return Recommended(method=name, lead=lead, lead_over_methods=over, tied=tuple(tied))
+def judge_study(results: Results) -> tuple[MethodRow, ...]:
+    """Judge the methods of all networks: by the neutral truth where the scene can be drawn anew, else by removal."""
+    rows: list[MethodRow] = []
+    for name in inputs_in_order(results.study.inputs)[::-1]:
+        truth, faithful = results.study.truth.get(name), results.study.faithfulness.get(name)
+        reason = why_no_verdict(results, name)
+        if truth is not None and any(method.neutral is not None for method in truth.methods.values()):
+            rows += judge_methods(truth, verdict=reason is None)
+        elif faithful is not None:
+            rows += _judge_by_removal(name, faithful, truth, verdict=reason is None)
+    return tuple(rows)
 
 
-def _compared(truth: Truth) -> list[tuple[str, Difference, Lead]]:
-    """Methods with their correlation and lead, the best first."""
+def judge_methods(truth: Truth, *, verdict: bool = True) -> list[MethodRow]:
+    """Judge methods by the neutral truth, the best first; without a verdict where there is to be none."""
     compared = [
-        (name, method.neutral, method.lead_over_controls)
+        (method.neutral, name, method.lead_over_controls)
         for name, method in truth.methods.items()
         if method.neutral is not None and method.lead_over_controls is not None
     ]
-    return sorted(compared, key=lambda item: -item[1].estimate)
-
-
-def _judge_methods(results: Results) -> Iterator[Row]:
-    for name in inputs_in_order(results.study.inputs)[::-1]:
-        truth, faithful = results.study.truth.get(name), results.study.faithfulness.get(name)
-        if truth is not None and _compared(truth):
-            yield from _judge_by_truth(name, truth)
-        elif faithful is not None:
-            yield from _judge_by_removal(name, faithful, truth)
-        else:
-            sentence = "Not scored yet; `sliplens study` does that."
-            yield Row(claim="Any method", subject=input_name(name), outcome="undecided", sentence=sentence)
-
-
-def _judge_by_truth(name: str, truth: Truth) -> Iterator[Row]:
-    best = recommend(truth)
-    assert best is not None
-    for method, correlation, lead in _compared(truth):
-        outcome, sentence = _compare_by_truth(method, lead, best)
-        if correlation.units < FEWEST_UNITS:
-            outcome, sentence = "undecided", _too_few(correlation.units)
-        yield Row(
-            claim=method_name(method),
-            subject=input_name(name),
-            outcome=outcome,
-            sentence=sentence + _scope(correlation),
-            number=signed(correlation.estimate, 2),
-            interval=write_ends(correlation, digits=2),
+    write = partial(write_gap, digits=2)
+    return [
+        MethodRow(
+            input=truth.input,
+            method=name,
+            score=write(score),
+            control=f"{method_name(lead.control).removesuffix(' (control)')}, "
+            f"{signed(abs(score.estimate - lead.gap.estimate), 2)}",
+            lead=write(lead.gap),
+            status=_status(lead.gap) if verdict and score.units >= FEWEST_UNITS else "no verdict",
         )
+        for score, name, lead in sorted(compared, key=lambda item: -item[0].estimate)
+    ]
 
 
-def _scope(correlation: Difference) -> str:
-    """Say what an interval of one network leaves out."""
-    days = "this day" if correlation.days == 1 else "these days"
-    return f" For this network on {days}." if correlation.networks == 1 else ""
+def _status(gap: Difference) -> Status:
+    return "ahead" if gap.above_zero else "behind" if gap.below_zero else "tied"
 
 
-def _compare_by_truth(method: str, lead: Lead, best: Recommended) -> tuple[Outcome, str]:
-    """Judge a method against the strongest control and the other methods."""
-    write, control = partial(write_gap, digits=2), method_name(lead.control).removesuffix(" (control)")
-    if not lead.shows_something:
-        outcome = "does not hold" if lead.gap.below_zero else "undecided"
-        return outcome, f"Not shown to beat every control: its lead over {control} is {write(lead.gap)}."
-    if method != best.method:
-        behind = "Ties with" if method in best.tied else "Behind"
-        return "holds", f"{behind} {method_name(best.method)}, by {write(best.lead_over_methods[method])}."
-    over, ahead = best.lead_over_methods, f"it leads {control}, the strongest control, by {write(lead.gap)}"
-    if best.tied:
-        return "holds", f"First, but not shown to be best: {ahead}, and ties with {listed(_titles(best.tied))}."
-    if over:
-        rival = min(over, key=lambda other: over[other].estimate)
-        ahead += f", and {method_name(rival)}, the next method, by {write(over[rival])}"
-    return "holds", f"Believe it: {ahead}."
-
-
-def _titles(methods: Iterable[str]) -> list[str]:
-    return [method_name(method) for method in methods]
-
-
-def _too_few(trials: int) -> str:
-    few = "one trial is" if trials == 1 else f"{trials} trials are"
-    return f"Not known: {few} too few to tell a method from chance; {FEWEST_UNITS} or more are needed."
-
-
-def _judge_by_removal(name: str, faithful: Faithfulness, truth: Truth | None) -> Iterator[Row]:
+def _judge_by_removal(name: str, faithful: Faithfulness, truth: Truth | None, *, verdict: bool) -> list[MethodRow]:
     """Judge methods by the fills under which they beat chance and the best control, the best method first."""
     scores = {score.key: score for score in faithful.scores}
-    ranked: list[tuple[bool, float, str, list[str], list[str]]] = []
+    ranked: list[tuple[float, MethodRow]] = []
     for method in methods_in_order(score.method for score in faithful.scores if not score.control):
         leads = {
             setting: lead
@@ -275,26 +193,56 @@ def _judge_by_removal(name: str, faithful: Faithfulness, truth: Truth | None) ->
             if (score := scores.get((*setting, method))) and (lead := score.lead_over_controls) is not None
         }
         gain = float(np.mean([scores[*setting, method].srg.estimate for setting in leads])) if leads else -np.inf
-        beaten = [fill_name(*setting) for setting, lead in leads.items() if lead.shows_something]
-        unbeaten = [fill_name(*setting) for setting, lead in leads.items() if not lead.shows_something]
-        ranked.append((len(beaten) > len(unbeaten), gain, method, beaten, unbeaten))
-    ranked.sort(key=lambda item: (not item[0], -item[1]))
-    for place, (most, gain, method, beaten, unbeaten) in enumerate(ranked):
-        outcome: Outcome = "undecided"
-        if faithful.trials < FEWEST_UNITS:
-            sentence = _too_few(faithful.trials)
-        elif not beaten + unbeaten:
-            sentence = "Not known: it was compared with a control under no fill that can judge it."
-        else:
-            outcome = "holds" if most else "undecided" if beaten else "does not hold"
-            best = "Believe it: it beats" if place == 0 and most else "Beats"
-            fills = f"{len(beaten)} of {len(beaten + unbeaten)} fills"
-            except_for = f", not under {listed(unbeaten)}" if unbeaten else ""
-            sentence = f"{best} chance and every control under {fills}{except_for}."
-        number = signed(gain, 3) if np.isfinite(gain) else ""
-        yield Row(
-            claim=method_name(method), subject=input_name(name), outcome=outcome, sentence=sentence, number=number
+        ahead = [fill_name(*setting) for setting, lead in leads.items() if lead.shows_something]
+        status: Status = "ahead" if 2 * len(ahead) > len(leads) else "tied" if ahead else "behind"
+        row = MethodRow(
+            input=name,
+            method=method,
+            score=signed(gain, 3) if leads else UNKNOWN,
+            control="the best under each fill",
+            lead=f"ahead under {len(ahead)} of {number_of(len(leads), 'fill')}",
+            status=status if verdict and leads and faithful.trials >= FEWEST_UNITS else "no verdict",
         )
+        ranked.append((gain, row))
+    return [row for _, row in sorted(ranked, key=lambda item: -item[0])]
+
+
+def answer_trust(rows: Sequence[MethodRow], reasons: Sequence[str | None]) -> str:
+    """Answer in one sentence an input whether its maps can be trusted."""
+    sentences = []
+    for name in dict.fromkeys(row.input for row in rows):
+        of_input = [row for row in rows if row.input == name]
+        ahead = [method_name(row.method) for row in of_input if row.status == "ahead"]
+        rest = [method_name(row.method) for row in of_input if row.status in {"tied", "behind"}]
+        subject = input_name(name)
+        if ahead:
+            sentences.append(
+                f"{subject}: yes, {listed(ahead)}"
+                + (
+                    f"; no, {listed(rest)}, which do no better than a map that knows nothing of the network"
+                    if rest
+                    else ""
+                )
+            )
+        elif rest:
+            sentences.append(f"{subject}: no; no method is ahead of a map that knows nothing of the network")
+        else:
+            sentences.append(f"{subject}: not known")
+    because = [f"{reason[:1].upper()}{reason[1:]}." for reason in dict.fromkeys(filter(None, reasons))]
+    return " ".join([f"{sentence}." for sentence in sentences] + because)
+
+
+def cautions(results: Results) -> tuple[str, ...]:
+    """Return what limits every row of the verdict: few trials, an unsound sample."""
+    choice, sentences = results.study.choice, []
+    if choice is not None and len(choice.trials) < FEWEST_UNITS:
+        sentences.append(
+            f"This study explains {number_of(len(choice.trials), 'trial')}, and fewer than {FEWEST_UNITS} decide "
+            "nothing: below is how explanations are judged, not yet which one to believe."
+        )
+    if choice is not None and not choice.sound:
+        sentences.append(f"{write_sample(choice)} An explanation of a wrong prediction explains the error.")
+    return tuple(sentences)
 
 
 # networks, real touch and the grip

@@ -107,9 +107,7 @@ def choose_frames(
         levels=LEVELS,
         scored_levels=SCORED_LEVELS,
         trials=tuple(candidate.trial for candidate in taken),
-        frames=tuple(
-            replace(frame, shown=frame.trial == best) for candidate in taken for frame in candidate.frames
-        ),
+        frames=tuple(replace(frame, shown=frame.trial == best) for candidate in taken for frame in candidate.frames),
     )
     return replace(choice, summary=_summarise(choice, len(infos)))
 
