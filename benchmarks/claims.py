@@ -13,11 +13,11 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
 
 import numpy as np
-import replica
 import torch
 from jaxtyping import UInt8
 from torch.nn import functional
 
+import replica
 import sliplens as sl
 from sliplens.cli.console import Terminal
 from sliplens.codec import save_record
@@ -63,9 +63,10 @@ def measure_shift(data: Dataset) -> tuple[tuple[ShiftPoint, ...], str]:
             frames, reference = recording.frames[rows], recording.reference
             if shift:
                 both = np.concatenate([frames, reference[None]])
-                *frames, reference = shift_image(both, x_px=shift * np.cos(angle), y_px=shift * np.sin(angle))
+                both = shift_image(both, x_px=shift * np.cos(angle), y_px=shift * np.sin(angle))
+                frames, reference = both[:-1], both[-1]
             for name, network in networks.items():
-                predicted[name][at].append(network.predict(network.encode(np.stack(frames), reference)).numpy())
+                predicted[name][at].append(network.predict(network.encode(frames, reference)).numpy())
 
     def r2(some: list[np.ndarray], trials: np.ndarray) -> float:
         true, values = (np.concatenate([each[trial] for trial in trials]) for each in (labels, some))

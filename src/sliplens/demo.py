@@ -114,7 +114,14 @@ def run_demo(
         show(real_title)
         # the networks of the thesis are for one simulated sensor
         network = networks["difference"] if train_minutes is not None else DIFFERENCE_NETWORK
-        explain(network, real, labels_in_names=True, out=folder / "explain-real", on_progress=on_progress)
+        explain(
+            network,
+            real,
+            method="occlusion",
+            labels_in_names=True,
+            out=folder / "explain-real",
+            on_progress=on_progress,
+        )
     return show()
 
 

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 from command_line import run
 
+from sliplens.errors import InputError
 from sliplens.recordings import Dataset
 from sliplens.results.study import StudyConfig
 from sliplens.study.run import run_study
 
-STAGES = ("evaluate", "explain", "score", "faithfulness", "randomisation", "map-quality", "timing")
+STAGES = ("evaluate", "explain", "score", "faithfulness", "map-quality")
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
     assert run(*words, "-o", output, "--on", "serial") == 0
     folders = {path.name for path in output.iterdir() if path.is_dir() and not path.name.startswith(".")}
     stages = {f"{stage}-{name}" for stage in STAGES for name in ("difference", "pair")}
-    assert folders >= {"choice", "states", *stages}
+    assert folders >= {"choice", "states", "strip", *stages}
     assert (output / "report.html").is_file()
     for name in ("difference", "pair"):
         told = json.loads((output / f"faithfulness-{name}" / "result.json").read_text())
@@ -60,19 +61,16 @@ def test_a_study_makes_every_stage_and_the_page_and_keeps_what_is_there(
             assert methods[1][name][key] == (pytest.approx(figure, rel=1e-5) if isinstance(figure, float) else figure)
 
 
-def test_too_few_trials_are_told_before_a_network_is_loaded(
+def test_data_of_too_few_trials_are_refused_before_a_network_is_loaded(
     fine_dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    notes: list[str] = []
-
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("sliplens.study.run.add_note", notes.append)
     monkeypatch.setattr("sliplens.study.run.load_networks", stop)
+    with pytest.raises(InputError, match="3 test trials of condition dry, and fewer than 5 decide nothing"):
+        run_study(fine_dataset, out=tmp_path / "study")
+    # asked for, they are studied
     with pytest.raises(KeyboardInterrupt):
-        run_study(fine_dataset, out=tmp_path / "study", config=StudyConfig(trials=2))
-    assert notes == [
-        "2 test trials of condition dry: fewer than 5 decide nothing, whatever the page then shows; --trials is 2"
-    ]
+        run_study(fine_dataset, out=tmp_path / "study", config=StudyConfig(trials=3))
     assert not list(tmp_path.iterdir())

@@ -80,7 +80,7 @@ def test_page_needs_nothing_but_itself(text, reader, complete):
 def test_links_of_the_contents_lead_to_sections(reader):
     targets = {attributes.get("id") for _, attributes in reader.tags}
     links = [attributes["href"] for tag, attributes in reader.tags if tag == "a"]
-    assert links == ["#verdict", "#accuracy", "#deletion", "#maps", "#real", "#recipe"]
+    assert links == ["#opening", "#verdict", "#real", "#accuracy", "#deletion", "#maps", "#recipe"]
     assert all(link[1:] in targets for link in links)
 
 

@@ -36,13 +36,13 @@ def test_each_level_gets_the_frame_whose_label_is_nearest(choice: Choice, fine_d
         assert abs(pick.safety_margin - pick.level) == pytest.approx(np.nanmin(np.abs(margin - pick.level)))
 
 
-def test_one_trial_is_shown_whole_and_every_trial_is_scored_at_three_levels(choice: Choice):
+def test_every_trial_has_six_frames_to_look_at_and_three_to_score(choice: Choice):
     shown = [pick for pick in choice.frames if pick.shown]
     assert [pick.level for pick in shown] == [1.0, 0.8, 0.6, 0.4, 0.2, 0.0]
     assert len({pick.trial for pick in shown}) == 1
     scored = [pick for pick in choice.frames if pick.scored]
     assert len(scored) == 3 * len(choice.trials) == 6
-    assert len({pick.id for pick in choice.frames}) == len(choice.frames) == 9
+    assert len({pick.id for pick in choice.frames}) == len(choice.frames) == 12
 
 
 def test_frames_with_nothing_to_explain_are_not_scored(material: Material, choice: Choice):
@@ -86,7 +86,8 @@ def test_of_two_networks_the_worse_decides(network: Network, fine_dataset: Datas
 def test_where_too_few_qualify_the_text_says_what_was_done(network: Network, fine_dataset: Dataset):
     found = choose_frames({"difference": says(network, 0.5)}, fine_dataset, trials=5, tolerance=0.01)
     assert "in 0 of those" in found.summary
-    assert "the 3 read best among the others were taken too" in found.summary
+    assert "the 3 next best were taken too: 0 of the 3 are within 5 points" in found.summary
+    assert found.close == 0
     assert "3 instead of 5" in found.summary
     assert (found.sound, found.qualified_alone) == (False, {"difference": 0})
     enough = choose_frames({"difference": says(network, 0.5)}, fine_dataset, trials=2, tolerance=0.9)

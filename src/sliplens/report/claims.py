@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 
 from sliplens.codec import load_record
 from sliplens.intervals import Difference, mean_interval, paired_difference
-from sliplens.plots.style import UNKNOWN, input_name, method_name, tell_ends
+from sliplens.plots.style import UNKNOWN, input_name, inputs_in_order, method_name, tell_ends
 from sliplens.report.comparisons import AS_RUN, DELETION, compare_errors
 from sliplens.report.results import Results
 from sliplens.report.verdict import MethodRow, Outcome, all_of, judge_gap, judge_methods
@@ -78,15 +78,21 @@ def load_thesis() -> ThesisRecord:
 
 def judge_claims(sample: Results, held_out: Results, *, rng: np.random.Generator) -> tuple[ClaimRow, ...]:
     """Judge every claim: predictions on the test trials, maps on the training trials and, where it says so, on both."""
-    rows = [*_predictions(held_out, rng), *_deletion(sample, "", rng), *_deletion(held_out, ", test trials", rng)]
-    for name in ("difference", "raw"):
-        rows += [*_regions(sample, name, rng), *_looks(sample, name), *_reasoning(held_out, name, rng)]
+    rows = [*_predictions(held_out, rng), *_deletion(sample, "", rng)]
+    if sample is not held_out:
+        rows += _deletion(held_out, ", test trials", rng)
+    for name in inputs_in_order(sample.study.deletion):
+        rows += [*_regions(sample, name, rng), *_looks(sample, name)]
+    for name in inputs_in_order(held_out.study.truth):
+        rows += _reasoning(held_out, name, rng)
     return tuple(rows)
 
 
 def method_rows(held_out: Results) -> tuple[MethodRow, ...]:
     """Rows of every method under the neutral judge."""
-    return tuple(row for name in ("difference", "raw") for row in judge_methods(held_out.study.truth[name]))
+    return tuple(
+        row for name in inputs_in_order(held_out.study.truth) for row in judge_methods(held_out.study.truth[name])
+    )
 
 
 def _row(
@@ -226,8 +232,8 @@ def _deletion(results: Results, where: str, rng: np.random.Generator) -> Iterato
             ends = [float(_scores(of_input[NOISY], at=share).mean()) for share in (0.1, 0.95)]
             why = f"D {ends[0]:.2f} at 10 %, {ends[1]:.2f} at 95 %."
             yield _row("Figs. 9, 18", claim, name, "0.7 throughout", gap, why=why, outcome=outcome)
-    shared = [_shared(curves["raw"][method], curves["difference"][method]) for method in THREE]
-    if all(len(first) for first, _, _ in shared):
+    if {"raw", "difference"} <= set(curves):
+        shared = [_shared(curves["raw"][method], curves["difference"][method]) for method in THREE]
         gap = paired_difference(
             np.mean([first for first, _, _ in shared], axis=0),
             np.mean([second for _, second, _ in shared], axis=0),

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from sliplens.plots.style import input_name, inputs_in_order, listed, method_name
+from sliplens.plots.style import input_name, inputs_in_order, listed
 from sliplens.report import charts, plates, tables
 from sliplens.report.claims import load_thesis
 from sliplens.report.results import Results
@@ -59,7 +59,7 @@ def build_opening(results: Results, rows: Sequence[MethodRow]) -> Opening:
         answer = "Not known: no explanation was scored yet."
     blocks = [
         plates.plate_strip(strip) if strip else None,
-        plates.plate_moved(strip.moved, method_name(strip.method)) if strip and strip.moved else None,
+        plates.plate_moved(strip, strip.moved) if strip and strip.moved else None,
         charts.plate_shift(load_thesis()) if strip and strip.source == "simulated" else None,
         tables.table_methods(rows) if rows else None,
     ]

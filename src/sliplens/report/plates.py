@@ -122,16 +122,18 @@ def plate_strip(strip: Strip) -> Plate:
     )
 
 
-def plate_moved(moved: MovedMarkers, method: str) -> Plate:
+def plate_moved(strip: Strip, moved: MovedMarkers) -> Plate:
     """Draw a frame, and the same drawn anew with the markers that a map ranks first moved back to stick."""
     count = len(moved.from_px)
     few = f"{count} of {moved.markers} markers"
     figure = draw_pictures(
-        [PictureRow(name="camera", pictures=list(moved.pictures))],
+        [PictureRow(name="camera", pictures=[strip.pictures[-1], strip.redrawn[0]])],
         heads=[f"predicted {percent(moved.prediction)}", f"drawn anew:\n{percent(moved.prediction - moved.change)}"],
     )
     for ax in figure.axes:
-        ax.plot(*moved.from_px.T, "o", markersize=5, fillstyle="none", color="white", markeredgewidth=0.8)
+        ax.plot(
+            *zip(*moved.from_px, strict=True), "o", markersize=5, fillstyle="none", color="white", markeredgewidth=0.8
+        )
     return Plate(
         name="moved-markers",
         figure=figure,
@@ -140,9 +142,9 @@ def plate_moved(moved: MovedMarkers, method: str) -> Plate:
         f"points; moving all of them, by {_opposite(moved.change_all)}; {count} random ones, by "
         f"{_opposite(moved.change_random)} (mean of {moved.random_sets} draws). The simulator drew the second picture "
         "anew, and the network predicted it. The circled markers are the fewest that hold half of the evidence in the "
-        f"map of {method}.",
+        f"map of {method_name(strip.method)}.",
         columns=("from_x_px", "from_y_px", "to_x_px", "to_y_px"),
-        rows=rows_of(*moved.from_px.T, *moved.to_px.T),
+        rows=[(*now, *then) for now, then in zip(moved.from_px, moved.to_px, strict=True)],
         pixels=True,
     )
 

@@ -117,9 +117,9 @@ def table_methods(rows: Sequence[MethodRow]) -> CellTable:
     """Tabulate every method beside the best control."""
     return make_table(
         "Every method beside the best control, a map that uses nothing the network learned. Truth: correlation of a "
-        "map's sums over groups of markers with the change of this network's prediction as a group is moved to another "
-        "margin of the trial; on recordings, the symmetric gain of removal in margin units. Ahead or behind: beyond the "
-        "95 % interval over days and trials of one network; tied: neither.",
+        "map's sums over groups of markers with the change of this prediction as a group is moved to another margin of "
+        "the trial; on recordings, the symmetric gain of removal in margin units. Ahead or behind: beyond the 95 % "
+        "interval over days and trials of one network; tied: neither.",
         {
             "Input": lambda row: input_name(row.input),
             "Method": lambda row: method_name(row.method),

@@ -1,7 +1,7 @@
 """Explanations of frames by one or several methods, and a strip of one trial."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal, TypeAlias
@@ -293,11 +293,9 @@ class MovedMarkers:
     random_sets: Annotated[int, AMOUNT]
     markers: Annotated[int, AMOUNT]
     """Markers that lie wholly in the image."""
-    from_px: Float64[np.ndarray, "moved 2"]
-    to_px: Float64[np.ndarray, "moved 2"]
+    from_px: tuple[tuple[float, float], ...]
+    to_px: tuple[tuple[float, float], ...]
     """Places of the moved markers, x and y in camera pixels."""
-    pictures: UInt8[np.ndarray, "2 height width 3"]
-    """The frame, and that drawn anew."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -318,3 +316,7 @@ class Strip(Result):
     baseline: BaselineName = "untouched"
     moved: MovedMarkers | None = None
     """Of the last frame that is shown; None where no stick frame was found or the trial cannot be drawn anew."""
+    redrawn: UInt8[np.ndarray, "redrawn rows_px columns_px 3"] = field(
+        default_factory=lambda: np.zeros((0, 1, 1, 3), dtype=np.uint8)
+    )
+    """That frame drawn anew, or none."""

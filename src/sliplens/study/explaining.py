@@ -358,7 +358,7 @@ def make_strip(
     [(name, maps)] = explain_frames(network, chosen, explainers).relevance.items()
     predicted = (np.where(trusted, values, np.nan).astype(np.float64) for values in (estimate.margin, low, high))
     prediction, low, high = predicted
-    return Strip(
+    strip = Strip(
         trial=recording.trial,
         condition=recording.condition,
         source=source,
@@ -377,7 +377,8 @@ def make_strip(
         pictures=pictures,
         relevance=maps,
         baseline="untouched" if stick is None else "stick",
-        moved=None
-        if folder is None or stick is None
-        else move_markers(network, folder, recording, frame=rows[-1], stick=stick, relevance=maps[-1]),
     )
+    if folder is None or stick is None:
+        return strip
+    proof = move_markers(network, folder, recording, frame=rows[-1], stick=stick, relevance=maps[-1])
+    return strip if proof is None else replace(strip, moved=proof[0], redrawn=proof[1])

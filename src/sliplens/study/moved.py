@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from sliplens.errors import InputError
 from sliplens.explainers.occlusion import marker_regions
@@ -26,10 +26,11 @@ def move_markers(
     frame: int,
     stick: int,
     relevance: Float32[np.ndarray, "size size"],
-) -> MovedMarkers | None:
+) -> tuple[MovedMarkers, UInt8[np.ndarray, "1 height width 3"]] | None:
     """Move the fewest markers that hold half of a map's supporting relevance to the stick frame, and predict again.
 
-    `folder` is that of the data set. As many random markers are moved for comparison. None where the trial cannot be
+    `folder` is that of the data set. As many random markers are moved for comparison. The frame drawn anew is returned
+    beside the record. None where the trial cannot be
     drawn anew, or the map supports the change of the prediction nowhere.
     """
     try:
@@ -48,7 +49,7 @@ def move_markers(
         return drawn, network.predict(network.encode(drawn, recording.reference)).cpu().numpy().astype(np.float64)
 
     count = len(visible)
-    pictures, (now, after_all) = predict(np.stack([np.zeros(count, dtype=bool), np.ones(count, dtype=bool)]))
+    _, (now, after_all) = predict(np.stack([np.zeros(count, dtype=bool), np.ones(count, dtype=bool)]))
     sums = marker_sums(relevance, marker_regions((size, size), centres).numpy(), markers=count)
     supporting = np.clip(sums * np.sign(now - after_all), 0, None)
     if supporting.sum() <= 0:
@@ -61,7 +62,7 @@ def move_markers(
     np.put_along_axis(moved, sets, values=True, axis=1)
     drawn, after = predict(moved)
     chosen = visible[order[:few]]
-    return MovedMarkers(
+    record = MovedMarkers(
         frame=frame,
         prediction=float(now),
         change=float(now - after[0]),
@@ -69,7 +70,7 @@ def move_markers(
         change_random=float(np.mean(now - after[1:])),
         random_sets=RANDOM_SETS,
         markers=count,
-        from_px=film.marker_px[frame][chosen].astype(np.float64),
-        to_px=film.marker_px[stick][chosen].astype(np.float64),
-        pictures=np.stack([pictures[0], drawn[0]]),
+        from_px=tuple((float(x), float(y)) for x, y in film.marker_px[frame][chosen]),
+        to_px=tuple((float(x), float(y)) for x, y in film.marker_px[stick][chosen]),
     )
+    return record, drawn[:1]
