@@ -1,14 +1,16 @@
 """The verdicts flip where the data flips."""
 
+import runpy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sliplens.intervals import Difference
 from sliplens.report import load_results
-from sliplens.report.claims import GRAD_CAM, NOISY, POLY_CAM, ClaimRow, judge_claims, load_thesis
+from sliplens.report.claims import ClaimRow, load_thesis
 from sliplens.report.comparisons import voting_settings, write_gap
 from sliplens.report.opening import build_opening, without_weak
 from sliplens.report.results import Results
@@ -18,6 +20,8 @@ from sliplens.results.explanation import MethodNotes
 
 from .study_results import GAINS, MAP_MEASURES, SPEARMAN, Made, write_choice, write_study
 
+BENCHMARK = SimpleNamespace(**runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "claims.py")))
+GRAD_CAM, NOISY, POLY_CAM = BENCHMARK.THREE
 THREE = {"grad-cam": GRAD_CAM, "integrated-gradients": NOISY, "poly-cam": POLY_CAM}
 DIFFERENCE, RAW = "Difference images", "Raw images"
 
@@ -60,7 +64,7 @@ def judged(made, rng):
 
     def judge(**options: object) -> dict[tuple[str, str], ClaimRow]:
         results = as_the_thesis(made(Made(**options)))  # pyright: ignore[reportArgumentType]
-        return {(row.claim, row.subject): row for row in judge_claims(results, results, rng=rng)}
+        return {(row.claim, row.subject): row for row in BENCHMARK.judge_claims(results, results, rng=rng)}
 
     return judge
 
