@@ -24,10 +24,18 @@ from sliplens.codec import save_record
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots.style import UNKNOWN, input_name, inputs_in_order, method_name, tell_ends
 from sliplens.recordings import Dataset
-from sliplens.report.claims import ClaimRow, ShiftPoint, ThesisRecord
 from sliplens.report.comparisons import AS_RUN, DELETION, compare_errors
 from sliplens.report.results import Results, load_results
-from sliplens.report.verdict import MethodRow, Outcome, all_of, judge_gap, judge_methods
+from sliplens.report.verdict import (
+    ClaimRow,
+    MethodRow,
+    Outcome,
+    ShiftPoint,
+    ThesisRecord,
+    all_of,
+    judge_gap,
+    judge_methods,
+)
 from sliplens.results.faithfulness import CHANCE, DeletionCurve
 from sliplens.results.study import QUICK_METHODS, MarkerEffects, StudyConfig
 

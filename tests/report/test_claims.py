@@ -10,12 +10,21 @@ import pytest
 
 from sliplens.intervals import Difference
 from sliplens.report import load_results
-from sliplens.report.claims import ClaimRow, load_thesis
 from sliplens.report.comparisons import voting_settings, write_gap
 from sliplens.report.opening import build_opening, without_weak
 from sliplens.report.results import Results
 from sliplens.report.sections import build_sections
-from sliplens.report.verdict import MethodRow, all_of, answer_trust, cautions, judge_gap, judge_study, why_no_verdict
+from sliplens.report.verdict import (
+    ClaimRow,
+    MethodRow,
+    all_of,
+    answer_trust,
+    cautions,
+    judge_gap,
+    judge_study,
+    load_thesis,
+    why_no_verdict,
+)
 from sliplens.results.explanation import MethodNotes
 
 from .study_results import GAINS, MAP_MEASURES, SPEARMAN, Made, write_choice, write_study

@@ -13,10 +13,10 @@ from sliplens.grip.records import Grip
 from sliplens.plots import errors, style
 from sliplens.plots.margins import plot_grip
 from sliplens.progress import number_of
-from sliplens.report.claims import ThesisRecord
 from sliplens.report.comparisons import settings
 from sliplens.report.plates import Plate, rows_of
 from sliplens.report.results import Results
+from sliplens.report.verdict import ThesisRecord
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, is_control
 
 _FEW = 4  # charts in a row

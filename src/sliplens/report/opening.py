@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 
 from sliplens.plots.style import input_name, inputs_in_order, listed
 from sliplens.report import charts, plates, tables
-from sliplens.report.claims import load_thesis
 from sliplens.report.results import Results
-from sliplens.report.verdict import MethodRow, answer_trust, test_r2, why_no_verdict
+from sliplens.report.verdict import MethodRow, answer_trust, load_thesis, test_r2, why_no_verdict
 
 SHOWN_R2 = 0.5
 """R2 on test trials below which a network's maps are not shown."""

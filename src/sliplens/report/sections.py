@@ -7,9 +7,9 @@ from typing import ClassVar, Literal
 from sliplens.plots.style import fill_name, input_name, inputs_in_order, listed, method_name, name_methods
 from sliplens.progress import number_of
 from sliplens.report import charts, plates, tables
-from sliplens.report.claims import load_thesis
 from sliplens.report.comparisons import write_sample
 from sliplens.report.results import Results
+from sliplens.report.verdict import load_thesis
 from sliplens.results.explanation import BASELINES
 from sliplens.results.study import TESTS
 

@@ -21,7 +21,6 @@ from sliplens.plots.style import (
     signed,
 )
 from sliplens.progress import number_of
-from sliplens.report.claims import ThesisRecord
 from sliplens.report.comparisons import (
     ACCURACY,
     DELETION,
@@ -35,7 +34,7 @@ from sliplens.report.comparisons import (
     write_units,
 )
 from sliplens.report.results import Results
-from sliplens.report.verdict import MethodRow
+from sliplens.report.verdict import MethodRow, ThesisRecord
 from sliplens.results.faithfulness import (
     CHANCE,
     DeletionScores,

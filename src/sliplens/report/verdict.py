@@ -2,13 +2,15 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from importlib.resources import as_file, files
 from itertools import combinations
 from typing import ClassVar, Literal
 
 import numpy as np
 from scipy.stats import binomtest
 
+from sliplens.codec import load_record
 from sliplens.intervals import FEWEST_UNITS, Difference
 from sliplens.plots.style import (
     UNKNOWN,
@@ -323,3 +325,49 @@ def _judge_grip(results: Results) -> Iterator[Row]:
         number=f"{percent(dropped / count, digits=1)} fell",
         interval="" if count == 1 else f"{percent(low, digits=1)} to {percent(high, digits=1)}",
     )
+
+
+# the claims of the thesis, as they come with the package (`python benchmarks/claims.py`)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClaimRow:
+    """A claim of the thesis with its number, ours, and what follows."""
+
+    source: str
+    """Table or figure of the thesis."""
+    claim: str
+    subject: str
+    thesis: str
+    ours: str
+    """Estimate and 95 % interval."""
+    outcome: Outcome
+    why: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShiftPoint:
+    """R2 of the networks on test trials seen by a shifted camera."""
+
+    shift_px: float
+    r2: dict[str, tuple[float, float, float]]
+    """Estimate and ends of the 95 % interval, by input."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThesisRecord:
+    """Results on the networks of the thesis that come with the package."""
+
+    sample: str
+    claims: tuple[ClaimRow, ...]
+    methods: tuple[MethodRow, ...]
+    """Of the test trials."""
+    shift: tuple[ShiftPoint, ...]
+    shift_frames: str
+
+
+@cache
+def load_thesis() -> ThesisRecord:
+    """Load the record that comes with the package."""
+    with as_file(files("sliplens.report") / "thesis.json") as path:
+        return load_record(path, ThesisRecord, command="python benchmarks/claims.py")

@@ -57,7 +57,7 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.results.explanation import BASELINES, Explanation, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, part
 from sliplens.study.choice import study_explainers, without_markers
-from sliplens.study.moved import move_markers
+from sliplens.study.neutral import move_markers
 from sliplens.study.stages import MakeRecord, Stage
 
 
