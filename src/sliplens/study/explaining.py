@@ -57,7 +57,7 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.results.explanation import BASELINES, Explanation, Strip, StripReadings, load_explanation
 from sliplens.runner import Part, part
 from sliplens.study.choice import study_explainers, without_markers
-from sliplens.study.neutral import move_markers
+from sliplens.study.neutral import prove_map
 from sliplens.study.stages import MakeRecord, Stage
 
 
@@ -333,7 +333,7 @@ def make_strip(
 
     `source` is `simulated` or `real`. Without a stick frame the baseline is the untouched sensor. A method by
     marker becomes one by tile where no markers are found. `folder` is that of the simulated data set whose trial it is:
-    the last of the frames is then drawn anew with markers moved back to the stick frame (`move_markers`).
+    the last of the frames is then drawn anew with markers moved back to the stick frame (`prove_map`).
     """
     margin = require_labels(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
     rows = tuple(sorted({nearest_frame(margin, level) for level in levels}))
@@ -380,5 +380,5 @@ def make_strip(
     )
     if folder is None or stick is None:
         return strip
-    proof = move_markers(network, folder, recording, frame=rows[-1], stick=stick, relevance=maps[-1])
+    proof = prove_map(network, folder, recording, frame=rows[-1], stick=stick, relevance=maps[-1])
     return strip if proof is None else replace(strip, moved=proof[0], redrawn=proof[1])

@@ -83,7 +83,7 @@ def split_half_reliability(
 RANDOM_SETS = 20
 
 
-def move_markers(
+def prove_map(
     network: Network,
     folder: Path,
     recording: Recording,
