@@ -23,7 +23,7 @@ help: ## list these targets
 install: $(INSTALLED) ## set up .venv with the pinned packages and sliplens itself
 
 demo: $(INSTALLED) ## have a first look, in minutes: runs/demo/report.html
-	$(BIN)/sliplens demo runs/demo --on processes=2
+	$(BIN)/sliplens demo runs/demo
 
 test: $(INSTALLED) ## run the tests on all cores; the last line says how long they took
 	$(BIN)/pytest --durations 10
