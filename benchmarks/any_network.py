@@ -41,7 +41,11 @@ def build(name: str, *, seed: int) -> torch.nn.Module:
     """Build an architecture with one output and random weights."""
     torch.manual_seed(seed)
     size = {"image_size": SIZE_PX} if name.startswith("vit") else {}
-    return torchvision.models.get_model(name, weights=None, num_classes=1, **size).eval()
+    module = torchvision.models.get_model(name, weights=None, num_classes=1, **size).eval()
+    for layer in module.modules():
+        if isinstance(layer, torch.nn.Linear) and layer.out_features == 1:
+            layer.reset_parameters()  # that of ViT is zero
+    return module
 
 
 def compare_with_captum(module: torch.nn.Module, images: torch.Tensor) -> float:
