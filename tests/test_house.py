@@ -27,13 +27,13 @@ def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
     "lines": 43_010,
-    "modules": 175,
+    "modules": 174,
     "riddles_per_1000": 0.35,
     "vague_docstrings": 0,
     "most_parameters": 12,
-    "functions_with_on_progress": 19,
-    "functions_with_out": 23,
-    "functions_with_overwrite": 23,
+    "functions_with_on_progress": 18,
+    "functions_with_out": 22,
+    "functions_with_overwrite": 22,
     "functions_with_device": 20,
     "names_defined_twice": 0,
     "dicts_across_functions": 0,
