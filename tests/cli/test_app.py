@@ -40,8 +40,8 @@ def test_every_command_has_a_call_and_every_call_a_command():
     calls = {COMMANDS[name].function.rpartition(":")[2] for name in COMMANDS} - {"shipped_profiles"}
     public = {name for name in sliplens.__all__ if inspect.isfunction(getattr(sliplens, name))}
     assert calls <= public
-    # `load*` and `plot` give a value to go on with; corrections are drafted by `label --draft`
-    assert public - calls == {"load", "load_dataset", "plot", "draft_corrections"}
+    # `load*`, `wrap` and `plot` give a value to go on with; corrections are drafted by `label --draft`
+    assert public - calls == {"load", "load_dataset", "wrap", "plot", "draft_corrections"}
 
 
 @NAMED

@@ -32,7 +32,7 @@ MISTAKES = {
     "predict NOTHING DATA -o OUT.csv": "the run NOTHING does not exist",
     "predict RUN NOTHING -o OUT.csv": "NOTHING does not exist",
     "predict RUN DATA -o OUT.csv --split exam": "no trial with split exam",
-    "study DATA -o OUT --network RUN chromatouch-difference": "two networks read the input difference",
+    "study DATA -o OUT --network RUN chromatouch-difference --trials 4": "two networks read the input difference",
     "study DATA -o OUT --method guess": "no method named 'guess'",
     "study DATA -o OUT --random-orders 0": "at least 1",
     "study DATA -o OUT --on cloud": "no executor named 'cloud'",

@@ -95,4 +95,4 @@ def test_withholding_by_the_errors_themselves_is_best_and_by_chance_gains_nothin
     # of an exponential with mean m, what lies below its quantile q has the mean m (1 + (1 - q) ln(1 - q) / q)
     assert found.error_at("perfect", 0.8) == pytest.approx(0.1 * (1 + 0.2 * np.log(0.2) / 0.8), rel=0.1)
     assert found.error_at("known", 0.5) == pytest.approx(errors.mean(), rel=0.1)
-    assert str(found).startswith(f"mean error {100 * errors.mean():.1f} points; with a fifth of the frames withheld ")
+    assert f"{100 * errors.mean():.1f} points" in str(found)

@@ -153,8 +153,10 @@ def frames_from_arrays(
     if not len(frames):
         raise ImageError("there is no frame to explain; give one at least")
     network.require_frame_size(frames.shape[1:3])
+    # images of other sources than a sensor are independent, frames of a sensor are of one trial
+    of_images = isinstance(network, WrappedNetwork)
     encoding, image_size = network.encoding, network.manifest.image_size
-    if reference is None and encoding.compares and not encoding.empty_is_black:
+    if reference is None and not encoding.empty_is_black and (encoding.compares or not of_images):
         raise InputError(
             f"a network on {encoding.name} images needs the untouched sensor; give it as reference, on the command "
             "line with --reference IMAGE"
@@ -183,12 +185,10 @@ def frames_from_arrays(
         return [markers_in_frame(frame, image_size=image_size) for frame in frames]
 
     ids = tuple(f"frame-{number:04d}" for number in range(len(frames)))
-    # images of other sources than a sensor are independent, frames of a sensor are of one trial
-    independent = isinstance(network, WrappedNetwork) and reference is None
     return ChosenFrames(
         ids=ids,
         day=(1,) * len(frames),
-        trial=ids if independent else ("frames",) * len(frames),
+        trial=ids if of_images and reference is None else ("frames",) * len(frames),
         condition=("unknown",) * len(frames),
         safety_margin=np.full(len(frames), np.nan, dtype=np.float32),
         images=images,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import torch
+from torch import nn
 
 from sliplens.codec import load_result, save_record, save_result
 from sliplens.errors import InputError
@@ -69,7 +70,7 @@ from sliplens.study.stages import Stage
 from sliplens.study.truth import TRUE_FILL, JudgingByTruth, true_curves
 from sliplens.training.evaluation import evaluate
 
-NetworkLike: TypeAlias = Network | Path | str
+NetworkLike: TypeAlias = Network | nn.Module | Path | str
 
 
 def run_study(
@@ -181,7 +182,7 @@ def run_study(
 
 def load_networks(networks: NetworkLike | Sequence[NetworkLike], *, device: str = "cpu") -> dict[str, Network]:
     """Load the networks of a study by their inputs, in one order whatever order they were named in."""
-    several = [networks] if isinstance(networks, Network | Path | str) else networks
+    several = [networks] if isinstance(networks, Network | nn.Module | Path | str) else networks
     by_input: dict[str, Network] = {}
     for run in (open_run(network, device=device) for network in several):
         if by_input.setdefault(run.encoding.name, run) is not run:
