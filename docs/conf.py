@@ -142,8 +142,9 @@ def complete_docstring(_app: Sphinx, what: str, name: str, thing: object, _optio
     if what == "module" and isinstance(thing, ModuleType):
         names = [
             one
-            for one in sorted(thing.__all__)
-            if inspect.isroutine(getattr(thing, one)) or inspect.isclass(getattr(thing, one))
+            for one in sorted(getattr(thing, "__all__", [name for name in vars(thing) if not name.startswith("_")]))
+            if (inspect.isroutine(getattr(thing, one)) or inspect.isclass(getattr(thing, one)))
+            and getattr(getattr(thing, one), "__module__", "").startswith("sliplens")
         ]
         lines += [".. autosummary::", "   :nosignatures:", "", *(f"   {one}" for one in names), ""]
     # examples name a class by the shortest path that leads to it, whether or not it is exported there
