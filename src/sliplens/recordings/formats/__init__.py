@@ -17,6 +17,7 @@ from sliplens.recordings.formats.gelsight import is_gelsight, read_gelsight
 from sliplens.recordings.formats.images import read_image_folder
 from sliplens.recordings.formats.lerobot import read_lerobot
 from sliplens.recordings.formats.rosbag import read_rosbag
+from sliplens.recordings.formats.stills import find_states, read_stills
 from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.formats.thesis import is_thesis_list, read_thesis
 from sliplens.recordings.formats.video import read_video
@@ -66,6 +67,12 @@ _ROWS = {
         recognises=is_gelsight,
         takes=("frame_rate",),
         read=read_gelsight,
+    ),
+    "stills": Reader(
+        words="table of labelled stills: a column of files, and forces",
+        recognises=lambda path: find_states(path) is not None,
+        takes=("image_root", "force_columns", "force_unit"),
+        read=read_stills,
     ),
     "images": Reader(
         words="folder of images, with a table of forces",

@@ -96,12 +96,17 @@ def common_size(paths: tuple[Path, ...]) -> tuple[int, int]:
 _NAME_COLUMNS = ("file", "filename", "file_name", "image", "image_name", "frame", "path", "name")
 
 
+def guess_name_column(header: Sequence[str]) -> str | None:
+    """Find the column that holds names of images by its name; None if there is none."""
+    return next((name for name in header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
+
+
 def read_frame_times(
     path: Path, images: Sequence[Path]
 ) -> tuple[tuple[Path, ...], Float[np.ndarray, " frames"], list[str]]:
     """Sort images by a table with names of files and times; return them, their times, and notes."""
     table = open_text_table(path)
-    name_column = next((name for name in table.header if name.lower().replace(" ", "_") in _NAME_COLUMNS), None)
+    name_column = guess_name_column(table.header)
     if name_column is None:
         columns = ", ".join(map(repr, table.header))
         raise RecordingError(f"{path} has no column with the names of images among {columns}; call it file")

@@ -47,6 +47,7 @@ _AXES = {
     **{axis: rf"f(orce)?_?{axis}" for axis in "xyz"},
     "normal": r"f_?n|normal(_?force)?|force_normal",
     "tangential": r"f_?t|(tangential|shear)(_?force)?|force_(tangential|shear)",
+    "shear": r"(tangential|shear)(_force)?_[xyz]",
 }
 """Ends of the names of columns with a force along an axis, in lower case with underscores between words."""
 
@@ -190,9 +191,9 @@ def guess_force_columns(header: Sequence[str], *, path: Path) -> tuple[str, ...]
         words = _words(name)
         if axis := _axis(words) or _axis(words[:-1]):  # the last word may be a unit
             columns[axis].append(name)
-    for axes in (("x", "y", "z"), ("normal", "tangential")):
+    for axes in (("x", "y", "z"), ("shear", "normal"), ("normal", "tangential")):
         names = [name for axis in axes for name in columns[axis]]
-        if all(columns[axis] for axis in axes) and len(names) == len(axes):
+        if all(columns[axis] for axis in axes) and len(names) == (2 if "tangential" in axes else 3):
             return tuple(names)
     looks = "has no columns that look like forces, one an axis (fx, fy, fz or fn, ft),"
     raise RecordingError(f"{path} {looks} among {_quote(header)}; name them with --force-columns")
@@ -259,15 +260,37 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
         time_name, by_name = guess_time_column(table.header, path=path), "by its name"
     else:
         time_name, by_name = find_column(table, options.time_column, option="--time-column"), "declared"
+    names, by_names = choose_force_columns(table, options)
+    numbers, lines, notes = read_numbers(table, (time_name, *names), complete=1)
+    time_s, in_time = scale_times(numbers[:, 0], lines, path=path, column=time_name, unit=options.time_unit)
+    force_n, words = scale_forces(numbers[:, 1:], lines, names, options, path=path)
+    notes = (
+        f"{path.name}: times are those of column {time_name!r} ({by_name}), in {in_time}.",
+        f"{path.name}: forces are those of {_quote(names)} as {words[0]} ({by_names}), {words[1]}.",
+        *notes,
+    )
+    return Forces(time_s=time_s, force_n=force_n, source=str(path)), notes
+
+
+def choose_force_columns(table: TextTable, options: ReadOptions) -> tuple[tuple[str, ...], str]:
+    """Return the columns of a table with forces, and how they are known."""
     if options.force_columns is None:
-        names, by_names = guess_force_columns(table.header, path=path), "by their names"
-    else:
-        by_names = "declared"
-        names = tuple(find_column(table, name, option="--force-columns") for name in options.force_columns)
-        if len(names) not in {2, 3} or len(set(names)) < len(names):
-            raise RecordingError(f"columns {_quote(names)} are no force; name each of x, y, z, or normal, tangential")
-    time, forces, lines, decimal_comma = _read_numbers(table, time_name, names)
-    time_s, in_time = scale_times(time, lines, path=path, column=time_name, unit=options.time_unit)
+        return guess_force_columns(table.header, path=table.path), "by their names"
+    names = tuple(find_column(table, name, option="--force-columns") for name in options.force_columns)
+    if len(names) not in {2, 3} or len(set(names)) < len(names):
+        raise RecordingError(f"columns {_quote(names)} are no force; name each of x, y, z, or normal, tangential")
+    return names, "declared"
+
+
+def scale_forces(
+    forces: Float[np.ndarray, "rows columns"],
+    lines: Sequence[int],
+    names: Sequence[str],
+    options: ReadOptions,
+    *,
+    path: Path,
+) -> tuple[Float[np.ndarray, "rows 3"], tuple[str, str]]:
+    """Convert forces of columns to newtons along x, y, z; return also words for the axes and the units."""
     if options.force_unit is not None:
         units, how_force = [require_unit(options.force_unit, quantity="force")] * len(names), "declared"
     else:
@@ -284,27 +307,21 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     if len(names) == 2:  # z points into the gel; the tangential force has no direction
         axes = "normal (laid along z), tangential (laid along x)"
         forces = np.stack([forces[:, 1], np.zeros(len(forces)), forces[:, 0]], axis=1)
-    in_units = f"in {', '.join(dict.fromkeys(units))} ({how_force})"
-    notes = (
-        f"{path.name}: times are those of column {time_name!r} ({by_name}), in {in_time}.",
-        f"{path.name}: forces are those of {_quote(names)} as {axes} ({by_names}), {in_units}.",
-        *([f"{path.name}: commas were read as decimal points."] if decimal_comma else []),
-    )
-    return Forces(time_s=time_s, force_n=np.ascontiguousarray(forces), source=str(path)), notes
+    return np.ascontiguousarray(forces), (axes, f"in {', '.join(dict.fromkeys(units))} ({how_force})")
 
 
-def _read_numbers(
-    table: TextTable, time_name: str, names: Sequence[str]
-) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows columns"], array, bool]:
-    """Read times and forces, the line of each row, and True where decimals have commas."""
-    places = [table.header.index(name) for name in (time_name, *names)]
+def read_numbers(
+    table: TextTable, names: Sequence[str], *, complete: int = 0
+) -> tuple[Float[np.ndarray, "rows columns"], array, tuple[str, ...]]:
+    """Read columns of a table as numbers, the line of each row, and notes; the first `complete` may lack no value."""
+    places = [table.header.index(name) for name in names]
     values, lines, commas, points = array("d"), array("q"), False, False
     for line, cells in table.rows:
         lines.append(line)
-        for place in places:
+        for number, place in enumerate(places):
             cell = cells[place]
             commas, points = commas or "," in cell, points or "." in cell
-            if place != places[0] and cell.lower() in _LACKING:
+            if number >= complete and cell.lower() in _LACKING:
                 values.append(nan)
             else:
                 values.append(to_number(cell, path=table.path, line=line, column=table.header[place]))
@@ -313,7 +330,7 @@ def _read_numbers(
     if commas and points:
         raise RecordingError(f"{table.path} mixes decimal commas and points; write all numbers in one way")
     numbers = np.frombuffer(values, dtype=np.float64).reshape(-1, len(places))
-    return numbers[:, 0], numbers[:, 1:], lines, commas
+    return numbers, lines, (f"{table.path.name}: commas were read as decimal points.",) if commas else ()
 
 
 def place_on_clock(

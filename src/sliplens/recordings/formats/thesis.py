@@ -45,7 +45,7 @@ def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
     if not len(frames) == len(references) == len(margins):
         counts = f"{len(references)} references and {margins_list.name} {len(margins)} margins"
         raise RecordingError(f"{frames_list} has {len(frames)} frames, {references_list.name} {counts}; give as many")
-    find = partial(_find_image, folder=frames_list.parent, root=options.image_root or frames_list.parent)
+    find = partial(find_image, folder=frames_list.parent, root=options.image_root or frames_list.parent)
     trials: dict[Path, dict[Path, float]] = {}
     for (number, frame), (at, reference), margin in zip(frames, references, margins.tolist(), strict=True):
         rows = trials.setdefault(find(reference, f"{references_list}, line {at}"), {})
@@ -83,7 +83,7 @@ def _read_lines(path: Path) -> list[tuple[int, str]]:
     raise RecordingError(f"{path} is empty; list one entry a line")
 
 
-def _find_image(listed: str, where: str, *, folder: Path, root: Path) -> Path:
+def find_image(listed: str, where: str, *, folder: Path, root: Path) -> Path:
     """Find the file of a list at its path, which must stay in the root, or under the root by its last parts."""
     if Path(listed).is_absolute() and _is_file(Path(listed)):
         return Path(listed)

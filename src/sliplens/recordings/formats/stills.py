@@ -1,0 +1,112 @@
+"""Stills under known forces: a table with a column of files, a row an image."""
+
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from sliplens.errors import RecordingError
+from sliplens.recordings.capture import Capture, Forces
+from sliplens.recordings.formats.images import common_size, guess_name_column, read_frame
+from sliplens.recordings.formats.tables import (
+    TextTable,
+    choose_force_columns,
+    open_text_table,
+    read_numbers,
+    scale_forces,
+    trial_name,
+)
+from sliplens.recordings.formats.thesis import find_image
+from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.trial import ContactState, labels_of_margins
+
+_SUFFIXES = frozenset({".csv", ".tsv", ".txt"})
+_LEAST_FORCE_N = 1e-9  #: Forces below it are none: the sensor is untouched.
+
+
+def find_states(path: Path) -> Path | None:
+    """Find the table of stills that a path is, or the only one in a folder: a column of files, forces beside it."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    tables = [file for file in files if file.suffix.lower() in _SUFFIXES and file.is_file() and _lists_stills(file)]
+    return tables[0] if len(tables) == 1 else None
+
+
+def _lists_stills(path: Path) -> bool:
+    """Return True for a table whose first row names an image that exists; a number of a frame is no file."""
+    with suppress(RecordingError, OSError):
+        table = open_text_table(path)
+        column, row = guess_name_column(table.header), next(table.rows, None)
+        if column is not None and row is not None:
+            choose_force_columns(table, ReadOptions())
+            find_image(row[1][table.header.index(column)], str(path), folder=path.parent, root=path.parent)
+            return True
+    return False
+
+
+def read_stills(path: Path, options: ReadOptions) -> Capture:
+    """Open the images that a table lists, in its order, each with its forces.
+
+    Stills have no times: they count as one a second. The margin is unknown, for nothing tells the friction. The forces
+    of columns such as `shear_x_n`, `shear_y_n`, `normal_n` become x, y and z, those of `fn`, `ft` become z and x; the
+    first image without any force shows the untouched sensor.
+    """
+    states = path if path.is_file() else find_states(path)
+    if states is None:
+        raise RecordingError(f"{path} has no table of stills, or more than one; name the table itself")
+    table = open_text_table(states)
+    name_column = guess_name_column(table.header)
+    if name_column is None:
+        raise RecordingError(f"{states} has no column with the names of images; call it file")
+    names, how = choose_force_columns(table, options)
+    rows = list(table.rows)
+    numbers, lines, notes = read_numbers(replace(table, rows=iter(rows)), names)
+    force_n, (axes, unit) = scale_forces(numbers, lines, names, options, path=states)
+    root = options.image_root or states.parent
+    images = _find_images(table, name_column, rows, root=root)
+    size = common_size(images)
+    time_s = np.arange(float(len(images)))
+    normal_n, tangential_n = force_n[:, 2], np.hypot(force_n[:, 0], force_n[:, 1])
+    if (normal_n < 0).any():
+        where = f"{states}, line {lines[int(np.argmax(normal_n < 0))]}"
+        raise RecordingError(f"{where}: the normal force is {normal_n.min():.4g} N; give it positive where it presses")
+    untouched = np.flatnonzero(np.abs(force_n).max(axis=1) < _LEAST_FORCE_N)
+    labels = labels_of_margins(np.full(len(images), np.nan))
+    states_of = [
+        ContactState.NO_CONTACT if index in untouched else ContactState.UNKNOWN for index in range(len(images))
+    ]
+    return Capture(
+        trial=trial_name(states.resolve().parent.name),
+        source=str(states),
+        frame_time_s=time_s,
+        frame_size=size,
+        read_frames=partial(map, partial(read_frame, size=size), images),
+        forces=Forces(time_s=time_s, force_n=force_n, source=str(states)),
+        notes=(
+            f"{states.name}: forces are those of {', '.join(map(repr, names))} as {axes} ({how}), {unit}.",
+            f"{states.name}: stills have no times; they count as one a second. Their margins are unknown.",
+            *notes,
+        ),
+        labels=replace(
+            labels,
+            normal_force_n=normal_n,
+            tangential_force_n=tangential_n,
+            contact_state=tuple(states_of),
+        ),
+        reference_index=int(untouched[0]) if len(untouched) else None,
+        files=tuple(image.name for image in images),
+    )
+
+
+def _find_images(table: TextTable, column: str, rows: list[tuple[int, list[str]]], *, root: Path) -> tuple[Path, ...]:
+    """Find the image of each row; the same one twice is an error."""
+    at, lines = table.header.index(column), {}
+    for line, cells in rows:
+        image = find_image(cells[at], f"{table.path}, line {line}", folder=table.path.parent, root=root)
+        if image in lines:
+            raise RecordingError(
+                f"{table.path}, line {line} names {cells[at]!r} again, as line {lines[image]}; drop one"
+            )
+        lines[image] = line
+    return tuple(lines)
