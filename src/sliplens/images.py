@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -17,7 +17,9 @@ from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2, missing_packages
 from sliplens.files import require_file, require_folder
 
-__all__ = ["absolute_difference", "list_images", "read_image", "signed_difference", "write_png"]
+__all__ = ["absolute_difference", "as_frames", "list_images", "read_image", "signed_difference", "write_png"]
+
+Images: TypeAlias = Any  #: Images in memory that `as_frames` takes: an array, a PyTorch tensor, or a list of them.
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
 
@@ -299,7 +301,7 @@ _CURES = {
 """Conversions to 8-bit levels, by NumPy's kind of a type."""
 
 
-def require_rgb(images: np.ndarray, *, what: str = "frames") -> None:
+def require_rgb(images: Images, *, what: str = "frames") -> None:
     """Refuse an array that holds no 8-bit RGB images, one or a batch with the colours on the last axis.
 
     Levels of other types are ambiguous: 1.0 may be white or almost black.
@@ -314,6 +316,46 @@ def require_rgb(images: np.ndarray, *, what: str = "frames") -> None:
             f"the {what} have shape {tuple(images.shape)}, which does not end in (height, width, 3); give RGB images "
             "with the colours on the last axis, a grey one as three equal colours"
         )
+
+
+def as_frames(images: Images, *, what: str = "frames") -> UInt8[np.ndarray, "frames height width 3"]:
+    """Return images in memory as 8-bit RGB frames; their layout is converted, their levels are not.
+
+    Parameters
+    ----------
+    images
+        Array or PyTorch tensor: frames (frames, height, width, 3), or one of them; of a tensor also with the colours
+        first (frames, 3, height, width); or a list of such images.
+
+    Raises
+    ------
+    ImageError
+        If they are none of these, have different sizes, or hold other levels than uint8.
+
+    Examples
+    --------
+    >>> as_frames(np.zeros((24, 32, 3), dtype=np.uint8)).shape
+    (1, 24, 32, 3)
+    >>> as_frames([np.zeros((24, 32, 3), dtype=np.uint8)] * 5).shape
+    (5, 24, 32, 3)
+    """
+    if isinstance(images, list | tuple):
+        parts = [as_frames(image, what=what) for image in images]
+        if not parts:
+            raise ImageError("there is no frame; give one or more")
+        if len(sizes := {part.shape[1:] for part in parts}) > 1:
+            sides = " and ".join(f"{height} x {width}" for height, width, _ in sorted(sizes)[:2])
+            raise ImageError(f"the {what} have different sizes, such as {sides} pixels; give those of one camera")
+        return np.concatenate(parts)
+    if tensor := hasattr(images, "detach"):  # PyTorch, which this module does without
+        images = images.detach().cpu().numpy()
+    if tensor and images.ndim in {3, 4} and images.shape[-1] != 3 == images.shape[-3]:
+        images = np.moveaxis(images, -3, -1)
+    require_rgb(images, what=what)
+    images = images[None] if images.ndim == 3 else images
+    if images.ndim != 4:
+        raise ImageError(f"the {what} have shape {images.shape}; give (frames, height, width, 3)")
+    return images
 
 
 def require_same_size(frames: np.ndarray, reference: np.ndarray) -> None:

@@ -271,7 +271,7 @@ def frames_from_folder(
     network: Network,
     folder: Path,
     *,
-    reference: Path | None = None,
+    reference: Path | str | UInt8[np.ndarray, "height width 3"] | None = None,
     labels_in_names: bool = False,
     sensor: SensorProfile | Path | str | None = None,
     baseline: Baseline | None = "untouched",

@@ -13,6 +13,7 @@ from sliplens._version import __version__
 from sliplens.codec import Result, read_written, regrouped, write_tables
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2, pick
+from sliplens.images import Images
 from sliplens.markers.detect import KINDS
 from sliplens.markers.tracker import Tracker
 from sliplens.markers.tracks import MarkerStatus, TrackedFrame
@@ -20,7 +21,7 @@ from sliplens.progress import OnProgress, add_note, number_of, report_progress, 
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import load_profile
-from sliplens.recordings.source import Frame, Frames, SourceOptions, Trials, open_trials
+from sliplens.recordings.source import Frame, SourceOptions, Trials, open_trials
 from sliplens.runner import MakePart, Work, require_new_table, run_table
 
 OnTracked: TypeAlias = Callable[[Frame, TrackedFrame, Float[np.ndarray, "markers 2"]], None]
@@ -86,7 +87,7 @@ class Tracking(Result):
 
 
 def track(
-    source: Path | str | Frames | Dataset | Sequence[Capture],
+    source: Path | str | Dataset | Sequence[Capture] | Images,
     *,
     markers: str = "auto",
     on: str = "serial",

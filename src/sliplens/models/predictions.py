@@ -19,7 +19,7 @@ from sliplens.codec import TABLE_SUFFIXES, Result, read_written, write_tables
 from sliplens.errors import InputError
 from sliplens.files import DEFAULT_NETWORK, DIFFERENCE_NETWORK, hash_json
 from sliplens.friction import Friction, FrictionLike, as_friction
-from sliplens.images import LEAST_TOUCH, picture_change, soften
+from sliplens.images import LEAST_TOUCH, Images, picture_change, soften
 from sliplens.markers.camera import CAMERA_LIMIT_PX, CAMERA_REASON, CameraWatch
 from sliplens.models.checkpoint import Estimate, Network
 from sliplens.models.engines import Engine, make_engine
@@ -30,7 +30,7 @@ from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE
 from sliplens.recordings.sensor import SensorProfile, load_profile
-from sliplens.recordings.source import Frame, Frames, SourceOptions, Trials, open_trials
+from sliplens.recordings.source import Frame, SourceOptions, Trials, open_trials
 from sliplens.recordings.trial import ContactState
 from sliplens.runner import LONGEST, MakePart, Work, require_new_table, run_table
 from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, range_words
@@ -189,8 +189,8 @@ class _Options(SourceOptions, total=False):
 
 
 def predict(
-    run: Network | nn.Module | Path | str | Frames | Dataset | Sequence[Capture],
-    source: Path | str | Frames | Dataset | Sequence[Capture] | None = None,
+    run: Network | nn.Module | Path | str | Dataset | Sequence[Capture] | Images,
+    source: Path | str | Dataset | Sequence[Capture] | Images | None = None,
     *,
     friction: FrictionLike | None = None,
     sequence: bool = False,

@@ -1,6 +1,8 @@
 """Sources of frames: data sets, folders of images, videos, bags and whatever else a reader opens, or arrays."""
 
 import hashlib
+import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -12,7 +14,7 @@ from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.files import hash_file, hash_json, hash_tree
-from sliplens.images import list_images, read_image, require_rgb
+from sliplens.images import Images, as_frames, is_image, list_images, read_image, require_rgb
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
@@ -31,7 +33,7 @@ Other = TypeVar("Other")
 class SourceOptions(TypedDict, total=False):
     """Parameters of `open_source` that a command passes on."""
 
-    reference: Path | str | Frame | None
+    reference: Path | str | Images | None
     reference_frame: int | None
     split: str | None
     trial: str | None
@@ -41,9 +43,9 @@ class SourceOptions(TypedDict, total=False):
 
 
 def open_source(
-    source: Path | str | Frames | Dataset,
+    source: Path | str | Dataset | Images,
     *,
-    reference: Path | str | Frame | None = None,
+    reference: Path | str | Images | None = None,
     reference_frame: int | None = None,
     split: str | None = None,
     trial: str | None = None,
@@ -57,7 +59,8 @@ def open_source(
     Parameters
     ----------
     source
-        Data set, folder of images, recording, or uint8 RGB frames (frames, height, width, 3).
+        Data set, folder of images, recording, one image, an array in a file (NPY or NPZ), or uint8 frames in memory as
+        `sliplens.images.as_frames` takes them.
     reference, reference_frame
         Untouched sensor: an image, or the number of the frame that shows it. If neither, that of the source.
     split, trial
@@ -196,7 +199,7 @@ class Trials:
 
 
 def open_trials(
-    source: Path | str | Frames | Dataset | Sequence[Capture],
+    source: Path | str | Dataset | Sequence[Capture] | Images,
     *,
     on: str = "serial",
     resumable: bool = True,
@@ -214,7 +217,10 @@ def open_trials(
         return Trials(source=source, options=options, kinds=kinds, rows=rows)
     if on != "serial" and not isinstance(source, Path):
         raise InputError("frames in memory are worked on in this process; name their file or folder, or leave out --on")
-    captures = tuple(open_source(source, **options) if isinstance(source, Path | np.ndarray) else source)
+    if isinstance(source, list | tuple) and source and all(isinstance(each, Capture) for each in source):
+        captures = tuple(source)
+    else:
+        captures = open_source(source, **options)
     if len({capture.name for capture in captures}) < len(captures):
         raise InputError("two of the trials have the same name; give each its own")
     sha256 = hash_tree(source) if resumable and isinstance(source, Path) else ""
@@ -227,23 +233,32 @@ def open_trials(
 
 
 def _read_captures(
-    source: Path | Frames, format: str | None, options: ReadOptions, *, whole: bool
+    source: Path | Images, format: str | None, options: ReadOptions, *, whole: bool
 ) -> Sequence[Capture]:
     own = set(options.given()) <= {"frame_rate"}  # options that frames in memory take
     if isinstance(source, Path):
         # unlike on import, the times of images may stay unknown
-        if whole or not own or (format or recognise(source)) != "images":
+        if format is None and source.suffix.lower() in _ARRAYS and source.is_file():
+            return [
+                replace(capture, trial=trial_name(source.stem), source=str(source))
+                for capture in _read_captures(
+                    as_frames(_load_array(source), what=f"frames of {source}"), None, options, whole=whole
+                )
+            ]
+        single = format is None and is_image(source)
+        if whole or not own or not (single or (format or recognise(source)) == "images"):
             return open_captures(source, format=format, options=options)
-        paths = list_images(source)
-        name, where, count, size = trial_name(source.resolve().name), str(source), len(paths), frame_size(paths[0])
+        paths = [source] if single else list_images(source)
+        name = trial_name(source.stem if single else source.resolve().name)
+        where, count, size = str(source), len(paths), frame_size(paths[0])
         files = tuple(path.name for path in paths)
 
         def read() -> Iterator[Frame]:
             return (read_frame(path, size=size) for path in paths)
     else:
+        source = as_frames(source)
         if not len(source):
             raise InputError("there is no frame; give one or more")
-        require_rgb(source)
         if not own:
             flags = option_flags(name for name in options.given() if name != "frame_rate")
             raise InputError(f"{Capture.opened} do not take {flags}; leave it out")
@@ -255,6 +270,34 @@ def _read_captures(
     rate = options.frame_rate
     time_s = np.full(count, np.nan) if rate is None else evenly_spaced(count, frame_rate=rate)
     return [Capture(trial=name, source=where, frame_time_s=time_s, frame_size=size, read_frames=read, files=files)]
+
+
+_ARRAYS = frozenset({".npy", ".npz"})
+
+
+def _load_array(path: Path) -> np.ndarray:
+    """Read the frames of a NumPy file: its only array, or the one named frames or images; no pickle is opened."""
+    try:
+        if path.suffix.lower() == ".npy":
+            return np.load(path, mmap_mode="r", allow_pickle=False)
+        # a stream of ours: NumPy leaves its own open where an archive is damaged
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            names = [name for name in stored.files if name in {"frames", "images"} or len(stored.files) == 1]
+            if len(names) == 1:
+                return stored[names[0]]
+            count = len(stored.files)
+    except (
+        OSError,
+        ValueError,
+        EOFError,
+        MemoryError,
+        SyntaxError,
+        TypeError,
+        zlib.error,
+        zipfile.BadZipFile,
+    ) as error:
+        raise RecordingError(f"{path} cannot be read as a NumPy array ({error}); save it again") from None
+    raise RecordingError(f"{path} holds {number_of(count, 'array')}; name that of the frames 'frames'")
 
 
 def _require_usual(capture: Capture, allowed: Sequence[Budget]) -> None:
@@ -282,7 +325,7 @@ def _choose_trial(names: Sequence[str], trial: str | None, source: str) -> Seque
     return [names.index(trial)]
 
 
-def _with_reference(trial: Capture, image: Path | str | Frame | None, number: int | None) -> Capture:
+def _with_reference(trial: Capture, image: Path | str | Images | None, number: int | None) -> Capture:
     """Set the image of the untouched sensor; that of the trial stays if neither image nor number is given."""
     if image is None and number is None and trial.reference is None:
         number = trial.reference_index
@@ -292,9 +335,16 @@ def _with_reference(trial: Capture, image: Path | str | Frame | None, number: in
         return replace(trial, reference=None, reference_index=number)
     if image is None:
         return trial
-    pixels = read_image(Path(image)) if isinstance(image, str | Path) else image
+    pixels = read_image(Path(image)) if isinstance(image, str | Path) else _one_frame(image)
     if pixels.shape[:2] != trial.frame_size:
         height, width = trial.frame_size
         sizes = f"{pixels.shape[0]} x {pixels.shape[1]} pixels but the frames of {trial.name} are {height} x {width}"
         raise ImageError(f"the reference is {sizes}; record both with the same camera settings")
     return replace(trial, reference=pixels)
+
+
+def _one_frame(image: Images) -> Frame:
+    frames = as_frames(image, what="levels of the reference")
+    if len(frames) != 1:
+        raise ImageError(f"the reference is {len(frames)} images; give one of the untouched sensor")
+    return frames[0]

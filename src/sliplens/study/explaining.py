@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Literal, TypedDict, Unpack, cast
 
 import numpy as np
-from jaxtyping import UInt8
 from torch import nn
 
 from sliplens.codec import save_result
@@ -38,7 +37,7 @@ from sliplens.explainers.frames import (
 from sliplens.explainers.occlusion import markers_in_recording
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
 from sliplens.files import output_folder, remove
-from sliplens.images import read_image, write_png
+from sliplens.images import Images, as_frames, read_image, write_png
 from sliplens.models import Network
 from sliplens.models.wrapping import Preprocess, open_run
 from sliplens.plots.saliency import draw_explanation, overlay_points
@@ -80,9 +79,9 @@ class Running(TypedDict, total=False):
 
 def explain(
     run: Network | nn.Module | Path | str,
-    source: UInt8[np.ndarray, "batch height width 3"] | Dataset | Path | str,
+    source: Dataset | Path | str | Images,
     *,
-    reference: UInt8[np.ndarray, "height width 3"] | Path | str | None = None,
+    reference: Path | str | Images | None = None,
     baseline: Baseline | Path | str | None = None,
     method: Methods | None = None,
     budget: float | None = None,
@@ -204,8 +203,8 @@ def explain(
 
 def _choose(
     network: Network,
-    source: np.ndarray | Dataset | Path | str,
-    reference: np.ndarray | Path | str | None,
+    source: Dataset | Path | str | Images,
+    reference: Path | str | Images | None,
     select: FrameSelection | None,
     *,
     sensor: SensorProfile | None,
@@ -219,15 +218,16 @@ def _choose(
             raise InputError("a data set's frames went through their profile on import; leave out --sensor")
         selection = select or FrameSelection()
         return frames_from_dataset(network, source, selection, baseline="stick" if baseline is None else baseline)
-    if isinstance(source, np.ndarray):
+    if not isinstance(source, str | Path):
         image = read_image(Path(reference)) if isinstance(reference, str | Path) else reference
-        return frames_from_arrays(network, source, image, baseline="untouched" if baseline is None else baseline)
-    if isinstance(reference, np.ndarray):
-        raise InputError("the reference of a folder is an array; give the path of its image")
+        image = None if image is None else as_frames(image, what="levels of the reference")[0]
+        return frames_from_arrays(
+            network, as_frames(source), image, baseline="untouched" if baseline is None else baseline
+        )
     return frames_from_folder(
         network,
         Path(source),
-        reference=None if reference is None else Path(reference),
+        reference=reference,
         labels_in_names=labels_in_names,
         sensor=sensor,
         baseline=baseline,
