@@ -26,8 +26,8 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 43_010,
-    "modules": 174,
+    "lines": 43_250,
+    "modules": 175,
     "riddles_per_1000": 0.35,
     "vague_docstrings": 0,
     "most_parameters": 12,

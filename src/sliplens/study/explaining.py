@@ -220,7 +220,11 @@ def _choose(
         return frames_from_dataset(network, source, selection, baseline="stick" if baseline is None else baseline)
     if not isinstance(source, str | Path):
         image = read_image(Path(reference)) if isinstance(reference, str | Path) else reference
-        image = None if image is None else as_frames(image, what="levels of the reference")[0]
+        if image is not None:
+            images = as_frames(image, what="levels of the reference")
+            if len(images) != 1:
+                raise InputError(f"the reference has {len(images)} images; give one of the untouched sensor")
+            image = images[0]
         return frames_from_arrays(
             network, as_frames(source), image, baseline="untouched" if baseline is None else baseline
         )
