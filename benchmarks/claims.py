@@ -435,8 +435,7 @@ def main() -> None:
     options = parser.parse_args()
     import replica  # noqa: PLC0415 - beside this file, where tests do not look
 
-    replica.FRAMES = options.frames
-    data = replica.simulate(options.work, seed=0, quiet=options.json)
+    data = replica.simulate(options.work, seed=0, quiet=options.json, frames=options.frames)
     for name, config in STUDIES.items():
         out = options.work / f"study-{name}"
         sl.run_study(data, list(NETWORKS.values()), config, out=out, on=options.on, on_progress=Terminal())

@@ -32,19 +32,19 @@ from sliplens.errors import SliplensError
 from sliplens.recordings import Dataset
 from sliplens.results.evaluation import ScoredFrames
 
-TEST_DAYS, TRIALS_A_DAY, FRAMES = 6, 11, 200
+TEST_DAYS, TRIALS_A_DAY = 6, 11
 LEVELS = np.linspace(0, 1, 6)
 """Margins at which training trials are compared with their labels, as in the thesis."""
 WITHIN = 0.03
 RESAMPLES = 2000
 
 
-def simulate(work: Path, *, seed: int, quiet: bool) -> Dataset:
+def simulate(work: Path, *, seed: int, quiet: bool, frames: int = 200) -> Dataset:
     """Simulate the sensor, three training days and the test days, or load what is there."""
     return sl.simulate(
         work / "data",
         preset="thesis",
-        frames_per_trial=FRAMES,
+        frames_per_trial=frames,
         days=3 + TEST_DAYS,
         test_days=TEST_DAYS,
         dry_trials=(100, 40, 40, *[TRIALS_A_DAY] * TEST_DAYS),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from bounds import least_sigma
 
 from sliplens.errors import ContactError
 from sliplens.simulation import CHROMATOUCH, Nuisances, SimulationRecipe, plan_trials
@@ -9,7 +10,6 @@ from sliplens.simulation.intervention import (
     MARGIN,
     NOISE_PX,
     FilmedTrial,
-    least_sigma,
     marker_readings,
     marker_sensitivity,
     prior_sigma,

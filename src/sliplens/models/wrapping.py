@@ -122,13 +122,12 @@ def wrap(
     device = next(module.parameters(), torch.empty(0)).device
     try:
         with torch.no_grad():
-            answers = model(torch.zeros(2, row.colours, size, size, device=device))
+            model(torch.zeros(2, row.colours, size, size, device=device))
     except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError) as error:
         raise ModelError(
             f"the module does not run on images of shape (2, {row.colours}, {size}, {size}): {error}; set size=, or "
             "preprocess= for what it needs before it"
         ) from error
-    del answers
     return WrappedNetwork(
         model=model,
         manifest=Manifest(

@@ -24,7 +24,8 @@ class Opening:
 
 def without_weak(results: Results) -> tuple[Results, tuple[str, ...]]:
     """Leave out maps of networks that predict too badly to be explained, and say so."""
-    weak = [name for name in results.evaluations if (test_r2(results, name) or 1.0) < SHOWN_R2]
+    scores_of = {name: test_r2(results, name) for name in results.evaluations}
+    weak = [name for name, r2 in scores_of.items() if r2 is not None and r2 < SHOWN_R2]
     if not weak:
         return results, ()
     tables_of = ("explanations", "deletion", "faithfulness", "randomisation", "map_quality", "timing", "truth")

@@ -463,8 +463,16 @@ class Study(Result):
     @property
     def summary(self) -> str:
         """Gain of the best method with each network, in a sentence."""
-        scores = "; ".join(f"{name} images: {record.summary}" for name, record in self.faithfulness.items())
-        return scores or "no method was scored"
+        scores = [f"{name} images: {record.summary}" for name, record in self.faithfulness.items()]
+        for name, truth in self.truth.items():
+            rows = {method: truth.methods.get(method) for method in (self.config or StudyConfig()).methods}
+            judged = {
+                method: row.neutral for method, row in rows.items() if row is not None and row.neutral is not None
+            }
+            best = max(judged, key=lambda method: judged[method].estimate, default=None)
+            if best is not None:
+                scores.append(f"{name} images: correlation of {best} with the effects of markers {judged[best]}")
+        return "; ".join(scores) or "no method was scored"
 
     def to_arrow(self) -> pa.Table:
         """Arrow table of the scores, a row a network, fill, unit and method; gains in margin units."""

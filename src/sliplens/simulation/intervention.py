@@ -158,20 +158,6 @@ def observations(
     return rows, np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
 
 
-def least_sigma(jacobian: Jacobian, unknowns: tuple[str, ...], *, noise_px: float, prior: Mapping[str, float]) -> float:
-    """Compute the least standard deviation of an unbiased estimate of the margin: Cramer and Rao's bound with priors.
-
-    The square root of the margin's entry in (J^T J / sigma^2 + diag(1 / prior^2))^-1, infinite without information.
-    """
-    if wrong := set(prior) - set(unknowns):
-        raise ContactError(f"there is no unknown {sorted(wrong)[0]!r}; choose from {', '.join(unknowns)}")
-    rows, scale = observations(jacobian, unknowns, noise_px, prior)
-    # the part of the margin's column that no nuisance can imitate
-    margin, nuisances = rows[:, 0], (rows / scale)[:, 1:]
-    evidence = np.linalg.norm(margin - nuisances @ np.linalg.lstsq(nuisances, margin, rcond=None)[0])
-    return float(1 / evidence) if evidence > 0 else float("inf")
-
-
 def _sigma(limits: Range) -> float:
     return (limits[1] - limits[0]) / np.sqrt(12)
 

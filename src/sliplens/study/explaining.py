@@ -332,12 +332,14 @@ def make_strip(
     levels: Sequence[float] = MARGIN_LEVELS,
     baseline: Literal["untouched", "stick"] = "stick",
     folder: Path | None = None,
+    seed: int = 0,
 ) -> Strip:
     """Predict every frame of a trial, and explain those nearest to some safety margins in [0, 1].
 
     `source` is `simulated` or `real`. Without a stick frame the baseline is the untouched sensor. A method by
     marker becomes one by tile where no markers are found. `folder` is that of the simulated data set whose trial it is:
-    the last of the frames is then drawn anew with markers moved back to the stick frame (`prove_map`).
+    the last of the frames is then drawn again with markers moved back to the stick frame (`prove_map`, whose random
+    markers `seed` draws).
     """
     margin = require_labels(recording.trial, np.where(recording.labelled, recording.safety_margin, np.nan))
     rows = tuple(sorted({nearest_frame(margin, level) for level in levels}))
@@ -384,5 +386,7 @@ def make_strip(
     )
     if folder is None or stick is None:
         return strip
-    proof = prove_map(network, folder, recording, frame=rows[-1], stick=stick, relevance=maps[-1])
+    proof = prove_map(
+        network, folder, recording, frame=rows[-1], stick=stick, relevance=maps[-1], rng=np.random.default_rng(seed)
+    )
     return strip if proof is None else replace(strip, moved=proof[0], redrawn=proof[1])

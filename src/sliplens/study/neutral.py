@@ -81,6 +81,7 @@ def split_half_reliability(
 
 
 RANDOM_SETS = 20
+"""Sets of random markers that are moved beside those of a map."""
 
 
 def prove_map(
@@ -91,12 +92,12 @@ def prove_map(
     frame: int,
     stick: int,
     relevance: Float32[np.ndarray, "size size"],
+    rng: np.random.Generator,
 ) -> tuple[MovedMarkers, UInt8[np.ndarray, "1 height width 3"]] | None:
     """Move the fewest markers that hold half of a map's supporting relevance to the stick frame, and predict again.
 
-    `folder` is that of the data set. As many random markers are moved for comparison. The frame drawn anew is returned
-    beside the record. None where the trial cannot be
-    drawn anew, or the map supports the change of the prediction nowhere.
+    `folder` is that of the data set. As many random markers are moved for comparison. The new drawing is returned with
+    the record; None where the trial cannot be drawn again, or the map nowhere supports the change of the prediction.
     """
     try:
         film = rebuild_trial(folder, recording).film
@@ -121,7 +122,6 @@ def prove_map(
         return None
     order = np.argsort(-supporting, kind="stable")
     few = 1 + int(np.argmax(np.cumsum(supporting[order]) >= 0.5 * supporting.sum()))
-    rng = np.random.default_rng(0)
     sets = np.stack([order[:few], *(rng.choice(count, few, replace=False) for _ in range(RANDOM_SETS))])
     moved = np.zeros((len(sets), count), dtype=bool)
     np.put_along_axis(moved, sets, values=True, axis=1)

@@ -342,6 +342,7 @@ def _show_trial(records: Records) -> Strip:
         method=method,
         baseline=records.config.baseline,
         folder=records.data.folder if records.data.simulated else None,
+        seed=records.config.seed,
     )
 
 
@@ -459,7 +460,7 @@ STUDY = (
         title="Explaining a trial from stick to slip",
         make=_show_trial,
         needs=("choice",),
-        options=(*_SAMPLE, "methods", "baseline"),
+        options=(*_SAMPLE, "methods", "baseline", "seed"),
         shared=True,
     ),
     Step(
