@@ -81,6 +81,21 @@ def test_real_touch_is_compared_with_the_best_constant(workspace, verdict, label
     assert (row.outcome, row.number) == expected
 
 
+def test_fewer_than_five_trials_decide_nothing(workspace, verdict):
+    def name_one_trial(value):
+        for frame in value["frames"]:
+            frame.update(trial="t0", safety_margin=0.5, prediction=0.5)
+
+    edit(workspace / "maps-raw-real" / "result.json", name_one_trial)
+    assert verdict()["Predicts real touch better than a constant", RAW].outcome == "undecided"
+    path = workspace / "test-raw" / "predictions.parquet"
+    table = pq.read_table(path)
+    replace(path, "trial", ["t0" if name == "wet" else each for name, each in zip(
+        table["condition"].to_pylist(), table["trial"].to_pylist(), strict=True)])  # fmt: skip
+    assert verdict()["Predicts the margin on wet objects", RAW].outcome == "undecided"
+    assert verdict()["Predicts the margin on dry objects", RAW].outcome == "holds"
+
+
 def predictions(error: np.ndarray, *, order: np.ndarray | None = None) -> ScoredFrames:
     trials, frames = error.shape
     rows = np.arange(error.size) if order is None else order

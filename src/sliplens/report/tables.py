@@ -45,7 +45,7 @@ from sliplens.results.faithfulness import (
 )
 from sliplens.results.study import MAP_MEASURES, REGIONS, MapQuality, Randomisation, Timing, Truth
 
-Kind = Literal["name", "number", "best", "thesis", "badge"]
+Kind = Literal["name", "number", "best", "thesis", "outcome"]
 Record = TypeVar("Record")
 _LOOK_NAMES = ("Resolution", "Total variation")
 _TRUTHS = ("oracle", "degraded-oracle")
@@ -122,13 +122,14 @@ def table_methods(rows: Sequence[MethodRow]) -> CellTable:
         {
             "Input": lambda row: input_name(row.input),
             "Method": lambda row: method_name(row.method),
+            "Status": lambda row: Cell(text=row.status, kind="outcome"),
             "Truth": lambda row: row.score,
             "Best control": lambda row: row.control,
             "Lead": lambda row: row.lead,
-            "Status": lambda row: Cell(text=row.status, kind="badge"),
         },
         rows,
         names=2,
+        wrap=True,
     )
 
 
@@ -140,9 +141,9 @@ def table_claims(record: ThesisRecord) -> CellTable:
             "Claim": lambda row: row.claim,
             "Where": lambda row: row.source,
             "Network": lambda row: row.subject,
+            "Outcome": lambda row: Cell(text="open" if row.outcome == "undecided" else row.outcome, kind="outcome"),
             "Its number": lambda row: Cell(text=row.thesis, kind="thesis"),
             "Ours": lambda row: row.ours,
-            "Outcome": lambda row: Cell(text="open" if row.outcome == "undecided" else row.outcome, kind="badge"),
             "Why": lambda row: Cell(text=row.why, kind="name"),
         },
         record.claims,

@@ -92,7 +92,7 @@ def judge_results(results: Results, *, rng: np.random.Generator) -> tuple[Verdic
         (
             "real-touch",
             "Does it carry over to real touch?",
-            "Frames of a real sensor. Holds where the mean error is below that of the best constant prediction.",
+            "Frames of a real sensor. Holds where it beats the best constant prediction on five trials or more.",
             _judge_real_touch(results),
         ),
         (
@@ -256,16 +256,16 @@ def _judge_networks(results: Results, *, rng: np.random.Generator) -> Iterator[R
     # the network of the smallest error first
     for name in sorted(scores, key=lambda name: np.mean([score.mse for score in scores[name].values()])):
         predictions = evaluations[name].predictions
-        trials, days = (len(np.unique(labels)) for labels in (predictions.trial, predictions.day))
         for condition in conditions_in_order(scores[name]):
-            score = scores[name][condition]
+            score, of_condition = scores[name][condition], predictions.condition == condition
+            trials, days = (len(np.unique(every[of_condition])) for every in (predictions.trial, predictions.day))
             useless = score.r2 is not None and score.r2 <= 0
-            worth = ", no better than the mean label" if useless else ""
+            outcome, worth = ("does not hold", ", no better than the mean label") if useless else ("holds", "")
             yield Row(
                 claim=f"Predicts the margin on {condition} objects",
                 subject=input_name(name),
                 # of labels that do not vary there is no R²
-                outcome="undecided" if score.r2 is None else "does not hold" if useless else "holds",
+                outcome=outcome if score.r2 is not None and trials >= FEWEST_UNITS else "undecided",
                 sentence=f"Off by {decimals(100 * score.mae, 1)} percentage points on average{worth}; of one "
                 f"network, over {number_of(trials, 'trial')} of {number_of(days, 'day')}.",
                 number=f"R² {decimals(score.r2, 2)}",
@@ -300,13 +300,14 @@ def _judge_real_touch(results: Results) -> Iterator[Row]:
         labels = np.array([frame.safety_margin for frame in frames], dtype=np.float64)
         error = np.abs(labels - [frame.prediction for frame in frames]).mean()
         constant = np.abs(labels - np.median(labels)).mean()
-        trials = number_of(len({frame.trial for frame in frames}), "trial")
+        trials = len({frame.trial for frame in frames})
+        worth = "holds" if error < constant else "does not hold"
         yield Row(
             claim=claim,
             subject=subject,
-            outcome="holds" if error < constant else "does not hold",
-            sentence=f"Mean error on {number_of(len(frames), 'frame')} of {trials}; the best constant is off by "
-            f"{100 * constant:.0f} points.",
+            outcome="undecided" if trials < FEWEST_UNITS else worth,
+            sentence=f"Mean error on {number_of(len(frames), 'frame')} of {number_of(trials, 'trial')}; the best "
+            f"constant is off by {100 * constant:.0f} points.",
             number=f"{100 * error:.0f} points",
         )
 
