@@ -91,6 +91,8 @@ class SlipState(StrEnum):
     SLIP = "slip"
     STICKING = "no full slip"
     """The contact as a whole does not slide; its rim may (incipient slip)."""
+    WILL_SLIP = "will slip"
+    """It does not slide, but its margin is below `TARGET`, with the whole interval."""
     CANNOT_TELL = "cannot tell"
 
 
@@ -110,6 +112,8 @@ class MarkerReading:
     slipped_s: float | None = None
     """Time since a slip began, in the one frame that confirms it: the load was not let go. Confirmed slips teach
     friction."""
+    fall: float | None = None
+    """Share of its largest value that the mean shear has lost, from 0 to 1, of a grasp that begins pressed."""
 
 
 NO_NETWORK = "no network, so no margin is read; name one with --network"
