@@ -9,6 +9,7 @@ from .grip.episodes import run_episodes as run_episodes
 from .grip.hold import hold_grip as hold_grip
 from .live.loop import LiveReader as LiveReader
 from .live.loop import read_live as read_live
+from .live.slip_clips import evaluate_slip as evaluate_slip
 from .live.viewer import view as view
 from .markers.tracking import track as track
 from .models.checkpoint import load as load

@@ -143,6 +143,19 @@ def test_contacts_of_a_batch_are_read_as_each_alone(rng: np.random.Generator):
                 assert together.shear_px[contact] == pytest.approx(reading.shear_px)
 
 
+@pytest.mark.parametrize("rate_hz", [8, 15, 60])
+def test_a_grasp_that_begins_pressed_slips_where_its_shear_falls_at_any_frame_rate(rate_hz, rng: np.random.Generator):
+    """No untouched frame and no still phase: the first frame is pressed, and the pull begins at once."""
+    frames = np.arange(PULLED, 240, 60 // rate_hz)
+    holds, slips = (play(pull(back), rng=rng)[frames] for back in (0.0, 1.0))
+    assert {SlipState.STICKING} < set(states(watch(holds, holds[0]))) <= {SlipState.STICKING, SlipState.CANNOT_TELL}
+    said = states(watch(slips, slips[0]))
+    assert SlipState.SLIP not in [state for state, frame in zip(said, frames, strict=True) if frame <= SPRUNG]
+    assert said[-1] is SlipState.SLIP
+    # 4 standard deviations of the mean of 49 markers, about 0.03 of the shear, count as noise
+    assert watch(slips, slips[0])[-1].fall == pytest.approx(1 - 3 / pull(1.0)[frames].max(), abs=0.05)
+
+
 @pytest.mark.parametrize("frames", [2.0, 9.0])  # as fast as skin springs back, and by hand
 @pytest.mark.parametrize("share", [0.5, 0.75, 1.0])
 def test_a_pull_that_is_let_go_is_no_confirmed_slip_and_teaches_no_friction(share, frames, rng: np.random.Generator):

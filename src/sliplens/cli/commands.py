@@ -338,6 +338,19 @@ def call_check(call: Any) -> None:
     say(f"{data.folder} is sound: {size}, every hash and law holds")
 
 
+@command("slip", "live.slip_clips:evaluate_slip", "sliplens slip lifts.csv --after 10", ("frame_rate_hz", "--rate"))
+def call_slip(call: Any) -> None:
+    """Print the balanced accuracy of the slip detector and of trivial baselines."""
+    result = call(on_progress=Terminal())
+    slips = sum(clip.slips for clip in result.clips)
+    header = ("method", "balanced accuracy", "low", "high")
+    rows = [
+        (score.method, *(f"{value:.2f}" for value in (score.balanced_accuracy, score.low, score.high)))
+        for score in result.scores
+    ]
+    print_table(f"Slip of {number_of(len(result.clips), 'clip')}, {slips} of which slip", header, rows)
+
+
 @command("compare", "simulation.sharing:compare_datasets", "sliplens compare runs/mine/data runs/other/data")
 def call_compare(call: Any) -> None:
     """Print what two data sets share, or which trials of a data set trained a network."""

@@ -448,12 +448,12 @@ class ShearFall:
     >>> from sliplens.live.slip import ShearFall
     >>> start_px = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), axis=-1).reshape(-1, 2) * 20
     >>> fall = ShearFall(start_px)
-    >>> [fall.update(start_px + [shear_px, 0]) for shear_px in (0.0, 2.0, 2.0, 1.0)]
-    [None, 0.0, 0.0, 0.49]
+    >>> [fall.update(start_px + [shear_px, 0]) for shear_px in (0.0, 4.0, 4.0, 2.0)]
+    [None, None, 0.0, 0.496]
     """
 
     def __init__(self, start_px: Field) -> None:
-        self._start_px, self._last_px = start_px, np.full_like(start_px, np.nan)
+        self._start_px, self._before = start_px, np.full((2, *start_px.shape), np.nan)
         self._noises_px: deque[float] = deque(maxlen=_NOISE_FRAMES)
         self._largest_px = 0.0
 
@@ -464,11 +464,12 @@ class ShearFall:
         if seen.sum() < _FEWEST:
             return None
         mean = moved[seen].mean(axis=0)
-        steps = moved - mean - self._last_px
-        self._last_px = moved - mean
-        steps = steps[np.isfinite(steps[:, 0])]
-        if len(steps) >= _FEWEST:
-            self._noises_px.append(float(np.median(np.abs(steps))) / 0.6745 / np.sqrt(2))
+        # second differences: skin that moves on evenly is no noise
+        bends = moved - mean - 2 * self._before[1] + self._before[0]
+        self._before = np.stack([self._before[1], moved - mean])
+        bends = bends[np.isfinite(bends[:, 0])]
+        if len(bends) >= _FEWEST:
+            self._noises_px.append(float(np.median(np.abs(bends))) / 0.6745 / np.sqrt(6))
         shear_px = float(np.linalg.norm(mean))
         self._largest_px = max(self._largest_px, shear_px)
         if not self._noises_px:

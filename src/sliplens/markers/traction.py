@@ -109,7 +109,7 @@ def _marginal(
 
 def calibrate_traction(
     displacement_px: Float[np.ndarray, "states markers 2"],
-    force_n: Float[np.ndarray, "states 3"],
+    force_n: Float[np.ndarray, "_ 3"],
     *,
     largest_ratio: float = 1.0,
 ) -> TractionModel:
