@@ -11,7 +11,8 @@ training, as if as many slipped as held in either part: knowing which part a cli
 answer still depends on length is measured by cutting clips.
 
 Objects are left out one at a time (for the network in folds); intervals are of 95 %, from drawing objects again.
-Balanced accuracy and F1 (of slip) are of clips; `grasps` joins both fingers. Whatever lies in folders laid out alike,
+Balanced accuracy and F1 (of slip) are of clips; `grasps` joins both fingers, and so do `balanced_accuracy`, `low` (the
+lower end of its interval) and `frame_count_alone` at the top. Whatever lies in folders laid out alike,
 with a table of the same columns, can be measured with --clips and --labels.
 
 Rest jitter is measured where the picture says that the sensor is still. The clips are compressed: between key frames,
@@ -26,6 +27,7 @@ import json
 import os
 import shutil
 import tempfile
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -56,6 +58,7 @@ _CONTACT_PX = 1.0
 _SOON = 5  # frames
 _RIDGE = 1.0
 _DRAWS = 2000
+_STILL = 0.003  # pitches, of motion that is noise
 _CUT = 60
 """Frames that clips of full length are cut to: about what a short one has."""
 _SHOWN = Console(stderr=True)  # what is printed is the result alone
@@ -284,6 +287,35 @@ def window_features(clip: Clip, places: np.ndarray) -> np.ndarray:
     return np.log1p(np.abs(np.nan_to_num(values))) * np.sign(np.nan_to_num(values))
 
 
+def lag_features(clip: Clip, places: np.ndarray | None = None) -> np.ndarray:
+    """How the dots move within 1, 4 and 12 frames, in pitches.
+
+    Quantiles of the motion of their mean, of what moves against it, and of the divergence; and both of the latter over
+    the former where that is fast.
+    """
+    moved = ((clip.position_px if places is None else places) - clip.rest_px) / clip.pitch_px
+    parts = affine_parts(clip.rest_px / clip.pitch_px, moved)
+    at, known = np.arange(len(parts)), np.isfinite(parts[:, 0])
+    mean_x, mean_y, spread = (np.interp(at, at[known], parts[known, column]) for column in range(3))
+    mean, values = np.stack([mean_x, mean_y], axis=1), []
+    for lag in (1, 4, 12):
+        step = moved[lag:] - moved[:-lag]
+        apart = ((step - np.nanmean(step, axis=1, keepdims=True)) ** 2).sum(axis=2)
+        together = np.linalg.norm(mean[lag:] - mean[:-lag], axis=1)
+        rest = np.nan_to_num(np.sqrt(np.nanmean(apart, axis=1)))
+        spreads = np.abs(spread[lag:] - spread[:-lag])
+        fast = together > np.quantile(together, 0.9)
+        values += [np.quantile(motion, share) for share in (0.5, 0.9, 0.99) for motion in (together, rest, spreads)]
+        values += [(motion[fast].mean() + _STILL) / (together[fast].mean() + _STILL) for motion in (rest, spreads)]
+    return np.log(np.array(values) + _STILL)
+
+
+def resampled_features(clip: Clip) -> np.ndarray:
+    """Motion in as many frames of every clip, spread over all of it, as video networks sample."""
+    at = np.linspace(0, len(clip) - 1, FRAMES).round().astype(int)
+    return window_features(clip, clip.position_px[at])
+
+
 def _known_mean(values: np.ndarray) -> np.ndarray:
     known = np.all(np.isfinite(values), axis=-1)
     return np.where(known[..., None], values, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)[:, None]
@@ -491,11 +523,16 @@ def measure_classifiers(clips: list[Clip], *, epochs: int, seeds: int) -> dict[s
         grasped=np.array([clip.grasped for clip in clips]),
         frames=np.array([len(clip) for clip in clips]),
     )
-    motion = np.array([motion_features(clip) for clip in clips])
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # frames in which all dots are lost
+        both = np.array([np.concatenate([motion_features(clip), lag_features(clip)]) for clip in clips])
+        sampled = np.array([resampled_features(clip) for clip in clips])
+    motion = both[:, : motion_features(clips[0]).size]
     inputs = {
+        "motion_and_lags": both,
         "motion": motion,
         "largest_step_alone": motion[:, [1]],
         "largest_displacement_alone": motion[:, [3]],
+        "leak_in_frames_sampled_from_the_whole_clip": sampled,
         "leak_frame_count": np.log(cases.frames)[:, None],
         "leak_marker_count": np.array([[float(len(clip.rest_px))] for clip in clips]),
         "leak_brightness": np.array([[clip.picture.mean()] for clip in clips]),
@@ -504,7 +541,8 @@ def measure_classifiers(clips: list[Clip], *, epochs: int, seeds: int) -> dict[s
     answers = {name: ask(leave_one_out(values, cases), values, cases) for name, values in inputs.items()}
     told: dict[str, object] = {"always_slip": score(np.ones(len(clips)), cases.slipped, cases.grasped)}
     told |= {name: _score_all(chance, cases) for name, chance in answers.items()}
-    told["grasps"] = _score_grasps(clips, answers["motion"])
+    told["grasps"] = _score_grasps(clips, answers["motion_and_lags"])
+    told["grasps_by_frame_count"] = _score_grasps(clips, answers["leak_frame_count"])
     told["motion_when_cut"] = measure_cuts(clips, motion, cases)
     networks = [network_answers(clips, cases, epochs=epochs, seed=seed) for seed in range(seeds)]
     if networks:
@@ -649,9 +687,11 @@ def main() -> None:
         **measure_jitter(clips),
         **measure_classifiers(clips, epochs=options.epochs, seeds=options.seeds),
     }
-    motion = found["motion"]
-    assert isinstance(motion, dict)  # as made above
-    found |= {name: motion[name] for name in ("balanced_accuracy", "balanced_accuracy_95", "f1", "f1_95")}
+    grasps, by_count = found["grasps"], found["grasps_by_frame_count"]
+    assert isinstance(grasps, dict)  # as made above
+    assert isinstance(by_count, dict)
+    found |= {name: grasps[name] for name in ("balanced_accuracy", "balanced_accuracy_95", "f1", "f1_95")}
+    found |= {"low": grasps["balanced_accuracy_95"][0], "frame_count_alone": by_count["balanced_accuracy"]}
     if options.json:
         print(json.dumps(found))
         return

@@ -8,9 +8,9 @@ lights. `track` takes a video, a folder of images or a data set too.
 
 import matplotlib.pyplot as plt
 import numpy as np
+from scipy.interpolate import griddata
 
 import sliplens as sl
-from sliplens.markers import interpolate_field
 
 data = sl.simulate(sensor="flat-gel", dry_trials=4, wet_trials=1, days=4, frames_per_trial=40)
 trial = data.load(data.trials[0])
@@ -23,7 +23,7 @@ status, counts = np.unique(table["status"].to_numpy(zero_copy_only=False), retur
 print(dict(zip(status.tolist(), counts.tolist(), strict=True)))
 
 # %%
-# One frame during the pull: displacement of each dot, and the interpolated field. Grey is extrapolated.
+# One frame during the pull: displacement of each dot, and the field between them; it is unknown where it is grey.
 number = 26
 rows = table.filter(np.asarray(table["frame"]) == number)
 rest, moved = (
@@ -31,20 +31,21 @@ rest, moved = (
     for names in (("rest_x_px", "rest_y_px"), ("dx_px", "dy_px"))
 )
 known = np.isfinite(moved).all(axis=1) & np.isfinite(rest).all(axis=1)
-field = interpolate_field(rest[known], moved[known], size=trial.reference.shape[:2])
+height, width = trial.reference.shape[:2]
+x, y = np.meshgrid(np.arange(4, width, 8), np.arange(4, height, 8))
+field = griddata(rest[known], moved[known], (x, y))
 
 figure, (left, right) = plt.subplots(ncols=2, figsize=(10, 4.6), layout="compressed")
 left.imshow(trial.frames[number])
 left.quiver(*rest[known].T, *moved[known].T, angles="xy", scale_units="xy", scale=0.2, color="white")
 left.set(title="displacement of each dot, five times its length", xlabel="x (px)", ylabel="y (px)")
-length = np.where(field.confidence > 0.2, np.linalg.norm(field.displacement_px, axis=-1), np.nan)
 right.set_facecolor("lightgrey")
-scale = right.pcolormesh(field.x_px, field.y_px, length, cmap="cividis")
-right.streamplot(field.x_px, field.y_px, *np.moveaxis(field.displacement_px, -1, 0), color="white", density=0.8)
+scale = right.pcolormesh(x, y, np.linalg.norm(field, axis=-1), cmap="cividis")
+right.streamplot(x, y, *np.moveaxis(field, -1, 0), color="white", density=0.8)
 figure.colorbar(scale, ax=right, label="Displacement (px)")
 right.set(title="interpolated field", xlabel="x (px)", ylabel="y (px)", aspect="equal")
 right.invert_yaxis()
 plt.show()
 
 # %%
-# :doc:`/markers` compares margins computed from such fields with those of a network.
+# :doc:`/markers` tells how such a field gives the traction of a real dome.

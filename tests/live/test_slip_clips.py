@@ -9,7 +9,7 @@ from PIL import Image
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.live.slip_clips import balanced_accuracy, leave_out
+from sliplens.live.slip_clips import score_guesses, threshold_left_out
 
 PLACES = np.stack(np.meshgrid(np.arange(5) * 22.0 + 20, np.arange(5) * 22.0 + 20), axis=-1).reshape(-1, 2)
 
@@ -42,17 +42,17 @@ def test_lifts_that_lose_shear_are_detected_and_a_decision_before_the_slip_is_bl
 def test_a_threshold_is_chosen_without_the_object_it_classifies():
     labels, groups = np.array([True, False] * 4), np.repeat(np.arange(4), 2)
     separated = np.where(labels, 2.0, 1.0)
-    assert balanced_accuracy(leave_out(separated, labels, groups), labels) == 1
-    assert balanced_accuracy(leave_out(-separated, labels, groups), labels) == 1  # either sign
-    # the value names the object alone: nothing can be learnt of others
-    assert balanced_accuracy(leave_out(groups.astype(float), labels, groups), labels) == 0.5
+    # either sign separates; a value that names the object alone tells nothing of others
+    for values, accuracy in ((separated, 1.0), (-separated, 1.0), (groups.astype(float), 0.5)):
+        guess = threshold_left_out(values, labels, groups)
+        assert score_guesses("", guess, labels, groups).balanced_accuracy == accuracy
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("file,object\na.mp4,cup", "needs the columns file and slips"),
-        ("file,slips\na.mp4,maybe\nb.mp4,1", "row 1: the label is 'maybe'"),
+        ("file,slips\na.mp4,maybe\nb.mp4,1", "row 1: slips is 'maybe'"),
         ("file,slips\na.mp4,1\nb.mp4,1", "all labelled alike"),
         ("file,slips,start_frame\na.mp4,1,soon\nb.mp4,0,2", "row 1: start_frame is 'soon'"),
     ],

@@ -338,17 +338,13 @@ def call_check(call: Any) -> None:
     say(f"{data.folder} is sound: {size}, every hash and law holds")
 
 
-@command("slip", "live.slip_clips:evaluate_slip", "sliplens slip lifts.csv --after 10", ("frame_rate_hz", "--rate"))
+@command("slip", "live.slip_clips:evaluate_slip", "sliplens slip lifts.csv --after 10")
 def call_slip(call: Any) -> None:
     """Print the balanced accuracy of the slip detector and of trivial baselines."""
-    result = call(on_progress=Terminal())
-    slips = sum(clip.slips for clip in result.clips)
-    header = ("method", "balanced accuracy", "low", "high")
-    rows = [
-        (score.method, *(f"{value:.2f}" for value in (score.balanced_accuracy, score.low, score.high)))
-        for score in result.scores
-    ]
-    print_table(f"Slip of {number_of(len(result.clips), 'clip')}, {slips} of which slip", header, rows)
+    result = call()
+    values = [(score.balanced_accuracy, score.low, score.high) for score in result.scores]
+    rows = [(score.method, *(f"{value:.2f}" for value in of)) for score, of in zip(result.scores, values, strict=True)]
+    print_table(f"Slip of {number_of(len(result.clips), 'clip')}", ("method", "balanced accuracy", "low", "high"), rows)
 
 
 @command("compare", "simulation.sharing:compare_datasets", "sliplens compare runs/mine/data runs/other/data")

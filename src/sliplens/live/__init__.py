@@ -6,7 +6,7 @@ from sliplens.live.loop import LiveReader, read_live
 from sliplens.live.mailbox import OutputState
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.live.recorder import ForceStream, Recorder
-from sliplens.live.slip import SlipDetector, SlipLimits
+from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import (
     SOURCES,
     Camera,
@@ -23,6 +23,6 @@ from sliplens.live.sources import (
 __all__ = [
     "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthMonitor",
     "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "OutputState", "Reading",
-    "Recorder", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipLimits", "SlipState", "SourceKind",
+    "Recorder", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipState", "SourceKind",
     "StreamSource", "list_cameras", "open_live", "read_live",
 ]  # fmt: skip

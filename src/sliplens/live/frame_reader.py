@@ -16,18 +16,7 @@ from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.images import require_rgb, soften
 from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.health import HealthMonitor, check_direction, check_novelty, margin_risk
-from sliplens.live.reading import (
-    OFF,
-    TARGET,
-    Check,
-    Latency,
-    LiveFrame,
-    MarkerReading,
-    Reading,
-    SlipState,
-    small_factor,
-    small_picture,
-)
+from sliplens.live.reading import OFF, Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
 from sliplens.live.slip import SlipDetector
 from sliplens.markers import TrackedFrame, Tracker
 from sliplens.models.checkpoint import Network
@@ -328,10 +317,9 @@ class FrameReader:
         [state] = contact_states(values[:1], without=ContactState.UNKNOWN)
         margin, *ends = values.tolist()
         low, high = ends or (None, None)
-        soon = high is not None and high < TARGET[0] and reading.slip not in (None, SlipState.SLIP)
         return replace(
             reading,
-            slip=SlipState.WILL_SLIP if soon else reading.slip,
+            slip=reading.slip and reading.slip.with_margin(high),
             margin=margin,
             low=low,
             high=high,

@@ -95,6 +95,11 @@ class SlipState(StrEnum):
     """It does not slide, but its margin is below `TARGET`, with the whole interval."""
     CANNOT_TELL = "cannot tell"
 
+    def with_margin(self, high: float | None) -> "SlipState":
+        """Return the state given the upper end of the margin's interval."""
+        soon = high is not None and high < TARGET[0] and self is not SlipState.SLIP
+        return SlipState.WILL_SLIP if soon else self
+
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerReading:

@@ -29,49 +29,26 @@ _BENT_SHARE = 0.1
 _CONFIRMED_S = 0.3
 """Time after a recoil in which a controller has tightened the grip, and a pull that is let go by hand has gone."""
 _CARRIED, _TIGHTENED, _CARRIED_TIGHTENED = 0.7, 1.1, 0.75
-"""Least share of the shear that is left after a slip; the same where the contact was pressed further, and how much.
-Chosen on 12 simulated fingertips (seeds 50 to 61): kinetic friction of 0.7 to 0.9 of the static one leaves 0.76 to 0.9,
-a pull that is let go to 0.7 leaves 0.64 to 0.72. One that is let go by less passes for a slip, too."""
+"""Least share of the shear that is left after a slip; how much a contact is pressed further, and the same there. Of 12
+simulated fingertips (seeds 50 to 61) kinetic friction leaves 0.76 to 0.9, a pull let go to 0.7 leaves 0.64 to 0.72."""
 _LEAST_SHEAR, _UNCERTAIN, _NOISE_FRAMES = 20.0, 4.0, 64
 """Shear whose fall counts, and part of a fall that does not, in standard deviations of the mean over the markers; last
 frames whose lower quartile of motion against each other is the noise."""
 HOLD_FALL, SLIP_FALL = 0.05, 0.1
-"""Fall of the mean shear, as a share of its largest, up to which a grasp that begins pressed holds, and from which it
-slips. Chosen on 48 simulated grips (seed 30) at 8 to 60 frames a second, with 0.1 to 0.2 px of noise: 73 to 98 % of the
-slips fall by more within half a second, and no grip before. Spread of the increments and growth of the slip zone added
-nothing there (AUC 0.83 and 0.52, the fall 0.999), and 104 real clips do not show when they slip."""
+"""Fall of the mean shear, as a share, up to which a grasp that begins pressed holds, and from which it slips. Chosen on
+48 simulated grips (seed 30), 8 to 60 frames a second, 0.1 to 0.2 px of noise: 73 to 98 % fall by more within 0.5 s of
+the slip, none before. Spread of increments and slip zone add nothing there (AUC 0.83 and 0.52, the fall 0.999)."""
 _RAYLEIGH_95 = 2.45
 """95 % of the lengths of two-dimensional normal noise are below so many standard deviations."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class SlipLimits:
-    """Limits from which a motion counts; `recoil` and `evidence` in standard deviations of the still sensor's noise.
-
-    The defaults were chosen on simulated trials of other seeds than `benchmarks/slip.py` tests on.
-    """
-
-    still_s: float = 0.4
-    """Time at the beginning, in seconds, in which the noise of the markers is measured."""
-    still_frames: int = 12
-    """Frames that this takes at least."""
-    window_s: float = 0.1
-    """Longest time over which a motion is measured, in seconds."""
-    pattern_s: float = 0.4
-    """Time over which the pattern of the shear is averaged, in seconds."""
-    recoil: float = 4.0
-    """Motion of the skin against that pattern."""
-    evidence: float = 0.5
-    """Part of that motion that no rigid motion explains (Dong's residual)."""
-    fall: float = 0.045
-    """Least share of the shear that is lost within the window: a pull that is let go slowly is no slip."""
-    hold_s: float = 0.25
-    """Time for which a detected slip is reported, in seconds."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise InputError(f"the slip limit {name} must be positive, got {value:g}")
+_STILL_S, _STILL_FRAMES = 0.4, 12
+"""Time at the beginning in which the noise of the markers is measured, and the frames that this takes at least."""
+_WINDOW_S, _PATTERN_S, _REPORTED_S = 0.1, 0.4, 0.25
+"""Longest time over which a motion is measured, over which the pattern of the shear is averaged, and for which a
+detected slip is reported."""
+_RECOIL, _EVIDENCE, _FALL = 4.0, 0.5, 0.045
+"""Limits chosen on other simulated trials than `benchmarks/slip.py` tests on: motion of the skin against that pattern,
+and its part that no rigid motion explains (Dong's residual), in standard deviations of the still sensor's noise; and
+the least share of the shear that is lost within the window: a pull that is let go slowly is no slip."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,26 +91,12 @@ class _Frame:
 
 
 class SlipBatch:
-    """Detects slip in many contacts at once, each with its own sensor; `SlipDetector` describes how.
+    """Detects slip in many contacts at once, each with its own sensor; `SlipDetector` describes how."""
 
-    Parameters
-    ----------
-    rest_px
-        Places (x, y) of the markers in the untouched sensors; at least 6 each.
-    limits
-        Limits from which a motion counts.
-
-    Raises
-    ------
-    InputError
-        If there are fewer markers.
-    """
-
-    def __init__(self, rest_px: Float[np.ndarray, "contacts markers 2"], *, limits: SlipLimits | None = None) -> None:
+    def __init__(self, rest_px: Float[np.ndarray, "contacts markers 2"]) -> None:
         contacts, markers, _ = rest_px.shape
         if markers < _FEWEST:
             raise InputError(f"{markers} markers are too few to tell slip, at least {_FEWEST} are needed")
-        self.limits = limits or SlipLimits()
         # fields have the coordinate before the marker: sums over markers are several times faster
         self._rest = np.ascontiguousarray(rest_px.swapaxes(1, 2), dtype=np.float64)
         self._reach_px = np.linalg.norm(_from_middle(self._rest), axis=1).mean(axis=1)
@@ -205,12 +168,12 @@ class SlipBatch:
         self._slip_s = np.where(springs & np.isnan(self._slip_s), began_s, self._slip_s)
         self._recoil_s = np.where(springs, time_s, self._recoil_s)
         self._least_px = np.fmin(np.where(springs, np.inf, self._least_px), shear_px)
-        slip = np.isfinite(self._slip_s) & (time_s - self._recoil_s <= self.limits.hold_s)
+        slip = np.isfinite(self._slip_s) & (time_s - self._recoil_s <= _REPORTED_S)
         # pulled on, and it follows: it sticks again
-        sticks = ~slip & (shear_px > self._least_px + self.limits.recoil * self._middle_noise_px())
+        sticks = ~slip & (shear_px > self._least_px + _RECOIL * self._middle_noise_px())
         self._slip_s = np.where(sticks, np.nan, self._slip_s)
         # after a slip, and until the press is over, neither is certain
-        unknown = np.isfinite(self._slip_s) | (time_s - self._hold_s < self.limits.window_s)
+        unknown = np.isfinite(self._slip_s) | (time_s - self._hold_s < _WINDOW_S)
         return ContactStates(
             ready=ready,
             contact=contact,
@@ -255,11 +218,10 @@ class SlipBatch:
 
     def _learn_noise(self, rows: Bool[np.ndarray, " contacts"], moved: Fields, time_s: float) -> None:
         """Take a still frame for some contacts; measure the noise of those that have enough of them."""
-        limits = self.limits
         self._still.append((time_s, moved))
         self._still_s[rows] = np.minimum(self._still_s[rows], time_s)
         self._still_frames[rows] += 1
-        enough = rows & (time_s - self._still_s >= limits.still_s) & (self._still_frames >= limits.still_frames)
+        enough = rows & (time_s - self._still_s >= _STILL_S) & (self._still_frames >= _STILL_FRAMES)
         for first_s in np.unique(self._still_s[enough]).tolist():
             at = np.flatnonzero(enough & (self._still_s == first_s))
             fields = np.stack([field[at] for then_s, field in self._still if then_s >= first_s], axis=1)
@@ -325,14 +287,14 @@ class SlipBatch:
 
     def _shorten_windows(self, time_s: float) -> None:
         """Take frames that are too old out of each window, and into the pattern."""
-        frames, limits = self._frames, self.limits
+        frames = self._frames
         times = np.array([frame.time_s for frame in frames])
         while True:
             first = len(times) - np.maximum(self._window, 1)
-            late = (self._window > _FEWEST_FRAMES) & (time_s - times[first] > limits.window_s)
+            late = (self._window > _FEWEST_FRAMES) & (time_s - times[first] > _WINDOW_S)
             for at in np.unique(first[late]).tolist():
                 rows = np.flatnonzero(late & (first == at))
-                share = -np.expm1(-(times[at + 1] - times[at]) / limits.pattern_s)
+                share = -np.expm1(-(times[at + 1] - times[at]) / _PATTERN_S)
                 field = np.where(frames[at].visible[rows][:, None], frames[at].moved[rows] - self._hold[rows], np.nan)
                 pattern = self._pattern[rows]
                 blended = pattern + share * (field - pattern)
@@ -355,7 +317,7 @@ class SlipBatch:
 
     def _recoils_of(self, rows: Int[np.ndarray, " rows"], frames: Sequence[_Frame]) -> Float[np.ndarray, " rows"]:
         """Find these times for contacts whose windows are some frames."""
-        began_s, limits = np.full(len(rows), np.nan), self.limits
+        began_s = np.full(len(rows), np.nan)
         picks = slice(None) if len(rows) == len(self._rest) else rows
         rest, pattern, hold = (values[picks] for values in (self._rest, self._pattern, self._hold))
         valid = np.isfinite(pattern[:, 0]) & np.isfinite(hold[:, 0])
@@ -370,7 +332,7 @@ class SlipBatch:
         pattern = _without(pattern, press, _unit(_without(arm, press)))
         length = np.sqrt(np.einsum("rkm,rkm->r", pattern, pattern))
         # of little shear the pattern is noise
-        enough = (length >= 2 * limits.recoil * self._together_px[rows]) & (valid.sum(axis=1) >= _FEWEST)
+        enough = (length >= 2 * _RECOIL * self._together_px[rows]) & (valid.sum(axis=1) >= _FEWEST)
         if not enough.any():
             return began_s
         if not enough.all():
@@ -391,7 +353,7 @@ class SlipBatch:
         cut = (drops_px / spread).argmax(axis=-1)
         drop, wide = np.take_along_axis(drops_px, cut[:, None], axis=-1)[:, 0], spread[cut]
         whole = drop / wide / self._together_px[rows]
-        springs = (drop >= limits.fall * length) & (whole >= limits.recoil)
+        springs = (drop >= _FALL * length) & (whole >= _RECOIL)
         if not springs.any():
             return began_s
         shifts = [_unit(valid[springs, None] * np.array(way)) for way in ([[1.0], [0.0]], [[0.0], [1.0]])]
@@ -402,7 +364,7 @@ class SlipBatch:
         bending = bending / wide[springs] / self._noise_px[rows[springs]]
         # a large motion must show more than noise that happens to bend
         bends = springs.copy()
-        bends[springs] = bending >= np.maximum(limits.evidence, _BENT_SHARE * residual * whole[springs])
+        bends[springs] = bending >= np.maximum(_EVIDENCE, _BENT_SHARE * residual * whole[springs])
         bends[bends] = ~self._handled(rows[bends], frames, cut[bends] + 1, valid[bends], drop[bends])
         began_s[enough] = np.where(bends, np.array([frame.time_s for frame in frames])[cut], np.nan)
         return began_s
@@ -426,7 +388,7 @@ class SlipBatch:
         hold = np.where(markers, self._hold[rows], 0)
         middle = np.stack([(np.where(markers, frame.moved[rows], 0) - hold).sum(axis=2) / count for frame in frames])
         before, after = (np.linalg.norm((middle * share[..., None]).sum(axis=0), axis=1) for share in shares)
-        pulled = after > before + self.limits.recoil * self._middle_noise_px()[rows]
+        pulled = after > before + _RECOIL * self._middle_noise_px()[rows]
         return pulled | (pressed / 2 * self._reach_px[rows] > drop / np.sqrt(valid.sum(axis=1)))
 
 
@@ -436,11 +398,6 @@ class ShearFall:
     A contact that holds carries its load, so that the shear grows or stays; one that slips loses part of it. The fall
     is a share of the largest shear, beyond the noise of the mean, which the stiller frames so far show. Neither an
     untouched frame nor a still phase is needed. It cannot distinguish a slip from a load that is taken away.
-
-    Parameters
-    ----------
-    start_px
-        Places (x, y) of the markers in the first frame of the grasp.
 
     Examples
     --------
@@ -460,10 +417,10 @@ class ShearFall:
     def update(self, positions_px: Field) -> float | None:
         """Take the markers of a frame, and return the fall as a share; None before any shear, or without markers."""
         moved = positions_px - self._start_px
-        seen = np.isfinite(moved[:, 0])
-        if seen.sum() < _FEWEST:
+        visible = np.isfinite(moved[:, 0])
+        if visible.sum() < _FEWEST:
             return None
-        mean = moved[seen].mean(axis=0)
+        mean = moved[visible].mean(axis=0)
         # second differences: skin that moves on evenly is no noise
         bends = moved - mean - 2 * self._before[1] + self._before[0]
         self._before = np.stack([self._before[1], moved - mean])
@@ -474,7 +431,7 @@ class ShearFall:
         self._largest_px = max(self._largest_px, shear_px)
         if not self._noises_px:
             return None
-        noise_px = max(float(np.quantile(self._noises_px, 0.25)), _LEAST_NOISE_PX) / np.sqrt(seen.sum())
+        noise_px = max(float(np.quantile(self._noises_px, 0.25)), _LEAST_NOISE_PX) / np.sqrt(visible.sum())
         if self._largest_px <= _LEAST_SHEAR * noise_px:
             return None
         return float(max(0.0, self._largest_px - shear_px - _UNCERTAIN * noise_px) / self._largest_px)
@@ -502,8 +459,6 @@ class SlipDetector:
     ----------
     rest_px
         Places (x, y) of the markers in the untouched sensor, or at the beginning of the grasp; at least 6.
-    limits
-        Limits from which a motion counts.
 
     Raises
     ------
@@ -524,8 +479,8 @@ class SlipDetector:
     <SlipState.CANNOT_TELL: 'cannot tell'>
     """
 
-    def __init__(self, rest_px: Field, *, limits: SlipLimits | None = None) -> None:
-        self._batch, self._fall = SlipBatch(rest_px[None], limits=limits), ShearFall(rest_px)
+    def __init__(self, rest_px: Field) -> None:
+        self._batch, self._fall = SlipBatch(rest_px[None]), ShearFall(rest_px)
         self._press_seen = False
 
     def update(self, positions_px: Field, time_s: float, /) -> MarkerReading:
@@ -584,4 +539,4 @@ def _without(fields: Fields, *ways: Fields) -> Fields:
     return fields
 
 
-__all__ = ["HOLD_FALL", "SLIP_FALL", "ContactStates", "ShearFall", "SlipBatch", "SlipDetector", "SlipLimits"]
+__all__ = ["HOLD_FALL", "SLIP_FALL", "ContactStates", "ShearFall", "SlipBatch", "SlipDetector"]

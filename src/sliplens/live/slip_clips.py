@@ -1,22 +1,26 @@
 """Evaluation of slip detection on labelled clips, beside trivial baselines."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from sliplens.codec import Result
 from sliplens.errors import ImageError, InputError
 from sliplens.live.reading import SlipState
 from sliplens.live.slip import SlipDetector
-from sliplens.markers import Tracker
+from sliplens.markers import track_markers
 from sliplens.progress import OnProgress, add_note, report_progress, reporting
 from sliplens.recordings.formats.tables import open_text_table
 from sliplens.recordings.source import open_source
 
+Flags: TypeAlias = Bool[np.ndarray, " clips"]
+Groups: TypeAlias = Shaped[np.ndarray, " clips"]
 _LABELS = ("slips", "slip", "slip_label", "label")
-_YES, _NO = {"1", "true", "yes", "slip", "slips"}, {"0", "false", "no", "hold", "holds"}
 _DRAWS = 2000
 
 
@@ -33,22 +37,19 @@ class SlipScore:
 
 @dataclass(frozen=True, kw_only=True)
 class ClipReading:
-    """Slip of one clip: its label, and the detector's states."""
+    """Slip of one clip as the markers show it."""
 
-    clip: str
-    object: str
-    slips: bool
     detected: bool
     """True where a frame up to the decision was read as slip."""
     fall: float
-    """Largest fall of the mean shear so far, as a share; 0 where no shear was seen."""
+    """Largest fall of the mean shear, as a share; 0 where no shear was seen."""
     displacement_px: float
     """Largest mean displacement of the markers, in pixels."""
     frames: int
 
 
 @dataclass(frozen=True, kw_only=True)
-class SlipEvaluation:
+class SlipEvaluation(Result):
     """Scores of the detector and of baselines on labelled clips, and the reading of each clip."""
 
     scores: tuple[SlipScore, ...]
@@ -60,7 +61,6 @@ def evaluate_slip(
     *,
     after: int | None = None,
     markers: str = "auto",
-    frame_rate_hz: float = 30.0,
     on_progress: OnProgress | None = None,
 ) -> SlipEvaluation:
     """Evaluate slip detection on clips with labels.
@@ -77,149 +77,102 @@ def evaluate_slip(
         Frames after the start at which a clip is classified, from those before alone; its end if None.
     markers
         Row of `KINDS`.
-    frame_rate_hz
-        Frames a second of clips without times.
-
-    Returns
-    -------
-    SlipEvaluation
-        Balanced accuracy of the detector, of the fall of the mean shear, frame count, largest displacement and width.
 
     Raises
     ------
     InputError
-        If the table lacks a column or has an unknown label, or all clips have one label.
+        If the table lacks a column or has an unknown value, or all clips have one label.
 
     Examples
     --------
     >>> import sliplens as sl
     >>> scores = sl.evaluate_slip("lifts.csv", after=10).scores  # doctest: +SKIP
     """
-    path = Path(table)
-    text = open_text_table(path)
+    text = open_text_table(Path(table))
     rows = [dict(zip(text.header, cells, strict=True)) for _, cells in text.rows]
-    label = next((name for name in _LABELS if name in text.header), None)
-    if label is None or "file" not in text.header:
-        raise InputError(f"{path} needs the columns file and slips; it has {', '.join(text.header)}")
-    for number, row in enumerate(rows, 1):
-        if row[label].strip().lower() not in _YES | _NO:
-            raise InputError(f"{path}, row {number}: the label is {row[label]!r}; write 1 for slip or 0")
-    slips = np.array([row[label].strip().lower() in _YES for row in rows])
+    label = next((name for name in _LABELS if name in text.header), "slips")
+    if not {label, "file"} <= set(text.header):
+        raise InputError(f"{table} needs the columns file and slips; it has {', '.join(text.header)}")
+    numbers = {name: _numbers(rows, name, table) for name in (label, "start_frame", "width") if name in text.header}
+    slips, start = numbers[label] > 0, numbers.get("start_frame", np.zeros(len(rows))).astype(int)
     if slips.all() or not slips.any():
-        raise InputError(f"the clips of {path} are all labelled alike; add clips that slip and clips that hold")
+        raise InputError(f"the clips of {table} are all labelled alike; add clips that slip and clips that hold")
+    objects = np.array([row.get("object") or row["file"] for row in rows])
     clips = []
     with reporting(on_progress):
         for number, row in enumerate(rows):
-            report_progress(number, len(rows))
-            start = int(_number(row.get("start_frame") or "0", "start_frame", where=f"{path}, row {number + 1}"))
-            clips.append(
-                _read_clip(
-                    path.parent / row["file"],
-                    row.get("object") or row["file"],
-                    slips=bool(slips[number]),
-                    frames=slice(start, None if after is None else start + after + 1),
-                    markers=markers,
-                    frame_rate_hz=frame_rate_hz,
-                )
-            )
-        report_progress(len(rows), len(rows))
-    objects = np.array([clip.object for clip in clips])
+            report_progress(number + 1, len(rows))
+            chosen = slice(start[number], None if after is None else start[number] + after + 1)
+            clips.append(_read_clip(Path(table).parent / row["file"], chosen, markers))
     values = {
-        "fall of the mean shear": [clip.fall for clip in clips],
-        "largest displacement": [clip.displacement_px for clip in clips],
-        "frame count": [clip.frames for clip in clips],
+        "fall of the mean shear": np.array([clip.fall for clip in clips]),
+        "largest displacement": np.array([clip.displacement_px for clip in clips]),
+        "frame count": np.array([float(clip.frames) for clip in clips]),
     }
-    if "width" in text.header:
-        values["gripper width"] = [
-            _number(row["width"], "width", where=f"{path}, row {number}") for number, row in enumerate(rows, 1)
-        ]
-    detected = {"detector": np.array([clip.detected for clip in clips])}
-    fitted = {name: leave_out(np.array(of, dtype=float), slips, objects) for name, of in values.items()}
-    scores = (_score(name, guess, slips, objects) for name, guess in (detected | fitted).items())
-    return SlipEvaluation(scores=tuple(scores), clips=tuple(clips))
+    if "width" in numbers:
+        values["gripper width"] = numbers["width"]
+    guesses = {"detector": np.array([clip.detected for clip in clips])}
+    guesses |= {name: threshold_left_out(value, slips, objects) for name, value in values.items()}
+    scores = tuple(score_guesses(name, guess, slips, objects) for name, guess in guesses.items())
+    return SlipEvaluation(scores=scores, clips=tuple(clips))
 
 
-def _number(text: str, column: str, *, where: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not 0 <= value < np.inf:
-        raise InputError(f"{where}: {column} is {text!r}; write a number of 0 or more")
-    return value
+def _numbers(rows: list[dict[str, str]], column: str, table: Path | str) -> Float[np.ndarray, " rows"]:
+    values = np.full(len(rows), np.nan)
+    for number, row in enumerate(rows):
+        with suppress(ValueError):
+            values[number] = float(row[column])
+        if not 0 <= values[number] < np.inf:
+            raise InputError(f"{table}, row {number + 1}: {column} is {row[column]!r}; write a number of 0 or more")
+    return values
 
 
-def _read_clip(
-    path: Path, object: str, *, slips: bool, frames: slice, markers: str, frame_rate_hz: float
-) -> ClipReading:
+def _read_clip(path: Path, chosen: slice, markers: str) -> ClipReading:
     capture = open_source(path)[0]
-    time_s = np.arange(len(capture)) / frame_rate_hz if capture.time_s is None else capture.time_s
-    detected, fall, largest_px = False, 0.0, 0.0
+    frames = list(islice(capture.read_frames(), chosen.start, chosen.stop))
+    if not frames:
+        raise InputError(f"{path} has {len(capture)} frames, too few for a start_frame of {chosen.start}")
     try:
-        images = islice(capture.read_frames(), frames.start, frames.stop)
-        first = next(images, None)
-        if first is None:
-            raise InputError(f"{path} has {len(capture)} frames, fewer than its start_frame {frames.start}")
-        tracker = Tracker(first, markers)
-        detector = SlipDetector(tracker.rest.centre_px)
-        for number, image in enumerate([first, *images], frames.start):
-            tracked = tracker.update(image)
-            reading = detector.update(tracked.position_px, float(time_s[number]))
-            seen = np.isfinite(tracked.motion_px[:, 0])
-            if seen.any():
-                largest_px = max(largest_px, float(np.linalg.norm(tracked.motion_px[seen].mean(axis=0))))
-            detected |= reading.state is SlipState.SLIP
-            fall = max(fall, reading.fall or 0.0)
+        tracks = track_markers(frames, frames[0], markers)
     except ImageError as error:
         add_note(f"{path.name} counts as not slipping: {error}")
+        return ClipReading(detected=False, fall=0.0, displacement_px=0.0, frames=len(capture))
+    detector = SlipDetector(tracks.rest_px)
+    readings = [
+        detector.update(place_px, number / capture.frame_rate_hz) for number, place_px in enumerate(tracks.position_px)
+    ]
+    moved = np.ma.masked_invalid(tracks.displacement_px).mean(axis=1).filled(0)
     return ClipReading(
-        clip=path.name,
-        object=object,
-        slips=slips,
-        detected=detected,
-        fall=fall,
-        displacement_px=largest_px,
+        detected=SlipState.SLIP in [reading.state for reading in readings],
+        fall=max(reading.fall or 0.0 for reading in readings),
+        displacement_px=float(np.linalg.norm(moved, axis=1).max()),
         frames=len(capture),
     )
 
 
-def leave_out(
-    values: Float[np.ndarray, " clips"], labels: Bool[np.ndarray, " clips"], groups: Shaped[np.ndarray, " clips"]
-) -> Bool[np.ndarray, " clips"]:
+def threshold_left_out(values: Float[np.ndarray, " clips"], labels: Flags, groups: Groups) -> Flags:
     """Classify clips by a threshold on a value, chosen with its sign on the clips of all other groups."""
     guess = np.zeros(len(values), dtype=bool)
     for group in np.unique(groups):
         rest = groups != group
         levels = np.unique(values[rest])
-        limits = np.concatenate([[-np.inf], (levels[1:] + levels[:-1]) / 2, [np.inf]])
-        above = np.array([balanced_accuracy(values[rest] > limit, labels[rest]) for limit in limits])
-        at = int(np.abs(above - 0.5).argmax())
-        guess[~rest] = (values[~rest] > limits[at]) == (above[at] >= 0.5)
+        limits = np.concatenate([[-np.inf], (levels[1:] + levels[:-1]) / 2])
+        above = np.array([_balanced(values[rest] > limit, labels[rest]) for limit in limits])
+        best = int(np.abs(above - 0.5).argmax())
+        guess[~rest] = (values[~rest] > limits[best]) == (above[best] >= 0.5)
     return guess
 
 
-def balanced_accuracy(guess: Bool[np.ndarray, " clips"], labels: Bool[np.ndarray, " clips"]) -> float:
-    """Compute the mean of the shares of both labels that are guessed rightly; 0.5 where one of them is missing."""
-    if labels.all() or not labels.any():
-        return 0.5
-    return float((guess[labels].mean() + (~guess[~labels]).mean()) / 2)
-
-
-def _score(
-    method: str,
-    guess: Bool[np.ndarray, " clips"],
-    labels: Bool[np.ndarray, " clips"],
-    groups: Shaped[np.ndarray, " clips"],
-) -> SlipScore:
-    rng, names = np.random.default_rng(0), np.unique(groups)
-    rows = [np.flatnonzero(groups == name) for name in names]
-    draws = []
-    for _ in range(_DRAWS):
-        drawn = np.concatenate([rows[at] for at in rng.integers(0, len(rows), len(rows))])
-        if 0 < labels[drawn].mean() < 1:
-            draws.append(balanced_accuracy(guess[drawn], labels[drawn]))
+def score_guesses(method: str, guess: Flags, labels: Flags, groups: Groups) -> SlipScore:
+    """Compute the balanced accuracy of a method with its interval over groups."""
+    rng, rows = np.random.default_rng(0), [np.flatnonzero(groups == name) for name in np.unique(groups)]
+    drawn = [np.concatenate([rows[at] for at in rng.integers(0, len(rows), len(rows))]) for _ in range(_DRAWS)]
+    draws = [_balanced(guess[some], labels[some]) for some in drawn if 0 < labels[some].mean() < 1]
     low, high = np.quantile(draws or [0.0, 1.0], [0.025, 0.975]).tolist()
-    return SlipScore(method=method, balanced_accuracy=balanced_accuracy(guess, labels), low=low, high=high)
+    return SlipScore(method=method, balanced_accuracy=_balanced(guess, labels), low=low, high=high)
 
 
-__all__ = ["ClipReading", "SlipEvaluation", "SlipScore", "balanced_accuracy", "evaluate_slip", "leave_out"]
+def _balanced(guess: Flags, labels: Flags) -> float:
+    """Compute the mean of the shares of both labels that are guessed rightly; 0.5 where one of them is missing."""
+    both = labels.any() and not labels.all()
+    return float((guess[labels].mean() + (~guess[~labels]).mean()) / 2) if both else 0.5

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Float32
 
 from sliplens.images import LEAST_TOUCH
-from sliplens.markers.tracks import TrackedFrame
+from sliplens.markers.tracker import TrackedFrame
 from sliplens.recordings.capture import Frame
 
 Plane = Float32[np.ndarray, "height width"]

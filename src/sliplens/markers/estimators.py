@@ -1,10 +1,17 @@
-"""Parts of a marker field: its affine fit, the centre of the contact, the end of the press, and what sticks."""
+"""Estimates from a marker field: its affine parts, the end of the press, the sticking share, and the traction."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
+from sliplens.errors import InputError
+
 _PRESSED_SHARE = 0.9  # of the trial's largest spread, at which the press is complete, creep aside
 _PULL_PX = 0.2  # of the inner markers' mean motion: several times its noise
+_HERTZ = 2 / 3  # exponent of the load in the displacement that it causes, of a sphere that is pressed
+_LARGEST_RATIO = 1.0  # that a contact carries: a load that is smaller than the shear over it is raised
+_FEWEST_STATES, _FEWEST_MARKERS = 3, 6
 INNER_SHARE = 1 / 3
 """Share of the markers, nearest to the centre of the contact, that surely touches."""
 
@@ -113,3 +120,139 @@ def stick_share(
     turn = (across * rest)[middle].sum() / max((arm[middle] ** 2).sum(), 1e-9)
     distance = np.linalg.norm(rest - turn * across, axis=1)
     return float((distance[contact] < tolerance_px).mean())
+
+
+@dataclass(frozen=True, kw_only=True)
+class MarkerTraction:
+    """Load and shear of some frames, as the markers show them; NaN where fewer than 6 are followed."""
+
+    shear_n: Float[np.ndarray, "frames 2"]
+    """Tangential force in newtons, on the axes of the calibration."""
+    normal_n: Float[np.ndarray, " frames"]
+    """Normal force in newtons, as given, or from how far the field spreads."""
+
+    @property
+    def vector(self) -> Float[np.ndarray, "frames 2"]:
+        """Shear over load: the traction ratio F_t / F_n with its direction."""
+        return self.shear_n / self.normal_n[:, None]
+
+    @property
+    def ratio(self) -> Float[np.ndarray, " frames"]:
+        """Traction ratio F_t / F_n."""
+        return np.linalg.norm(self.vector, axis=1)
+
+    @property
+    def direction_deg(self) -> Float[np.ndarray, " frames"]:
+        """Direction of the pull, from 0 to 360 degrees, counted from the first axis towards the second."""
+        return np.degrees(np.arctan2(self.shear_n[:, 1], self.shear_n[:, 0])) % 360
+
+
+@dataclass(frozen=True, kw_only=True)
+class TractionModel:
+    """Displacement of each marker by shear and load; see `calibrate_traction`."""
+
+    fields: Float[np.ndarray, "3 markers 2"]
+    """Displacement in pixels per newton along each axis of shear, and per newton^(2/3) of normal force."""
+    covariance: Float[np.ndarray, "coordinates coordinates"]
+    """Covariance of what these leave of a state of 1 newton, in square pixels, coordinate after coordinate."""
+
+    def measure(
+        self, displacement_px: Float[np.ndarray, "frames _ 2"], normal_n: Float[np.ndarray, " frames"] | None = None
+    ) -> MarkerTraction:
+        """Measure the traction of frames by weighted least squares.
+
+        Parameters
+        ----------
+        displacement_px
+            Displacement of the markers from the untouched sensor, in pixels; NaN where one is not followed.
+        normal_n
+            Normal force in newtons where it is measured, as by a gripper; estimated from the markers if None.
+
+        Raises
+        ------
+        InputError
+            If the markers are others than those of the calibration, or a normal force is not positive.
+        """
+        frames, markers = displacement_px.shape[:2]
+        if markers != self.fields.shape[1]:
+            raise InputError(
+                f"the field has {markers} markers, the calibration {self.fields.shape[1]}; track both from one "
+                "untouched frame"
+            )
+        if normal_n is not None and not np.all(normal_n > 0):
+            raise InputError("a normal force must be positive, in newtons; leave out frames without contact")
+        parts = np.full((frames, 3), np.nan)
+        for frame, moved in enumerate(displacement_px.reshape(frames, -1)):
+            followed = np.isfinite(moved)
+            if followed.sum() < 2 * _FEWEST_MARKERS:
+                continue
+            fields, rest = self.fields.reshape(3, -1)[:, followed], moved[followed]
+            if normal_n is not None:
+                parts[frame, 2] = normal_n[frame] ** _HERTZ
+                fields, rest = fields[:2], rest - parts[frame, 2] * fields[2]
+            weighted = np.linalg.solve(self.covariance[np.ix_(followed, followed)], fields.T)
+            parts[frame, : len(fields)] = np.linalg.solve(fields @ weighted, rest @ weighted)
+        shear_n, load_n = parts[:, :2], np.maximum(parts[:, 2], 0) ** (1 / _HERTZ)
+        least_n = np.maximum(np.linalg.norm(shear_n, axis=1), 1e-9) / _LARGEST_RATIO
+        return MarkerTraction(shear_n=shear_n, normal_n=np.maximum(load_n, least_n) if normal_n is None else normal_n)
+
+
+def calibrate_traction(
+    displacement_px: Float[np.ndarray, "states markers 2"], force_n: Float[np.ndarray, "_ 3"]
+) -> TractionModel:
+    """Calibrate markers by known loads: five states, one of them vertical, are enough.
+
+    A dome under load is spread by the press, as Hertz's contact by F_n^(2/3), and sheared in proportion to F_t. Both
+    fields are fitted for each marker; states weigh by 1 / F_n, as their errors grow with the load. What a dome does
+    besides (it leans, its contact wanders) is the covariance of the residuals, shrunk by half towards equal ones; it
+    weighs the markers when traction is measured.
+
+    Parameters
+    ----------
+    displacement_px
+        Displacement of each marker from the untouched sensor, in pixels; markers with a NaN count as unmoved.
+    force_n
+        Shear along two axes and normal force, in newtons.
+
+    Raises
+    ------
+    InputError
+        If states or markers are too few, a normal force is not positive, or the states have no shear in two directions.
+
+    References
+    ----------
+    Johnson, *Contact Mechanics* (1985), sections 4.2 and 7.2. Ledoit and Wolf, *A well-conditioned estimator for
+    large-dimensional covariance matrices*, 2004, for the shrinkage.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sliplens.markers import calibrate_traction
+    >>> place_px = np.array([[x, y] for x in (-40.0, 0, 40) for y in (-40.0, 0, 40)])
+    >>> force_n = np.array([[0.0, 0, 1], [0.3, 0, 1], [0, 0.3, 1], [-0.3, 0, 1], [0, 0, 8]])
+    >>> moved_px = force_n[:, None, :2] + 0.01 * force_n[:, None, 2:] ** (2 / 3) * place_px
+    >>> model = calibrate_traction(moved_px, force_n)
+    >>> heavier_px = np.array([2.0, 0]) + 0.01 * 5 ** (2 / 3) * place_px  # 2 N of shear, 5 N of load
+    >>> model.measure(heavier_px[None]).ratio.round(2)
+    array([0.4])
+    """
+    states, markers, _ = displacement_px.shape
+    if len(force_n) != states:
+        raise InputError(f"{states} fields but {len(force_n)} forces; give a force for each state")
+    if states < _FEWEST_STATES or markers < _FEWEST_MARKERS:
+        raise InputError(
+            f"{states} states of {markers} markers cannot be calibrated; give {_FEWEST_STATES} and {_FEWEST_MARKERS}"
+        )
+    if not np.all(force_n[:, 2] > 0):
+        raise InputError("every calibration state needs a normal force above 0 N; leave out the untouched sensor")
+    weight = force_n[:, 2:] ** -0.5
+    terms = np.concatenate([force_n[:, :2], force_n[:, 2:] ** _HERTZ], axis=1) * weight
+    if np.linalg.matrix_rank(terms, tol=1e-3 * np.linalg.norm(terms)) < 3:
+        raise InputError("the calibration states do not shear in two directions; tilt the sensor about two axes")
+    moved = np.nan_to_num(displacement_px.reshape(states, -1)) * weight
+    fields = np.linalg.lstsq(terms, moved, rcond=None)[0]
+    residual = moved - terms @ fields
+    covariance = residual.T @ residual / states
+    level = max(float(np.trace(covariance)) / len(covariance), 1e-6)
+    shrunk = (covariance + level * np.eye(len(covariance))) / 2
+    return TractionModel(fields=fields.reshape(3, markers, 2), covariance=shrunk)

@@ -142,11 +142,6 @@ def _lit_box(bright: Float[np.ndarray, "height width"]) -> tuple[int, int, int, 
     return x, y, across, down
 
 
-def marker_spacing(frame: Frame) -> float:
-    """Measure the median distance of a marker to the next, in pixels; NaN without a pattern of markers."""
-    return _find_markers(frame, (0, 0, frame.shape[1], frame.shape[0]))[2]
-
-
 def _find_markers(
     frame: Frame, lit: tuple[int, int, int, int]
 ) -> tuple[str | None, Float[np.ndarray, "markers 2"], float]:

@@ -1,20 +1,76 @@
 """Tracking of markers from the untouched sensor through a trial."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from sliplens.errors import ImageError, RecordingError
 from sliplens.markers.detect import MarkerKind, Markers, detect_markers, measure_markers
 from sliplens.markers.linking import Pairing, Pattern, Places
-from sliplens.markers.tracks import MarkerStatus, TrackedFrame, Tracks
 
 _FEWEST = 4
 _RADIUS_CHANGE = (0.6, 1.6)  # of the radius at rest, over the median change of all markers
 _CONTRAST_LEFT = 0.45
 _ROUNDNESS_LEFT, _ROUND = 0.75, 0.7
 _WHOLE_EVERY = 10  # frames, of which one is searched as a whole
+
+
+class MarkerStatus(IntEnum):
+    """State of a marker in a frame; only followed markers have a displacement."""
+
+    FOLLOWED = 0
+    """Detected, and identified with a marker of the reference frame."""
+    MISSING = 1
+    """Should be in view but was not detected."""
+    BROKEN = 2
+    """Detected, but changed in size or shape, or astray from its neighbours: its centre is unreliable."""
+    OUTSIDE = 3
+    """Cut by the edge of the frame, or beyond it."""
+    LOST = 4
+    """The pattern jumped so far that markers cannot be identified."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackedFrame:
+    """Markers of one frame, in the order of the reference frame."""
+
+    position_px: Float[np.ndarray, "markers 2"]
+    """x, y; NaN where a marker was not detected whole."""
+    motion_px: Float[np.ndarray, "markers 2"]
+    """Displacement from the place at rest."""
+    size: tuple[int, int]
+    """Height and width of the picture, in pixels."""
+    radius_px: Float[np.ndarray, " markers"]
+    deviation_px: Float[np.ndarray, " markers"]
+    """Distance of a marker's displacement from that of the skin around it; NaN where either is unknown."""
+    status: UInt8[np.ndarray, " markers"]
+    """`MarkerStatus` of each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tracks:
+    """Markers of a trial; pixel coordinates are (x, y), pixel centres at whole numbers."""
+
+    rest_px: Float[np.ndarray, "markers 2"]
+    """Places in the reference frame T_0."""
+    position_px: Float[np.ndarray, "frames markers 2"]
+    """NaN where a marker was not detected whole."""
+    radius_px: Float[np.ndarray, "frames markers"]
+    deviation_px: Float[np.ndarray, "frames markers"]
+    status: UInt8[np.ndarray, "frames markers"]
+
+    @property
+    def followed(self) -> Bool[np.ndarray, "frames markers"]:
+        """Markers that have a displacement, frame by frame."""
+        return self.status == MarkerStatus.FOLLOWED
+
+    @property
+    def displacement_px(self) -> Float[np.ndarray, "frames markers 2"]:
+        """T_n less T_0, x and y; NaN where a marker was not followed."""
+        return np.where(self.followed[..., None], self.position_px - self.rest_px, np.nan)
 
 
 class Tracker:

@@ -15,8 +15,7 @@ from sliplens.errors import InputError
 from sliplens.extras import import_cv2, pick
 from sliplens.images import Images
 from sliplens.markers.detect import KINDS
-from sliplens.markers.tracker import Tracker
-from sliplens.markers.tracks import MarkerStatus, TrackedFrame
+from sliplens.markers.tracker import MarkerStatus, TrackedFrame, Tracker
 from sliplens.progress import OnProgress, add_note, number_of, report_progress, reporting
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture

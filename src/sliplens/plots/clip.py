@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2
 from sliplens.images import absolute_difference
-from sliplens.markers.tracks import MarkerStatus, TrackedFrame
+from sliplens.markers.tracker import MarkerStatus, TrackedFrame
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.style import BLACK, SKY, VERMILLION, YELLOW, percent, written_whole
 from sliplens.progress import report_each
