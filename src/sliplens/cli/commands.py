@@ -341,7 +341,8 @@ def call_check(call: Any) -> None:
 @command("slip", "live.slip_clips:evaluate_slip", "sliplens slip lifts.csv --after 10")
 def call_slip(call: Any) -> None:
     """Print the balanced accuracy of the slip detector and of trivial baselines."""
-    result = call()
+    with reporting(Terminal()), open_stage("Reading clips"):
+        result = call()
     values = [(score.balanced_accuracy, score.low, score.high) for score in result.scores]
     rows = [(score.method, *(f"{value:.2f}" for value in of)) for score, of in zip(result.scores, values, strict=True)]
     print_table(f"Slip of {number_of(len(result.clips), 'clip')}", ("method", "balanced accuracy", "low", "high"), rows)

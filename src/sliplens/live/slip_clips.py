@@ -14,7 +14,7 @@ from sliplens.errors import ImageError, InputError
 from sliplens.live.reading import SlipState
 from sliplens.live.slip import SlipDetector
 from sliplens.markers import track_markers
-from sliplens.progress import OnProgress, add_note, report_progress, reporting
+from sliplens.progress import add_note, report_progress
 from sliplens.recordings.formats.tables import open_text_table
 from sliplens.recordings.source import open_source
 
@@ -56,13 +56,7 @@ class SlipEvaluation(Result):
     clips: tuple[ClipReading, ...]
 
 
-def evaluate_slip(
-    table: Path | str,
-    *,
-    after: int | None = None,
-    markers: str = "auto",
-    on_progress: OnProgress | None = None,
-) -> SlipEvaluation:
+def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str = "auto") -> SlipEvaluation:
     """Evaluate slip detection on clips with labels.
 
     Each clip is read from its first frame, or its `start_frame`, as a grasp that is pressed already: no untouched frame
@@ -99,11 +93,10 @@ def evaluate_slip(
         raise InputError(f"the clips of {table} are all labelled alike; add clips that slip and clips that hold")
     objects = np.array([row.get("object") or row["file"] for row in rows])
     clips = []
-    with reporting(on_progress):
-        for number, row in enumerate(rows):
-            report_progress(number + 1, len(rows))
-            chosen = slice(start[number], None if after is None else start[number] + after + 1)
-            clips.append(_read_clip(Path(table).parent / row["file"], chosen, markers))
+    for number, row in enumerate(rows):
+        chosen = slice(start[number], None if after is None else start[number] + after + 1)
+        clips.append(_read_clip(Path(table).parent / row["file"], chosen, markers))
+        report_progress(number + 1, len(rows))
     values = {
         "fall of the mean shear": np.array([clip.fall for clip in clips]),
         "largest displacement": np.array([clip.displacement_px for clip in clips]),
