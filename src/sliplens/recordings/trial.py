@@ -1,7 +1,7 @@
 """One trial of a tactile sensor: frames, forces, labels and facts."""
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
@@ -120,6 +120,30 @@ def labels_of_margins(safety_margin: Float[np.ndarray, " frames"]) -> Labels:
         stick_ratio=stick_ratio(safety_margin),
         contact_state=contact_states(safety_margin, without=ContactState.UNKNOWN),
         reason=tuple("" if finite else "not labelled" for finite in np.isfinite(safety_margin)),
+    )
+
+
+def label_by_friction(labels: Labels, friction: float) -> Labels:
+    """Add the margins that follow from the forces and a given coefficient of static friction.
+
+    Raises
+    ------
+    RecordingError
+        If F_t / F_n of a frame exceeds that friction.
+    """
+    pressed = labels.normal_force_n > 0
+    ratio = np.where(pressed, labels.tangential_force_n, 0) / np.where(pressed, labels.normal_force_n, 1)
+    if (most := ratio.max(initial=0)) > friction:
+        raise RecordingError(f"F_t / F_n reaches {most:.2f}, above the given friction {friction:g}; give a larger --mu")
+    margin = np.where(pressed, 1 - ratio / friction, np.nan)
+    made = labels_of_margins(margin)
+    contact = zip(labels.contact_state, made.contact_state, pressed.tolist(), strict=True)
+    return replace(
+        made,
+        normal_force_n=labels.normal_force_n,
+        tangential_force_n=labels.tangential_force_n,
+        friction_coefficient=np.where(pressed, friction, np.nan),
+        contact_state=tuple(new if presses else old for old, new, presses in contact),
     )
 
 

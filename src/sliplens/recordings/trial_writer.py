@@ -32,7 +32,7 @@ from sliplens.recordings.store import (
     save_forces,
     write_trial,
 )
-from sliplens.recordings.trial import labels_of_margins
+from sliplens.recordings.trial import label_by_friction, labels_of_margins
 from sliplens.runner import MakePart, Work, part, run_parts
 
 PARTS = "parts"  #: Folder of a data set in the making, with a data set of each trial; the caller removes it.
@@ -153,6 +153,8 @@ def import_trial(
                 basis, untouched = labels.basis, np.array([reason is Reason.NO_CONTACT for reason in labels.reason])
                 if (doubt := describe_repeats(motion, capture.frame_time_s)) is not None:
                     basis = replace(basis, doubts=(*basis.doubts, doubt))
+            elif settings.mu is not None and not labels.labelled.any():
+                labels = label_by_friction(labels, settings.mu)
             reference, choice = _choose_reference(footage, settings=settings, untouched=untouched)
         except RecordingError as error:
             raise RecordingError(f"{capture.source}: {error}") from None

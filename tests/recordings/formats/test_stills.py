@@ -10,7 +10,7 @@ from sliplens.errors import InputError
 from sliplens.images import write_png
 from sliplens.recordings import check_dataset, import_recordings
 from sliplens.recordings.formats import recognise
-from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.source import open_source
 
 FORCES = np.array([[0.5, -1.0, 2.0], [0.0, 0.0, 0.0], [-0.25, 0.5, 1.5]])  # tangential twice, normal
@@ -65,14 +65,21 @@ def test_each_image_has_the_forces_of_its_row(tmp_path: Path, frames: np.ndarray
         assert (trial.name, trial.reference_index) == ("dome", 1)  # the row without a force
 
 
-def test_an_import_keeps_the_forces_and_invents_no_margin(tmp_path: Path, frames: np.ndarray):
+def test_margins_are_those_of_the_given_friction_and_none_without_it(tmp_path: Path, frames: np.ndarray):
     folder = write_stills(tmp_path / "dome", frames, table("file,fx,fy,fz", FORCES))
-    data = import_recordings(folder, out=tmp_path / "data", sensor="dome")
-    assert check_dataset(data) == ()
-    recording = data.load(data.trials[0])
-    np.testing.assert_allclose(recording.normal_force_n, FORCES[:, 2])
-    np.testing.assert_array_equal(recording.frames, frames)
-    assert not recording.labelled.any()
+    for mu, expected in (
+        (None, [np.nan] * 3),
+        (0.8, [1 - np.sqrt(1.25) / 2 / 0.8, np.nan, 1 - np.hypot(1, 2) / 6 / 0.8]),
+    ):
+        data = import_recordings(folder, out=tmp_path / f"{mu}", sensor="dome", labelling=LabelSettings(mu=mu))
+        assert check_dataset(data) == ()
+        recording = data.load(data.trials[0])
+        np.testing.assert_allclose(recording.normal_force_n, FORCES[:, 2])
+        np.testing.assert_array_equal(recording.frames, frames)
+        np.testing.assert_allclose(recording.safety_margin, expected)
+        assert recording.contact_state[1] == "no contact"
+    with pytest.raises(InputError, match=r"reaches 0\.56, above the given friction 0\.5"):
+        import_recordings(folder, out=tmp_path / "slippery", sensor="dome", labelling=LabelSettings(mu=0.5))
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def _lists_stills(path: Path) -> bool:
 def read_stills(path: Path, options: ReadOptions) -> Capture:
     """Open the images that a table lists, in its order, each with its forces.
 
-    Stills have no times: they count as one a second. The margin is unknown, for nothing tells the friction. The forces
+    Stills have no times: they count as one a second. The margin is unknown unless `LabelSettings.mu` gives the friction. The forces
     of columns such as `shear_x_n`, `shear_y_n`, `normal_n` become x, y and z, those of `fn`, `ft` become z and x; the
     first image without any force shows the untouched sensor.
     """
@@ -85,7 +85,7 @@ def read_stills(path: Path, options: ReadOptions) -> Capture:
         forces=Forces(time_s=time_s, force_n=force_n, source=str(states)),
         notes=(
             f"{states.name}: forces are those of {', '.join(map(repr, names))} as {axes} ({how}), {unit}.",
-            f"{states.name}: stills have no times; they count as one a second. Their margins are unknown.",
+            f"{states.name}: stills have no times; they count as one a second. Margins need a friction (--mu).",
             *notes,
         ),
         labels=replace(
