@@ -10,10 +10,15 @@ mounting. Every number is of states that the calibration never saw.
   of three penalties on the states asked about: what the model has to beat.
 - `fitted_to_itself`: the same model calibrated on the states that it is asked about, with the load given. It has more
   weights than states, so this is no accuracy.
+- `adapted_r2` (with --adapt): R2 of F_t / F_n by a network, means over the repeats of a state, on tilts that its training
+  never saw. Friction is set to 1, so that the margin is 1 - F_t / F_n. `ten` trains on ten states (both masses, upright
+  and at 30 degrees about one axis); `mass`, `tilt` and `direction` leave out each of two halves in turn. Of each
+  training state two repeats of ten are held out to stop the training.
 - `leave_out`: one mass, tilt or direction left out of both masses, the others calibrate.
 """
 
 import argparse
+import csv
 import json
 import os
 from pathlib import Path
@@ -22,7 +27,10 @@ import numpy as np
 
 from sliplens.images import read_image
 from sliplens.markers import calibrate_traction, track_markers
+from sliplens.recordings import import_recordings
 from sliplens.recordings.formats.tables import open_text_table
+from sliplens.recordings.options import LabelSettings, ReadOptions
+from sliplens.training import evaluate, train
 
 LIGHT_G, HEAVY_G = 135.6, 584.2
 
@@ -97,6 +105,69 @@ def leave_out(moved_px: np.ndarray, force_n: np.ndarray, states: np.ndarray, *, 
     }
 
 
+def halves(states: np.ndarray) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]:
+    """Return the training and test states of each question, as masks over the states."""
+    light, heavy = (np.abs(states[:, 0] - mass) < 0.5 for mass in (LIGHT_G, HEAVY_G))
+    tilt = np.abs(states[:, 1:])
+    tilted, steep, one_axis = tilt.max(axis=1) > 0, tilt.max(axis=1) == tilt.max(), tilt.min(axis=1) == 0
+    ten = (light | heavy) & one_axis & (steep | ~tilted)
+
+    def both(half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        return [(~asked | ~tilted, asked & tilted) for asked in (half, ~half)]
+
+    return {"ten": [(ten, tilted & ~ten)], "mass": both(light), "tilt": both(steep), "direction": both(one_axis)}
+
+
+def adapt(folder: Path, work: Path, *, start: str | None) -> dict[str, dict[str, float]]:
+    """R2 and mean absolute error of F_t / F_n by networks trained on some states and asked about others."""
+    with (folder / "states.csv").open(encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        rows, header = list(reader), list(reader.fieldnames or ())
+    by_row = np.array([[float(row[name]) for name in ("mass_g", "tilt_x_deg", "tilt_z_deg")] for row in rows])
+    states, number = np.unique(by_row, axis=0, return_inverse=True)
+    untouched, held_out = by_row[:, 0] == 0, np.array([int(row["repeat"]) >= 8 for row in rows])
+    results = {}
+    for question, folds in halves(states).items():
+        truth, predicted = [], []
+        for fold, masks in enumerate(folds):
+            known, asked = (mask[number.ravel()] & ~untouched for mask in masks)
+            parts = {"train": known & ~held_out, "validation": known & held_out, "test": asked}
+            place = work / f"{start or 'scratch'}-{question}-{fold}"
+            for name, members in parts.items():
+                (place / name).mkdir(parents=True, exist_ok=True)
+                with (place / name / "states.csv").open("w", encoding="utf-8", newline="") as file:
+                    writer = csv.DictWriter(file, header)
+                    writer.writeheader()
+                    writer.writerows(row for row, member in zip(rows, members | untouched, strict=True) if member)
+            data = import_recordings(
+                [place / name for name in parts],
+                out=place / "data",
+                sensor="fingervision",
+                splits={name: name for name in parts},
+                reading=ReadOptions(image_root=folder),
+                labelling=LabelSettings(mu=1.0),
+            )
+            settings = {"epochs": 20, "epoch_frames": 640, "image_size": 112, "augmentation": "all-directions"}
+            recipe = "default" if start is None else "adapt"
+            network = train(data, place / "run", input="pair", recipe=recipe, start_from=start, patience=20, **settings)
+            table = evaluate(network, data).predictions
+            recording = data.load(data.find("test"))
+            ratio = recording.tangential_force_n / np.maximum(recording.normal_force_n, 1e-9)
+            state = number.ravel()[np.flatnonzero(parts["test"] | untouched)]
+            frame = np.asarray(table.frame)
+            for kind in np.unique(state[frame]):
+                of = state[frame] == kind
+                truth.append(float(ratio[frame[of]].mean()))
+                predicted.append(float(1 - np.asarray(table.prediction)[of].mean()))
+        error = np.array(predicted) - truth
+        results[question] = {
+            "r2": float(1 - np.sum(error**2) / np.sum((np.array(truth) - np.mean(truth)) ** 2)),
+            "mae": float(np.abs(error).mean()),
+            "states": len(truth),
+        }
+    return results
+
+
 def main() -> None:
     """Print what was measured, as a table or as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -104,6 +175,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=default, help="folder with states.csv and its frames")
     parser.add_argument("--calibrate", type=float, default=LIGHT_G, help="mass of the tilted calibration states, in g")
     parser.add_argument("--ask", type=float, default=HEAVY_G, help="mass of the states that are asked about, in g")
+    parser.add_argument("--adapt", type=Path, metavar="FOLDER", help="train 14 networks there, about an hour")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if not (options.data / "states.csv").is_file():
@@ -128,6 +200,9 @@ def main() -> None:
         "leave_out": leave_out(moved_px, force_n, states, given=False),
         "leave_out_load_given": leave_out(moved_px, force_n, states, given=True),
     }
+    if options.adapt is not None:
+        starts = {"chromatouch-pair": "chromatouch-pair", "scratch": None}
+        found["adapted_r2"] = {name: adapt(options.data, options.adapt, start=start) for name, start in starts.items()}
     if options.json:
         print(json.dumps(found))
         return

@@ -48,9 +48,9 @@ def _lists_stills(path: Path) -> bool:
 def read_stills(path: Path, options: ReadOptions) -> Capture:
     """Open the images that a table lists, in its order, each with its forces.
 
-    Stills have no times: they count as one a second. The margin is unknown unless `LabelSettings.mu` gives the friction. The forces
-    of columns such as `shear_x_n`, `shear_y_n`, `normal_n` become x, y and z, those of `fn`, `ft` become z and x; the
-    first image without any force shows the untouched sensor.
+    Stills have no times: they count as one a second. The margin is unknown unless `LabelSettings.mu` gives the
+    friction. The forces of columns such as `shear_x_n`, `shear_y_n`, `normal_n` become x, y and z, those of `fn`, `ft`
+    become z and x; the first image without any force shows the untouched sensor.
     """
     states = path if path.is_file() else find_states(path)
     if states is None:
