@@ -10,10 +10,10 @@ mounting. Every number is of states that the calibration never saw.
   of three penalties on the states asked about: what the model has to beat.
 - `fitted_to_itself`: the same model calibrated on the states that it is asked about, with the load given. It has more
   weights than states, so this is no accuracy.
-- `adapted_r2` (with --adapt): R2 of F_t / F_n by a network, means over the repeats of a state, on tilts that its training
-  never saw. Friction is set to 1, so that the margin is 1 - F_t / F_n. `ten` trains on ten states (both masses, upright
-  and at 30 degrees about one axis); `mass`, `tilt` and `direction` leave out each of two halves in turn. Of each
-  training state two repeats of ten are held out to stop the training.
+- `adapted_r2` (with --adapt): R2 of F_t / F_n by a network, means over the repeats of a state, on tilts that its
+  training never saw. Friction is set to 1, so that the margin is 1 - F_t / F_n. `ten` trains on ten states (both
+  masses, upright and at 30 degrees about one axis); `mass`, `tilt` and `direction` leave out each of two halves in
+  turn. Of each training state two repeats of ten are held out to stop the training.
 - `leave_out`: one mass, tilt or direction left out of both masses, the others calibrate.
 """
 
@@ -29,7 +29,7 @@ from sliplens.images import read_image
 from sliplens.markers import calibrate_traction, track_markers
 from sliplens.recordings import import_recordings
 from sliplens.recordings.formats.tables import open_text_table
-from sliplens.recordings.options import LabelSettings, ReadOptions
+from sliplens.recordings.options import LabelSettings
 from sliplens.training import evaluate, train
 
 LIGHT_G, HEAVY_G = 135.6, 584.2
@@ -135,6 +135,9 @@ def adapt(folder: Path, work: Path, *, start: str | None) -> dict[str, dict[str,
             place = work / f"{start or 'scratch'}-{question}-{fold}"
             for name, members in parts.items():
                 (place / name).mkdir(parents=True, exist_ok=True)
+                for path in folder.iterdir():
+                    if path.is_dir() and not (place / name / path.name).exists():
+                        (place / name / path.name).symlink_to(path.resolve())
                 with (place / name / "states.csv").open("w", encoding="utf-8", newline="") as file:
                     writer = csv.DictWriter(file, header)
                     writer.writeheader()
@@ -144,7 +147,6 @@ def adapt(folder: Path, work: Path, *, start: str | None) -> dict[str, dict[str,
                 out=place / "data",
                 sensor="fingervision",
                 splits={name: name for name in parts},
-                reading=ReadOptions(image_root=folder),
                 labelling=LabelSettings(mu=1.0),
             )
             settings = {"epochs": 20, "epoch_frames": 640, "image_size": 112, "augmentation": "all-directions"}
