@@ -165,15 +165,12 @@ def _extra(name: str, needs: list[str]) -> str:
 
 
 def _cameras() -> str:
-    try:
-        cameras = list_cameras()
-    except InputError as error:
-        return _absent(str(error))
+    cameras = list_cameras()
     if not cameras:
         return _absent("none is connected")
-    if not any(camera.modes for camera in cameras):
+    if not any(camera.formats for camera in cameras):
         raise InputError(f"{cameras[0].path} {cameras[0].name}; close what holds it, or join the group video")
-    return ", ".join(f"{camera.path} {camera.name} ({number_of(len(camera.modes), 'mode')})" for camera in cameras)
+    return ", ".join(f"{camera.path} {camera.name} ({number_of(len(camera.formats), 'format')})" for camera in cameras)
 
 
 def _reference(folder: Path) -> str:

@@ -41,6 +41,5 @@ def test_the_address_of_the_page_is_told_with_its_token(small_dataset: Dataset):
 
 
 def test_what_can_be_read_is_listed(capsys: pytest.CaptureFixture[str]):
-    pytest.importorskip("linuxpy")
     assert main(["live", "--list"]) == 0
     assert "camera by its number or device file" in capsys.readouterr().out

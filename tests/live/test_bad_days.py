@@ -6,15 +6,16 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from threading import Event, Thread
-from types import SimpleNamespace
 
 import av
+import av.logging
 import numpy as np
 import pytest
+from av.error import ExitError
 from PIL import Image
 
 import sliplens as sl
@@ -23,7 +24,6 @@ from sliplens.images import write_png
 from sliplens.live import FolderSource, LiveOptions, StreamSource, list_cameras, loop, open_live, sources
 from sliplens.live.contract import LiveSource
 from sliplens.live.reading import LiveFrame, Reading
-from sliplens.live.sources import FrameDecoder
 
 plain_reader = partial(sl.LiveReader, health=None, slip=None)
 """What is captured and read, without judging it."""
@@ -265,217 +265,143 @@ def test_a_stream_leads_to_no_file_of_this_machine(tmp_path: Path):
         StreamSource(f"file://{tmp_path}/list.m3u8").__enter__()
 
 
-# cameras, as the kernel would show them
+# cameras: FFmpeg opens a film in place of the device
 
 
-def jpeg(image: np.ndarray, **options: int) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="JPEG", **options)
-    return buffer.getvalue()
+class FakeCamera:
+    """Camera whose packets, in MJPEG, are a film: times in seconds and bytes, None for a whole picture."""
 
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.packets: list[tuple[float, bytes | None]] = [(0.0, None)]
+        self.size, self.formats, self.fails = (48, 64), {"mjpeg"}, list[OSError | None]()
+        self.asked: list[dict[str, str]] = []
+        self.open = av.open
+        monkeypatch.setattr(sources.av, "open", self.play)
 
-def smooth(height: int, width: int) -> np.ndarray:
-    rows, columns = np.mgrid[:height, :width]
-    return np.stack([rows, columns, 255 - rows], axis=-1).clip(0, 255).astype(np.uint8)
-
-
-@pytest.mark.parametrize("wanted", [(96, 128), (48, 64), (24, 32)])
-def test_a_jpeg_is_decoded_as_pillow_does_it_and_scaled_down(wanted: tuple[int, int]):
-    image = smooth(96, 128)
-    data = jpeg(image, quality=95)
-    decoded = FrameDecoder("MJPG", size=(96, 128), wanted=wanted).decode(data)
-    assert decoded is not None
-    step = 96 // wanted[0]
-    blocks = image.reshape(wanted[0], step, wanted[1], step, 3).mean(axis=(1, 3))
-    # two ways to interpolate colour, and JPEG's own loss: some grey levels
-    assert np.abs(decoded - blocks).mean() < 3
-
-
-@pytest.mark.parametrize("data", [b"", b"garbage" * 50, jpeg(smooth(48, 64))[:300]])
-def test_garbage_is_no_frame(data: bytes):
-    decoder = FrameDecoder("MJPG", size=(48, 64))
-    assert decoder.decode(data) is None
-    assert decoder.decode(jpeg(smooth(48, 64))) is not None
-
-
-def test_padded_rows_of_a_camera_are_left_out():
-    image = smooth(4, 6)
-    padded = np.zeros((4, 20), dtype=np.uint8)
-    padded[:, :18] = image.reshape(4, 18)
-    decoded = FrameDecoder("RGB3", size=(4, 6)).decode(padded.tobytes(), row_bytes=20)
-    np.testing.assert_array_equal(decoded, image)
-
-
-MONOTONIC, ERROR = 0x2000, 0x40
-
-
-class FakeDriver:
-    """What linuxpy asks of the kernel, with two modes, frames that are sent by hand, and errors on demand."""
-
-    def __init__(self) -> None:
-        self.sent: list[SimpleNamespace | OSError] = []
-        self.refuses: OSError | None = None
-        self.chosen: tuple[int, int, str] = (480, 640, "MJPG")
-        self.opened = 0
-
-    def send(self, data: bytes, *, number: int, stamp_s: float, flags: int = MONOTONIC) -> None:
-        from linuxpy.video.device import BufferFlag  # noqa: PLC0415 (an extra)
-
-        self.sent.append(SimpleNamespace(data=data, frame_nb=number, timestamp=stamp_s, flags=BufferFlag(flags)))
-
-    def install(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        from linuxpy.video import device  # noqa: PLC0415 (an extra)
-
-        driver = self
-
-        def fourcc(name: str) -> SimpleNamespace:
-            return SimpleNamespace(human_str=lambda: name)
-
-        class Device:
-            def __init__(self, _: Path) -> None:
-                kinds = [("YUYV", 480, 640, 30), ("MJPG", 480, 640, 60), ("MJPG", 96, 128, 60), ("MJPG", 480, 640, 30)]
-                modes = [
-                    SimpleNamespace(pixel_format=fourcc(name), height=height, width=width, max_fps=rate)
-                    for name, height, width, rate in kinds
-                ]
-                takes = device.Capability.VIDEO_CAPTURE
-                self.info = SimpleNamespace(frame_types=modes, device_capabilities=takes, card="A camera")
-
-            def __enter__(self) -> "Device":
-                if driver.refuses is not None:
-                    raise driver.refuses
-                driver.opened += 1
-                self.ends = os.pipe()
-                os.write(self.ends[1], b"always ready")
-                return self
-
-            def __exit__(self, *_: object) -> None:
-                for end in self.ends:
-                    os.close(end)
-
-            def fileno(self) -> int:
-                return self.ends[0]
-
-        class VideoCapture(nullcontext):
-            def __init__(self, opened: Device, size: int) -> None:
-                super().__init__(opened)
-                assert size > 2
-                self.buffer, self.set_fps, self.get_fps = self, lambda _: None, lambda: 60.0
-
-            def set_format(self, width: int, height: int, pixel_format: str) -> None:
-                driver.chosen = (height, width, pixel_format)
-
-            def get_format(self) -> SimpleNamespace:
-                height, width, name = driver.chosen
-                return SimpleNamespace(height=height, width=width, pixel_format=fourcc(name), bytes_per_line=0)
-
-            def raw_read(self) -> SimpleNamespace:
-                if not driver.sent:
-                    raise BlockingIOError
-                sent = driver.sent.pop(0)
-                if isinstance(sent, OSError):
-                    raise sent
-                return sent
-
-        monkeypatch.setattr(device, "Device", Device)
-        monkeypatch.setattr(device, "VideoCapture", VideoCapture)
+    def play(self, path: str, *, format: str, options: dict[str, str]) -> object:
+        assert (path, format) == ("/dev/video0", "v4l2")
+        self.asked.append(options)
+        if self.fails and (failure := self.fails.pop(0)) is not None:
+            raise failure
+        if options.get("input_format", "yuyv422") not in self.formats:
+            raise OSError(errno.EINVAL, "Invalid argument")
+        height, width = self.size
+        image = np.tile(np.arange(width, dtype=np.uint8)[:, None], (height, 1, 3))
+        buffer = io.BytesIO()
+        Image.fromarray(image).save(buffer, format="JPEG", quality=95)
+        film = io.BytesIO()
+        with self.open(film, "w", format="matroska") as out:
+            stream = out.add_stream("mjpeg", rate=50)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuvj420p"
+            for time_s, data in self.packets:
+                packet = av.Packet(buffer.getvalue() if data is None else data)
+                packet.stream, packet.time_base = stream, Fraction(1, 1000)
+                packet.pts = packet.dts = round(1000 * time_s)
+                out.mux(packet)
+        film.seek(0)
+        return self.open(film, format="matroska")
 
 
 @pytest.fixture
-def driver(monkeypatch: pytest.MonkeyPatch) -> FakeDriver:
-    pytest.importorskip("linuxpy")
-    fake = FakeDriver()
-    fake.install(monkeypatch)
-    return fake
+def camera(monkeypatch: pytest.MonkeyPatch) -> FakeCamera:
+    return FakeCamera(monkeypatch)
 
 
-def test_a_camera_keeps_the_stamps_and_numbers_of_the_kernel(driver: FakeDriver):
-    now_s = time.monotonic()
-    data = jpeg(smooth(480, 640))
-    driver.send(data, number=4, stamp_s=now_s - 0.02)
-    driver.send(b"torn", number=5, stamp_s=now_s)
-    driver.send(data, number=6, stamp_s=now_s, flags=MONOTONIC | ERROR)
-    driver.send(data, number=7, stamp_s=now_s + 0.02)
-    with open_live("0") as source:
-        assert (source.size, source.rate_hz) == ((480, 640), 60.0)
-        frames = source.frames()
-        first, second = next(frames), next(frames)
-    assert (first.number, second.number) == (4, 7)
-    assert (first.time_s, first.captured_s) == (now_s - 0.02, now_s - 0.02)
+def test_a_camera_keeps_the_stamps_of_the_kernel_and_counts_what_is_lost(camera: FakeCamera):
+    now_s = round(time.monotonic(), 3)
+    camera.packets = [(now_s, None), (now_s + 0.02, b"torn"), (now_s + 0.06, None)]
+    frames: list[LiveFrame] = []
+    with open_live("0") as source, pytest.raises(SourceError, match="has ended"):
+        frames.extend(source.frames())
+    # the second was torn, and the third never came
+    assert [frame.number for frame in frames] == [0, 3]
+    assert [frame.time_s for frame in frames] == pytest.approx([now_s, now_s + 0.06])
+    assert [frame.captured_s for frame in frames] == pytest.approx([now_s, now_s + 0.06])
 
 
 @pytest.mark.parametrize(
-    ("options", "chosen", "size"),
+    ("options", "asked", "size"),
     [
-        (LiveOptions(), (480, 640, "MJPG"), (480, 640)),
-        (LiveOptions(size=(96, 128)), (96, 128, "MJPG"), (96, 128)),
-        (LiveOptions(size=(240, 320)), (480, 640, "MJPG"), (240, 320)),  # decoded scaled down
-        (LiveOptions(fit_size=(240, 320)), (480, 640, "MJPG"), (240, 320)),
-        (LiveOptions(fit_size=(224, 224)), (480, 640, "MJPG"), (480, 640)),  # of another shape: the network says so
-        (LiveOptions(pixel_format="YUYV", size=(480, 640)), (480, 640, "YUYV"), (480, 640)),
+        (LiveOptions(), {"input_format": "mjpeg"}, (48, 64)),
+        (LiveOptions(size=(24, 32), rate_hz=50.0), {"video_size": "32x24", "framerate": "50"}, (24, 32)),  # scaled down
+        (LiveOptions(fit_size=(24, 32)), {"video_size": "32x24"}, (24, 32)),
+        (
+            LiveOptions(fit_size=(224, 224)),
+            {"video_size": "224x224"},
+            (48, 64),
+        ),  # of another shape
+        (LiveOptions(pixel_format="YUYV"), {"input_format": "yuyv422"}, (48, 64)),
     ],
 )
-def test_the_mode_of_a_camera_suits_the_wishes(
-    driver: FakeDriver, options: LiveOptions, chosen: tuple[int, int, str], size: tuple[int, int]
+def test_a_camera_is_asked_for_what_the_options_say(
+    camera: FakeCamera, options: LiveOptions, asked: dict[str, str], size: tuple[int, int]
 ):
+    camera.formats |= {"yuyv422"}
     with open_live("/dev/video0", options=options) as source:
         assert source.size == size
-    assert driver.chosen == chosen
+        assert next(iter(source.frames())).image.shape == (*size, 3)
+    assert camera.asked == [{"input_format": "mjpeg"} | asked]
+
+
+def test_a_camera_without_mjpg_is_read_as_it_is(camera: FakeCamera):
+    camera.formats = {"yuyv422"}
+    with open_live("0"):
+        assert camera.asked == [{"input_format": "mjpeg"}, {}]
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (LiveOptions(size=(100, 100)), "has no mode that gives 100x100 .*128x96, 640x480"),
-        (LiveOptions(size=(480, 640), rate_hz=200.0), "or a lower --rate"),
-        (LiveOptions(pixel_format="H264"), "has no format H264; choose MJPG, YUYV with --pixel-format"),
+        (LiveOptions(size=(100, 100)), "gives 64x48 and not 100x100; choose a --size of the same shape and no larger"),
+        (LiveOptions(pixel_format="H264"), "does not take these settings; see"),
     ],
 )
-def test_a_mode_that_a_camera_has_not_is_told(driver: FakeDriver, options: LiveOptions, words: str):
+def test_a_mode_that_a_camera_has_not_is_told(camera: FakeCamera, options: LiveOptions, words: str):
     with pytest.raises(SourceError, match=words):
         open_live("0", options=options).__enter__()
-    assert driver.opened == 1
 
 
-def test_a_camera_that_is_unplugged_is_read_again_when_it_is_back(driver: FakeDriver):
-    data, begun_s = jpeg(IMAGE), time.monotonic()
-    driver.chosen = (48, 48, "MJPG")
-    driver.send(data, number=8, stamp_s=begun_s)
-    driver.sent.append(OSError(errno.ENODEV, "No such device"))
-    numbers = []
-    with plain_reader("0", reference=IMAGE, seconds=10.0) as reader:
-        for reading in reader.readings():
-            numbers.append(reading.number)
-            if len(numbers) == 2:
-                break
-            driver.send(data, number=0, stamp_s=begun_s + 0.5)
-    assert numbers == [8, 0]
-    assert driver.opened == 2
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.EBUSY, "close that one"), (errno.EACCES, "group video"), (errno.EIO, "plug it in again")],
+)
+def test_a_camera_that_cannot_be_opened_says_why(camera: FakeCamera, number: int, words: str):
+    camera.fails = [OSError(number, os.strerror(number))] * 2
+    with pytest.raises(SourceError, match=words):
+        open_live("0").__enter__()
 
 
-def test_a_camera_that_sends_garbage_alone_says_so(driver: FakeDriver):
-    for number in range(40):
-        driver.send(b"garbage", number=number, stamp_s=float(number))
-    with open_live("0") as source, pytest.raises(SourceError, match="sends frames that cannot be decoded"):
-        list(source.frames())
+def test_a_camera_that_is_unplugged_is_read_again_when_it_is_back(camera: FakeCamera):
+    camera.fails = [None, *([OSError(errno.ENODEV, "No such device")] * 20)]
+    withheld: list[str | None] = []
+    reader = plain_reader("0", reference=np.zeros((48, 64, 3), np.uint8), stall_s=0.05)
+    reader.subscribe(lambda reading, _: withheld.append(reading.withheld))
+    with reader:
+        while len(camera.asked) < 24:  # opened again
+            time.sleep(0.01)
+    assert withheld[0] is None
+    assert "the camera /dev/video0 was unplugged; plug it in again" in withheld
 
 
-def test_a_camera_that_is_silent_says_so(driver: FakeDriver, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sliplens.live.sources._STALL_S", 0.05)
-    with open_live("0") as source, pytest.raises(SourceError, match=r"has given no frame for 0\.05 s"):
-        list(source.frames())
-    assert driver.opened == 1
-
-
-def test_cameras_are_listed_with_their_modes(driver: FakeDriver, tmp_path: Path):
-    for name in ("video10", "video2", "null"):
+def test_cameras_are_listed_with_their_formats(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("video10", "video2", "video3", "video4", "null"):
         (tmp_path / name).touch()
+
+    def listed(path: str, *, format: str, options: dict[str, str]) -> None:
+        assert (format, options) == ("v4l2", {"list_formats": "all"})
+        if path.endswith("3"):
+            raise OSError(errno.EBUSY, "Device or resource busy")
+        if path.endswith("4"):
+            raise OSError(errno.ENOTTY, "Inappropriate ioctl for device")
+        for text in ("Compressed:       mjpeg :          Motion-JPEG :", " 640x480", " 320x240", "\n"):
+            av.logging.log(av.logging.INFO, "v4l2", text)
+        raise ExitError(1, "Immediate exit requested")
+
+    monkeypatch.setattr(sources.av, "open", listed)
     cameras = list_cameras(tmp_path)
-    assert [camera.path.name for camera in cameras] == ["video2", "video10"]
-    told = [(mode.pixel_format, mode.size, mode.rates_hz) for mode in cameras[0].modes]
-    assert told == [("MJPG", (96, 128), (60.0,)), ("MJPG", (480, 640), (60.0, 30.0)), ("YUYV", (480, 640), (30.0,))]
-    driver.refuses = OSError(errno.EBUSY, "Device or resource busy")
-    assert list_cameras(tmp_path)[0].name == "cannot be opened (Device or resource busy)"
+    assert [camera.path.name for camera in cameras] == ["video2", "video3", "video10"]
+    assert cameras[0].formats == ("mjpeg 640x480 320x240",)
+    assert cameras[1].name == "cannot be opened (Device or resource busy)"
 
 
 @pytest.fixture

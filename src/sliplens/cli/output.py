@@ -305,8 +305,8 @@ def print_sources() -> None:
     """Print the cameras and the other live sources."""
     from sliplens.live import SOURCES, list_cameras
 
-    rows = [(str(camera.path), camera.name, *mode.in_words()) for camera in list_cameras() for mode in camera.modes]
-    columns = ("device", "name", "format", "size", "frames/s")
+    rows = [(str(camera.path), camera.name, each) for camera in list_cameras() for each in camera.formats or ("",)]
+    columns = ("device", "name", "format and sizes")
     print_table("Cameras", columns, rows) if rows else say("no camera was found")
     for words in ("simulated gripper that holds (grip, or grip:egg)", *(kind.words for kind in SOURCES.values())):
         say(f"  {words}")

@@ -10,7 +10,6 @@ from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import (
     SOURCES,
     Camera,
-    CameraMode,
     CameraSource,
     FolderSource,
     ReplaySource,
@@ -21,7 +20,7 @@ from sliplens.live.sources import (
 )
 
 __all__ = [
-    "SOURCES", "Camera", "CameraMode", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthMonitor",
+    "SOURCES", "Camera", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthMonitor",
     "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "OutputState", "Reading",
     "Recorder", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipState", "SourceKind",
     "StreamSource", "list_cameras", "open_live", "read_live",

@@ -26,7 +26,7 @@ class LiveOptions:
     size: tuple[int, int] | None = None
     """Height and width of the frames, in pixels; larger ones are scaled down. The source's own if None."""
     pixel_format: str | None = None
-    """Format of a camera, four letters such as MJPG or YUYV; MJPG where the camera has it if None."""
+    """Format of a camera, such as MJPG or YUYV; MJPG where the camera has it if None."""
     fit_size: tuple[int, int] | None = None
     """Height and width that a network was trained on, in pixels: used where the source can give it, else ignored."""
 
@@ -133,6 +133,8 @@ class SourceKind:
     """Returns True for the names of this kind, without opening anything."""
     open: Callable[[str, LiveOptions], LiveSource]
     """Nothing runs before the source is entered."""
+    takes: tuple[str, ...] = ("rate_hz", "speed", "trial", "size", "pixel_format")
+    """Options of `LiveOptions` that apply; others are refused."""
 
 
 __all__ = ["LiveOptions", "LiveSource", "SourceKind"]

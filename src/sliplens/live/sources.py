@@ -1,29 +1,29 @@
 """Running sources: cameras, network streams, growing folders, replays, and a simulated fingertip."""
 
 import errno
-import select
+import re
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import av
+import av.logging
 import numpy as np
-from av.error import FFmpegError, InvalidDataError
-from av.video.codeccontext import VideoCodecContext
-from av.video.frame import VideoFrame
+from av.container import InputContainer
+from av.error import ExitError, FFmpegError, InvalidDataError
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
 from sliplens.errors import ImageError, InputError, SourceError
-from sliplens.extras import Table, pick, require_packages
+from sliplens.extras import Table, pick
 from sliplens.files import require_folder
 from sliplens.images import is_image, list_images, natural_key
 from sliplens.live.contract import LiveOptions, LiveSource, Pace, SourceKind
 from sliplens.live.reading import LiveFrame
-from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.video import upright
@@ -34,22 +34,6 @@ from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp, Nuisances, draw_unit
 from sliplens.simulation.sensor import SENSORS
 
-if TYPE_CHECKING:
-    from linuxpy.video.device import Device
-
-_DECODERS = {
-    "MJPG": ("mjpeg", "", 0),
-    "JPEG": ("mjpeg", "", 0),
-    "YUYV": ("rawvideo", "yuyv422", 2),
-    "UYVY": ("rawvideo", "uyvy422", 2),
-    "RGB3": ("rawvideo", "rgb24", 3),
-    "BGR3": ("rawvideo", "bgr24", 3),
-    "GREY": ("rawvideo", "gray", 1),
-}
-"""Formats of V4L2 by their four letters: the decoder of FFmpeg, its pixel format, and bytes a pixel."""
-_BUFFERS = 4  # two are not enough where a process is now and then late
-_POLL_S, _STALL_S = 0.1, 2.0
-_MOST_BAD = 30  # frames in a row that cannot be decoded
 _CURES = {
     errno.EBUSY: "is taken by another program; close that one",
     errno.EACCES: "may not be opened; add yourself to the group video and log in again",
@@ -59,68 +43,97 @@ _CURES = {
     errno.ENOTTY: "is no camera; see `sliplens live --list`",
     errno.EINVAL: "does not take these settings; see `sliplens live --list`",
 }
+_NETWORK = ("rtsp", "rtp", "udp", "tcp", "http", "https", "rtmp", "srt")
+_OPEN_S, _READ_S = 5.0, 2.0
+_QUICK = {
+    # a stream must not lead to a file of this machine
+    "protocol_whitelist": ",".join((*_NETWORK, "rtsps", "tls", "crypto", "rtmps")),
+    "rtsp_transport": "tcp",
+    "fflags": "nobuffer",
+    "flags": "low_delay",
+    "analyzeduration": "500000",
+}
+_FFMPEG_NAMES = {"MJPG": "mjpeg", "YUYV": "yuyv422", "GREY": "gray"}
+_CLOCKS_S = 10.0  # stamps of a camera that differ from the monotonic clock by more are of another one
 
 
-@dataclass(frozen=True, kw_only=True)
-class CameraMode:
-    """Mode of a camera: format (four letters, such as MJPG), size (height, width) in pixels, and frames a second."""
+class StreamSource(LiveSource):
+    """Video that a network camera sends, as far as FFmpeg reads it: RTSP, HTTP, MPEG-TS over UDP or TCP, SRT."""
 
-    pixel_format: str
-    size: tuple[int, int]
-    rates_hz: tuple[float, ...]
+    reconnects = True
 
-    def in_words(self) -> tuple[str, str, str]:
-        """Describe format, size and rates."""
-        rates = ", ".join(f"{rate:g}" for rate in self.rates_hz)
-        return self.pixel_format, f"{self.size[1]}x{self.size[0]}", rates or "unknown"
+    def __init__(self, address: str, *, size: tuple[int, int] | None = None) -> None:
+        self.name, self._address, self._wanted = f"the stream {address}", address, size
 
-
-@dataclass(frozen=True, kw_only=True)
-class Camera:
-    """Camera of this machine: its device file, the name of its driver, and the modes that sliplens can read."""
-
-    path: Path
-    name: str
-    modes: tuple[CameraMode, ...] = ()
-
-
-class FrameDecoder:
-    """Decoder of a camera's frames, of a size (height, width) in pixels; scales them down to `wanted`."""
-
-    def __init__(self, pixel_format: str, *, size: tuple[int, int], wanted: tuple[int, int] | None = None) -> None:
-        codec, pixels, pixel_bytes = _DECODERS[pixel_format]
-        self._height, self._row_bytes, self._wanted = size[0], size[1] * pixel_bytes, wanted or size
-        context = av.CodecContext.create(codec, "r")
-        assert isinstance(context, VideoCodecContext)
-        context.thread_count = 1  # frame by frame: more threads would each keep one back
-        if pixels:
-            (context.height, context.width), context.pix_fmt = size, pixels
-        else:  # a JPEG decoder halves the picture up to three times for nothing
-            ratio = min(have / want for have, want in zip(size, self._wanted, strict=True))
-            context.options = {"lowres": str(min(max(int(np.log2(ratio)), 0), 3)), "err_detect": "explode"}
-        self._context, self._to_rgb = context, VideoReformatter()
-
-    def decode(self, data: bytes, *, row_bytes: int = 0) -> Frame | None:
-        """Decode one frame as RGB; None where the bytes are no whole frame. `row_bytes`: length of a padded row."""
-        if row_bytes > self._row_bytes > 0 and len(data) >= self._height * row_bytes:
-            rows = np.frombuffer(data, dtype=np.uint8, count=self._height * row_bytes).reshape(self._height, row_bytes)
-            data = rows[:, : self._row_bytes].tobytes()
-        if len(data) < max(1, self._height * self._row_bytes):
-            return None
+    def open(self, stack: ExitStack, /) -> None:
+        """Connect, and look for pictures."""
         try:
-            frames = self._context.decode(av.Packet(data))
-        except FFmpegError:
-            return None
-        return _to_rgb(self._to_rgb, frames[0], self._wanted) if len(frames) == 1 and not frames[0].is_corrupt else None
+            self._start(stack, av.open(self._address, options=_QUICK, timeout=(_OPEN_S, _READ_S)))
+        except (FFmpegError, OSError, ValueError) as error:
+            raise self._explained(error) from None
+
+    def _start(self, stack: ExitStack, container: InputContainer) -> None:
+        self._container = stack.enter_context(container)
+        if not container.streams.video:
+            raise SourceError(f"{self.name} shows no pictures; name the address of a camera")
+        self._video = container.streams.video[0]
+        self._video.thread_type = "SLICE"  # by frame, each thread would keep one back
+        self.size = self._wanted or (self._video.codec_context.height, self._video.codec_context.width)
+        self.rate_hz = float(self._video.average_rate or 0) or None
+
+    def frames(self) -> Iterator[LiveFrame]:
+        """Iterate over frames as they arrive; those that cannot be decoded are missing in the numbers."""
+        to_rgb, number, steps, last_s = VideoReformatter(), -1, 1, np.nan
+        packets = self._container.demux(self._video)
+        while not self.closed.is_set():
+            try:
+                packet = next(packets)
+                arrived_s = time.monotonic()
+                frames = packet.decode()
+            except InvalidDataError:
+                steps += 1
+                continue
+            except (FFmpegError, OSError) as error:
+                if self.closed.is_set():
+                    return
+                raise self._explained(error) from None
+            except StopIteration:
+                raise SourceError(f"{self.name} has ended; start the camera again") from None
+            for frame in frames:
+                if frame.is_corrupt:
+                    steps += 1
+                    continue
+                time_s = arrived_s if frame.time is None else float(frame.time)
+                number += self._count(steps, time_s - last_s)
+                steps, last_s = 1, time_s
+                height, width = self._wanted if self._wanted else (frame.height, frame.width)
+                if self._wanted and frame.rotation % 180:
+                    height, width = width, height
+                pixels = to_rgb.reformat(frame, width=width, height=height, format="rgb24", interpolation="AREA")
+                yield LiveFrame(
+                    image=upright(frame, pixels.to_ndarray(), where=self.name),
+                    number=number,
+                    time_s=time_s,
+                    captured_s=self._captured_s(time_s, arrived_s),
+                    decode_ms=1e3 * (time.monotonic() - arrived_s),
+                )
+
+    def _count(self, steps: int, _passed_s: float) -> int:
+        return steps
+
+    def _captured_s(self, _time_s: float, arrived_s: float) -> float:
+        return arrived_s
+
+    def _explained(self, error: Exception) -> SourceError:
+        reason = getattr(error, "strerror", None) or str(error)
+        return SourceError(f"{self.name} cannot be read ({reason}); check its address and that the camera runs")
 
 
-def _to_rgb(reformatter: VideoReformatter, frame: VideoFrame, size: tuple[int, ...]) -> Frame:
-    height, width = size
-    return reformatter.reformat(frame, width=width, height=height, format="rgb24", interpolation="AREA").to_ndarray()
+class CameraSource(StreamSource):
+    """V4L2 camera, in MJPG where it has that; its frames carry the stamps of the kernel.
 
-
-class CameraSource(LiveSource):
-    """V4L2 camera, in MJPG where it has that; its frames carry the kernel's stamps and numbers.
+    The camera gives the size that is nearest to the one asked for; a larger picture of the same shape is scaled down.
+    Gaps between stamps count as lost frames.
 
     Parameters
     ----------
@@ -130,147 +143,82 @@ class CameraSource(LiveSource):
         Rate, size and pixel format; the camera's own where None.
     """
 
-    reconnects = True
-
     def __init__(self, path: Path, options: LiveOptions) -> None:
-        require_packages("linuxpy", extra="live", purpose="reading a camera")
-        self.name, self._path, self._options = f"the camera {path}", path, options
+        super().__init__(str(path))
+        self.name, self._options = f"the camera {path}", options
 
     def open(self, stack: ExitStack, /) -> None:
         """Open the device in the mode that suits the options, and start it."""
-        from linuxpy.video.device import Device, VideoCapture  # noqa: PLC0415 (an extra)
+        options, chosen = self._options, self._options.pixel_format or "MJPG"
+        size = options.size or options.fit_size
+        try:  # compressed first: what is not compressed fills the cable, and the rate falls
+            container = self._open_as(_FFMPEG_NAMES.get(chosen, chosen.lower()), size)
+        except SourceError:
+            if options.pixel_format is not None:
+                raise
+            container = self._open_as(None, size)
+        self._wanted = None
+        self._start(stack, container)
+        self._video.codec_context.options = {"err_detect": "explode"}
+        given = self.size
+        if size is not None and given[0] * size[1] == given[1] * size[0] and given[0] >= size[0]:
+            self.size = self._wanted = size
+        elif size is not None and options.size is not None:  # a network that needs another size says so itself
+            raise SourceError(
+                f"{self.name} gives {given[1]}x{given[0]} and not {size[1]}x{size[0]}; choose a --size of the same "
+                "shape and no larger, see `sliplens live --list`"
+            )
 
-        options = self._options
+    def _open_as(self, pixel_format: str | None, size: tuple[int, int] | None) -> InputContainer:
+        settings = {
+            "input_format": pixel_format,
+            "video_size": size and f"{size[1]}x{size[0]}",
+            "framerate": self._options.rate_hz and f"{self._options.rate_hz:g}",
+        }
         try:
-            self._device = stack.enter_context(Device(self._path))
-            mode = self._choose(read_modes(self._device))
-            self._capture = VideoCapture(self._device, size=_BUFFERS)
-            if mode is not None:
-                self._capture.set_format(mode.size[1], mode.size[0], mode.pixel_format)
-            if options.rate_hz is not None:
-                self._capture.set_fps(options.rate_hz)
-            chosen = self._capture.get_format()
-            pixel_format, size = chosen.pixel_format.human_str(), (chosen.height, chosen.width)
-            if pixel_format not in _DECODERS:
-                formats = ", ".join(_DECODERS)
-                raise self._failure(f"gives {pixel_format}, which is not read; choose {formats} with --pixel-format")
-            fit = options.fit_size
-            self.size = options.size or (fit if fit is not None and _shrinks_to(size, fit) else size)
-            self._decoder = FrameDecoder(pixel_format, size=size, wanted=self.size)
-            self._row_bytes, self.rate_hz = chosen.bytes_per_line, float(self._capture.get_fps())
-            stack.enter_context(self._capture)
-        except (OSError, ZeroDivisionError) as error:
-            raise self._failure(error) from None
+            return av.open(self._address, format="v4l2", options={name: str(it) for name, it in settings.items() if it})
+        except (FFmpegError, OSError) as error:
+            raise self._explained(error) from None
 
-    def frames(self) -> Iterator[LiveFrame]:
-        """Iterate over frames; those that are broken, or cannot be decoded, are missing in the numbers."""
-        from linuxpy.video.device import BufferFlag  # noqa: PLC0415 (an extra)
+    def _count(self, steps: int, passed_s: float) -> int:
+        return max(steps, round(np.nan_to_num(passed_s) * (self.rate_hz or 0)))
 
-        buffers, last_s, bad = self._capture.buffer, time.monotonic(), 0
-        assert buffers is not None
-        while not self.closed.is_set():
-            try:
-                ready, _, _ = select.select([self._device], [], [], _POLL_S)
-                sent = buffers.raw_read() if ready else None
-            except BlockingIOError:
-                sent = None
-            except (OSError, ValueError) as error:
-                raise self._failure(error) from None
-            now_s = time.monotonic()
-            if sent is None:
-                if now_s - last_s > _STALL_S:
-                    raise self._failure(f"has given no frame for {_STALL_S:g} s; check its cable, or use another port")
-                continue
-            last_s = now_s
-            is_whole = BufferFlag.ERROR not in sent.flags
-            image = self._decoder.decode(bytes(sent.data), row_bytes=self._row_bytes) if is_whole else None
-            bad = bad + 1 if image is None else 0
-            if bad >= _MOST_BAD:
-                cure = "check its cable, choose another --pixel-format, or a smaller --size"
-                raise self._failure(f"sends frames that cannot be decoded; {cure}")
-            if image is not None:
-                is_monotonic = (sent.flags & BufferFlag.TIMESTAMP_MASK) == BufferFlag.TIMESTAMP_MONOTONIC
-                yield LiveFrame(
-                    image=image,
-                    number=int(sent.frame_nb),
-                    time_s=float(sent.timestamp),
-                    captured_s=float(sent.timestamp) if is_monotonic else now_s,
-                    decode_ms=1e3 * (time.monotonic() - now_s),
-                )
+    def _captured_s(self, time_s: float, arrived_s: float) -> float:
+        return time_s if abs(arrived_s - time_s) < _CLOCKS_S else arrived_s
 
-    def _choose(self, modes: Sequence[CameraMode]) -> CameraMode | None:
-        """Choose the mode that suits the options; None to leave the camera as it is."""
-        options = self._options
-        wanted, rate_hz = options.size or options.fit_size, options.rate_hz or 0.0
-        usable = [mode for mode in modes if options.pixel_format in {None, mode.pixel_format}]
-        if modes and not usable:
-            formats = ", ".join(sorted({mode.pixel_format for mode in modes}))
-            raise self._failure(f"has no format {options.pixel_format}; choose {formats} with --pixel-format")
-        # compressed first: what is not compressed fills the cable, and the rate falls
-        usable.sort(key=lambda mode: list(_DECODERS).index(mode.pixel_format))
-        if wanted is None or not usable:
-            return usable[0] if usable and options.pixel_format is not None else None
-        fitting = [
-            mode
-            for mode in usable
-            if mode.pixel_format == usable[0].pixel_format
-            and _shrinks_to(mode.size, wanted)
-            and max(mode.rates_hz, default=np.inf) >= rate_hz
-        ]
-        if fitting or options.size is None:  # the network refuses frames of another size
-            return min(fitting, key=lambda mode: mode.size, default=None)
-        sizes = ", ".join(dict.fromkeys(mode.in_words()[1] for mode in usable))
-        raise self._failure(
-            f"has no mode that gives {wanted[1]}x{wanted[0]} at {rate_hz:g} frames a second; choose a --size of the "
-            f"same shape as one of {sizes}, or a lower --rate"
-        )
-
-    def _failure(self, reason: Exception | str) -> SourceError:
-        if isinstance(reason, Exception):
-            number = getattr(reason, "errno", None) or 0
-            reason = _CURES.get(number, f"cannot be read ({reason}); plug it in again")
-        return SourceError(f"{self.name} {reason}")
+    def _explained(self, error: Exception) -> SourceError:
+        cure = _CURES.get(getattr(error, "errno", None) or 0, f"cannot be read ({error}); plug it in again")
+        return SourceError(f"{self.name} {cure}")
 
 
-def _shrinks_to(size: tuple[int, int], wanted: tuple[int, int]) -> bool:
-    """Return True where frames of a size have the wanted shape, and are at least as large."""
-    return size[0] * wanted[1] == size[1] * wanted[0] and size[0] >= wanted[0]
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """Camera of this machine: its device file, the name of its driver, and its formats with their sizes."""
 
-
-def read_modes(device: "Device") -> tuple[CameraMode, ...]:
-    """List the modes of an open camera that can be read, the largest rate first in each."""
-    assert device.info is not None
-    rates: dict[tuple[str, tuple[int, int]], set[float]] = {}
-    for kind in device.info.frame_types:
-        rates.setdefault((kind.pixel_format.human_str(), (kind.height, kind.width)), set()).add(float(kind.max_fps))
-    return tuple(
-        CameraMode(pixel_format=name, size=size, rates_hz=tuple(sorted(values - {0.0}, reverse=True)))
-        for (name, size), values in sorted(rates.items())
-        if name in _DECODERS
-    )
+    path: Path
+    name: str
+    formats: tuple[str, ...] = ()
+    """Format and sizes (width x height) of each, such as `mjpeg 640x480 320x240`."""
 
 
 def list_cameras(folder: Path = Path("/dev")) -> tuple[Camera, ...]:
-    """List the cameras of this machine, with their modes.
-
-    Raises
-    ------
-    InputError
-        If the extra `live` is not installed.
-    """
-    require_packages("linuxpy", extra="live", purpose="listing cameras")
-    from linuxpy.video.device import Capability, Device  # noqa: PLC0415 (an extra)
-
-    cameras = []
-    for path in sorted(folder.glob("video*"), key=lambda path: (len(path.name), path.name)):
-        try:
-            with Device(path) as device:
-                assert device.info is not None
-                if Capability.VIDEO_CAPTURE in device.info.device_capabilities:
-                    cameras.append(Camera(path=path, name=device.info.card, modes=read_modes(device)))
-        except OSError as error:
-            if error.errno not in {errno.ENOTTY, errno.ENODEV}:
-                cameras.append(Camera(path=path, name=f"cannot be opened ({error.strerror})"))
+    """List the cameras of this machine, with their formats and sizes."""
+    cameras, level = [], av.logging.get_level()
+    for path in sorted(folder.glob("video*"), key=lambda path: natural_key(path.name)):
+        names = Path("/sys/class/video4linux", path.name, "name")
+        name = names.read_text(encoding="utf-8").strip() if names.exists() else path.name
+        av.logging.set_level(av.logging.INFO)  # FFmpeg lists formats in its log only
+        with av.logging.Capture() as log:
+            try:
+                av.open(str(path), format="v4l2", options={"list_formats": "all"}).close()
+            except ExitError:
+                lines = "".join(text for *_, text in log).splitlines()
+                found = [re.match(r"(?:Raw|Compressed)\s*:\s*(\w+)\s*:[^:]*:(.*)", line) for line in lines]
+                cameras.append(Camera(path=path, name=name, formats=tuple(f"{m[1]}{m[2]}" for m in found if m)))
+            except (FFmpegError, OSError) as error:
+                if error.errno not in {errno.ENOTTY, errno.ENODEV}:
+                    cameras.append(Camera(path=path, name=f"cannot be opened ({error.strerror})"))
+        av.logging.set_level(level)
     return tuple(cameras)
 
 
@@ -329,74 +277,6 @@ class FolderSource(LiveSource):
                         decode_ms=1e3 * (now_s - before),
                     )
             self.closed.wait(_FOLDER_S)
-
-
-_NETWORK = ("rtsp", "rtp", "udp", "tcp", "http", "https", "rtmp", "srt")
-_OPEN_S, _READ_S = 5.0, 2.0
-_QUICK = {
-    # a stream must not lead to a file of this machine
-    "protocol_whitelist": ",".join((*_NETWORK, "rtsps", "tls", "crypto", "rtmps")),
-    "rtsp_transport": "tcp",
-    "fflags": "nobuffer",
-    "flags": "low_delay",
-    "analyzeduration": "500000",
-}
-
-
-class StreamSource(LiveSource):
-    """Video that a network camera sends, as far as FFmpeg reads it: RTSP, HTTP, MPEG-TS over UDP or TCP, SRT."""
-
-    reconnects = True
-
-    def __init__(self, address: str, *, size: tuple[int, int] | None = None) -> None:
-        self.name, self._address, self._size = f"the stream {address}", address, size
-
-    def open(self, stack: ExitStack, /) -> None:
-        """Connect, and look for pictures."""
-        try:
-            self._container = stack.enter_context(av.open(self._address, options=_QUICK, timeout=(_OPEN_S, _READ_S)))
-        except (FFmpegError, OSError, ValueError) as error:
-            raise self._explained(error) from None
-        if not self._container.streams.video:
-            raise SourceError(f"{self.name} shows no pictures; name the address of a camera")
-        self._video = self._container.streams.video[0]
-        self._video.thread_type = "SLICE"  # by frame, each thread would keep one back
-        self.size = self._size or (self._video.codec_context.height, self._video.codec_context.width)
-        self.rate_hz = float(self._video.average_rate or 0) or None
-
-    def frames(self) -> Iterator[LiveFrame]:
-        """Iterate over frames as they arrive; those that cannot be decoded are missing in the numbers."""
-        to_rgb, number = VideoReformatter(), 0
-        packets = self._container.demux(self._video)
-        while not self.closed.is_set():
-            try:
-                packet = next(packets)
-                arrived_s = time.monotonic()
-                frames = packet.decode()
-            except InvalidDataError:
-                number += 1
-                continue
-            except (FFmpegError, OSError) as error:
-                if self.closed.is_set():
-                    return
-                raise self._explained(error) from None
-            except StopIteration:
-                raise SourceError(f"{self.name} has ended; start the camera again") from None
-            for frame in frames:
-                size = self._size or (frame.height, frame.width)
-                pixels = _to_rgb(to_rgb, frame, size[::-1] if self._size and frame.rotation % 180 else size)
-                yield LiveFrame(
-                    image=upright(frame, pixels, where=self.name),
-                    number=number,
-                    time_s=arrived_s if frame.time is None else float(frame.time),
-                    captured_s=arrived_s,
-                    decode_ms=1e3 * (time.monotonic() - arrived_s),
-                )
-                number += 1
-
-    def _explained(self, error: Exception) -> SourceError:
-        reason = getattr(error, "strerror", None) or str(error)
-        return SourceError(f"{self.name} cannot be read ({reason}); check its address and that the camera runs")
 
 
 class ReplaySource(LiveSource):
@@ -569,52 +449,40 @@ def _open_replay(name: str, options: LiveOptions) -> LiveSource:
     return ReplaySource(capture, speed=options.speed or 1.0, rate_hz=options.rate_hz)
 
 
-def _kind(
-    words: str, recognises: Callable[[str], bool], make: Callable[[str, LiveOptions], LiveSource], *takes: str
-) -> SourceKind:
-    """Make the row of a source that takes some options only."""
-
-    def open_named(name: str, options: LiveOptions) -> LiveSource:
-        source = make(name, options)
-        options.require_only(*takes, what=source.name)
-        return source
-
-    return SourceKind(words=words, recognises=recognises, open=open_named)
-
-
 _ROWS = {
-    "simulated": _kind(
-        "simulated fingertip (simulated, or simulated:flat-gel)",
-        lambda name: name.partition(":")[0] == "simulated",
-        lambda name, options: SimulatedSource(
+    "simulated": SourceKind(
+        words="simulated fingertip (simulated, or simulated:flat-gel)",
+        recognises=lambda name: name.partition(":")[0] == "simulated",
+        open=lambda name, options: SimulatedSource(
             name.partition(":")[2] or "chromatouch", rate_hz=options.rate_hz or 30.0
         ),
-        "rate_hz",
+        takes=("rate_hz",),
     ),
-    "camera": _kind(
-        "camera by its number or device file (0, or /dev/video0)",
-        lambda name: name.isdecimal() or name.startswith("/dev/"),
-        lambda name, options: CameraSource(Path(f"/dev/video{int(name)}" if name.isdecimal() else name), options),
-        "rate_hz", "size", "pixel_format",
+    "camera": SourceKind(
+        words="camera by its number or device file (0, or /dev/video0)",
+        recognises=lambda name: name.isdecimal() or name.startswith("/dev/"),
+        open=lambda name, options: CameraSource(Path(f"/dev/video{int(name)}" if name.isdecimal() else name), options),
+        takes=("rate_hz", "size", "pixel_format"),
     ),
-    "stream": _kind(
-        "network stream by its address (rtsp://, http://, udp://)",
-        lambda name: name.partition("://")[0].lower() in _NETWORK and "://" in name,
-        lambda name, options: StreamSource(name, size=options.size),
-        "size",
+    "stream": SourceKind(
+        words="network stream by its address (rtsp://, http://, udp://)",
+        recognises=lambda name: name.partition("://")[0].lower() in _NETWORK and "://" in name,
+        open=lambda name, options: StreamSource(name, size=options.size),
+        takes=("size",),
     ),
-    "folder": _kind(
-        "folder into which images are saved",
-        lambda name: Path(name).is_dir() and recognise(Path(name)) in {None, "images"},
-        lambda name, _: FolderSource(Path(name)),
+    "folder": SourceKind(
+        words="folder into which images are saved",
+        recognises=lambda name: Path(name).is_dir() and recognise(Path(name)) in {None, "images"},
+        open=lambda name, _: FolderSource(Path(name)),
+        takes=(),
     ),
-    "replay": _kind(
-        "video, bag or trial of a data set, replayed",
-        lambda name: Path(name).exists(),
-        _open_replay,
-        "rate_hz", "speed", "trial",
+    "replay": SourceKind(
+        words="video, bag or trial of a data set, replayed",
+        recognises=lambda name: Path(name).exists(),
+        open=_open_replay,
+        takes=("rate_hz", "speed", "trial"),
     ),
-}  # fmt: skip
+}
 SOURCES = Table("source", "sliplens.sources", _ROWS)
 """Running sources by kind; an installed package adds its own by the entry point `sliplens.sources`."""
 
@@ -657,12 +525,14 @@ def open_live(
     added = [row for row in SOURCES if row not in _ROWS]
     for row in (*added, *_ROWS):
         if SOURCES[row].recognises(name):
-            return SOURCES[row].open(name, options)
+            opened = SOURCES[row].open(name, options)
+            options.require_only(*SOURCES[row].takes, what=opened.name)
+            return opened
     kinds = "; ".join(SOURCES[row].words for row in SOURCES)
     raise InputError(f"{name} is no source that is known, nor a path that exists; name a {kinds}")
 
 
 __all__ = [
-    "SOURCES", "Camera", "CameraMode", "CameraSource", "FolderSource", "FrameDecoder", "ReplaySource",
-    "SimulatedSource", "StreamSource", "list_cameras", "open_live",
+    "SOURCES", "Camera", "CameraSource", "FolderSource", "ReplaySource", "SimulatedSource", "StreamSource",
+    "list_cameras", "open_live",
 ]  # fmt: skip
