@@ -13,13 +13,11 @@ import pytest
 from data_sets import save_dataset
 from there import there
 
+import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.images import decode_png
+from sliplens.images import decode_png, write_png
 from sliplens.live import viewer as viewer_process
-from sliplens.live.viewer import view_capture, view_explained, view_stored, write_rrd
-from sliplens.progress import reporting
 from sliplens.recordings import ContactState, Dataset, Recording
-from sliplens.recordings.source import open_source
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -85,8 +83,7 @@ def written(trial: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulated")
     data = save_dataset(folder / "data", trial)
     told = []
-    with reporting(lambda done, total: told.append((done, total))):
-        write_rrd(view_stored(data, data.trials[0]), folder / "new" / "a.rrd")
+    sl.view(data.folder, out=folder / "new" / "a.rrd", on_progress=lambda done, total: told.append((done, total)))
     assert told == [(done, FRAMES) for done in range(1, FRAMES + 1)]
     assert [path.name for path in (folder / "new").iterdir()] == ["a.rrd"]
     return folder / "new" / "a.rrd"
@@ -168,7 +165,7 @@ def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
         contact_state=states,
     )
     data = save_dataset(tmp_path / "data", bare)
-    write_rrd(view_stored(data, data.trials[0]), tmp_path / "a.rrd")
+    sl.view(data.folder, out=tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
     np.testing.assert_array_equal(numbers(found, "label/margin"), margin)
     np.testing.assert_array_equal(numbers(found, "force/normal"), normal)
@@ -201,9 +198,8 @@ def test_what_networks_and_trackers_say_stands_on_the_clock_of_the_frames(trial:
     tracks = pa.table({"trial": [trial.trial] * len(flat), **place, "x_px": flat[:, 0], "y_px": flat[:, 1]})
     pq.write_table(tracks, tmp_path / "tracks.parquet")
     maps = explained_of(trial, [3, 4, 9])
-    viewed = view_stored(data, data.trials[0])
     margins, followed = tmp_path / "margins.parquet", tmp_path / "tracks.parquet"
-    write_rrd(replace(viewed, predictions=margins, maps=maps, tracks=followed), tmp_path / "a.rrd")
+    sl.view(data.folder, predictions=margins, maps=maps, tracks=followed, out=tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
     read = rows(found, "margin", "Scalars:scalars")
     np.testing.assert_array_equal(read.frame, frames)
@@ -227,25 +223,29 @@ def test_what_is_of_another_trial_is_refused(trial: Recording, tmp_path: Path):
     data = save_dataset(tmp_path / "data", trial)
     nothing = {"trial": ["other"], "frame": [0], "prediction": [0.5], "low_90": [0.1], "high_90": [0.9]}
     pq.write_table(pa.table(nothing), tmp_path / "margins.parquet")
-    viewed, margins = view_stored(data, data.trials[0]), tmp_path / "margins.parquet"
-    for with_results, words in (
-        (replace(viewed, predictions=margins), f"has no frame of {trial.trial}; it has other"),
-        (replace(viewed, maps=explained_of(replace(trial, trial="other"), [3])), "of no frame of"),
-        (replace(viewed, tracks=margins), "lacks the column"),
-    ):
+    margins = tmp_path / "margins.parquet"
+    wrong: list[tuple[dict[str, Any], str]] = [
+        ({"predictions": margins}, f"has no frame of {trial.trial}; it has other"),
+        ({"maps": explained_of(replace(trial, trial="other"), [3])}, "of no frame of"),
+        ({"tracks": margins}, "lacks the column"),
+    ]
+    for results, words in wrong:
         with pytest.raises(InputError, match=words):
-            write_rrd(with_results, tmp_path / "a.rrd")
+            sl.view(data.folder, out=tmp_path / "a.rrd", **results)
     assert not (tmp_path / "a.rrd").exists()
 
 
 def test_frames_of_any_source_and_explained_ones_are_viewed_alike(trial: Recording, tmp_path: Path):
-    (capture,) = open_source(trial.frames, reference=trial.reference)
-    write_rrd(view_capture(capture), tmp_path / "a.rrd")
+    (tmp_path / "images").mkdir()
+    for number, image in enumerate(trial.frames):
+        write_png(tmp_path / "images" / f"{number:02}.png", image)
+    write_png(tmp_path / "untouched.png", trial.reference)
+    sl.view(tmp_path / "images", reference=tmp_path / "untouched.png", out=tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
     np.testing.assert_array_equal(pictures(found, "frame"), trial.frames)
     np.testing.assert_array_equal(pictures(found, "reference"), trial.reference[None])
     maps = explained_of(trial, [3, 9])
-    write_rrd(replace(view_explained(maps), maps=maps), tmp_path / "b.rrd")
+    sl.view(maps, out=tmp_path / "b.rrd")
     found = read_rrd(tmp_path / "b.rrd")
     np.testing.assert_array_equal(pictures(found, "frame"), maps.pictures)
     np.testing.assert_allclose(numbers(found, "label/margin"), trial.safety_margin[[3, 9]])
@@ -282,8 +282,8 @@ def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
     def interrupt(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), reporting(interrupt):
-        write_rrd(view_stored(small_dataset, small_dataset.trials[0]), tmp_path / "a.rrd")
+    with pytest.raises(KeyboardInterrupt):
+        sl.view(small_dataset.folder, out=tmp_path / "a.rrd", on_progress=interrupt)
     assert not list(tmp_path.iterdir())
 
 

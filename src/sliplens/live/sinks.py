@@ -154,35 +154,33 @@ def _new_file(address: str, *, kind: str) -> Path:
 
 
 class RerunSink:
-    """Readings and frames for the Rerun viewer.
+    """Readings and frames for the Rerun viewer, by the stream that is connected to a file or a viewer.
 
-    Its entities are `margin`, `interval/low`, `interval/high`, `words` and `frame`.
-
-    Parameters
-    ----------
-    connect
-        Opens the stream that it is given: to a file, or to a running viewer.
-    lossless
-        If True, frames are stored as PNG, else as JPEG.
+    Its entities are `margin`, `interval/low`, `interval/high`, `words` and `frame`; with `lossless`, images are PNG.
     """
 
-    def __init__(self, connect: Callable[[Any], None], *, lossless: bool = False) -> None:
-        require_packages("rerun", extra="sinks", purpose="--sink rerun")
+    def __init__(self, *, lossless: bool = False) -> None:
+        require_packages("rerun", extra="view", purpose="the Rerun viewer")
         import rerun  # noqa: PLC0415 (an extra, and large)
 
-        self._rerun, self._lossless, self.stream = rerun, lossless, rerun.RecordingStream("sliplens")
-        connect(self.stream)
+        self.rerun, self._lossless, self.stream = rerun, lossless, rerun.RecordingStream("sliplens")
+        if not self.stream.is_enabled():
+            raise InputError("the environment variable RERUN switches Rerun off; unset it")
+
+    @staticmethod
+    def in_ns(time_s: Any) -> Any:
+        """Convert seconds to what Rerun takes as a duration; it would cut off what is less than a nanosecond."""
+        return np.round(1e9 * np.asarray(time_s)).astype("timedelta64[ns]")
 
     def set_frame(self, number: int, time_s: float) -> None:
         """Set number and time of the frame that is logged next."""
-        # Rerun would cut off what is less than a nanosecond
-        self.stream.set_time("time", duration=np.timedelta64(round(1e9 * time_s), "ns"))
+        self.stream.set_time("time", duration=self.in_ns(time_s))
         self.stream.set_time("frame", sequence=number)
 
     def log_image(self, entity: str, image: Frame, *, static: bool = False) -> None:
         """Log an image."""
         data, kind = (encode_png(image), "png") if self._lossless else (encode_jpeg(image, _QUALITY), "jpeg")
-        self.stream.log(entity, self._rerun.EncodedImage(contents=data, media_type=f"image/{kind}"), static=static)
+        self.stream.log(entity, self.rerun.EncodedImage(contents=data, media_type=f"image/{kind}"), static=static)
 
     def send(self, reading: Reading, image: Frame | None, /) -> None:
         """Log a reading on the clock of the source; one without a time is left out."""
@@ -192,9 +190,9 @@ class RerunSink:
         ends = ("margin", reading.margin), ("interval/low", reading.low), ("interval/high", reading.high)
         for entity, value in ends:
             # a withheld margin ends the line, and is no longer shown as the newest
-            scalar = self._rerun.Clear(recursive=False) if value is None else self._rerun.Scalars(value)
+            scalar = self.rerun.Clear(recursive=False) if value is None else self.rerun.Scalars(value)
             self.stream.log(entity, scalar)
-        self.stream.log("words", self._rerun.TextLog(str(describe_reading(reading))))
+        self.stream.log("words", self.rerun.TextLog(str(describe_reading(reading))))
         if image is not None:
             self.log_image("frame", image)
 
@@ -205,8 +203,8 @@ class RerunSink:
 
 
 def _open_rerun(address: str) -> Sink:
-    path = str(_new_file(address, kind="rerun"))
-    sink = RerunSink(lambda stream: stream.save(path))
+    path, sink = _new_file(address, kind="rerun"), RerunSink()
+    sink.stream.save(path)
     return Sink(sink.send, sink.close)
 
 
