@@ -160,12 +160,12 @@ class CameraSource(StreamSource):
         self._wanted = None
         self._start(stack, container)
         self._video.codec_context.options = {"err_detect": "explode"}
-        given = self.size
-        if size is not None and given[0] * size[1] == given[1] * size[0] and given[0] >= size[0]:
+        actual = self.size
+        if size is not None and actual[0] * size[1] == actual[1] * size[0] and actual[0] >= size[0]:
             self.size = self._wanted = size
         elif size is not None and options.size is not None:  # a network that needs another size says so itself
             raise SourceError(
-                f"{self.name} gives {given[1]}x{given[0]} and not {size[1]}x{size[0]}; choose a --size of the same "
+                f"{self.name} gives {actual[1]}x{actual[0]} and not {size[1]}x{size[0]}; choose a --size of the same "
                 "shape and no larger, see `sliplens live --list`"
             )
 
@@ -213,8 +213,8 @@ def list_cameras(folder: Path = Path("/dev")) -> tuple[Camera, ...]:
                 av.open(str(path), format="v4l2", options={"list_formats": "all"}).close()
             except ExitError:
                 lines = "".join(text for *_, text in log).splitlines()
-                found = [re.match(r"(?:Raw|Compressed)\s*:\s*(\w+)\s*:[^:]*:(.*)", line) for line in lines]
-                cameras.append(Camera(path=path, name=name, formats=tuple(f"{m[1]}{m[2]}" for m in found if m)))
+                matches = [re.match(r"(?:Raw|Compressed)\s*:\s*(\w+)\s*:[^:]*:(.*)", line) for line in lines]
+                cameras.append(Camera(path=path, name=name, formats=tuple(f"{m[1]}{m[2]}" for m in matches if m)))
             except (FFmpegError, OSError) as error:
                 if error.errno not in {errno.ENOTTY, errno.ENODEV}:
                     cameras.append(Camera(path=path, name=f"cannot be opened ({error.strerror})"))
