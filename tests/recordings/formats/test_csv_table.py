@@ -37,12 +37,51 @@ def table(*, header: str = "time_s,fx,fy,fz", separator: str = ",", comma: bool 
         table(header="sec,Force X (N),Force Y (N),Force Z (N)"),
         table(header="t,wrench.force.x,wrench.force.y,wrench.force.z"),
         table(header="elapsed_s,sensor_fx_n,sensor_fy_n,sensor_fz_n"),
+        table(header="Zeit [s],Fx [N],Fy [N],Fz [N]", separator=";", comma=True),
+        table(separator="  "),
+        "sep=;\n" + table(separator=";"),
+        "Messung von Hand, am Montag\nSensor: ATI Mini40, Nr. 3\n\n" + table(separator=";"),
+        "%" + table(header="time,field.wrench.force.x,field.wrench.force.y,field.wrench.force.z"),
+        "# time_s fx fy fz\n" + table(separator=" ").partition("\n")[2],
+        table(header="Time,Fx,Fy,Fz").replace("\n", "\ns,N,N,N\n", 1),
+        table(header="Zeit;Fx;Fy;Fz;Tx", separator=";")
+        .replace("\n", ";0\n")
+        .replace(";Tx;0\n", ";Tx\n[s];[N];[N];[N];[Nm]\n"),
+        table().replace("-", "\u2212"),
     ],
 )
 def test_layout_and_names_of_columns_do_not_matter(tmp_path: Path, text: str):
     forces, _ = read_force_table(write(tmp_path, text))
     np.testing.assert_allclose(forces.time_s, TIME)
     np.testing.assert_allclose(forces.force_n, FORCE)
+
+
+@pytest.mark.parametrize(
+    "number", ["1.234,5", "1,234.5", "1 234,5", "1'234.5", "1\u202f234,5", "\u22121.234.567,5", "1234.5"]
+)
+def test_separated_thousands_are_no_decimals(tmp_path: Path, number: str):
+    forces, _ = read_force_table(write(tmp_path, f"t [s];fx [mN];fy [mN];fz [mN]\n0;{number};0;0\n1;0;0;1\n"))
+    assert forces.force_n[0, 0] == pytest.approx(-1234.5675 if number.startswith("\u2212") else 1.2345)
+
+
+def test_seconds_and_nanoseconds_of_two_columns_are_one_time(tmp_path: Path):
+    text = "header.stamp.sec,header.stamp.nanosec,fx,fy,fz\n3,999000000,0,0,1\n4,1000000,0,0,1\n"
+    forces, _ = read_force_table(write(tmp_path, text))
+    np.testing.assert_allclose(forces.time_s, [3.999, 4.001])
+
+
+def test_the_stamp_of_a_message_goes_before_its_arrival(tmp_path: Path):
+    text = "%time,field.header.stamp,fx,fy,fz\n1700000000500000000,1700000000000000000,0,0,1\n"
+    text += "1700000000600000000,1700000000010000000,0,0,1\n"
+    forces, _ = read_force_table(write(tmp_path, text))
+    np.testing.assert_allclose(np.diff(forces.time_s), [0.01], rtol=1e-3)
+
+
+def test_samples_that_share_the_stamp_of_a_coarse_clock_are_spread(tmp_path: Path):
+    text = "t [ms],fx,fy,fz\n" + "".join(f"{row // 4 * 10},0,0,{row}\n" for row in range(20))
+    forces, notes = read_force_table(write(tmp_path, text))
+    np.testing.assert_allclose(forces.time_s, np.arange(20) * 0.0025)
+    assert "15 samples share a stamp" in notes[0]
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-8"])

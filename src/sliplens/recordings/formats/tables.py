@@ -5,8 +5,10 @@ import csv
 import re
 import unicodedata
 from array import array
-from collections.abc import Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain, islice
 from math import isfinite, nan
 from pathlib import Path
 
@@ -20,9 +22,11 @@ from sliplens.recordings.labels.axes import typical_step
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import MOST_FORCE_N
 
-_SEPARATORS = ("\t", ";", ",")  # a comma may be a decimal one where another separator is there
+_SEPARATORS = ("\t", ";", ",", " ")  # a comma may be a decimal one where another separator is there; " " is any space
+_HEAD = 200  # lines, of which most are rows: what comes before the header is text
 _LACKING = ("", "nan", "na", "n/a", "null")  # fields of a sample that dropped out
 _LONGEST_LINE = 100_000  # characters; a file without line breaks would be held whole
+_COARSE_STAMPS, _COARSE_SHARE = 3, 0.1  # distinct stamps, and share of samples without their own, of a coarse clock
 _CSV = "export the table as CSV in UTF-8"
 
 UNITS = {
@@ -43,6 +47,7 @@ UNITS = {
 }
 """Factor of each unit to seconds or newtons, and its spellings."""
 _TIME = {"time", "times", "t", "stamp", "timestamp", "timestamps", "ts", "elapsed", "clock"}
+_NANOSECONDS = {"nsec", "nsecs", "nanosec", "nanosecs"}
 _AXES = {
     **{axis: rf"f(orce)?_?{axis}" for axis in "xyz"},
     "normal": r"f_?n|normal(_?force)?|force_normal",
@@ -82,51 +87,111 @@ class TextTable:
 
 
 def open_text_table(path: Path) -> TextTable:
-    """Find the separator and the header of a table, after a byte order mark, comments and empty lines."""
-    rows = _split_lines(path)
-    first = next(rows, None)
-    if first is None:
+    """Find the separator and the header of a table.
+
+    Before the header may be a byte order mark, comments, lines such as `sep=;` and other text; below it a row of units.
+    """
+    lines = text_lines(path)
+    head = list(islice(lines, _HEAD))
+    plain = [(line, text) for line, text in head if not text.lstrip().startswith(("#", "%"))]
+    if not plain:
         raise RecordingError(f"{path} is empty; name a table with a header and a row a sample")
-    header = tuple(first[1])
-    if not re.search("[a-z]", "".join(header), re.IGNORECASE):
-        raise RecordingError(f"{path} begins with numbers, not names of columns; begin with time_s,fx,fy,fz")
-    return TextTable(path=path, header=header, rows=rows)
+    separator, width = _find_layout(path, plain)
+    rows = _split_lines(path, chain(plain, lines), separator, width)
+    _, header = next(rows)
+    if not _WORD.search("".join(header)):
+        # `rostopic echo -p` and NumPy write the header as a comment
+        above = [_split(path, line, text.lstrip("#% \t"), separator) for line, text in head if line < plain[0][0]]
+        commented = [cells for cells in above if len(cells) == width and all(map(_WORD.search, cells))]
+        if not commented:
+            # names of another number than the rows have: the first row that differs is the error
+            if _WORD.search(plain[0][1]):
+                deque(_split_lines(path, plain, separator, len(_split(path, *plain[0], separator))), maxlen=0)
+            raise RecordingError(f"{path} begins with numbers, not names of columns; begin with time_s,fx,fy,fz")
+        rows = _split_lines(path, chain(plain, lines), separator, width)
+        header = commented[-1]
+    first = next(rows, None)
+    if first is not None:
+        units = [cell.strip("[]()") for cell in first[1]]
+        known = [unit for quantity in UNITS for unit in units if _find_unit(unit.lower(), quantity)]
+        if known and not any(map(str.isdecimal, "".join(units))):
+            header = [f"{name} [{unit}]" if unit.strip("-") else name for name, unit in zip(header, units, strict=True)]
+        else:
+            rows = chain([first], rows)
+    return TextTable(path=path, header=tuple(header), rows=rows)
 
 
-def _split_lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    separator, width = None, 0
-    for line, text in text_lines(path):
+_WORD = re.compile("[a-z]", re.IGNORECASE)
+
+
+def _find_layout(path: Path, lines: list[tuple[int, str]]) -> tuple[str, int]:
+    """Return the separator by which most lines have the same number of columns, and that number."""
+    layouts = []
+    for place, separator in enumerate(_SEPARATORS):
+        counts = Counter(len(_split(path, line, text, separator)) for line, text in lines)
+        width, count = max(counts.items(), key=lambda item: (item[0] > 1, item[1], item[0]))
+        layouts.append((width > 1, count, -place, width))
+    several, _, place, width = max(layouts)
+    if not several:
+        text = lines[0][1][:40]
+        raise RecordingError(f"{path} has a single column {text!r}; separate by commas, semicolons, tabs or spaces")
+    return _SEPARATORS[-place], width
+
+
+def _split(path: Path, line: int, text: str, separator: str) -> list[str]:
+    if separator == " ":
+        return text.split()
+    try:
+        (cells,) = csv.reader([text], delimiter=separator, skipinitialspace=separator != "\t")
+    except (csv.Error, ValueError) as error:
+        raise RecordingError(f"{path}, line {line} cannot be split into columns ({error}); mend it") from None
+    return [cell.strip() for cell in cells]
+
+
+def _split_lines(
+    path: Path, lines: Iterable[tuple[int, str]], separator: str, width: int
+) -> Iterator[tuple[int, list[str]]]:
+    begun = False
+    for line, text in lines:
         if text.lstrip().startswith(("#", "%")):
             continue
-        separator = separator or next((mark for mark in _SEPARATORS if mark in text), None)
-        if separator is None:
-            raise RecordingError(f"{path} has a single column {text[:40]!r}; separate by commas, semicolons or tabs")
-        try:
-            (cells,) = csv.reader([text], delimiter=separator, skipinitialspace=separator != "\t")
-        except (csv.Error, ValueError) as error:
-            raise RecordingError(f"{path}, line {line} cannot be split into columns ({error}); mend it") from None
-        width = width or len(cells)
-        if len(cells) != width:
+        cells = _split(path, line, text, separator)
+        begun = begun or len(cells) == width
+        if begun and len(cells) != width:
             comma = separator == "," and len(cells) > width
             cure = "where decimals are commas, separate the columns by semicolons" if comma else "mend the line"
             raise RecordingError(f"{path}, line {line} has {len(cells)} columns but the header {width}; {cure}")
-        yield line, [cell.strip() for cell in cells]
+        if begun:
+            yield line, cells
 
 
 def find_column(table: TextTable, name: str, *, option: str) -> str:
     """Find a column that the user named, in any case, and return its name in the file."""
-    same = [column for column in table.header if column == name]
-    same = same or [column for column in table.header if column.lower() == name.strip().lower()]
+    forms = (lambda text: text), (lambda text: text.strip().lower()), (lambda text: re.sub(r" \[.*", "", text.lower()))
+    matches = ([column for column in table.header if form(column) == form(name)] for form in forms)
+    same = next(filter(None, matches), [])
     if len(same) != 1:
         count = f"{len(same)} columns" if same else "no column"
         raise RecordingError(f"{table.path} has {count} {name!r}, it has {_quote(table.header)}; name it with {option}")
     return same[0]
 
 
+_GROUPED = re.compile(r"([+-]?\d{1,3}(?:([,.'\u2019\s])\d{3})(?:\2\d{3})*)(?:(?!\2)[.,](\d*))?")
+
+
+def _without_groups(text: str) -> str:
+    """Remove separators of thousands, unless a single mark may be a decimal one, and write the minus sign in ASCII."""
+    text = text.replace("\u2212", "-")
+    grouped = _GROUPED.fullmatch(text)
+    if grouped is None or (grouped[3] is None and grouped[2] in ",." and grouped[1].count(grouped[2]) == 1):
+        return text
+    return re.sub(r"[^\d+-]", "", grouped[1]) + ("" if grouped[3] is None else f"{text[grouped.end(1)]}{grouped[3]}")
+
+
 def to_number(text: str, *, path: Path, line: int, column: str) -> float:
-    """Read a finite number, whose decimals may have a comma."""
+    """Read a finite number, whose decimals may have a comma and whose thousands may be separated."""
     try:
-        value = float(text.replace(",", "."))
+        value = float(_without_groups(text).replace(",", "."))
     except ValueError:
         value = nan
     if not isfinite(value):
@@ -171,17 +236,27 @@ def _axis(words: list[str]) -> str | None:
 
 
 def guess_time_column(header: Sequence[str], *, path: Path) -> str:
-    """Find the column that holds times by its name."""
+    """Find the column that holds times by its name, or by its unit."""
     times = []
     for name in header:
         words = _words(name)
-        by_word = bool(_TIME & set(words)) and _axis(words) is None  # "f_t" is a tangential force
-        if by_word or (len(words) == 1 and _find_unit(words[0], "time")):
+        bracket = re.search(r"[\[(]\s*(\w+)\s*[\])]", name.lower())
+        by_unit = _find_unit(bracket[1] if bracket else words[0] if len(words) == 1 else "", "time")
+        if by_unit or (_TIME & set(words) and _axis(words) is None):  # "f_t" is a tangential force
             times.append(name)
+    if len(times) > 1:  # a ROS message has a stamp of its own beside the time of its arrival
+        times = [name for name in times if {"header", "stamp"} <= set(_words(name))] or times
     if len(times) != 1:
         looks = f"{len(times) or 'no'} columns that look like the time among {_quote(header)}"
         raise RecordingError(f"{path} has {looks}; name the right one with --time-column")
     return times[0]
+
+
+def _seconds_and_nanoseconds(header: Sequence[str]) -> tuple[str, ...]:
+    """Find a column of whole seconds and one of the nanoseconds beside them; none if there is no such pair."""
+    last = {name: (_words(name) or [""])[-1] for name in header}
+    pairs = [[name for name, word in last.items() if word in words] for words in ({"sec", "secs"}, _NANOSECONDS)]
+    return tuple(names[0] for names in pairs) if [len(names) for names in pairs] == [1, 1] else ()
 
 
 def guess_force_columns(header: Sequence[str], *, path: Path) -> tuple[str, ...]:
@@ -211,6 +286,7 @@ def scale_times(
     A unit that is not given is that in the column's name, else a guess from the size of the times: by the date where
     they count from 1970, else by the usual step.
     """
+    time, shared = _spread(time)
     wrong = np.flatnonzero(~(np.diff(time) > 0))
     if len(wrong):
         before, after = time[wrong[0] : wrong[0] + 2].tolist()
@@ -227,7 +303,19 @@ def scale_times(
         usual = next((unit for unit, since_1970 in dated if size >= since_1970), None)
         usual = usual or next((unit for unit, most in (("s", 0.5), ("ms", 500.0), ("us", 5e5)) if step <= most), "ns")
         how = f"guessed: {len(time)} samples in {(time[-1] - time[0]) * UNITS['time'][usual][0]:.4g} s"
+    how += f"; {shared} samples share a stamp of a coarse clock, and are spread evenly" if shared else ""
     return time * UNITS["time"][usual][0], f"{usual} ({how})"
+
+
+def _spread(time: Float[np.ndarray, " rows"]) -> tuple[Float[np.ndarray, " rows"], int]:
+    """Spread samples with the same stamp evenly up to the next, if many share one; return also their number."""
+    stamps, first, count = np.unique(time, return_index=True, return_counts=True)
+    shared = len(time) - len(stamps)
+    if len(stamps) < _COARSE_STAMPS or shared < _COARSE_SHARE * len(time) or np.any(np.diff(time) < 0):
+        return time, 0
+    step = np.append(np.diff(stamps), np.median(np.diff(stamps)))
+    number = np.arange(len(time)) - np.repeat(first, count)
+    return time + number * np.repeat(step / count, count), shared
 
 
 def evenly_spaced(count: int, *, frame_rate: float) -> Float[np.ndarray, " frames"]:
@@ -256,14 +344,18 @@ def read_force_table(path: Path, options: ReadOptions) -> tuple[Forces, tuple[st
     `wrench.force.x`; `fn` and `ft`), the unit of the time also from its steps.
     """
     table = open_text_table(path)
-    if options.time_column is None:
-        time_name, by_name = guess_time_column(table.header, path=path), "by its name"
+    by_name, in_parts = "by its name", _seconds_and_nanoseconds(table.header)
+    if options.time_column is not None:
+        in_parts, by_name = (), "declared"
+        times = (find_column(table, options.time_column, option="--time-column"),)
     else:
-        time_name, by_name = find_column(table, options.time_column, option="--time-column"), "declared"
+        times = in_parts or (guess_time_column(table.header, path=path),)
     names, by_names = choose_force_columns(table, options)
-    numbers, lines, notes = read_numbers(table, (time_name, *names), complete=1)
-    time_s, in_time = scale_times(numbers[:, 0], lines, path=path, column=time_name, unit=options.time_unit)
-    force_n, words = scale_forces(numbers[:, 1:], lines, names, options, path=path)
+    numbers, lines, notes = read_numbers(table, (*times, *names), complete=len(times))
+    time = numbers[:, 0] + 1e-9 * numbers[:, 1] if in_parts else numbers[:, 0]
+    time_name, unit = " and ".join(times), "s" if in_parts else options.time_unit
+    time_s, in_time = scale_times(time, lines, path=path, column=time_name, unit=unit)
+    force_n, words = scale_forces(numbers[:, len(times) :], lines, names, options, path=path)
     notes = (
         f"{path.name}: times are those of column {time_name!r} ({by_name}), in {in_time}.",
         f"{path.name}: forces are those of {_quote(names)} as {words[0]} ({by_names}), {words[1]}.",
@@ -319,7 +411,7 @@ def read_numbers(
     for line, cells in table.rows:
         lines.append(line)
         for number, place in enumerate(places):
-            cell = cells[place]
+            cell = _without_groups(cells[place])
             commas, points = commas or "," in cell, points or "." in cell
             if number >= complete and cell.lower() in _LACKING:
                 values.append(nan)
