@@ -6,6 +6,7 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.manifest import find_rows, pair_recordings, read_rows
+from sliplens.recordings.options import ReadOptions
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -45,6 +46,16 @@ def test_recordings_that_end_like_tables_and_names_of_any_script_find_theirs(tmp
 def test_a_folder_that_leaves_a_choice_is_refused(tmp_path: Path, names, words):
     with pytest.raises(RecordingError, match=words):
         pair_recordings(touch(tmp_path, *names))
+
+
+def test_a_column_named_as_an_option_of_reading_sets_it_for_its_trial(tmp_path: Path):
+    path = tmp_path / "trials.csv"
+    path.write_text(
+        "video;forces;time_unit;force_columns;start_s;skip_stale\na.mp4;a.csv;ms;Fz Ft;1.5;yes\nb.mp4;b.csv;;;;\n"
+    )
+    first, second = read_rows(path)
+    assert first.reading == ReadOptions(time_unit="ms", force_columns=("Fz", "Ft"), start_s=1.5, skip_stale=True)
+    assert (first.forces, second.reading) == (tmp_path / "a.csv", ReadOptions())
 
 
 def test_a_manifest_says_all_of_a_trial(tmp_path: Path):

@@ -245,7 +245,8 @@ class _ImportWork(TrialWork):
         facts = {"sensor": profile.name if profile else row.sensor, "day": row.day}
         facts |= {"object": row.object, "condition": row.condition}
         facts = {name: fact for name, fact in facts.items() if fact is not None}
-        options = replace(self.reading, forces=row.forces)
+        listed = {name: getattr(row.reading, name) for name in row.reading.given()}
+        options = replace(self.reading, **listed, forces=row.forces)
         opened = open_source(
             row.video, reference=image, format=self.format, options=options, sensor=profile, whole=True
         )

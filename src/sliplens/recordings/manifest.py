@@ -5,13 +5,14 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.tables import trial_name
+from sliplens.recordings.options import ReadOptions
 
 _VIDEOS = frozenset({".mp4", ".m4v", ".mkv", ".mov", ".avi", ".webm", ".mpg", ".mpeg"})
 _TABLES = frozenset({".csv", ".tsv", ".txt"})
@@ -33,6 +34,7 @@ class ManifestRow:
     condition: str | None = None  #: State of the surface, such as dry or wet.
     mu: float | None = None  #: Static coefficient of friction.
     reference: Path | int | None = None  #: Image of the untouched sensor, or the number of the frame that shows it.
+    reading: ReadOptions = field(default_factory=ReadOptions)  #: Options of reading, each a column of its own.
 
 
 def find_rows(source: Path) -> tuple[ManifestRow, ...] | None:
@@ -81,9 +83,11 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
 def read_rows(path: Path) -> tuple[ManifestRow, ...]:
     """Read a manifest: a CSV with a row a trial and the columns of `ManifestRow`, of which `video` alone is required.
 
-    Paths are relative to the manifest; `reference` is an image or the number of a frame.
+    Paths are relative to the manifest; `reference` is an image or the number of a frame. A column named as an option of
+    `ReadOptions`, such as `time_unit` or `force_columns` (separated by spaces), sets it for its trial.
     """
-    columns = tuple(field.name for field in fields(ManifestRow))
+    columns = dict.fromkeys(item.name for kind in (ManifestRow, ReadOptions) for item in fields(kind))
+    del columns["reading"], columns["allow_large"]
     rows = tuple(_parse_row(cells, path.parent, where) for where, cells in read_csv(path, columns, what="a manifest"))
     if not rows:
         raise RecordingError(f"{path} lists no trial; write a row for each below the header")
@@ -139,14 +143,19 @@ def _parse_row(cells: dict[str, str], folder: Path, where: str) -> ManifestRow:
         **dict.fromkeys(("video", "forces"), folder.joinpath),
         "sensor": lambda text: str(folder / text) if text.endswith(".toml") else text,
         "reference": lambda text: int(text) if text.isdecimal() else folder / text,
-        "day": int,
-        "mu": float,
+        **dict.fromkeys(("day", "skip_frames"), int),
+        **dict.fromkeys(("mu", "frame_rate", "start_s"), float),
+        **dict.fromkeys(("times", "image_root"), folder.joinpath),
+        "force_columns": lambda text: tuple(text.split()),
+        "skip_stale": lambda text: {"yes": True, "no": False}[text.lower()],
     }
     facts: dict[str, Any] = {"trial": Path(cells["video"]).stem}
     for name, text in cells.items():
         try:
             facts[name] = kinds.get(name, str)(text)
-        except ValueError:
-            raise RecordingError(f"{where}: {name} is {text!r}, which is no number; correct it") from None
+        except (ValueError, KeyError):
+            kind = "yes or no" if name == "skip_stale" else "a number"
+            raise RecordingError(f"{where}: {name} is {text!r}, not {kind}; correct it") from None
     facts["trial"] = trial_name(facts["trial"])
-    return ManifestRow(**facts)
+    options = {name: facts.pop(name) for name in vars(ReadOptions()).keys() & facts.keys() - {"forces"}}
+    return ManifestRow(**facts, reading=ReadOptions(**options))
