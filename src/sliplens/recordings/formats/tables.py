@@ -113,8 +113,8 @@ def open_text_table(path: Path) -> TextTable:
     first = next(rows, None)
     if first is not None:
         units = [cell.strip("[]()") for cell in first[1]]
-        known = [unit for quantity in UNITS for unit in units if _find_unit(unit.lower(), quantity)]
-        if known and not any(map(str.isdecimal, "".join(units))):
+        measures = [unit for quantity in UNITS for unit in units if _find_unit(unit.lower(), quantity)]
+        if measures and not any(map(str.isdecimal, "".join(units))):
             header = [f"{name} [{unit}]" if unit.strip("-") else name for name, unit in zip(header, units, strict=True)]
         else:
             rows = chain([first], rows)
