@@ -26,9 +26,8 @@ from sliplens.grip.controllers import make_controller
 from sliplens.grip.episodes import EpisodeOptions, run_episodes, run_scripts
 from sliplens.grip.fingertip import ReadingTable, load_readings
 from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor, Tick
-from sliplens.grip.plant import OBJECTS, Plant
+from sliplens.grip.plant import CONDITIONS, OBJECTS, Plant, Scripts, draw_scripts
 from sliplens.grip.records import EpisodeTable
-from sliplens.grip.scripts import CONDITIONS, Scripts, draw_scripts
 from sliplens.models import load
 
 SEED = 500_000
@@ -305,7 +304,12 @@ def compare_all(options: argparse.Namespace, rng: np.random.Generator) -> dict[s
 RUN = load(DEFAULT_NETWORK)
 _TABLE = load_readings(RUN)
 assert _TABLE is not None  # it comes with the network
-READINGS = _TABLE.of(slice(CHOSEN, None))
+READINGS = replace(
+    _TABLE,
+    seed=_TABLE.seed + CHOSEN,
+    ratio={name: values[CHOSEN:] for name, values in _TABLE.ratio.items()},
+    **{name: getattr(_TABLE, name)[CHOSEN:] for name in ("margin", "low", "high")},
+)
 """Seed of fingertips that no table has."""
 
 if __name__ == "__main__":

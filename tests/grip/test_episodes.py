@@ -23,13 +23,11 @@ from sliplens.grip.fingertip import (
     Fingertip,
     MarkerField,
     ReadingTable,
-    draw_film,
     load_readings,
 )
 from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor
-from sliplens.grip.plant import OBJECTS, Plant
+from sliplens.grip.plant import EPISODE_S, OBJECTS, Plant, draw_scripts, hand_motion
 from sliplens.grip.records import Grip
-from sliplens.grip.scripts import EPISODE_S, draw_scripts, hand_motion
 from sliplens.models import Network
 
 
@@ -72,7 +70,7 @@ def test_what_the_network_reads_of_a_fingertip_is_what_its_table_has(network, ta
     tip, margins = Fingertip(seed=table.seed), np.array(MARGINS[:-1])
     full = np.ones(len(margins))
     film = tip.film(FORCES_N[2] * full, friction=FRICTIONS[3] * full, margins=margins, held_s=full)
-    read = network.predict(network.encode(draw_film(film), tip.reference)).numpy()
+    read = network.predict(network.encode(film.draw_all(), tip.reference)).numpy()
     # of one state, twice filmed, the answers differ by the noise
     assert np.abs(read - table.margin[0, 3, 2, :-1]).max() < 5 * table.noise
 

@@ -48,13 +48,12 @@ def wait_until(true) -> None:
     assert true()
 
 
-def test_a_force_a_width_and_a_question_are_lines(fake):
+def test_a_force_and_a_question_are_lines(fake):
     gripper = open_gripper(fake.address, timeout_s=2.0)
     gripper.set_force(1.25)
-    gripper.set_width(0.04)
     state = gripper.read_state()
     gripper.close()
-    assert fake.heard == ["F 1.250", "W 0.0400", "S"]
+    assert fake.heard == ["F 1.250", "S"]
     assert (state.force_n, state.width_m) == (1.0, 0.04)
 
 
@@ -160,8 +159,6 @@ def test_a_reader_that_stops_makes_the_gripper_hold_and_not_open(clock):
         wait_until(lambda: len(dry.sent) > 1)
         assert gripper.holding
         assert set(dry.sent) == {"F 2.000"}
-        with pytest.raises(GripperError, match="opens nothing"):
-            gripper.set_width(0.08)
         gripper.set_force(1.0)
         assert not gripper.holding
     assert set(dry.sent) == {"F 2.000", "F 1.000"}
@@ -177,9 +174,6 @@ class Broken(DryRun):
             raise RuntimeError("the driver lost its mind")
         super().set_force(force_n)
 
-    def set_width(self, width_m: float) -> None:
-        raise RuntimeError(f"the driver lost its mind at {width_m}")
-
 
 def test_whatever_a_driver_raises_the_watchdog_lives_and_holds():
     driver = Broken()
@@ -190,30 +184,6 @@ def test_whatever_a_driver_raises_the_watchdog_lives_and_holds():
         driver.broken = False
         wait_until(lambda: driver.sent)
     assert set(driver.sent) == {"F 1.500"}
-
-
-def test_a_gripper_that_fails_to_open_goes_on_holding(clock):
-    driver = Broken()
-    driver.broken = False
-    with GuardedGripper(driver, watchdog_s=SOON_S) as gripper:
-        gripper.set_force(1.5)
-        with pytest.raises(RuntimeError):
-            gripper.set_width(0.08)
-        clock.now_s += 2 * SOON_S
-        wait_until(lambda: len(driver.sent) > 2)
-    assert set(driver.sent) == {"F 1.500"}
-
-
-def test_an_open_gripper_holds_nothing_and_may_be_opened_further(clock):
-    dry = DryRun()
-    with GuardedGripper(dry, watchdog_s=SOON_S) as gripper:
-        gripper.set_force(1.0)
-        gripper.set_width(0.04)
-        clock.now_s += 2 * SOON_S
-        time.sleep(SOON_S)  # the watchdog looks four times
-        assert not gripper.holding
-        gripper.set_width(0.08)
-    assert dry.sent == ["F 1.000", "W 0.0400", "W 0.0800"]
 
 
 class FakeRosGripper:
@@ -227,7 +197,7 @@ class FakeRosGripper:
         self.address, self.heard = f"zenoh:hand@{address}", []
         self.state: bytes | None = self.joints(effort=[1.0, 2.0], position=[0.5, 0.04])
         self._session, self._stop = session, threading.Event()
-        self._names = {f"hand/{one.topic}": one.kind for row in ROS_MESSAGES.values() for one in row}
+        self._names = {f"hand/{row.topic}": row.kind for row in ROS_MESSAGES.values()}
         self._ears = session.declare_subscriber("hand/**", self._hear)
         self._thread = threading.Thread(target=self._tell, daemon=True)
         self._thread.start()
@@ -271,24 +241,17 @@ def hand():
 @pytest.mark.parametrize(
     ("messages", "told"),
     [
-        ("gripper-command", [("hand/command", 0.0, 1.25), ("hand/command", 0.04, 2.0), ("hand/command", 0.0, 0.01)]),
-        ("numbers", [("hand/force", 1.25), ("hand/width", 0.04), ("hand/force", 0.0)]),
-        (
-            "controllers",
-            [
-                (f"hand/{kind}_controller/commands", [value])
-                for kind, value in (("effort", 1.25), ("position", 0.04), ("effort", 0.0))
-            ],
-        ),
+        ("gripper-command", [("hand/command", 0.0, 1.25), ("hand/command", 0.0, 0.01)]),
+        ("numbers", [("hand/force", 1.25), ("hand/force", 0.0)]),
+        ("controllers", [("hand/effort_controller/commands", [value]) for value in (1.25, 0.0)]),
     ],
 )
-def test_a_gripper_of_ros_hears_forces_and_widths_as_its_messages(hand, messages, told):
+def test_a_gripper_of_ros_hears_forces_as_its_messages(hand, messages, told):
     gripper = open_gripper(hand.address, timeout_s=2.0, messages=messages, joint="finger")
     gripper.set_force(1.25)
-    gripper.set_width(0.04)
     gripper.set_force(0.0)  # which some drivers take for no limit
     state = gripper.read_state()
-    wait_until(lambda: len(hand.heard) == 3)
+    wait_until(lambda: len(hand.heard) == 2)
     gripper.close()
     assert hand.heard == told
     assert (state.force_n, state.width_m) == (2.0, 0.04)

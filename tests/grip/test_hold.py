@@ -80,7 +80,6 @@ def test_a_gripper_that_misbehaves_holds_a_cup_by_what_is_read_of_its_frames(gri
     forces = [float(line.removeprefix("F ")) for line in gripper.heard if line.startswith("F ")]
     assert min(forces) >= MarginLaw.least_n
     assert max(forces) <= 2.6
-    assert not [line for line in gripper.heard if line.startswith("W")]
     blind = np.flatnonzero(np.isnan(steps.margin))[1:]
     assert np.all(steps.command_n[blind] >= steps.command_n[blind - 1])
 

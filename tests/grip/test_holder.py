@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lying_gripper import CEILING_N, LIES, WIRE, hold
 
-from sliplens.grip.controllers import CONTROLLERS, FRICTION_CONSTANTS, MarginLaw, Observation
-from sliplens.grip.holder import Holder
+from sliplens.grip.controllers import CONTROLLERS, FRICTION_CONSTANTS, Holder, MarginLaw, Observation
 from sliplens.grip.plant import PERIOD_S
 from sliplens.live.reading import Reading, SlipState
 
@@ -187,7 +186,7 @@ def test_a_slip_counts_once_and_only_where_the_skin_does_not_spring_back_by_itse
 @pytest.mark.parametrize("lie", [*LIES, *WIRE])
 def test_a_lying_gripper_is_never_opened_overloaded_or_loosened_below_the_target(lie):
     held = hold(lie)
-    assert held.sent <= {"F", "S"}  # no width
+    assert held.sent <= {"F", "S"}
     assert held.command_n.max() <= CEILING_N
     assert held.command_n.min() >= MarginLaw.least_n
     change = np.diff(held.command_n, prepend=0.0)

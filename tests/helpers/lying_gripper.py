@@ -1,19 +1,17 @@
 """Grippers that lie for a while, held by the margin in virtual time; run as a script it prints what they were sent."""
 
 import random
-import socket
 import sys
-import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
+from fake_gripper import FakeGripper
 
-from sliplens.grip.controllers import Controller, MarginLaw
-from sliplens.grip.gripper import GuardedGripper, LineGripper
-from sliplens.grip.holder import Holder
+from sliplens.grip.controllers import Controller, Holder, MarginLaw
+from sliplens.grip.gripper import GuardedGripper, open_gripper
 from sliplens.grip.plant import PERIOD_S
 from sliplens.live.reading import Reading
 
@@ -45,36 +43,24 @@ WIRE = ("late answers", "hangs up")
 """Lies of the line itself."""
 
 
-class LyingGripper:
-    """Gripper on a pair of sockets that presses as it is told, with a lag, and tells something else."""
+class LyingGripper(FakeGripper):
+    """Gripper that presses as commanded, with a lag, and reports something else while it lies."""
 
     def __init__(self, lie: str) -> None:
-        self.lie, self.lies = lie, False
+        super().__init__()
+        self.lie, self.lies, self.answer = lie, False, self.report
         self.force_n = self.command_n = 0.0
-        self.sent: list[str] = []
 
-    def connect(self) -> socket.socket:
-        ours, theirs = socket.socketpair()
-        threading.Thread(target=self._serve, args=(theirs,), daemon=True).start()
-        return ours
-
-    def _serve(self, wire: socket.socket) -> None:
-        with suppress(OSError), wire, wire.makefile("rwb") as stream:
-            for line in stream:
-                words = line.decode().split()
-                self.sent.append(words[0])
-                if words[0] == "F":
-                    self.command_n = float(words[1])
-                answer = state(self.force_n)
-                if self.lies and self.lie == "hangs up":
-                    return
-                if self.lies and self.lie == "late answers":
-                    time.sleep(0.05)
-                elif self.lies:
-                    answer = LIES[self.lie](self.force_n)
-                if answer is not None:
-                    stream.write(answer)
-                    stream.flush()
+    def report(self, line: str) -> bytes | None:
+        if line.startswith("F "):
+            self.command_n = float(line.removeprefix("F "))
+        if self.lies and self.lie in LIES:
+            return LIES[self.lie](self.force_n)
+        if self.lies and self.lie == "hangs up":
+            self.hang_up()
+        elif self.lies:
+            time.sleep(0.05)
+        return state(self.force_n)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,8 +83,8 @@ def hold(lie: str, controller: str | Controller = "margin") -> LyingHold:
     gripper = LyingGripper(lie)
     holder = Holder(controller, ceiling_n=CEILING_N)
     rows, troubles = [], dict[str, None]()
-    line = LineGripper(gripper.connect, timeout_s=0.02)
-    with GuardedGripper(line, ceiling_n=CEILING_N, watchdog_s=60.0) as guard:
+    line = open_gripper(gripper.address, timeout_s=2.0)
+    with closing(gripper), GuardedGripper(line, ceiling_n=CEILING_N, watchdog_s=60.0) as guard:
         for step in range(round(OVER_S / PERIOD_S)):
             now_s = step * PERIOD_S
             gripper.lies = LIES_S <= now_s < ENDS_S
@@ -123,7 +109,7 @@ def hold(lie: str, controller: str | Controller = "margin") -> LyingHold:
     time_s, command_n, acted, force_n = np.array(rows).T
     return LyingHold(
         time_s=time_s, command_n=command_n, acted=acted, force_n=force_n,
-        troubles=tuple(troubles), sent=frozenset(gripper.sent),
+        troubles=tuple(troubles), sent=frozenset(line.split()[0] for line in gripper.heard),
     )  # fmt: skip
 
 

@@ -23,15 +23,12 @@ from sliplens.simulation import (
 from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.intervention import (
     FilmedTrial,
-    draw_with_markers_back,
-    marker_outlines,
     put_markers_back,
-    read_recipe,
     rebuild_trial,
 )
-from sliplens.simulation.loading import load_at_margins
-from sliplens.simulation.motion import move_markers
+from sliplens.simulation.loading import load_at_margins, move_markers
 from sliplens.simulation.nuisances import Day, Grasp
+from sliplens.simulation.plan import read_recipe
 
 """Of what is drawn of a marker: half of its patch of 32 pixels, and the rounding of its place."""
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=5)
@@ -69,7 +66,7 @@ def in_pull(trial: FilmedTrial) -> int:
 def test_with_no_marker_put_back_a_frame_has_the_stored_bytes(trials, recordings):
     for trial, recording in zip(trials, recordings, strict=True):
         for frame in (0, in_pull(trial), len(trial.film) - 1):
-            drawn = draw_with_markers_back(trial.film, frame, nobody(trial, 5)).numpy()
+            drawn = put_markers_back(trial.film, frame, nobody(trial, 5)).draw_all()
             np.testing.assert_array_equal(drawn, np.broadcast_to(recording.frames[frame], drawn.shape))
 
 
@@ -78,7 +75,7 @@ def test_markers_moved_to_where_they_are_change_no_byte(trials, recordings):
         frame, all_markers = in_pull(trial), ~nobody(trial)
         stored = recording.frames[frame]
         for back, to in ((all_markers, frame), (nobody(trial), 0)):
-            np.testing.assert_array_equal(draw_with_markers_back(trial.film, frame, back, to=to).numpy()[0], stored)
+            np.testing.assert_array_equal(put_markers_back(trial.film, frame, back, to=to).draw_all()[0], stored)
         # moved elsewhere, they have the places and sizes of the other frame
         moved = put_markers_back(trial.film, frame, all_markers, to=0)
         np.testing.assert_array_equal(moved.marker_px[0], trial.film.marker_px[0])
@@ -121,14 +118,15 @@ def test_a_frames_touch_moves_its_markers_as_the_trial_did(trials):
 
 def test_outlines_are_the_drawn_circles(trials):
     film = trials[0].film
-    outlines = marker_outlines(film, 0)
+    rest, radius = film.outlines(None)
     scale = film.sensor.geometry.marker_scale() * film.unit.radius_factor
-    np.testing.assert_allclose(outlines.rest_radius_px, scale * max(film.sensor.look.radius_px))
-    np.testing.assert_allclose(outlines.now_radius_px, outlines.rest_radius_px)
-    pressed = marker_outlines(film, in_pull(trials[0]))
+    np.testing.assert_allclose(radius, scale * max(film.sensor.look.radius_px))
+    np.testing.assert_array_equal(rest, film.marker_rest_px)
+    np.testing.assert_allclose(film.outlines(0)[1], radius)
+    _, pressed = film.outlines(in_pull(trials[0]))
     # the apex comes nearer and is squeezed, the rim of the dome does neither
-    assert pressed.now_radius_px[0] > 1.03 * pressed.rest_radius_px[0]
-    assert pressed.now_radius_px[-1] == pytest.approx(pressed.rest_radius_px[-1], rel=0.02)
+    assert pressed[0] > 1.03 * radius[0]
+    assert pressed[-1] == pytest.approx(radius[-1], rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,7 @@ from sliplens.errors import ContactError
 from sliplens.mechanics import contact_radius, reduced_modulus, stick_ratio
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL
 from sliplens.simulation.geometry import FlatPad
-from sliplens.simulation.loading import load_at_margins
-from sliplens.simulation.motion import move_markers
+from sliplens.simulation.loading import load_at_margins, move_markers
 from sliplens.simulation.nuisances import Grasp, Touch
 
 WAYS = [(CHROMATOUCH, "calibrated"), (CHROMATOUCH, "half-space"), (FLAT_GEL, "half-space")]

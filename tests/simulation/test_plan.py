@@ -15,30 +15,25 @@ from sliplens.simulation import (
     make_recipe,
     plan_trials,
 )
-from sliplens.simulation.nuisances import draw_grasp
+from sliplens.simulation.filming import move_camera
+from sliplens.simulation.nuisances import CameraSetup, Day, draw_grasp, mount_camera
+from sliplens.simulation.trials import prepare_trial
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.integers(3, 40), st.integers(0, 5), st.integers(2, 6), st.data())
-def test_splits_are_disjoint_and_none_is_empty(dry, wet, days, data):
-    test_day = data.draw(st.integers(2, days))
-    plans = plan_trials(SimulationRecipe(dry_trials=dry, wet_trials=wet, days=days, test_day=test_day))
-    assert len({plan.trial for plan in plans}) == len(plans) == dry + wet
-    assert {plan.split for plan in plans} == {"train", "validation", "test"}
-    assert {plan.day for plan in plans if plan.split == "test"} == {test_day}
-    assert all(plan.split == "test" for plan in plans if plan.condition == "wet")
-    assert any(plan.split == "test" and plan.condition == "dry" for plan in plans)
-
-
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.integers(3, 40), st.integers(0, 9), st.integers(2, 9), st.data())
-def test_several_days_may_test(dry, wet, days, data):
-    test_days = data.draw(st.integers(1, days - 1))
-    plans = plan_trials(SimulationRecipe(dry_trials=dry, wet_trials=wet, days=days, test_days=test_days))
+def test_splits_are_disjoint_none_is_empty_and_the_days_asked_for_test(dry, wet, days, data):
+    if data.draw(st.booleans()):
+        test = {"test_day": data.draw(st.integers(2, days))}
+        tested = range(test["test_day"], test["test_day"] + 1)
+    else:
+        test = {"test_days": data.draw(st.integers(1, days - 1))}
+        tested = range(days - test["test_days"] + 1, days + 1)
+    plans = plan_trials(SimulationRecipe(dry_trials=dry, wet_trials=wet, days=days, **test))
     assert len({plan.trial for plan in plans}) == len(plans) == dry + wet
     assert {plan.split for plan in plans} == {"train", "validation", "test"}
-    tested = range(days - test_days + 1, days + 1)
     assert all((plan.split == "test") == (plan.day in tested) for plan in plans)
+    assert any(plan.split == "test" and plan.condition == "dry" for plan in plans)
     count = [sum(plan.day == day for plan in plans if plan.condition == "wet") for day in tested]
     assert sum(count) == wet
     assert max(count) - min(count) <= 1
@@ -67,10 +62,32 @@ def test_the_camera_of_the_thesis_preset_belongs_to_the_sensor():
     assert len({tuple(shift) for shift in shifts}) == 6
 
 
+def test_mounting_adds_seats_and_multiplies_light():
+    day = Day(gain=1.1, gradient=0.02, gradient_direction_rad=0.0, camera_shift_px=(0.1, -0.1), glare=0.5)
+    camera = CameraSetup(gain=0.9, gradient=0.2, gradient_direction_rad=np.pi, camera_shift_px=(1.0, 2.0), glare=0.8)
+    mounted = mount_camera(day, camera)
+    assert mounted.gain == pytest.approx(0.99)
+    assert mounted.glare == pytest.approx(0.4)
+    assert mounted.gradient == pytest.approx(0.18)
+    assert mounted.camera_shift_px == pytest.approx((1.1, 1.9))
+    assert mount_camera(day, CameraSetup()) == day
+
+
+def test_a_moved_camera_turns_and_magnifies_markers_about_the_middle():
+    _, film = prepare_trial(plan_trials(make_recipe("small"))[0])
+    turned = move_camera(
+        film, Nuisances(frame_turn_deg=(1.0, 1.0), frame_zoom=(1.02, 1.02)), rng=np.random.default_rng(0)
+    )
+    before, after = (one.marker_px - np.asarray(film.sensor.geometry.centre_px) for one in (film, turned))
+    expected = 1.02 * np.exp(1j * np.radians(1.0)) * (before[..., 0] + 1j * before[..., 1])
+    np.testing.assert_allclose(after[..., 0] + 1j * after[..., 1], expected)
+    np.testing.assert_array_equal(turned.marker_rest_px, film.marker_rest_px)
+
+
 def test_more_trials_leave_the_others_as_they_were():
     few, many = ({plan.trial: plan for plan in plan_trials(SimulationRecipe(dry_trials=count))} for count in (8, 20))
     for name, plan in few.items():
-        assert replace(many[name], split=plan.split, recipe=plan.recipe, recipe_hash=plan.recipe_hash) == plan
+        assert replace(many[name], split=plan.split, recipe=plan.recipe) == plan
 
 
 def test_presets_share_no_trial_no_sensor_and_no_day():
@@ -135,56 +152,35 @@ def test_recipes_have_the_same_hash_only_if_they_are_the_same():
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("kind", "change", "message"),
     [
-        ({"dry_trials": (2, 2)}, "dry_trials has 2 days but there are 4; give one number a day"),
-        ({"dry_trials": (0, 2, 2, 2)}, "but the first day trains; give it more trials"),
-        ({"dry_trials": (3, 0, 0, -1)}, "no day has fewer than 0 trials"),
-        ({"displacement": "magic"}, "displacement is 'magic', which sensor chromatouch does not have; choose calib"),
-        ({"sensor": FLAT_GEL, "displacement": "calibrated"}, "sensor flat-gel does not have; choose half-space"),
-        ({"dry_trials": 2}, "dry_trials is 2, at least 3 is needed: training, validation and test need one each"),
-        ({"wet_trials": -1}, "wet_trials is -1, at least 0"),
-        ({"frames_per_trial": 5}, "frames_per_trial is 5, at least 20 is needed"),
-        ({"days": 1}, "days is 1, at least 2 is needed: the test needs a day of its own"),
-        ({"test_day": 1}, "test_day is 1, but the first of 4 days trains; choose a day from 2 to 4"),
-        ({"test_days": 4}, "test_days is 4, but of 4 days the first trains"),
-        ({"test_days": 0}, "test_days is 0, but of 4 days"),
-        ({"test_days": 2, "test_day": 3}, "test_day tests alone; ask for fewer"),
-        ({"validation_share": 1.0}, "validation_share must lie between 0 and 1, got 1"),
-        ({"seed": -1}, "seed is -1, at least 0"),
+        (SimulationRecipe, {"dry_trials": (2, 2)}, "there are 4 days; give one number a day"),
+        (SimulationRecipe, {"dry_trials": ()}, "there are 4 days; give one number a day"),
+        (SimulationRecipe, {"dry_trials": (0, 2, 2, 2)}, "but the first day trains; give it more trials"),
+        (SimulationRecipe, {"dry_trials": (1, 0, 0, 2)}, "but the first day trains; give it more trials"),
+        (SimulationRecipe, {"dry_trials": (3, 0, 0, -1)}, "no day has fewer than 0 trials"),
+        (SimulationRecipe, {"displacement": "magic"}, "but sensor chromatouch has calibrated and half-space"),
+        (SimulationRecipe, {"sensor": FLAT_GEL, "displacement": "calibrated"}, "sensor flat-gel has half-space"),
+        (SimulationRecipe, {"dry_trials": 2}, "dry_trials is 2, but at least 3 are needed"),
+        (SimulationRecipe, {"wet_trials": -1}, "wet_trials is -1"),
+        (SimulationRecipe, {"frames_per_trial": 5}, "frames_per_trial is 5, but at least 20"),
+        (SimulationRecipe, {"days": 1}, "days is 1, but at least 2 are needed"),
+        (SimulationRecipe, {"test_day": 1}, "test_day is 1, but choose from 2 to 4"),
+        (SimulationRecipe, {"test_days": 4}, "test_days is 4, but of 4 days the first trains"),
+        (SimulationRecipe, {"test_days": 0}, "test_days is 0, but of 4 days"),
+        (SimulationRecipe, {"test_days": 2, "test_day": 3}, "test_day tests alone"),
+        (SimulationRecipe, {"validation_share": 1.0}, "validation_share is 1.0, but it must lie between 0 and 1"),
+        (SimulationRecipe, {"seed": -1}, "seed is -1"),
+        (Nuisances, {"normal_force_n": (2.0, 0.5)}, "the range of normal_force_n is .*; give a finite low, then a high"),
+        (Nuisances, {"dry_friction": (0.0, 1.0)}, "dry_friction must be positive, got 0; raise its lower end"),
+        (Nuisances, {"marker_depth": (-0.1, 0.1)}, "marker_depth must not be negative, got -0.1; raise its lower end"),
+        (Nuisances, {"kinetic_ratio": (0.8, 1.2)}, "kinetic_ratio must be at most 1, got 1.2; lower its upper end"),
+        (Pulls, {"duration_s": (0.0, 8.0)}, "the range of duration_s is .*; give a positive low, then a high"),
+        (Pulls, {"let_back": (0.2, 1.2)}, "let_back must be at most 1, got 1.2; lower its upper end"),
+        (Pulls, {"most_events": 9}, "9 jerks of 0.1 s leave no time in a pull of 0.8 s; make pulls longer"),
+        (Pulls, {"rate": 0.5}, "a rate of 1 or more, got 3 and 0.5"),
     ],
 )
-def test_impossible_recipes_are_refused(change, message):
-    with pytest.raises(InputError, match=message):
-        SimulationRecipe(**change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            {"normal_force_n": (2.0, 0.5)},
-            r"the range of normal_force_n is \(2.0, 0.5\); give a finite low, then a high",
-        ),
-        ({"dry_friction": (0.0, 1.0)}, "dry_friction must be positive, got 0; raise its lower end"),
-        ({"marker_depth": (-0.1, 0.1)}, "marker_depth must not be negative, got -0.1; raise its lower end"),
-        ({"kinetic_ratio": (0.8, 1.2)}, "kinetic_ratio must be at most 1, got 1.2; lower its upper end"),
-    ],
-)
-def test_impossible_ranges_are_refused(change, message):
-    with pytest.raises(ContactError, match=message):
-        Nuisances(**change)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"duration_s": (0.0, 8.0)}, r"the range of duration_s is \(0.0, 8.0\); give a positive low, then a high"),
-        ({"let_back": (0.2, 1.2)}, "let_back must be at most 1, got 1.2; lower its upper end"),
-        ({"most_events": 9}, "9 jerks of 0.1 s leave no time in a pull of 0.8 s; make pulls longer or jerks shorter"),
-        ({"rate": 0.5}, "a rate of 1 or more, got 3 and 0.5"),
-    ],
-)
-def test_impossible_pulls_are_refused(change, message):
-    with pytest.raises(ContactError, match=message):
-        Pulls(**change)
+def test_impossible_settings_are_refused(kind, change, message):
+    with pytest.raises(ContactError if kind is not SimulationRecipe else InputError, match=message):
+        kind(**change)

@@ -11,7 +11,7 @@ from sliplens.cli import main
 from sliplens.files import output_folder
 from sliplens.recordings import Dataset, Recording, import_recordings, load_dataset
 from sliplens.simulation import SimulationRecipe, simulate_dataset
-from sliplens.simulation.sharing import compare_datasets
+from sliplens.simulation.trials import compare_datasets
 
 RECIPE = SimulationRecipe(dry_trials=4, wet_trials=0, days=2, frames_per_trial=20, sensors=2, seed=3)
 

@@ -9,7 +9,7 @@ import torch
 import sliplens as sl
 from sliplens.explainers.occlusion import marker_regions
 from sliplens.recordings import Recording
-from sliplens.simulation.intervention import draw_with_markers_back, rebuild_trial, visible_markers
+from sliplens.simulation.intervention import put_markers_back, rebuild_trial, visible_markers
 from sliplens.study.neutral import prove_map
 
 
@@ -58,7 +58,7 @@ def test_the_fewest_markers_with_half_of_the_relevance_are_moved(scene):
     np.testing.assert_allclose(record.to_px, film.marker_px[stick][visible[[3, 5]]])
     back = np.zeros((3, len(film.marker_rest_px)), dtype=bool)
     back[1, visible[[3, 5]]] = back[2, visible] = True
-    images = draw_with_markers_back(film, frame, back, to=stick).numpy()
+    images = put_markers_back(film, frame, back, to=stick).draw_all()
     now, after, all_back = network.predict(network.encode(images, recording.reference)).tolist()
     np.testing.assert_array_equal(drawn[0], images[1])
     assert record.prediction == pytest.approx(now, abs=1e-6)

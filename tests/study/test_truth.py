@@ -22,7 +22,7 @@ from sliplens.recordings import Dataset, load_dataset
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.results.study import Truth
 from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
-from sliplens.simulation.intervention import draw_with_markers_back, marker_readings, visible_markers
+from sliplens.simulation.intervention import marker_readings, put_markers_back, visible_markers
 from sliplens.study.truth import (
     FrameEffects,
     JudgingByTruth,
@@ -181,7 +181,7 @@ def test_effects_are_what_putting_one_marker_back_changes(trained, explained, da
         for row in rows[::9]:
             back = np.zeros((1, len(film.marker_rest_px)), dtype=bool)
             back[0, row["marker"]] = True
-            drawn = draw_with_markers_back(film, frame.number, back).numpy()
+            drawn = put_markers_back(film, frame.number, back).draw_all()
             changed = trained.predict(trained.encode(drawn, frame.reference))[0]
             # float32 sums of 37,632 terms, in another order
             assert row["network"] == pytest.approx(float(whole - changed), abs=1e-6)
@@ -219,7 +219,7 @@ def test_neutral_effects_and_correlations_follow_from_frames_drawn_one_by_one(tr
         for members in record.groups.tolist():
             back = np.zeros((1, len(film.marker_rest_px)), dtype=bool)
             back[0, frame.markers[members]] = True
-            drawn = draw_with_markers_back(film, frame.number, back, to=frame.neutral_frame).numpy()
+            drawn = put_markers_back(film, frame.number, back, to=frame.neutral_frame).draw_all()
             effects.append(float(whole - trained.predict(trained.encode(drawn, frame.reference))[0]))
             sums.append(sum(maps["attribution"][index][place.regions == member].sum() for member in members))
         np.testing.assert_allclose(record.moved, effects, atol=1e-6)

@@ -348,7 +348,7 @@ def call_slip(call: Any) -> None:
     print_table(f"Slip of {number_of(len(result.clips), 'clip')}", ("method", "balanced accuracy", "low", "high"), rows)
 
 
-@command("compare", "simulation.sharing:compare_datasets", "sliplens compare runs/mine/data runs/other/data")
+@command("compare", "simulation.trials:compare_datasets", "sliplens compare runs/mine/data runs/other/data")
 def call_compare(call: Any) -> None:
     """Print what two data sets share, or which trials of a data set trained a network."""
     from sliplens.recordings.dataset import DATASET_FILE

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
@@ -22,9 +22,19 @@ from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
 from sliplens.grip.controllers import Controller, make_controller
 from sliplens.grip.fingertip import ReadingTable, load_readings, measure_readings, require_calibration
 from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor, Tick
-from sliplens.grip.plant import OBJECTS, PERIOD_S, Episodes, GrippedObject, Plant, least_force
+from sliplens.grip.plant import (
+    EPISODE_S,
+    LIFT_S,
+    OBJECTS,
+    PERIOD_S,
+    Episodes,
+    Plant,
+    Scripts,
+    draw_scripts,
+    hand_motion,
+    least_force,
+)
 from sliplens.grip.records import EpisodeTable, Grip, GripSetup, GripTrace
-from sliplens.grip.scripts import EPISODE_S, LIFT_S, Scripts, draw_scripts, hand_motion
 from sliplens.mechanics import stick_ratio
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
@@ -66,16 +76,6 @@ class EpisodeOptions:
             raise InputError("latency and error scale must not be negative; give 0 or more")
         if self.method is not None:
             get_explainer(self.method)
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Batch:
-    """Episodes that were run together."""
-
-    episodes: EpisodeTable
-    trace: GripTrace
-    pictures: UInt8[np.ndarray, "moments height width 3"]
-    maps: Float32[np.ndarray, "moments side side"]
 
 
 def run_episodes(
@@ -179,9 +179,8 @@ def run_episodes(
                     readings = measure_readings(network, fingertips=_MEASURED)
             options = replace(options, readings=readings)
         job = _Job(
-            setup=setup, gripped=gripped, scripts=scripts, controller=controller, network=network, friction=friction,
-            options=options,
-        )  # fmt: skip
+            setup=setup, scripts=scripts, controller=controller, network=network, friction=friction, options=options
+        )
         if out is None:
             return job.run(None)
         table = options.readings
@@ -207,7 +206,6 @@ class _Job:
     """Episodes to run, with everything that they need."""
 
     setup: GripSetup
-    gripped: GrippedObject
     scripts: Scripts
     controller: str | Controller
     network: Network
@@ -217,21 +215,14 @@ class _Job:
     def run(self, folder: Path | None) -> Grip:
         """Run every batch that is not in the folder yet, and write the record."""
         begin, size, total = time.perf_counter(), 1 if self.setup.rendered else _BATCH, len(self.scripts)
-        done: list[_Batch] = []
+        done: list[Grip] = []
         chunks = [np.arange(first, min(first + size, total)) for first in range(0, total, size)]
         with open_stage("Gripping"):
             for number, rows in enumerate(report_each(chunks, sizes=list(map(len, chunks)))):
                 part = None if folder is None else folder / "parts" / str(number)
-                done.append(keep_part(part, _Batch, partial(self.run_batch, number, rows, folder)))
-        grip = Grip(
-            setup=self.setup,
-            seconds=time.perf_counter() - begin,
-            episodes=EpisodeTable.joined([batch.episodes for batch in done]),
-            trace=done[0].trace,
-            moments_s=_MOMENTS_S[: len(done[0].maps)],
-            pictures=done[0].pictures,
-            maps=done[0].maps,
-        )
+                done.append(keep_part(part, Grip, partial(self.run_batch, number, rows, folder)))
+        episodes = EpisodeTable.joined([batch.episodes for batch in done])
+        grip = replace(done[0], seconds=time.perf_counter() - begin, episodes=episodes)
         if folder is not None:
             if self.setup.rendered:
                 paths = sorted((folder / "data").glob("trials/*.parquet"))
@@ -241,7 +232,7 @@ class _Job:
             remove(folder / "parts")
         return grip
 
-    def run_batch(self, number: int, rows: Int[np.ndarray, " episodes"], folder: Path | None) -> _Batch:
+    def run_batch(self, number: int, rows: Int[np.ndarray, " episodes"], folder: Path | None) -> Grip:
         """Run some episodes; save images of a rendered one in the folder."""
         setup, options, scripts = self.setup, self.options, self.scripts.where(rows)
         learners = [SlipLearner(self.friction[row]) for row in rows] if self.friction else []
@@ -266,7 +257,7 @@ class _Job:
             controller = make_controller(self.controller, setup.settings, friction_known=bool(learners))
         else:
             controller = deepcopy(self.controller)
-        loop = GripLoop(Plant(self.gripped, episodes=len(rows)), sensor, controller, latency_s=setup.latency_s)
+        loop = GripLoop(Plant(OBJECTS[setup.object], episodes=len(rows)), sensor, controller, latency_s=setup.latency_s)
         ticks, traced = list[Tick](), setup.rendered or number == 0
         table = run_scripts(loop, scripts, condition=setup.condition, on_tick=ticks.append if traced else None)
         if self.friction:
@@ -281,7 +272,15 @@ class _Job:
                 explained = frames_from_arrays(self.network, pictures, sensor.references[0])
                 explainers, _ = choose_explainers(self.network, explained, options.method, budget=1.0)
                 [maps] = explain_frames(self.network, explained, explainers).relevance.values()
-        return _Batch(episodes=table, trace=_trace(ticks), pictures=pictures, maps=maps)
+        return Grip(
+            setup=setup,
+            seconds=0.0,
+            episodes=table,
+            trace=_trace(ticks),
+            moments_s=_MOMENTS_S[: len(maps)],
+            pictures=pictures,
+            maps=maps,
+        )
 
 
 def run_scripts(

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy.sparse import csr_array
 
@@ -19,7 +18,7 @@ from sliplens.models import Network, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.progress import report_each
 from sliplens.results.evaluation import ANSWER, MARGIN
-from sliplens.simulation.filming import Film, batches, prepare_film, see_markers
+from sliplens.simulation.filming import Film, prepare_film, see_markers
 from sliplens.simulation.loading import load_at_margins, load_at_states
 from sliplens.simulation.nuisances import Day, Nuisances, draw_day, draw_grasp, draw_unit
 from sliplens.simulation.sensor import CHROMATOUCH, Sensor
@@ -45,32 +44,20 @@ class Fingertip:
         nuisances = Nuisances() if nuisances is None else nuisances
         day_rng, unit_rng, grasp_rng, self._film_rng, self._rng = np.random.default_rng(seed).spawn(5)
         self.day = draw_day(nuisances, quantile=0.5, rng=day_rng) if day is None else day
-        self._sensor, self._grasp = sensor, draw_grasp(nuisances, day=self.day, wet=False, rng=grasp_rng)
-        self._unit = draw_unit(nuisances, markers=sensor.geometry.markers, rng=unit_rng)
+        self.sensor, self.grasp = sensor, draw_grasp(nuisances, day=self.day, wet=False, rng=grasp_rng)
+        self.unit = draw_unit(nuisances, markers=sensor.geometry.markers, rng=unit_rng)
 
     @cached_property
     def _film(self) -> Film:
         return prepare_film(
-            self._sensor,
-            loading=load_at_margins(np.ones(1), grasp=self._grasp),
-            grasp=self._grasp,
+            self.sensor,
+            loading=load_at_margins(np.ones(1), grasp=self.grasp),
+            grasp=self.grasp,
             day=self.day,
-            unit=self._unit,
+            unit=self.unit,
             rng=self._film_rng,
-            noise=self._sensor.noise,
+            noise=self.sensor.noise,
         )
-
-    def markers(
-        self,
-        normal_force_n: Float[np.ndarray, " frames"],
-        *,
-        friction: Float[np.ndarray, " frames"],
-        margins: Float[np.ndarray, " frames"],
-        held_s: Float[np.ndarray, " frames"],
-    ) -> tuple[Float[np.ndarray, "markers 2"], Float[np.ndarray, "frames markers 2"]]:
-        """Return the markers in pixels (x, y), at rest and in contact states as in `film`."""
-        loading = load_at_states(normal_force_n, friction=friction, margins=margins, held_s=held_s)
-        return see_markers(self._sensor, loading=loading, grasp=self._grasp, day=self.day, unit=self._unit)[1:]
 
     @cached_property
     def reference(self) -> UInt8[np.ndarray, "height width 3"]:
@@ -115,11 +102,6 @@ class Fingertip:
             held_s=float(state.held_s[0]),
             pulled_back=bool(state.shear_n[0, finger] < 0),
         )
-
-
-def draw_film(film: Film) -> UInt8[np.ndarray, "frames height width 3"]:
-    """Draw every frame of a film."""
-    return torch.cat([film.draw(part) for part in batches(len(film), device="cpu")]).numpy()
 
 
 class MarkerField:
@@ -178,10 +160,11 @@ def _marker_grid(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     first = Fingertip(seed=seed)
     parts = []
     for tip in (first, Fingertip(seed=seed + 1, day=first.day)):
-        rest, places = tip.markers(
+        loading = load_at_states(
             force.ravel(), friction=np.ones(force.size), margins=gamma.ravel(), held_s=np.ones(force.size)
         )
-        middle = np.asarray(tip._sensor.geometry.centre_px)
+        _, rest, places = see_markers(tip.sensor, loading=loading, grasp=tip.grasp, day=tip.day, unit=tip.unit)
+        middle = np.asarray(tip.sensor.geometry.centre_px)
         nearest = np.argsort(np.linalg.norm(rest - middle, axis=1), kind="stable")[:_MARKERS]
         moved = (places - rest)[:, nearest].reshape(*force.shape, len(nearest), 2)
         parts.append((rest[nearest], moved[:, -1], moved - moved[:, -1:]))
@@ -231,12 +214,6 @@ class ReadingTable:
 
     def __len__(self) -> int:
         return len(self.margin)
-
-    def of(self, fingertips: slice) -> "ReadingTable":
-        """Select fingertips."""
-        parts = {name: getattr(self, name)[fingertips] for name in ("margin", "low", "high")}
-        ratio = {name: values[fingertips] for name, values in self.ratio.items()}
-        return replace(self, seed=self.seed + (fingertips.start or 0), ratio=ratio, **parts)
 
     def read(
         self,
@@ -299,7 +276,8 @@ def measure_readings(run: Network, *, fingertips: int = 96, seed: int = 0, engin
         frames = []
         for rows in (np.arange(count), again):
             force_n, friction, margins = (values[drawn][rows] for values in (force, mu, gamma))
-            frames.append(draw_film(tip.film(force_n, friction=friction, margins=margins, held_s=np.ones(len(rows)))))
+            film = tip.film(force_n, friction=friction, margins=margins, held_s=np.ones(len(rows)))
+            frames.append(film.draw_all())
         estimate = ready.estimate(run, run.encode(np.concatenate(frames), tip.reference))
         ends = estimate.interval(LEVEL)
         assert ends is not None  # it is calibrated

@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from io import FileIO
 from pathlib import Path
@@ -40,14 +40,10 @@ class GripperState:
 
 @runtime_checkable
 class Gripper(Protocol):
-    """A parallel gripper that takes a force or a width."""
+    """A parallel gripper that takes a force; opening it is left to the robot's own program."""
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
-        ...
-
-    def set_width(self, width_m: float) -> None:
-        """Open to so many metres."""
         ...
 
     def read_state(self) -> GripperState:
@@ -62,10 +58,9 @@ class Gripper(Protocol):
 class LineGripper:
     """A gripper with a protocol of ASCII lines, over a serial port or TCP.
 
-    `F 1.250` sets the force in newtons, `W 0.0400` the width in metres, `S` asks; the answer to each is one line, `OK
-    force_n width_m` or `ERR reason`. A late, broken or foreign answer is a `GripperError`, and so is a connection that
-    breaks. An answer that is late cannot be matched to its line: the connection is then closed, and the next line
-    opens it again.
+    `F 1.250` sets the force in newtons, `S` asks; the answer to each is one line, `OK force_n width_m` or `ERR reason`.
+    A late, broken or foreign answer is a `GripperError`, and so is a connection that breaks. An answer that is late
+    cannot be matched to its line: the connection is then closed, and the next line opens it again.
 
     Parameters
     ----------
@@ -83,15 +78,11 @@ class LineGripper:
     ) -> None:
         self._connect, self.timeout_s, self._silence_s = connect, timeout_s, silence_s
         self._wire: socket.socket | FileIO | None = connect()
-        self._rest, self._silent_until_s = b"", -math.inf
+        self._silent_until_s = -math.inf
 
     def set_force(self, force_n: float) -> None:
         """Press with so many newtons."""
         self.ask(f"F {force_n:.3f}")
-
-    def set_width(self, width_m: float) -> None:
-        """Open to so many metres."""
-        self.ask(f"W {width_m:.4f}")
 
     def read_state(self) -> GripperState:
         """Measure force and width."""
@@ -108,7 +99,7 @@ class LineGripper:
         if self._wire is None:
             if (wait_s := self._silent_until_s - time.monotonic()) > 0:
                 raise GripperError(f"the gripper answered late; it is left alone for {wait_s:.1f} s")
-            self._wire, self._rest = self._connect(), b""
+            self._wire = self._connect()
         try:
             answer = self._exchange(self._wire.fileno(), line)
         except (OSError, ValueError) as error:
@@ -116,7 +107,7 @@ class LineGripper:
             fault = f"cannot be reached ({error})"
             if isinstance(error, TimeoutError):
                 self._silent_until_s = time.monotonic() + self._silence_s
-                fault = f"did not answer {line!r} in time" + (f", it sent {error}" if str(error) else "")
+                fault = f"did not answer {line!r} in time, it sent {str(error)!r}"
             raise GripperError(f"the gripper {fault}; check its cable and power") from None
         if answer[0] == "ERR":
             raise GripperError(f"the gripper refused {line!r}: {' '.join(answer[1:]) or 'no reason given'}")
@@ -131,67 +122,56 @@ class LineGripper:
         return GripperState(force_n=force_n, width_m=width_m)
 
     def _exchange(self, wire: int, line: str) -> list[str]:
-        """Send a line, and return the words of its answer; other lines are dropped."""
+        """Send a line, and return the words of its answer; what came before it and other lines are dropped."""
         ends_s, text = time.monotonic() + self.timeout_s, ""
-        while self._rest or select.select([wire], [], [], 0.0)[0]:
-            self._read_line(wire, ends_s)
+        while time.monotonic() < ends_s and select.select([wire], [], [], 0.0)[0]:
+            self._read(wire)
         os.write(wire, f"{line}\n".encode("ascii"))
-        while (words := text.split())[:1] not in (["OK"], ["ERR"]):
-            try:
-                text = self._read_line(wire, ends_s)
-            except TimeoutError:
-                raise TimeoutError(repr(text) if text else "") from None
-        return words
-
-    def _read_line(self, wire: int, ends_s: float) -> str:
-        """Read the next whole line; `TimeoutError` where none comes, or one without an end."""
-        while b"\n" not in self._rest:
+        while True:
+            *lines, rest = text.split("\n")
+            for words in map(str.split, lines):
+                if words[:1] in (["OK"], ["ERR"]):
+                    return words
             ready, _, _ = select.select([wire], [], [], max(0.0, ends_s - time.monotonic()))
-            if len(self._rest) >= _ANSWER_BYTES or not ready:
-                raise TimeoutError
-            read = os.read(wire, _ANSWER_BYTES)
-            if not read:
-                raise OSError("it has hung up")
-            self._rest += read
-        line, _, self._rest = self._rest.partition(b"\n")
-        return line.decode("ascii", errors="replace").strip()
+            if len(rest) >= _ANSWER_BYTES or not ready:
+                raise TimeoutError(text.strip())
+            text += self._read(wire).decode("ascii", errors="replace")
+
+    def _read(self, wire: int) -> bytes:
+        if not (read := os.read(wire, _ANSWER_BYTES)):
+            raise OSError("it has hung up")
+        return read
 
 
 class RosCommand(NamedTuple):
-    """Message by which a gripper of ROS 2 takes a force or a width."""
+    """Message by which a gripper of ROS 2 takes a force."""
 
     topic: str
     """Topic, below the key of the gripper."""
     kind: str
     """Type of the message."""
     fields: Callable[[float], tuple[object, ...]]
-    """Returns the fields of the message, in order, for a force in newtons, or a width in metres."""
+    """Returns the fields of the message, in order, for a force in newtons."""
 
 
 _LEAST_EFFORT_N = 0.01  # effort in place of 0, which some drivers take for no limit
-_MOVING_EFFORT_N = 2.0  # effort sent with a width: it moves open fingers, and crushes little between them
-_GRIPPER, _NUMBER = "control_msgs/msg/GripperCommand", "std_msgs/msg/Float64"
-_DEFINITIONS = {_GRIPPER: "float64 position\nfloat64 max_effort"}  # of types that ROS itself does not bring
-
-
+_DEFINITIONS = {  # of types that ROS itself does not bring
+    "control_msgs/msg/GripperCommand": "float64 position\nfloat64 max_effort"
+}
 ROS_MESSAGES = {
     # closed as far as the effort brings it
-    "gripper-command": (
-        RosCommand("command", _GRIPPER, lambda n: (0.0, max(n, _LEAST_EFFORT_N))),
-        RosCommand("command", _GRIPPER, lambda m: (m, _MOVING_EFFORT_N)),
+    "gripper-command": RosCommand(
+        "command", "control_msgs/msg/GripperCommand", lambda n: (0.0, max(n, _LEAST_EFFORT_N))
     ),
-    "numbers": tuple(RosCommand(topic, _NUMBER, lambda value: (value,)) for topic in ("force", "width")),
+    "numbers": RosCommand("force", "std_msgs/msg/Float64", lambda n: (n,)),
     # forward controllers of ros2_control take a number a joint
-    "controllers": tuple(
-        RosCommand(
-            f"{kind}_controller/commands",
-            "std_msgs/msg/Float64MultiArray",
-            lambda value: (SimpleNamespace(dim=[], data_offset=0), np.array([value])),
-        )
-        for kind in ("effort", "position")
+    "controllers": RosCommand(
+        "effort_controller/commands",
+        "std_msgs/msg/Float64MultiArray",
+        lambda n: (SimpleNamespace(dim=[], data_offset=0), np.array([n])),
     ),
 }
-"""Messages of grippers of ROS 2 by name, for a force and for a width."""
+"""Messages of grippers of ROS 2 by name."""
 _STATE_TOPIC, _STATE_KIND = "joint_states", "sensor_msgs/msg/JointState"
 
 
@@ -224,17 +204,14 @@ class RosGripper:
         joint: str | None = None,
         timeout_s: float = 0.1,
     ) -> None:
-        commands, key = pick(ROS_MESSAGES, messages, noun="kind of gripper messages"), key.strip("/")
+        self._command, key = pick(ROS_MESSAGES, messages, noun="kind of gripper messages"), key.strip("/")
         self._ros = ZenohRos(address, purpose="a gripper of ROS 2")
         self._topic, self._joint, self.timeout_s = f"{key}/{_STATE_TOPIC}", joint, timeout_s
         self._message, self._message_s, self._new = b"", -math.inf, threading.Condition()
         try:
-            for command in commands:
-                if command.kind in _DEFINITIONS:
-                    self._ros.define(command.kind, _DEFINITIONS[command.kind])
-            self._force, self._width = (
-                (command, self._ros.publisher(f"{key}/{command.topic}", command.kind)) for command in commands
-            )
+            if (kind := self._command.kind) in _DEFINITIONS:
+                self._ros.define(kind, _DEFINITIONS[kind])
+            self._publish = self._ros.publisher(f"{key}/{self._command.topic}", kind)
             self._ros.subscribe(self._topic, _STATE_KIND, self._receive)
             self._await_state(3.0)
         except SliplensError:
@@ -247,12 +224,12 @@ class RosGripper:
             ) from None
 
     def set_force(self, force_n: float) -> None:
-        """Press with so many newtons."""
-        self._send(*self._force, force_n)
-
-    def set_width(self, width_m: float) -> None:
-        """Open to so many metres."""
-        self._send(*self._width, width_m)
+        """Press with so many newtons, and check that the gripper still sends its state."""
+        try:
+            self._publish(self._command.fields(force_n), time.time_ns())
+        except OSError as error:
+            raise GripperError(f"the gripper cannot be reached ({error}); check its bridge") from None
+        self.read_state()
 
     def read_state(self) -> GripperState:
         """Return force and width from the newest state."""
@@ -273,14 +250,6 @@ class RosGripper:
     def close(self) -> None:
         """Close the connection."""
         self._ros.close()
-
-    def _send(self, command: RosCommand, publish: Callable[..., None], value: float) -> None:
-        """Send a force or a width, and check that the gripper still sends its state."""
-        try:
-            publish(command.fields(value), time.time_ns())
-        except OSError as error:
-            raise GripperError(f"the gripper cannot be reached ({error}); check its bridge") from None
-        self.read_state()
 
     def _receive(self, message: bytes) -> None:
         with self._new:
@@ -357,15 +326,10 @@ class DryRun:
     def set_force(self, force_n: float) -> None:
         """Record a force in newtons."""
         self.sent.append(f"F {force_n:.3f}")
-        self._state = replace(self._state, force_n=force_n)
-
-    def set_width(self, width_m: float) -> None:
-        """Record a width in metres."""
-        self.sent.append(f"W {width_m:.4f}")
-        self._state = replace(self._state, width_m=width_m)
+        self._state = GripperState(force_n=force_n, width_m=0.0)
 
     def read_state(self) -> GripperState:
-        """Return the last force and width."""
+        """Return the last force, with a width of 0."""
         return self._state
 
     def close(self) -> None:
@@ -376,7 +340,7 @@ class GuardedGripper:
     """A gripper behind a guard: a ceiling that no force exceeds, and a watchdog that holds.
 
     When no command comes for `watchdog_s`, or the gripper fails at one in whatever way, the guard repeats the last
-    force until commands return, and never opens. A force of NaN holds, too; a width is refused while holding.
+    force until commands return. A force of NaN holds, too.
     """
 
     def __init__(self, gripper: Gripper, *, ceiling_n: float = 4.0, watchdog_s: float = 0.2) -> None:
@@ -394,7 +358,7 @@ class GuardedGripper:
 
     @property
     def holding(self) -> bool:
-        """True while commands stay away or the gripper fails; an open gripper holds nothing."""
+        """True while commands stay away or the gripper fails."""
         late = time.monotonic() - self._command_s > self._limit
         return self._force is not None and (late or self.failure is not None)
 
@@ -405,17 +369,6 @@ class GuardedGripper:
             if not math.isnan(force_n):
                 self._force = min(max(force_n, 0.0), self._ceiling)
             self._send()
-
-    def set_width(self, width_m: float) -> None:
-        """Open to so many metres; refused while holding."""
-        if not 0 <= width_m < math.inf:
-            raise InputError(f"a gripper cannot open to {width_m:g} m; give a width of 0 or more")
-        with self._lock:
-            if self.holding:
-                raise GripperError("the guard holds the object and opens nothing; send a force first")
-            self._command_s = time.monotonic()
-            self._gripper.set_width(width_m)
-            self._force = None  # not before: a gripper that fails at it still has to hold
 
     def read_state(self) -> GripperState:
         """Measure force and width."""

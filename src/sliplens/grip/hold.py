@@ -14,9 +14,17 @@ import numpy as np
 from sliplens.codec import save_result
 from sliplens.errors import InputError
 from sliplens.files import output_folder
-from sliplens.grip.controllers import AssumedFriction, Controller, MarginLaw, Oracle, make_controller
+from sliplens.grip.controllers import (
+    STALE_S,
+    AssumedFriction,
+    Controller,
+    GripCommand,
+    Holder,
+    MarginLaw,
+    Oracle,
+    make_controller,
+)
 from sliplens.grip.gripper import DryRun, Gripper, GripperError, GripperState, GuardedGripper, open_gripper
-from sliplens.grip.holder import STALE_S, GripCommand, Holder
 from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.records import Ending, Hold, HoldSteps
 from sliplens.grip.source import GripSource, open_grip, usual_network
@@ -46,6 +54,11 @@ class HoldStep(GripCommand):
     """Grip force that the gripper measured before; NaN without a measurement."""
     readings: tuple[Reading | None, ...]
     """Newest reading of each fingertip; None before the first."""
+
+    @property
+    def failed(self) -> bool:
+        """True where the gripper failed to take the command, or to measure its force."""
+        return self.trouble is not None
 
     def __str__(self) -> str:
         several = len(self.readings) > 1
@@ -154,6 +167,16 @@ def hold_grip(
         for finger, reader in enumerate(readers):
             stack.callback(reader.subscribe(partial(loop.update_reading, finger)))
         ended, why = loop.run(seconds, on_step)
+        last = (
+            f"the gripper keeps the last command of {loop.steps[-1].command_n:.2f} N"
+            if loop.steps
+            else "the gripper got no command"
+        )
+        kinds = {"slip": bool, "failed": bool, "why": str}
+        columns = {
+            name: np.array([getattr(step, name) for step in loop.steps], dtype=kinds.get(name, np.float64))
+            for name in HoldSteps.__dataclass_fields__
+        }
         hold = Hold(
             sources=tuple(reader.source.name for reader in readers),
             gripper=address,
@@ -162,9 +185,9 @@ def hold_grip(
             ceiling_n=ceiling_n,
             watchdog_s=watchdog_s,
             ended=ended,
-            why=f"{why}; {'nothing was sent' if address == 'dry-run' else loop.last_force}",
+            why=f"{why}; {'nothing was sent' if address == 'dry-run' else last}",
             troubles=tuple(loop.troubles),
-            steps=loop.table(),
+            steps=HoldSteps(**columns),
         )
         if output is not None:
             save_result(hold, output.folder)
@@ -187,7 +210,7 @@ class HoldLoop:
     ) -> None:
         self._guard, self._readers = guard, readers
         self._readings: list[Reading | None] = [None] * len(readers)
-        self._steps: list[HoldStep] = []
+        self.steps: list[HoldStep] = []
         self.troubles: dict[str, None] = {}
         """Faults of the gripper, in the order in which they first came."""
         force_n = self._first_force()
@@ -235,23 +258,6 @@ class HoldLoop:
             return "failed", str(error)
         return "time", "the time is over"
 
-    @property
-    def last_force(self) -> str:
-        """State in which the gripper goes on, in words."""
-        if not self._steps:
-            return "the gripper got no command"
-        return f"the gripper keeps the last command of {self._steps[-1].command_n:.2f} N"
-
-    def table(self) -> HoldSteps:
-        """Return all commands so far."""
-        numbers = dict.fromkeys(("time_s", "command_n", "force_n", "margin", "low"), np.float64)
-        columns = {
-            name: np.array([getattr(step, name) for step in self._steps], dtype=kind)
-            for name, kind in {**numbers, "slip": bool, "why": str}.items()
-        }
-        failed = np.array([step.trouble is not None for step in self._steps], dtype=bool)
-        return HoldSteps(failed=failed, **columns)
-
     def step(self, begun_s: float) -> HoldStep:
         """Measure the force, and command the next one."""
         state, trouble = self._measure()
@@ -275,7 +281,7 @@ class HoldLoop:
                     for reading in self._readings
                 ),
             )
-            self._steps.append(replace(step, readings=()))
+            self.steps.append(replace(step, readings=()))
         return step
 
     def _first_force(self) -> float:
@@ -302,7 +308,7 @@ class HoldLoop:
         """Refuse a gripper that measures no force from the start although its fingers have stopped."""
         if math.isnan(state.width_m):
             return
-        if self._holder.touched or not self._steps:
+        if self._holder.touched or not self.steps:
             self._closing = None
             return
         since_s, low_m, high_m = self._closing or (now_s, state.width_m, state.width_m)
@@ -310,7 +316,7 @@ class HoldLoop:
             since_s = now_s
         # a width that was measured before is noise, not motion
         self._closing = since_s, min(low_m, state.width_m), max(high_m, state.width_m)
-        command_n = self._steps[-1].command_n
+        command_n = self.steps[-1].command_n
         if now_s - since_s > _STUCK_S and command_n > 0:
             raise GripperError(
                 f"the gripper measures {state.force_n:.2f} N and its fingers do not move, {_STUCK_S:g} s after "

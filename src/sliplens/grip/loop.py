@@ -13,9 +13,8 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.friction import SlipLearner
-from sliplens.grip.controllers import Controller, Observation
+from sliplens.grip.controllers import SPRINGS_BACK_S, Controller, Observation, SlipGate
 from sliplens.grip.fingertip import Fingertip, MarkerField, ReadingTable
-from sliplens.grip.holder import SPRINGS_BACK_S, SlipGate
 from sliplens.grip.plant import PERIOD_S, Episodes, Fingers, Plant, PlantState, World
 from sliplens.live.slip import SlipBatch
 from sliplens.markers import Tracker
@@ -36,8 +35,8 @@ class FingertipReading:
     margin: Float[np.ndarray, "episodes 2"]
     low: Float[np.ndarray, "episodes 2"]
     high: Float[np.ndarray, "episodes 2"]
-    markers_px: tuple[Markers, Markers] | None = None
-    """Positions (x, y) of the markers of both fingertips; None without markers."""
+    markers_px: Sequence[Markers] = ()
+    """Positions (x, y) of the markers of both fingertips; empty without markers."""
     frames: UInt8[np.ndarray, "2 height width 3"] | None = None
     """Camera images, where any were drawn."""
 
@@ -189,7 +188,7 @@ class RenderedSensor:
             margin=estimate.margin[None],
             low=low[None],
             high=high[None],
-            markers_px=(markers_px[0], markers_px[1]),
+            markers_px=markers_px,
             frames=np.stack(frames),
         )
 
@@ -219,7 +218,7 @@ class GripLoop:
     >>> from sliplens.grip.controllers import make_controller
     >>> from sliplens.grip.loop import GripLoop
     >>> from sliplens.grip.plant import OBJECTS, Plant
-    >>> from sliplens.grip.scripts import draw_scripts
+    >>> from sliplens.grip.plant import draw_scripts
     >>> scripts = draw_scripts("cup", "dry", episodes=1, seed=0)
     >>> loop = GripLoop(Plant(OBJECTS["cup"]), None, make_controller("fixed", {"force_n": 2.0}))
     >>> for _ in range(30):
@@ -257,10 +256,16 @@ class GripLoop:
         nothing, slip, slipped_s = np.full((count, 2), np.nan), np.zeros(count, dtype=bool), np.full(count, np.nan)
         reading = FingertipReading(margin=nothing, low=nothing, high=nothing)
         if self.sensor is not None:
-            reading = _darken(self.sensor.measure(now, self._slipping_s), dark)
-            assert reading.markers_px is not None
+            reading = self.sensor.measure(now, self._slipping_s)
+            markers = reading.markers_px
+            if dark is not None:
+                shown = {name: np.where(dark, np.nan, getattr(reading, name)) for name in ("margin", "low", "high")}
+                markers = [
+                    np.where(hidden[:, None, None], np.nan, at) for hidden, at in zip(dark.T, markers, strict=True)
+                ]
+                reading = replace(reading, markers_px=markers, **shown)
             self._forces.append(now.force_n)
-            for (batch, gate), places in zip(self._fingers, reading.markers_px, strict=True):
+            for (batch, gate), places in zip(self._fingers, markers, strict=True):
                 states = batch.update(places, now.time_s)
                 slip |= gate.update(
                     states.slip, since_touch_s=now.held_s, force_n=now.force_n, earlier_n=self._forces[0]
@@ -282,15 +287,3 @@ class GripLoop:
         self._command_n = np.asarray(self.controller.command(observation), dtype=np.float64)
         state = self.plant.step(self._command_n, world)
         return Tick(world=world, state=state, command_n=self._command_n, reading=reading, observation=observation)
-
-
-def _darken(reading: FingertipReading, dark: Bool[np.ndarray, "episodes 2"] | None) -> FingertipReading:
-    """Remove margins and markers of dark fingers."""
-    if dark is None or not dark.any():
-        return reading
-    margin, low, high = (np.where(dark, np.nan, values) for values in (reading.margin, reading.low, reading.high))
-    first, second = (
-        np.where(hidden, np.nan, places)
-        for hidden, places in zip(dark.T[..., None, None], reading.markers_px or (), strict=True)
-    )
-    return replace(reading, margin=margin, low=low, high=high, markers_px=(first, second))

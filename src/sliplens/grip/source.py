@@ -11,11 +11,20 @@ import numpy as np
 from sliplens.errors import InputError
 from sliplens.extras import pick
 from sliplens.files import DEFAULT_NETWORK
+from sliplens.grip.controllers import Holder
 from sliplens.grip.fingertip import Fingertip
-from sliplens.grip.gripper import GripperError, GripperState
-from sliplens.grip.holder import Holder
-from sliplens.grip.plant import OBJECTS, PERIOD_S, GripperModel, Plant, PlantState, World, least_force
-from sliplens.grip.scripts import LIFT_S, hand_motion
+from sliplens.grip.gripper import GripperState
+from sliplens.grip.plant import (
+    LIFT_S,
+    OBJECTS,
+    PERIOD_S,
+    GripperModel,
+    Plant,
+    PlantState,
+    World,
+    hand_motion,
+    least_force,
+)
 from sliplens.live.contract import LiveOptions, LiveSource, Pace
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Forces
@@ -135,10 +144,6 @@ class GripSource(LiveSource):
         """Press with so many newtons from now on, in place of the controller's force."""
         with self._lock:
             self._outside_n, self._why = force_n, "follows commands from outside"
-
-    def set_width(self, width_m: float) -> None:
-        """Refuse to open: the source opens by itself."""
-        raise GripperError(f"the simulated gripper cannot be opened to {width_m:g} m; command forces")
 
     def read_state(self) -> GripperState:
         """Return the grip force, and an assumed width."""

@@ -11,12 +11,12 @@ from torch import Tensor
 
 from sliplens.mechanics import normal_slope
 from sliplens.simulation.geometry import Point, Rays, pixel_grid
-from sliplens.simulation.loading import Loading
-from sliplens.simulation.motion import Motion, move_markers
+from sliplens.simulation.loading import Loading, Motion, move_markers
 from sliplens.simulation.nuisances import Day, Grasp, Nuisances, Touch, Unit
-from sliplens.simulation.sensor import DrawnMarkers, Noise, Sensor, draw_look, mix_noise, pick_noise
+from sliplens.simulation.sensor import Noise, Sensor, mix_noise, pick_noise
 
 Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
+Looks: TypeAlias = Float[np.ndarray, "frames markers 3"]
 
 _BATCHES = {"cpu": 4, "cuda": 512}  # frames drawn at once: few enough for a processor's caches, many enough for a GPU
 _PATCH = 32  # side of the square in which a marker is drawn, in pixels: the edge of the widest marker fades within it
@@ -122,17 +122,39 @@ class Film:
             pixels[..., channel].copy_(plane)
         return pixels
 
-    def look(self, frames: slice) -> DrawnMarkers:
-        """Compute the look of the markers in some of the frames."""
-        return draw_look(
-            self.sensor.look,
-            geometry=self.sensor.geometry,
-            unit=self.unit,
-            scale=self.motion.scale[frames],
-            pressure=self.motion.pressure[frames],
-            touch=self.motion.touch[frames],
-            blur_px=self.blur_px[_after_reference(frames)],
+    def look(self, frames: slice) -> tuple[Looks, Looks, Looks]:
+        """Compute radius and edge width in pixels, and contrast over the sensor's, of the markers in some frames.
+
+        A pressed marker is paler, for the object behind the thin skin throws light back, and it is sharp: pressing
+        brings the gel into the focus that the untouched one is out of, most in red and to one side of the image.
+        Markers seen aslant are paler, too.
+        """
+        look, geometry, motion, unit = self.sensor.look, self.sensor.geometry, self.motion, self.unit
+        rest = geometry.marker_positions()
+        aslant = 1 - geometry.slope_cosine(rest)[:, None] ** 2
+        pressed = np.minimum(motion.touch[frames], 1)[:, None, None]
+        tilt = np.maximum(1 + rest[:, :2] @ np.asarray(look.focus_tilt) / geometry.sphere_radius_m, 0)
+        defocus = (1 - pressed) * tilt[:, None] * np.asarray(look.defocus_px)
+        # the standard deviation of a logistic edge is 1.81 widths
+        blur = self.blur_px[_after_reference(frames)][:, None, None] / 1.81
+        size = geometry.marker_scale() * unit.radius_factor * motion.scale[frames]
+        squeezed = 1 + motion.pressure[frames][..., None] * np.asarray(look.squeeze)
+        slanted = unit.contrast_factor[:, None] * (1 - np.asarray(look.aslant_fade) * aslant)
+        return (
+            size[..., None] * squeezed * np.asarray(look.radius_px),
+            np.sqrt(np.asarray(look.edge_px) ** 2 + defocus**2 + blur**2),
+            slanted * (1 - np.asarray(look.pressed_fade) * pressed),
         )
+
+    def outlines(self, frame: int | None) -> tuple[Float[np.ndarray, "markers 2"], Float[np.ndarray, " markers"]]:
+        """Compute centres and radii, in pixels of the camera, of the circles that the markers fill; None: at rest."""
+        if frame is None:
+            return self.untouched().outlines(0)
+        return self.marker_px[frame], self.look(slice(frame, frame + 1))[0][0].max(axis=-1)
+
+    def draw_all(self) -> UInt8[np.ndarray, "frames height width 3"]:
+        """Draw every frame on the processor."""
+        return torch.cat([self.draw(part) for part in batches(len(self), device="cpu")]).numpy()
 
     def contact_map(self, frames: slice) -> UInt8[np.ndarray, "frames height width"]:
         """Compute the contact in the camera's image: 0 outside, 1 slipping, 2 sticking.
@@ -155,10 +177,9 @@ class Film:
         # markers outside the frame are skipped; the padding takes what of the others sticks out
         inside = np.all((centres_px > -_PATCH / 2) & (centres_px < size_px - 1 + _PATCH / 2), axis=-1)
         frame_index, marker_index = np.nonzero(inside)
-        centres, drawn = _tensor(centres_px[inside], device), self.look(frames)
+        centres = _tensor(centres_px[inside], device)
         radius, edge, contrast = (
-            _tensor(values[inside], device).T[:, :, None, None].contiguous()
-            for values in (drawn.radius_px, drawn.edge_px, drawn.contrast)
+            _tensor(values[inside], device).T[:, :, None, None].contiguous() for values in self.look(frames)
         )
         corner = torch.floor(centres).to(torch.int64) - _PATCH // 2 + 1
 
@@ -208,6 +229,9 @@ def prepare_film(
     contact_px = see(geometry.project(geometry.skin_point(motion.contact_centre_m)))
     edge, apex = (geometry.project(geometry.skin_point(np.array([x, 0.0]))) for x in (motion.nominal_radius_m, 0.0))
     light, grain = brightness(sensor, day=day), np.random.default_rng((unit.texture_seed, 1))
+    print_shape = (3, geometry.markers, _PATCH, _PATCH)
+    texture = np.random.default_rng(unit.texture_seed).standard_normal(print_shape, dtype=np.float32)
+    texture[1] = 0.5 * texture[0] + 0.75**0.5 * texture[1]  # red and green are half correlated
     return Film(
         sensor=sensor,
         grasp=grasp,
@@ -223,7 +247,7 @@ def prepare_film(
         rays=geometry.rays(
             (pixel_grid(sensor.image_size_px) - middle - np.asarray(day.camera_shift_px)) @ _turn(day).T + middle
         ),
-        texture=draw_texture(geometry.markers, rng=np.random.default_rng(unit.texture_seed)),
+        texture=texture,
         light=light,
         empty=empty_view(sensor, day=day, light=light),
         haze=haze(sensor, grasp=grasp, contact_px=contact_px, radius_px=float(edge[0] - apex[0]), rng=grain),
@@ -337,13 +361,6 @@ def _smooth_noise(size: int, *, rng: np.random.Generator) -> Float[np.ndarray, "
 
 def _planes(image: Float[np.ndarray, "height width 3"]) -> Planes:
     return np.ascontiguousarray(np.moveaxis(image, -1, 0), dtype=np.float32)
-
-
-def draw_texture(markers: int, *, rng: np.random.Generator) -> Float32[np.ndarray, "3 markers side side"]:
-    """Draw the grain of the markers' print, of unit strength, red and green half correlated."""
-    grain = rng.standard_normal((3, markers, _PATCH, _PATCH), dtype=np.float32)
-    grain[1] = 0.5 * grain[0] + 0.75**0.5 * grain[1]
-    return grain
 
 
 def place(

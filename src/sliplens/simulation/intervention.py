@@ -10,22 +10,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-import msgspec
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
-from torch import Tensor
+from jaxtyping import Bool, Float, Int
 
 from sliplens._version import __version__
 from sliplens.errors import ContactError, InputError
-from sliplens.files import RUN_FILE, read_json
 from sliplens.recordings import Recording
-from sliplens.simulation.filming import Film, batches
-from sliplens.simulation.loading import Loading, load_at_margins
-from sliplens.simulation.motion import move_markers
-from sliplens.simulation.nuisances import Nuisances, Pulls, Range, Touch
-from sliplens.simulation.plan import FrameTotals, SimulationRecipe, TrialPlan, plan_trials
-from sliplens.simulation.sensor import SENSORS, Sensor
+from sliplens.simulation.filming import Film
+from sliplens.simulation.loading import Loading, load_at_margins, move_markers
+from sliplens.simulation.nuisances import Nuisances, Range, Touch
+from sliplens.simulation.plan import SimulationRecipe, TrialPlan, plan_trials, read_recipe
+from sliplens.simulation.sensor import Sensor
 from sliplens.simulation.trials import prepare_trial
 
 Jacobian: TypeAlias = Float[np.ndarray, "coordinates unknowns"]
@@ -202,39 +198,6 @@ class FilmedTrial:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Outlines:
-    """Circles that the markers fill in a frame and at rest, in camera pixels."""
-
-    rest_px: Float[np.ndarray, "markers 2"]
-    rest_radius_px: Float[np.ndarray, " markers"]
-    """Radius in the widest channel."""
-    now_px: Float[np.ndarray, "markers 2"]
-    now_radius_px: Float[np.ndarray, " markers"]
-
-
-def read_recipe(folder: Path) -> SimulationRecipe:
-    """Read the recipe of a data set from its `run.json`."""
-    path = folder / RUN_FILE
-    try:
-        stored = read_json(path)["config"]["recipe"]
-        dry_trials = stored["dry_trials"]
-        return SimulationRecipe(
-            **stored
-            | {
-                "dry_trials": tuple(dry_trials) if isinstance(dry_trials, list) else dry_trials,
-                "sensor": SENSORS[stored["sensor"]["name"]],
-                "nuisances": msgspec.convert(stored["nuisances"], Nuisances),
-                "frame_totals": msgspec.convert(stored["frame_totals"], FrameTotals | None),
-                "pulls": msgspec.convert(stored.get("pulls"), Pulls | None),
-            }
-        )
-    except (InputError, KeyError, TypeError, AttributeError, ValueError, ArithmeticError):
-        raise InputError(
-            f"{path} holds no recipe of simulated trials; give the recipe, or a data set that sliplens simulate made"
-        ) from None
-
-
 def rebuild_trial(folder: Path, recording: Recording, *, recipe: SimulationRecipe | None = None) -> FilmedTrial:
     """Prepare a stored simulated trial to be drawn again with the same bytes; its recipe is read if None."""
     name, truth = recording.trial, recording.truth
@@ -268,46 +231,27 @@ def put_markers_back(
     paleness, which the touch gives to all markers, stay.
     """
     count, motion = len(back), film.motion
-    at, taken = np.full(count, frame), np.full(count, frame + 1)  # the untouched sensor's picks come first
+    source, there = (film.untouched(), 0) if to is None else (film, to)
 
-    def where_back(rest: np.ndarray | float, path: np.ndarray) -> np.ndarray:
-        now, then = path[frame], rest if to is None else path[to]
-        chosen = back[..., None] if now.ndim == 2 else back
-        return np.where(chosen, then, now[None])
+    def where_back(path: np.ndarray, paths: np.ndarray) -> np.ndarray:
+        chosen = back[..., None] if path.ndim == 3 else back
+        return np.where(chosen, paths[there], path[frame][None])
 
+    moved = {
+        name: where_back(getattr(motion, name), getattr(source.motion, name))
+        for name in ("centres_px", "scale", "pressure")
+    }
+    same = {
+        name: getattr(motion, name)[np.full(count, frame)]
+        for name in ("touch", "indentation_m", "contact_radius_m", "stick_radius_m")
+    }
+    picks = np.append(0, np.full(count, frame + 1))  # the untouched sensor's come first
     return replace(
         film,
-        motion=replace(
-            motion,
-            centres_px=where_back(motion.rest_px, motion.centres_px),
-            scale=where_back(1.0, motion.scale),
-            pressure=where_back(0.0, motion.pressure),
-            touch=motion.touch[at],
-            indentation_m=motion.indentation_m[at],
-            contact_radius_m=motion.contact_radius_m[at],
-            stick_radius_m=motion.stick_radius_m[at],
-        ),
-        marker_px=where_back(film.marker_rest_px, film.marker_px),
-        blur_px=film.blur_px[np.append(0, taken)],
-        noise_picks=film.noise_picks[np.append(0, taken)],
-    )
-
-
-def draw_with_markers_back(
-    film: Film, frame: int, back: Bool[np.ndarray, "variants markers"], *, to: int | None = None
-) -> UInt8[Tensor, "variants height width 3"]:
-    """Draw a frame with markers put back (`put_markers_back`), once for each choice; the stored frame for none."""
-    changed = put_markers_back(film, frame, back, to=to)
-    return torch.cat([changed.draw(part) for part in batches(len(back), device="cpu")])
-
-
-def marker_outlines(film: Film, frame: int) -> Outlines:
-    """Compute the circles that the markers fill in a frame and at rest."""
-    return Outlines(
-        rest_px=film.marker_rest_px,
-        rest_radius_px=film.untouched().look(slice(0, 1)).radius_px[0].max(axis=-1),
-        now_px=film.marker_px[frame],
-        now_radius_px=film.look(slice(frame, frame + 1)).radius_px[0].max(axis=-1),
+        motion=replace(motion, **moved, **same),
+        marker_px=where_back(film.marker_px, source.marker_px),
+        blur_px=film.blur_px[picks],
+        noise_picks=film.noise_picks[picks],
     )
 
 
@@ -323,15 +267,6 @@ def marker_readings(
 
     Gives numbers of the markers, and the estimate less the estimate with that marker put back, in margin units.
     """
-    sensitivity, prior = _sensitivity(trial, frame)
-    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
-    motion, visible = trial.film.motion, visible_markers(trial.plan.recipe.sensor)
-    moved = (motion.centres_px[frame] - motion.rest_px)[visible]
-    return visible, (gain.reshape(-1, 2) * moved).sum(axis=1)
-
-
-def _sensitivity(trial: FilmedTrial, frame: int) -> tuple[Sensitivity, dict[str, float]]:
-    """Compute the motion of a frame's markers with every unknown, and the standard deviations of these."""
     recipe, margin = trial.plan.recipe, float(trial.loading.safety_margin[frame])
     if np.isnan(margin):
         raise ContactError(
@@ -343,4 +278,8 @@ def _sensitivity(trial: FilmedTrial, frame: int) -> tuple[Sensitivity, dict[str,
         touch=trial.touch(frame),
         displacement=recipe.resolved_displacement,
     )
-    return sensitivity, prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet")
+    prior = prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet")
+    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
+    motion, visible = trial.film.motion, visible_markers(recipe.sensor)
+    moved = (motion.centres_px[frame] - motion.rest_px)[visible]
+    return visible, (gain.reshape(-1, 2) * moved).sum(axis=1)

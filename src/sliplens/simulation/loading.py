@@ -1,15 +1,25 @@
-"""Load on the fingertip through a trial: touch, press, hold, pull until it slips, slide on, let go."""
+"""Load on the fingertip through a trial, and the motion of its markers: by a calibrated model or the half-space."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from sliplens.errors import ContactError
-from sliplens.mechanics import safety_margin, stick_ratio
+from sliplens.mechanics import (
+    contact_radius,
+    hertz_displacement,
+    indentation,
+    partial_slip_displacement,
+    reduced_modulus,
+    safety_margin,
+    stick_radius,
+    stick_ratio,
+)
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.simulation.geometry import Frames
-from sliplens.simulation.nuisances import Grasp, Pulls
+from sliplens.simulation.nuisances import Grasp, Pulls, Touch
+from sliplens.simulation.sensor import Sensor
 
 _FALL_S = 0.06  # time in which friction falls from static to kinetic once the contact slips (assumed)
 _SLIP_SHARE = 0.2  # share of a stick-slip cycle in which the contact slips (assumed)
@@ -122,19 +132,13 @@ class Loading:
         return parts
 
 
-@dataclass(frozen=True, kw_only=True)
-class Pull:
-    """Course of a pull, frame by frame, in shares of the friction; see `Loading`."""
-
-    used: Frames
-    let_back: Frames
-    retaken: Frames
-
-
-def draw_pull(pulls: Pulls, *, progress: Frames, duration_s: float, rng: np.random.Generator) -> Pull:
+def draw_pull(
+    pulls: Pulls, *, progress: Frames, duration_s: float, rng: np.random.Generator
+) -> tuple[Frames, Frames, Frames]:
     """Draw a pull that uses the friction up, from 0 at its beginning to 1 at its end.
 
-    `progress` is the time since the first tug over the duration, from 0 to 1.
+    `progress` is the time since the first tug over the duration, from 0 to 1. Returns the used share of the friction,
+    and `let_back` and `retaken` of `Loading`.
     """
     events = rng.choice(["rest", "jerk", "let back"], size=rng.integers(pulls.most_events + 1))
     places = np.append(np.sort(rng.uniform(0.05, 0.95, len(events))), 1.0)
@@ -168,7 +172,7 @@ def draw_pull(pulls: Pulls, *, progress: Frames, duration_s: float, rng: np.rand
         again = away & (progress > times[turn])
         let_back[away] = farthest - np.where(again, lowest, used)[away]
         retaken[again] = used[again] - lowest
-    return Pull(used=used, let_back=let_back, retaken=retaken)
+    return used, let_back, retaken
 
 
 def load_grasp(
@@ -198,21 +202,20 @@ def load_grasp(
 
     pulled = np.clip((index - pull) / (slip - pull), 0, 1)
     if pulls is not None:
-        course = draw_pull(pulls, progress=pulled, duration_s=(slip - pull) * trial_s / frames, rng=rng)
+        used, *history = draw_pull(pulls, progress=pulled, duration_s=(slip - pull) * trial_s / frames, rng=rng)
     else:
         # a slow swing of the puller, small enough that the margin never rises
         swing = rng.uniform(-0.5, 0.5) * np.sin(2 * np.pi * pulled) / (2 * np.pi)
-        nothing = np.zeros(frames)
-        course = Pull(used=np.clip(pulled + swing, 0, 1), let_back=nothing, retaken=nothing)
+        used, history = np.clip(pulled + swing, 0, 1), [np.zeros(frames)] * 2
     sliding = slide(time_s - time_s[slip], static_friction=static, grasp=grasp, stuck_until=let_go - slip)
     friction = ContactFriction(
         coefficient=np.where(index < slip, static, sliding.coefficient),
-        used=np.where(index < slip, course.used, sliding.used),
+        used=np.where(index < slip, used, sliding.used),
         carried=np.where(index < slip, 0.0, sliding.carried),
         slips=(index >= slip) & sliding.slips,
     )
     held_s = np.where(index < touch, 0, time_s - time_s[touch])
-    return _label(time_s, normal=normal, static=static, friction=friction, held_s=held_s, course=course)
+    return _label(time_s, normal=normal, static=static, friction=friction, held_s=held_s, history=history)
 
 
 def load_at_margins(margins: Frames, *, grasp: Grasp) -> Loading:
@@ -241,22 +244,15 @@ def load_at_states(
     states = ContactFriction(coefficient=friction, used=used, carried=nothing, slips=margins == 0)
     normal = np.where(np.isnan(margins), 0.0, normal_force_n)
     time_s = np.arange(len(margins), dtype=np.float64)
-    return _label(time_s, normal=normal, static=friction, friction=states, held_s=nothing if held_s is None else held_s)
+    held_s = nothing if held_s is None else held_s
+    return _label(time_s, normal=normal, static=friction, friction=states, held_s=held_s, history=[nothing] * 2)
 
 
 def _label(
-    time_s: Frames,
-    *,
-    normal: Frames,
-    static: Frames,
-    friction: ContactFriction,
-    held_s: Frames,
-    course: Pull | None = None,
+    time_s: Frames, *, normal: Frames, static: Frames, friction: ContactFriction, held_s: Frames, history: list[Frames]
 ) -> Loading:
     """Compute forces and labels of frames from the share of the friction that they use."""
-    let_back = retaken = np.zeros(len(time_s))
-    if course is not None:
-        let_back, retaken = course.let_back, course.retaken
+    let_back, retaken = history
     coefficient, carried, slips = friction.coefficient, friction.carried, friction.slips
     tangential = friction.used * coefficient * normal
     # rounding alone would leave a sliding contact a margin of 1e-16
@@ -264,7 +260,10 @@ def _label(
     rest = coefficient - carried
     on_top = np.clip((friction.used * coefficient - carried) / np.where(rest > 0, rest, 1), 0, 1)
     again = ~np.isnan(margin) & ~slips & (carried > 0)
-    stick_margin = _newest_margin(np.where(again, 1 - on_top, margin), let_back=let_back, retaken=retaken)
+    stick_margin = np.where(again, 1 - on_top, margin)
+    # of the slip that last began at the rim of the contact
+    newest = np.where(retaken > 0, 1 - retaken / 2, 1 - let_back / 2)
+    stick_margin = np.where((let_back > 0) & ~np.isnan(stick_margin), newest, stick_margin)
     return Loading(
         time_s=time_s,
         normal_force_n=normal,
@@ -280,12 +279,6 @@ def _label(
         held_s=held_s,
         contact_state=contact_states(margin, without=ContactState.NO_CONTACT),
     )
-
-
-def _newest_margin(margin: Frames, *, let_back: Frames, retaken: Frames) -> Frames:
-    """Compute the margin of the slip that last began at the rim of the contact."""
-    newest = np.where(retaken > 0, 1 - retaken / 2, 1 - let_back / 2)
-    return np.where((let_back > 0) & ~np.isnan(margin), newest, margin)
 
 
 def _phase_ends(
@@ -309,3 +302,127 @@ def _smooth(progress: Frames) -> Frames:
     """Rise from 0 to 1 with a soft start and stop, like a servo."""
     inside = np.clip(progress, 0, 1)
     return inside**2 * (3 - 2 * inside)
+
+
+_FITTED_FRICTION = 0.775
+"""Friction ascribed to the trial of the real images, which names none: the dry range's geometric mean (assumed)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Displacement:
+    """Give of a fingertip: an elastic half-space held by its base, and a shear of the whole skin."""
+
+    layer: float
+    """Indentation over Hertz's for the same contact: on a hard core the gel is a layer; a thin one has half of it."""
+    local_friction: float
+    """Share of the friction that shows as Cattaneo and Mindlin's local field."""
+    clamp_exponent: float
+    """The base holds the gel: local displacements fade with the cosine of the polar angle to this power."""
+    skin_shear: float
+    """Shear of the whole skin at full slip in the fitted trial, in radii; as Mindlin's it grows with mu P / a, that is
+    with mu times the indentation, and with the pull as 1 - Gamma^p."""
+
+
+DISPLACEMENTS = {
+    # fitted, with the defaults of `Grasp`, to 34 markers x 4 frames of the published difference images
+    "calibrated": Displacement(
+        layer=0.69, local_friction=0.042 / _FITTED_FRICTION, clamp_exponent=0.76, skin_shear=0.0307
+    ),
+    # the exponent where a half-space alone was fitted to those markers
+    "half-space": Displacement(layer=1.0, local_friction=1.0, clamp_exponent=1.6, skin_shear=0.0),
+}
+"""`calibrated` moves as the real ChromaTouch did, and its stick zone is nominal; `half-space` is exact mechanics."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """Markers and contact through a trial; pixels are those of a camera that sits as drawn."""
+
+    rest_px: Float[np.ndarray, "markers 2"]
+    centres_px: Float[np.ndarray, "frames markers 2"]
+    scale: Float[np.ndarray, "frames markers"]
+    """Size over the size at rest; a marker that comes nearer looks larger."""
+    touch: Float[np.ndarray, " frames"]
+    """Indentation over that of the nominal grasp; 0 without contact."""
+    nominal_radius_m: float
+    """Contact radius of the nominal grasp."""
+    contact_centre_m: Float[np.ndarray, "2"]
+    pressure: Float[np.ndarray, "frames markers"]
+    """Hertz's pressure on each marker over the peak of the nominal grasp's."""
+    indentation_m: Float[np.ndarray, " frames"]
+    contact_radius_m: Float[np.ndarray, " frames"]
+    stick_radius_m: Float[np.ndarray, " frames"]
+
+
+def move_markers(sensor: Sensor, touch: Touch, *, loading: Loading, displacement: str | None = None) -> Motion:
+    """Displace a sensor's markers by a loading, and by the offset, tilt, shear and creep of the touch.
+
+    `displacement`: a row of `DISPLACEMENTS`; the sensor's default if None.
+    """
+    name = sensor.displacements[0] if displacement is None else displacement
+    if name not in sensor.displacements:
+        raise ContactError(
+            f"sensor {sensor.name} cannot be moved by {name!r}; choose {' or '.join(sensor.displacements)}"
+        )
+    model, grasp = DISPLACEMENTS[name], touch.grasp
+    modulus_pa = sensor.youngs_modulus_pa
+    if name == "calibrated" and sensor.effective_modulus_pa is not None:
+        modulus_pa = sensor.effective_modulus_pa
+    geometry = sensor.geometry
+    sphere_m, depth_m = geometry.sphere_radius_m, touch.marker_depth * geometry.sphere_radius_m
+    rest = geometry.marker_positions(depth_m)
+    creep = 1 + grasp.creep * (1 - np.exp(-loading.held_s / grasp.creep_time_s))
+
+    def radius(force_n: np.ndarray, factor: float) -> np.ndarray:
+        modulus = reduced_modulus(youngs_modulus_pa=modulus_pa * factor, poisson_ratio=sensor.poisson_ratio)
+        return np.asarray(contact_radius(force_n, sphere_radius_m=sphere_m, reduced_modulus_pa=modulus))
+
+    contact_m = radius(loading.normal_force_n * creep, touch.modulus_factor)
+    nominal_m = radius(np.array([Grasp().normal_force_n]), 1.0)
+    sunken = (contact_m / nominal_m) ** 2
+    clamp = geometry.slope_cosine(rest) ** model.clamp_exponent
+    centre_m = np.asarray(grasp.contact_offset) * sphere_m
+    from_centre = rest[:, :2] - centre_m
+    distance = np.linalg.norm(from_centre, axis=-1)
+    outward, inward = hertz_displacement(
+        distance,
+        depth_m,
+        contact_radius_m=contact_m[:, None],
+        sphere_radius_m=sphere_m,
+        poisson_ratio=sensor.poisson_ratio,
+    )
+    yielding = model.layer * clamp
+    outward, inward = outward * yielding / np.where(distance > 0, distance, 1), inward * yielding
+    pull = np.array([np.cos(grasp.shear_direction_rad), np.sin(grasp.shear_direction_rad)])
+    athwart = np.array([-pull[1], pull[0]])
+    # a tilted object pushes a little sideways
+    moved = rest + outward[..., None] * np.append(from_centre, np.zeros((len(rest), 1)), axis=1)
+    moved += inward[..., None] * np.append(np.tan(grasp.tilt_rad), -1)
+    for sign, *traction in loading.tractions:
+        friction, margin = (values[:, None] for values in traction)
+        along, across, sunk = partial_slip_displacement(
+            from_centre @ pull,
+            from_centre @ athwart,
+            depth_m,
+            friction_coefficient=friction * model.local_friction,
+            safety_margin=margin,
+            contact_radius_m=contact_m[:, None],
+            sphere_radius_m=sphere_m,
+            poisson_ratio=sensor.poisson_ratio,
+        )
+        skin = model.skin_shear * sphere_m * friction / _FITTED_FRICTION * sunken[:, None]
+        along = (along + skin * (1 - margin**grasp.shear_exponent)) * (sign * clamp)
+        moved[..., :2] += along[..., None] * pull + (across * (sign * clamp))[..., None] * athwart
+        moved[..., 2] -= sunk * (sign * clamp)
+    return Motion(
+        rest_px=geometry.project(rest),
+        centres_px=geometry.project(moved),
+        scale=geometry.camera_distance(rest) / geometry.camera_distance(moved),
+        touch=sunken,
+        pressure=np.sqrt(np.maximum(contact_m[:, None] ** 2 - distance**2, 0)) / nominal_m,
+        indentation_m=model.layer * np.asarray(indentation(contact_m, sphere_radius_m=sphere_m)),
+        nominal_radius_m=float(nominal_m[0]),
+        contact_centre_m=centre_m,
+        contact_radius_m=contact_m,
+        stick_radius_m=np.asarray(stick_radius(contact_m, np.nan_to_num(loading.stick_margin, nan=0.0))),
+    )

@@ -208,16 +208,23 @@ class Touch:
     """Depth of the markers under the skin, in radii of the contact's sphere."""
 
 
-def draw_camera(nuisances: Nuisances, *, rng: np.random.Generator) -> CameraSetup:
-    """Draw the camera and the lamps that are built into a sensor, from the ranges named `sensor_...`."""
+_BUILT_IN = tuple(
+    f"sensor_{name}" for name in ("gain", "white_balance", "gradient", "glare", "shift_px", "rotation_deg")
+)
+_DAILY = ("gain", "white_balance", "illumination_gradient", "glare", "camera_shift_px", "camera_rotation_deg")
+
+
+def draw_camera(nuisances: Nuisances, *, rng: np.random.Generator, ranges: tuple[str, ...] = _BUILT_IN) -> CameraSetup:
+    """Draw a camera and its lamps from some ranges: as built into a sensor (`sensor_...`), or their daily change."""
+    gain, white_balance, gradient, glare, shift_px, rotation_deg = (getattr(nuisances, name) for name in ranges)
     return CameraSetup(
-        gain=rng.uniform(*nuisances.sensor_gain),
-        white_balance=_three(rng, nuisances.sensor_white_balance),
-        gradient=rng.uniform(*nuisances.sensor_gradient),
+        gain=rng.uniform(*gain),
+        white_balance=_three(rng, white_balance),
+        gradient=rng.uniform(*gradient),
         gradient_direction_rad=rng.uniform(-np.pi, np.pi),
-        glare=rng.uniform(*nuisances.sensor_glare),
-        camera_shift_px=(rng.uniform(*nuisances.sensor_shift_px), rng.uniform(*nuisances.sensor_shift_px)),
-        camera_rotation_rad=float(np.radians(rng.uniform(*nuisances.sensor_rotation_deg))),
+        glare=rng.uniform(*glare),
+        camera_shift_px=(rng.uniform(*shift_px), rng.uniform(*shift_px)),
+        camera_rotation_rad=float(np.radians(rng.uniform(*rotation_deg))),
     )
 
 
@@ -248,17 +255,9 @@ def mount_camera(day: Day, camera: CameraSetup) -> Day:
 def draw_day(nuisances: Nuisances, *, quantile: float, rng: np.random.Generator) -> Day:
     """Draw a day; `quantile` places its dry friction in the range, from 0 to 1, so that days can be spread."""
     low, high = nuisances.dry_friction
-    return Day(
-        friction=low + quantile * (high - low),
-        modulus_factor=rng.uniform(*nuisances.modulus_factor),
-        gain=rng.uniform(*nuisances.gain),
-        white_balance=_three(rng, nuisances.white_balance),
-        gradient=rng.uniform(*nuisances.illumination_gradient),
-        gradient_direction_rad=rng.uniform(-np.pi, np.pi),
-        glare=rng.uniform(*nuisances.glare),
-        camera_shift_px=(rng.uniform(*nuisances.camera_shift_px), rng.uniform(*nuisances.camera_shift_px)),
-        camera_rotation_rad=float(np.radians(rng.uniform(*nuisances.camera_rotation_deg))),
-    )
+    modulus_factor = rng.uniform(*nuisances.modulus_factor)
+    camera = draw_camera(nuisances, rng=rng, ranges=_DAILY)
+    return Day(friction=low + quantile * (high - low), modulus_factor=modulus_factor, **vars(camera))
 
 
 def draw_unit(nuisances: Nuisances, *, markers: int, rng: np.random.Generator) -> Unit:

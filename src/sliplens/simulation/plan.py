@@ -3,14 +3,16 @@
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import TypedDict, Unpack, cast
 
+import msgspec
 import numpy as np
 
 from sliplens._version import __version__
 from sliplens.errors import InputError
 from sliplens.extras import pick
-from sliplens.files import hash_json, to_builtins
+from sliplens.files import RUN_FILE, hash_json, read_json, to_builtins
 from sliplens.simulation.loading import MINIMUM_FRAMES
 from sliplens.simulation.nuisances import Day, Nuisances, Pulls, draw_camera, draw_day, mount_camera
 from sliplens.simulation.sensor import CHROMATOUCH, SENSORS, Sensor
@@ -66,55 +68,36 @@ class SimulationRecipe:
     nuisances: Nuisances = field(default_factory=Nuisances)
 
     def __post_init__(self) -> None:
-        if isinstance(self.dry_trials, tuple):
-            self._check_days(self.dry_trials)
-        least = {
-            "dry_trials": (np.sum(self.dry_trials), 3, "training, validation and test need one each"),
-            "wet_trials": (self.wet_trials, 0, "ask for none or more"),
-            "frames_per_trial": (self.frames_per_trial, MINIMUM_FRAMES, "every phase of the load needs a frame"),
-            "days": (self.days, 2, "the test needs a day of its own"),
-            "sensors": (self.sensors, 1, "ask for one or more"),
-            "seed": (self.seed, 0, "seeds are not negative"),
-        }
-        for name, (value, minimum, cure) in least.items():
-            if value < minimum:
-                raise InputError(f"{name} is {value}, at least {minimum} is needed: {cure}")
-        if not 2 <= self.resolved_test_day <= self.days:
-            raise InputError(
-                f"test_day is {self.test_day}, but the first of {self.days} days trains; "
-                f"choose a day from 2 to {self.days}"
-            )
-        if not 1 <= self.test_days < self.days or (self.test_day is not None and self.test_days > 1):
-            raise InputError(
-                f"test_days is {self.test_days}, but of {self.days} days the first trains, and test_day tests alone; "
-                "ask for fewer"
-            )
-        if not 0 < self.validation_share < 1:
-            raise InputError(f"validation_share must lie between 0 and 1, got {self.validation_share:g}")
-        if self.displacement is not None and self.displacement not in self.sensor.displacements:
-            raise InputError(
-                f"displacement is {self.displacement!r}, which sensor {self.sensor.name} does not have; "
-                f"choose {' or '.join(self.sensor.displacements)}"
-            )
-
-    def _check_days(self, dry_trials: tuple[int, ...]) -> None:
-        if len(dry_trials) != self.days:
-            raise InputError(f"dry_trials has {len(dry_trials)} days but there are {self.days}; give one number a day")
-        if min(dry_trials) < 0:
-            raise InputError(f"dry_trials is {dry_trials}, but no day has fewer than 0 trials")
-        others = sum(trials for day, trials in enumerate(dry_trials, start=1) if day not in (1, *self.tested))
-        if dry_trials[0] < (1 if others else 2):
-            raise InputError(f"dry_trials is {dry_trials}, but the first day trains; give it more trials")
-
-    @property
-    def resolved_test_day(self) -> int:
-        """The last day that tests."""
-        return self.days if self.test_day is None else self.test_day
+        dry, days, share = np.atleast_1d(self.dry_trials), self.days, self.validation_share
+        each_day = isinstance(self.dry_trials, tuple)
+        between = dry[1 : self.tested.start - 1].sum() + dry[self.tested.stop - 1 :].sum()
+        for name, fits, cure in (
+            ("dry_trials", not each_day or len(dry) == days, f"there are {days} days; give one number a day"),
+            ("dry_trials", bool(np.all(dry >= 0)), "no day has fewer than 0 trials"),
+            ("dry_trials", dry.sum() >= 3, "at least 3 are needed: training, validation and test need one each"),
+            ("dry_trials", not each_day or dry[:1].sum() > (not between), "the first day trains; give it more trials"),
+            ("wet_trials", self.wet_trials >= 0, "ask for none or more"),
+            ("frames_per_trial", self.frames_per_trial >= MINIMUM_FRAMES, f"at least {MINIMUM_FRAMES} are needed"),
+            ("days", days >= 2, "at least 2 are needed: the test needs a day of its own"),
+            ("sensors", self.sensors >= 1, "ask for one or more"),
+            ("seed", self.seed >= 0, "seeds are not negative"),
+            ("test_day", self.tested.stop - 1 in range(2, days + 1), f"choose from 2 to {days}: the first day trains"),
+            ("test_days", self.test_days in range(1, days), f"of {days} days the first trains; ask for fewer"),
+            ("test_days", self.test_day is None or self.test_days == 1, "test_day tests alone; ask for 1"),
+            ("validation_share", 0 < share < 1, "it must lie between 0 and 1"),
+            (
+                "displacement",
+                self.resolved_displacement in self.sensor.displacements,
+                f"sensor {self.sensor.name} has {' and '.join(self.sensor.displacements)}; choose one of them",
+            ),
+        ):
+            if not fits:
+                raise InputError(f"{name} is {getattr(self, name)!r}, but {cure}")
 
     @property
     def tested(self) -> range:
         """Days that test."""
-        last = self.resolved_test_day
+        last = self.days if self.test_day is None else self.test_day
         return range(last - self.test_days + 1, last + 1)
 
     @property
@@ -154,7 +137,6 @@ class TrialPlan:
     day_draw: Day
     recipe: SimulationRecipe
     """Recipe of the whole data set."""
-    recipe_hash: str
 
 
 class RecipeChanges(TypedDict, total=False):
@@ -168,12 +150,8 @@ class RecipeChanges(TypedDict, total=False):
     """Frames of each trial; the thesis has about 800."""
     days: int | None
     """Number of days, each with its own friction, stiffness and light; the last one tests."""
-    test_day: int | None
-    """Number of the first day that tests."""
     test_days: int | None
     """Number of the last days that test."""
-    validation_share: float | None
-    """Share of the trials of the days between that validate."""
     sensors: int | None
     """Number of built sensors."""
     displacement: str | None
@@ -236,6 +214,28 @@ def make_recipe(
     return replace(start, **fields)
 
 
+def read_recipe(folder: Path) -> SimulationRecipe:
+    """Read the recipe of a data set from its `run.json`."""
+    path = folder / RUN_FILE
+    try:
+        stored = read_json(path)["config"]["recipe"]
+        dry_trials = stored["dry_trials"]
+        return SimulationRecipe(
+            **stored
+            | {
+                "dry_trials": tuple(dry_trials) if isinstance(dry_trials, list) else dry_trials,
+                "sensor": SENSORS[stored["sensor"]["name"]],
+                "nuisances": msgspec.convert(stored["nuisances"], Nuisances),
+                "frame_totals": msgspec.convert(stored["frame_totals"], FrameTotals | None),
+                "pulls": msgspec.convert(stored.get("pulls"), Pulls | None),
+            }
+        )
+    except (InputError, KeyError, TypeError, AttributeError, ValueError, ArithmeticError):
+        raise InputError(
+            f"{path} holds no recipe of simulated trials; give the recipe, or a data set that sliplens simulate made"
+        ) from None
+
+
 def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     """Plan the trials of a recipe: names, days, splits and seeds; dry before wet.
 
@@ -246,8 +246,18 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     >>> [plan.trial for plan in plans if plan.split == "test"]
     ['day4-dry-001', 'day4-dry-002', 'day4-wet-001', 'day4-wet-002']
     """
-    tested, recipe_hash = recipe.tested, recipe.hash
-    days = _draw_days(recipe)
+    tested = recipe.tested
+    # the dry friction of the days is spread over its range: few independent draws may all be alike
+    spread = np.random.default_rng(_seed(recipe, _DAYS))
+    strata = spread.permutation(recipe.days)
+    days = {
+        day: draw_day(
+            recipe.nuisances,
+            quantile=float((strata[day - 1] + spread.uniform()) / recipe.days),
+            rng=np.random.default_rng(_seed(recipe, _DAYS, day)),
+        )
+        for day in range(1, recipe.days + 1)
+    }
     cameras = [
         draw_camera(recipe.nuisances, rng=np.random.default_rng(_seed(recipe, _CAMERAS, unit)))
         for unit in range(recipe.sensors)
@@ -285,7 +295,6 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
                         day_seed=_seed(recipe, _DAYS, day),
                         day_draw=mount_camera(days[day], cameras[unit]),
                         recipe=recipe,
-                        recipe_hash=recipe_hash,
                     )
                 )
     return tuple(plans) if recipe.frame_totals is None else _with_totals(plans, recipe.frame_totals)
@@ -321,20 +330,6 @@ def _spread(trials: int, *, days: int, tested: range) -> dict[int, int]:
             dealt[tested[-1]] -= 1
             dealt[1] += 1
     return dealt
-
-
-def _draw_days(recipe: SimulationRecipe) -> dict[int, Day]:
-    """Draw the days, their dry friction spread over its range: few independent draws may all be alike."""
-    spread = np.random.default_rng(_seed(recipe, _DAYS))
-    strata = spread.permutation(recipe.days)
-    return {
-        day: draw_day(
-            recipe.nuisances,
-            quantile=float((strata[day - 1] + spread.uniform()) / recipe.days),
-            rng=np.random.default_rng(_seed(recipe, _DAYS, day)),
-        )
-        for day in range(1, recipe.days + 1)
-    }
 
 
 def _seed(recipe: SimulationRecipe, *branch: int) -> int:

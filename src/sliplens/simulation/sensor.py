@@ -11,10 +11,8 @@ from torch import Tensor
 
 from sliplens.errors import ContactError
 from sliplens.mechanics import reduced_modulus
-from sliplens.simulation.geometry import Dome, FlatPad, Frames, Geometry, require_positive
-from sliplens.simulation.nuisances import Unit
+from sliplens.simulation.geometry import Dome, FlatPad, Geometry, require_positive
 
-Sizes: TypeAlias = Float[np.ndarray, "frames markers"]
 Rgb: TypeAlias = tuple[float, float, float]
 _NONE: Rgb = (0.0, 0.0, 0.0)
 _FIELDS = 32
@@ -101,43 +99,6 @@ class MarkerLook:
         for name, values in (("marker radius", self.radius_px), ("marker edge", self.edge_px)):
             for channel, value in zip(("red", "green", "blue"), values, strict=True):
                 require_positive(**{f"{name} in {channel}": value})
-
-
-@dataclass(frozen=True, kw_only=True)
-class DrawnMarkers:
-    """Look of the drawn markers, by frame, marker and channel."""
-
-    radius_px: Float[np.ndarray, "frames markers 3"]
-    edge_px: Float[np.ndarray, "frames markers 3"]
-    """Width of the logistic edge."""
-    contrast: Float[np.ndarray, "frames markers 3"]
-    """Contrast over that of the sensor."""
-
-
-def draw_look(
-    look: MarkerLook, *, geometry: Geometry, unit: Unit, scale: Sizes, pressure: Sizes, touch: Frames, blur_px: Frames
-) -> DrawnMarkers:
-    """Compute the look of the markers under the load of a `Motion` and the trial's blur (a standard deviation).
-
-    A pressed marker is paler, for the object behind the thin skin throws light back, and it is sharp: pressing brings
-    the gel into the focus that the untouched one is out of, most in red and to one side of the image. Markers seen
-    aslant are paler, too.
-    """
-    rest = geometry.marker_positions()
-    aslant = 1 - geometry.slope_cosine(rest)[:, None] ** 2
-    pressed = np.minimum(touch, 1)[:, None, None]
-    tilt = np.maximum(1 + rest[:, :2] @ np.asarray(look.focus_tilt) / geometry.sphere_radius_m, 0)
-    defocus = (1 - pressed) * tilt[:, None] * np.asarray(look.defocus_px)
-    # the standard deviation of a logistic edge is 1.81 widths
-    blur = blur_px[:, None, None] / 1.81
-    size = geometry.marker_scale() * unit.radius_factor * scale
-    return DrawnMarkers(
-        radius_px=size[..., None] * (1 + pressure[..., None] * np.asarray(look.squeeze)) * np.asarray(look.radius_px),
-        edge_px=np.sqrt(np.asarray(look.edge_px) ** 2 + defocus**2 + blur**2),
-        contrast=unit.contrast_factor[:, None]
-        * (1 - np.asarray(look.aslant_fade) * aslant)
-        * (1 - np.asarray(look.pressed_fade) * pressed),
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

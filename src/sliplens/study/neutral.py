@@ -12,7 +12,7 @@ from sliplens.explainers.occlusion import marker_regions
 from sliplens.models import Network
 from sliplens.recordings import Recording
 from sliplens.results.explanation import MovedMarkers
-from sliplens.simulation.intervention import draw_with_markers_back, rebuild_trial, visible_markers
+from sliplens.simulation.intervention import put_markers_back, rebuild_trial, visible_markers
 
 GROUPS, GROUP_MARKERS = 24, 5
 """Groups of a frame, and markers of a group."""
@@ -111,7 +111,7 @@ def prove_map(
     def predict(moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         back = np.zeros((len(moved), len(film.marker_rest_px)), dtype=bool)
         back[:, visible] = moved
-        drawn = draw_with_markers_back(film, frame, back, to=stick).numpy()
+        drawn = put_markers_back(film, frame, back, to=stick).draw_all()
         return drawn, network.predict(network.encode(drawn, recording.reference)).cpu().numpy().astype(np.float64)
 
     count = len(visible)

@@ -43,9 +43,8 @@ from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTes
 from sliplens.runner import Part, part
 from sliplens.simulation.intervention import (
     FilmedTrial,
-    draw_with_markers_back,
-    marker_outlines,
     marker_readings,
+    put_markers_back,
     rebuild_trial,
     visible_markers,
 )
@@ -160,7 +159,7 @@ def redrawing(trained: Network, frames: Sequence[StagedFrame], *, to: Sequence[i
         film = frame.scene.film
         every = np.zeros((len(back), len(film.marker_rest_px)), dtype=bool)
         every[:, frame.markers] = back
-        drawn = draw_with_markers_back(film, frame.number, every, to=to[image] if to else None).numpy()
+        drawn = put_markers_back(film, frame.number, every, to=to[image] if to else None).draw_all()
         return trained.encode(drawn, frame.reference).to(trained.device)
 
     return redraw
@@ -171,7 +170,7 @@ def find_places(frame: StagedFrame, *, image_size: int) -> Places:
     height, width = frame.contact_map.shape
     scale = image_size / width
     steps = np.arange(image_size)
-    outlines = marker_outlines(frame.scene.film, frame.number)
+    centres_px, radius_px = frame.scene.film.outlines(frame.number)
 
     def from_outline(centres_px: np.ndarray, radius_px: np.ndarray) -> Float[np.ndarray, "circles size size"]:
         # pixel centres lie at whole numbers, edges half a pixel before
@@ -179,21 +178,16 @@ def find_places(frame: StagedFrame, *, image_size: int) -> Places:
         away = np.hypot(steps[None, None, :] - centres[:, :1, None], steps[None, :, None] - centres[:, 1:, None])
         return away - radius_px[:, None, None] * scale
 
-    if frame.baseline_frame is None:
-        rest_px, rest_radius_px = outlines.rest_px, outlines.rest_radius_px
-    else:
-        baseline = marker_outlines(frame.scene.film, frame.baseline_frame)
-        rest_px, rest_radius_px = baseline.now_px, baseline.now_radius_px
-    rest = from_outline(rest_px, rest_radius_px)
-    now = from_outline(outlines.now_px, outlines.now_radius_px)
+    rest = from_outline(*frame.scene.film.outlines(frame.baseline_frame))
+    now = from_outline(centres_px, radius_px)
     beyond = np.minimum(rest, now)
     nearest = beyond.argmin(axis=0)
     covered = beyond.min(axis=0) <= _RIM_PX
-    place = np.full(len(outlines.now_px), len(frame.markers))
+    place = np.full(len(centres_px), len(frame.markers))
     place[frame.markers] = np.arange(len(frame.markers))
     # the camera's pixel at the middle of the network's, in whole numbers: halves must not be rounded
     column, row = ((2 * steps + 1) * side // (2 * image_size) for side in (width, height))
-    now_px = outlines.now_px[frame.markers]
+    now_px = centres_px[frame.markers]
     x, y = np.clip(np.round(now_px).astype(np.int64), 0, [width - 1, height - 1]).T
     return Places(
         regions=marker_regions((image_size, image_size), torch.from_numpy((now_px + 0.5) * scale - 0.5)).numpy(),
