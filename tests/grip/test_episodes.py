@@ -134,7 +134,7 @@ def test_the_loop_closes_through_pixels(network):
     ticks = [loop.tick(scripts.world(loop.plant.state.time_s)) for _ in range(3)]
     frames = ticks[-1].reading.frames
     assert frames is not None
-    assert np.abs(frames.astype(int) - eyes.references).max() > 30  # touched
+    assert np.abs(frames.astype(int) - [tip.reference for tip in eyes.fingertips]).max() > 30  # touched
     plant = loop.plant
     near, far = (replace(plant.state, force_n=np.array([1.2]), shear_n=np.full((1, 2), s)) for s in (0.05, 0.65))
     reads = [eyes.measure(replace(one, friction=np.full((1, 2), 0.6)), np.full(1, np.nan)) for one in (near, far)]

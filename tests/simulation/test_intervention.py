@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from realism.scene import nominal_unit
+from realism.scene import nominal_unit, without_noise
 
 from sliplens.errors import InputError
 from sliplens.files import output_folder
@@ -86,13 +86,12 @@ def test_markers_moved_to_where_they_are_change_no_byte(trials, recordings):
 def test_all_markers_back_and_no_touch_is_the_untouched_sensor(sensor):
     grasp = Grasp()
     film = prepare_film(
-        sensor,
+        without_noise(sensor),
         loading=load_at_margins(np.array([0.3]), grasp=grasp),
         grasp=grasp,
         day=Day(camera_shift_px=(2.0, -1.0), camera_rotation_rad=0.02),
         unit=nominal_unit(sensor.geometry.markers),
         rng=np.random.default_rng(0),
-        noise=None,
     )
     changed = put_markers_back(film, 0, np.ones((1, sensor.geometry.markers), dtype=bool))
     nothing = np.zeros(1)

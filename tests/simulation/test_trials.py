@@ -4,7 +4,7 @@ from typing import cast
 import numpy as np
 import pytest
 import torch
-from realism.scene import nominal_unit
+from realism.scene import nominal_unit, without_noise
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
@@ -35,15 +35,14 @@ def dataset(tmp_path_factory):
     return simulate_dataset(tmp_path_factory.mktemp("simulated") / "whole", replace(RECIPE, frames_per_trial=20))
 
 
-def film(margins, *, grasp, sensor=CHROMATOUCH, noise=None, displacement=None):
+def film(margins, *, grasp, sensor=CHROMATOUCH, noise=False, displacement=None):
     return prepare_film(
-        sensor,
+        sensor if noise else without_noise(sensor),
         loading=load_at_margins(np.array(margins), grasp=grasp),
         grasp=grasp,
         day=Day(),
         unit=nominal_unit(sensor.geometry.markers),
         rng=np.random.default_rng(0),
-        noise=noise,
         displacement=displacement,
     )
 
@@ -92,7 +91,7 @@ def test_a_mirrored_pull_gives_the_mirrored_image(sensor, displacement):
 
 
 def test_frames_do_not_depend_on_which_are_drawn_together():
-    prepared = film(np.linspace(1, 0, 23), grasp=Grasp(blur_px=0.5), noise=CHROMATOUCH.noise)
+    prepared = film(np.linspace(1, 0, 23), grasp=Grasp(blur_px=0.5), noise=True)
     together = prepared.draw(slice(0, 23)).numpy()
     for start, stop in ((0, 1), (5, 6), (22, 23), (3, 10)):
         np.testing.assert_array_equal(prepared.draw(slice(start, stop)).numpy(), together[start:stop])
@@ -100,7 +99,7 @@ def test_frames_do_not_depend_on_which_are_drawn_together():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here to compare with the processor")
 def test_a_gpu_draws_the_same_frames_within_one_grey_level():
-    prepared = film(np.linspace(1, 0, 20), grasp=Grasp(blur_px=0.5), noise=CHROMATOUCH.noise)
+    prepared = film(np.linspace(1, 0, 20), grasp=Grasp(blur_px=0.5), noise=True)
     host, gpu = (prepared.draw(slice(0, 20), device=device).cpu().numpy().astype(int) for device in ("cpu", "cuda"))
     assert np.abs(host - gpu).max() <= 1
     # a value has to lie within some 1e-4 of a half to be rounded the other way

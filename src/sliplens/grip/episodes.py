@@ -269,7 +269,7 @@ class _Job:
                 _save_trials(folder, sensor, ticks, frames, condition=setup.condition, number=number)
             if options.method is not None and number == 0:
                 pictures = np.ascontiguousarray(frames[[round(at / PERIOD_S) for at in _MOMENTS_S], 0])
-                explained = frames_from_arrays(self.network, pictures, sensor.references[0])
+                explained = frames_from_arrays(self.network, pictures, sensor.fingertips[0].reference)
                 explainers, _ = choose_explainers(self.network, explained, options.method, budget=1.0)
                 [maps] = explain_frames(self.network, explained, explainers).relevance.values()
         return Grip(
@@ -371,7 +371,7 @@ def _save_trials(
             sensor=f"simulated-{finger + 1}",
             condition="wet" if condition == "wet" else "dry",
             object=condition,
-            reference=sensor.references[finger],
+            reference=sensor.fingertips[finger].reference,
             frames=frames[1:, finger],
             time_s=np.array([state.time_s for state in states]),
             normal_force_n=np.array([state.force_n[0] for state in states]),

@@ -56,7 +56,6 @@ class Fingertip:
             day=self.day,
             unit=self.unit,
             rng=self._film_rng,
-            noise=self.sensor.noise,
         )
 
     @cached_property

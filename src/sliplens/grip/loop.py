@@ -144,13 +144,6 @@ class RenderedSensor:
         with self._threads.limit(limits=1):
             self._engine = make_engine(engine, network, frames=frames, batch_size=1)
         self._trackers = [Tracker(tip.reference) for tip in self.fingertips]
-        if learner is not None:
-            network.require_ratio()
-
-    @property
-    def references(self) -> UInt8[np.ndarray, "2 height width 3"]:
-        """Images T_0 of both untouched fingertips."""
-        return np.stack([tip.reference for tip in self.fingertips])
 
     def still_markers(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
         """Return the markers of both untouched fingertips: at rest, then as followed in some frames."""

@@ -393,7 +393,6 @@ class SimulatedSource(LiveSource):
             day=Day(friction=friction),
             unit=draw_unit(Nuisances(), markers=chosen.geometry.markers, rng=self._rng),
             rng=self._rng,
-            noise=chosen.noise,
         )
         self.reference = self._film.draw_reference().numpy()
 

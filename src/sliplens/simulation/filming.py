@@ -13,7 +13,7 @@ from sliplens.mechanics import normal_slope
 from sliplens.simulation.geometry import Point, Rays, pixel_grid
 from sliplens.simulation.loading import Loading, Motion, move_markers
 from sliplens.simulation.nuisances import Day, Grasp, Nuisances, Touch, Unit
-from sliplens.simulation.sensor import Noise, Sensor, mix_noise, pick_noise
+from sliplens.simulation.sensor import Sensor, mix_noise, pick_noise
 
 Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
 Looks: TypeAlias = Float[np.ndarray, "frames markers 3"]
@@ -34,7 +34,6 @@ class Film:
     day: Day
     unit: Unit
     motion: Motion
-    noise: Noise | None
     marker_rest_px: Float[np.ndarray, "markers 2"]
     """Untouched markers in the camera's image, with the jitter of the print and the camera's pose."""
     marker_px: Float[np.ndarray, "frames markers 2"]
@@ -97,7 +96,8 @@ class Film:
         Devices agree within one grey level: they round sums of four terms in another order.
         """
         # one plane a channel: constants of a channel apply to whole rows of pixels, which vectorises
-        sensor, motion, noise, shade = self.sensor, self.motion, self.noise, self._shade(frames, device=device)
+        sensor, motion, shade = self.sensor, self.motion, self._shade(frames, device=device)
+        noise = sensor.noise
         contrast = _tensor(self.light, device)[:, None] * _channels(sensor.look.contrast, device)
         planes = torch.addcmul(_tensor(self.empty, device)[:, None], shade, contrast, value=-1)
         if self.relief is not None:
@@ -108,14 +108,12 @@ class Film:
             )
             planes *= 1 + _tensor(np.asarray(slope), device) * _tensor(self.relief, device)[:, None]
         planes.addcmul_(_tensor(motion.touch[frames], device)[:, None, None], _tensor(self.haze, device)[:, None])
-        if noise is not None:
-            background = _channels(noise.background, device)
-            excess, share = _channels(noise.marker, device) - background, shade.clamp_(0, 1)
-            strength = torch.addcmul((1 + noise.edge) * excess, share, noise.edge * excess, value=-1)
-            strength.mul_(share).add_(background)
-            picks = self.noise_picks[_after_reference(frames)]
-            mixed = mix_noise(picks, noise=noise, image_size_px=sensor.image_size_px, device=device)
-            planes.addcmul_(strength, mixed)
+        background = _channels(noise.background, device)
+        excess, share = _channels(noise.marker, device) - background, shade.clamp_(0, 1)
+        strength = torch.addcmul((1 + noise.edge) * excess, share, noise.edge * excess, value=-1)
+        strength.mul_(share).add_(background)
+        picks = self.noise_picks[frames.start + 1 : frames.stop + 1]
+        planes.addcmul_(strength, mix_noise(picks, noise=noise, image_size_px=sensor.image_size_px, device=device))
         planes.add_(0.5).clamp_(0, 255)
         pixels = torch.empty((*planes.shape[1:], 3), dtype=torch.uint8, device=device)
         for channel, plane in enumerate(planes):  # converts and interleaves in one go
@@ -136,7 +134,7 @@ class Film:
         tilt = np.maximum(1 + rest[:, :2] @ np.asarray(look.focus_tilt) / geometry.sphere_radius_m, 0)
         defocus = (1 - pressed) * tilt[:, None] * np.asarray(look.defocus_px)
         # the standard deviation of a logistic edge is 1.81 widths
-        blur = self.blur_px[_after_reference(frames)][:, None, None] / 1.81
+        blur = self.blur_px[frames.start + 1 : frames.stop + 1, None, None] / 1.81
         size = geometry.marker_scale() * unit.radius_factor * motion.scale[frames]
         squeezed = 1 + motion.pressure[frames][..., None] * np.asarray(look.squeeze)
         slanted = unit.contrast_factor[:, None] * (1 - np.asarray(look.aslant_fade) * aslant)
@@ -173,7 +171,7 @@ class Film:
 
     def _shade(self, frames: slice, *, device: str | torch.device) -> Float[Tensor, "3 frames height width"]:
         """Compute the share of the markers' contrast in each pixel: 0 in the background, about 1 in a marker."""
-        centres_px, noise, size_px = self.marker_px[frames], self.noise, self.sensor.image_size_px
+        centres_px, noise, size_px = self.marker_px[frames], self.sensor.noise, self.sensor.image_size_px
         # markers outside the frame are skipped; the padding takes what of the others sticks out
         inside = np.all((centres_px > -_PATCH / 2) & (centres_px < size_px - 1 + _PATCH / 2), axis=-1)
         frame_index, marker_index = np.nonzero(inside)
@@ -186,20 +184,13 @@ class Film:
         steps = torch.arange(_PATCH, device=device)
         dx, dy = (corner[:, axis, None] + steps - centres[:, axis, None] for axis in (0, 1))
         distance = torch.sqrt(dy.square()[:, :, None] + dx.square()[:, None, :])
-        if noise is None:
-            patch = (radius - distance).div_(edge).sigmoid_()
-        else:
-            texture = _tensor(self.texture, device)[:, torch.as_tensor(marker_index, device=device)]
-            patch = texture * _channels(noise.ragged_px, device)
-            patch.add_(radius).sub_(distance).div_(edge).sigmoid_()
-            patch.mul_(texture.mul_(_channels(noise.grain, device)).add_(1))
+        texture = _tensor(self.texture, device)[:, torch.as_tensor(marker_index, device=device)]
+        patch = texture * _channels(noise.ragged_px, device)
+        patch.add_(radius).sub_(distance).div_(edge).sigmoid_()
+        patch.mul_(texture.mul_(_channels(noise.grain, device)).add_(1))
         patch.mul_(contrast)
         at_once = patch.device.type != "cpu"
         return place(patch, corner=corner, frame=frame_index, frames=len(centres_px), size_px=size_px, at_once=at_once)
-
-
-def _after_reference(frames: slice) -> slice:
-    return slice(frames.start + 1, frames.stop + 1)
 
 
 def batches(frames: int, *, device: str | torch.device) -> list[slice]:
@@ -216,10 +207,9 @@ def prepare_film(
     day: Day,
     unit: Unit,
     rng: np.random.Generator,
-    noise: Noise | None,
     displacement: str | None = None,
 ) -> Film:
-    """Move the markers, set the light and draw all random numbers of a trial; no camera noise if `noise` is None."""
+    """Move the markers, set the light and draw all random numbers of a trial."""
     motion, rest_px, marker_px = see_markers(
         sensor, loading=loading, grasp=grasp, day=day, unit=unit, displacement=displacement
     )
@@ -238,10 +228,8 @@ def prepare_film(
         day=day,
         unit=unit,
         motion=motion,
-        noise=noise,
         marker_rest_px=rest_px,
         marker_px=marker_px,
-        # drawn before the noise, so that a film without noise differs in that alone
         blur_px=grasp.blur_px * rng.uniform(0.8, 1.2, frames + 1),
         noise_picks=pick_noise(frames + 1, rng=rng),
         rays=geometry.rays(

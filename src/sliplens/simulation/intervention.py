@@ -276,7 +276,7 @@ def marker_readings(
         np.array([np.clip(margin, _NEAREST_END, 1 - _NEAREST_END)]),
         sensor=recipe.sensor,
         touch=trial.touch(frame),
-        displacement=recipe.resolved_displacement,
+        displacement=recipe.displacement,
     )
     prior = prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet")
     gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)

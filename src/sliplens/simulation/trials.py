@@ -40,8 +40,7 @@ def prepare_trial(plan: TrialPlan, *, change: Callable[[Loading], Loading] | Non
         day=plan.day_draw,
         unit=draw_unit(recipe.nuisances, markers=sensor.geometry.markers, rng=np.random.default_rng(plan.unit_seed)),
         rng=rng,
-        noise=sensor.noise,
-        displacement=recipe.resolved_displacement,
+        displacement=recipe.displacement,
     )
     return loading, move_camera(film, recipe.nuisances, rng=rng)
 

@@ -1,6 +1,6 @@
 """The trial of the published difference images, real and simulated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ from sliplens.images import absolute_difference, read_image
 from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.loading import load_at_margins
 from sliplens.simulation.nuisances import Day, Grasp, Unit
-from sliplens.simulation.sensor import CHROMATOUCH
+from sliplens.simulation.sensor import CHROMATOUCH, Sensor
 
 PUBLISHED = {51: np.nan, 80: 1.0, 357: 0.6, 433: 0.2, 547: 0.0}
 """Number and safety margin of the published images; the first is before contact."""
@@ -54,6 +54,12 @@ def nominal_unit(markers: int) -> Unit:
     )
 
 
+def without_noise(sensor: Sensor) -> Sensor:
+    """Return a sensor with a camera without noise and an even print."""
+    nothing = dict.fromkeys(("background", "marker", "grain", "ragged_px"), (0.0, 0.0, 0.0))
+    return replace(sensor, noise=replace(sensor.noise, **nothing))
+
+
 def simulate(seed: int = 0) -> Simulated:
     """Simulate the trial with the fitted defaults of `Grasp`, on the nominal sensor."""
     sensor, grasp = CHROMATOUCH, Grasp()
@@ -65,7 +71,6 @@ def simulate(seed: int = 0) -> Simulated:
         day=Day(),
         unit=nominal_unit(sensor.geometry.markers),
         rng=np.random.default_rng(seed),
-        noise=sensor.noise,
     )
     return Simulated(
         images=absolute_difference(film.draw(slice(0, len(MARGINS))).numpy(), film.draw_reference().numpy()),
