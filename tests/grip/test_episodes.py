@@ -252,7 +252,6 @@ def test_a_slip_narrows_what_was_told_of_friction(table):
     ("options", "told"),
     [
         ({"latency_s": -1.0}, "latency and error scale must not be negative"),
-        ({"method": "guess", "rendered": True}, "there is no method named 'guess'"),
         ({"friction": 0.6, "network": "thesis-raw"}, "F_t / F_n"),
     ],
 )

@@ -9,13 +9,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
-from sliplens.explainers.explain import choose_explainers, explain_frames
-from sliplens.explainers.frames import frames_from_arrays
-from sliplens.explainers.table import get_explainer
 from sliplens.extras import pick
 from sliplens.files import DEFAULT_NETWORK, output_folder, remove, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
@@ -49,7 +46,6 @@ _BATCH = 500  # episodes stepped together: few enough for a processor's caches
 _MEASURED = 32  # fingertips by which the errors of a network without a table are measured
 _TICKS = round(EPISODE_S / PERIOD_S)
 _LIFTED_S = LIFT_S + 0.1  # time from which the least force counts: the object hangs in the hand
-_MOMENTS_S = (0.4, 1.4, 2.8, 5.0)  # times at which a rendered episode is explained
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,14 +64,10 @@ class EpisodeOptions:
     episode as it begins. Slips narrow a range down."""
     latency_s: float = 0.02
     """Time from an image to the command by it."""
-    method: str | None = None
-    """Explainer whose maps are drawn at four moments of the first rendered episode; None for no maps."""
 
     def __post_init__(self) -> None:
         if self.error_scale < 0 or self.latency_s < 0:
             raise InputError("latency and error scale must not be negative; give 0 or more")
-        if self.method is not None:
-            get_explainer(self.method)
 
 
 def run_episodes(
@@ -187,7 +179,6 @@ def run_episodes(
         config = to_builtins(setup) | {
             "episodes": episodes,
             "error_scale": options.error_scale,
-            "method": options.method,
             "script": dict(script or {}),
             "readings": None if table is None else (table.network, table.seed, len(table)),
         }
@@ -262,25 +253,9 @@ class _Job:
         table = run_scripts(loop, scripts, condition=setup.condition, on_tick=ticks.append if traced else None)
         if self.friction:
             table = replace(table, known_friction=np.array([self.friction[row].mean for row in rows]))
-        pictures, maps = np.zeros((0, 1, 1, 3), dtype=np.uint8), np.zeros((0, 1, 1), dtype=np.float32)
-        if isinstance(sensor, RenderedSensor):
-            frames = np.stack([tick.reading.frames for tick in ticks if tick.reading.frames is not None])
-            if folder is not None:
-                _save_trials(folder, sensor, ticks, frames, condition=setup.condition, number=number)
-            if options.method is not None and number == 0:
-                pictures = np.ascontiguousarray(frames[[round(at / PERIOD_S) for at in _MOMENTS_S], 0])
-                explained = frames_from_arrays(self.network, pictures, sensor.fingertips[0].reference)
-                explainers, _ = choose_explainers(self.network, explained, options.method, budget=1.0)
-                [maps] = explain_frames(self.network, explained, explainers).relevance.values()
-        return Grip(
-            setup=setup,
-            seconds=0.0,
-            episodes=table,
-            trace=_trace(ticks),
-            moments_s=_MOMENTS_S[: len(maps)],
-            pictures=pictures,
-            maps=maps,
-        )
+        if folder is not None and isinstance(sensor, RenderedSensor):
+            _save_trials(folder, sensor, ticks, condition=setup.condition, number=number)
+        return Grip(setup=setup, seconds=0.0, episodes=table, trace=_trace(ticks))
 
 
 def run_scripts(
@@ -352,18 +327,11 @@ def _trace(ticks: list[Tick]) -> GripTrace:
     )
 
 
-def _save_trials(
-    folder: Path,
-    sensor: RenderedSensor,
-    ticks: list[Tick],
-    frames: UInt8[np.ndarray, "ticks 2 height width 3"],
-    *,
-    condition: str,
-    number: int,
-) -> None:
+def _save_trials(folder: Path, sensor: RenderedSensor, ticks: list[Tick], *, condition: str, number: int) -> None:
     """Save the images of both fingertips of a rendered episode, with the plant's forces and margins as labels."""
     # an image shows the state before the step of its tick
     states = [tick.state for tick in ticks[:-1]]
+    frames = np.stack([tick.reading.frames for tick in ticks[1:] if tick.reading.frames is not None])
     for finger in range(2):
         margin = np.array([state.margin[0, finger] for state in states])
         recording = Recording(
@@ -372,7 +340,7 @@ def _save_trials(
             condition="wet" if condition == "wet" else "dry",
             object=condition,
             reference=sensor.fingertips[finger].reference,
-            frames=frames[1:, finger],
+            frames=frames[:, finger],
             time_s=np.array([state.time_s for state in states]),
             normal_force_n=np.array([state.force_n[0] for state in states]),
             tangential_force_n=np.array([abs(state.shear_n[0, finger]) for state in states]),

@@ -107,7 +107,7 @@ class LineGripper:
             fault = f"cannot be reached ({error})"
             if isinstance(error, TimeoutError):
                 self._silent_until_s = time.monotonic() + self._silence_s
-                fault = f"did not answer {line!r} in time, it sent {str(error)!r}"
+                fault = f"did not answer {line!r} in time" + (f", it sent {str(error)!r}" if str(error) else "")
             raise GripperError(f"the gripper {fault}; check its cable and power") from None
         if answer[0] == "ERR":
             raise GripperError(f"the gripper refused {line!r}: {' '.join(answer[1:]) or 'no reason given'}")

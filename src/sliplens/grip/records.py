@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Shaped, UInt8
+from jaxtyping import Bool, Float64, Shaped
 
 from sliplens.codec import UNKNOWN, Columns, Result
 from sliplens.results.evaluation import AMOUNT, ANSWER, EXCESS, FORCE, FRICTION, MARGIN
@@ -86,11 +86,6 @@ class Grip(Result):
     episodes: EpisodeTable
     trace: GripTrace
     """First episode."""
-    moments_s: tuple[float, ...]
-    """Times of the pictures; empty where nothing was rendered."""
-    pictures: UInt8[np.ndarray, "moments height width 3"]
-    maps: Annotated[Float32[np.ndarray, "moments side side"], ANSWER]
-    """Relevance of the first finger's frames, in margin units, signed."""
 
     @property
     def drop_rate(self) -> float:

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from sliplens.grip.records import Grip
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
 from sliplens.plots.margins import draw_strip
 from sliplens.plots.saliency import (
@@ -233,24 +232,6 @@ def plate_truth(results: Results, name: str) -> Plate | None:
         "lowers, blue raises; full colour at the largest effect of each picture.",
         columns=columns,
         rows=rows_of(*(getattr(truth.effects, column) for column in columns)),
-        pixels=True,
-    )
-
-
-def plate_moments(grip: Grip) -> Plate:
-    """Draw frames of the first finger, and the maps that explain their predictions."""
-    heads = [f"{time_s:g} s" for time_s in grip.moments_s]
-    maps = overlay_points(grip.pictures, grip.maps)
-    rows = [PictureRow(name="camera", pictures=list(grip.pictures))]
-    rows += [PictureRow(name="why", pictures=maps, full=full_points(grip.maps))]
-    return Plate(
-        name="grip-moments",
-        figure=draw_pictures(rows, heads=heads, bar=True),
-        alt=f"Camera frames and maps at {', '.join(heads)}",
-        caption="Frames of the first finger, and their relevance: orange lowers the margin against the untouched "
-        "sensor, blue raises it. How far to trust such maps: run `sliplens study`.",
-        columns=("time_s", "relevance"),
-        rows=rows_of(grip.moments_s, grip.maps.sum(axis=(1, 2)).astype(np.float64)),
         pixels=True,
     )
 

@@ -164,7 +164,6 @@ def _truth(results: Results) -> Blocks:
 def _grip(results: Results) -> Blocks:
     if results.grip is not None:
         yield charts.plate_trace(results.grip)
-        yield plates.plate_moments(results.grip) if len(results.grip.maps) else None
         yield tables.table_episodes(results.grip)
 
 
