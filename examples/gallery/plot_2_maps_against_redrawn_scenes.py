@@ -15,7 +15,7 @@ from scipy.stats import spearmanr
 import sliplens as sl
 from sliplens.explainers.table import get_explainer
 from sliplens.simulation import PRESETS, plan_trials
-from sliplens.simulation.intervention import draw_with_markers_back, visible_markers
+from sliplens.simulation.intervention import put_markers_back, visible_markers
 from sliplens.simulation.trials import prepare_trial, simulate_trial
 
 # %%
@@ -31,7 +31,7 @@ frame, network = trial.frames[number], sl.load("thesis-difference")
 markers = visible_markers(film.sensor)
 back = np.zeros((1 + len(markers), len(film.marker_rest_px)), dtype=bool)
 back[1 + np.arange(len(markers)), markers] = True
-drawn = draw_with_markers_back(film, number, back).numpy()
+drawn = put_markers_back(film, number, back).draw_all()
 predictions = network.predict(network.encode(drawn, trial.reference)).numpy()
 effects = predictions[0] - predictions[1:]
 print(

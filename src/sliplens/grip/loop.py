@@ -252,11 +252,11 @@ class GripLoop:
             reading = self.sensor.measure(now, self._slipping_s)
             markers = reading.markers_px
             if dark is not None:
-                shown = {name: np.where(dark, np.nan, getattr(reading, name)) for name in ("margin", "low", "high")}
+                visible = {name: np.where(dark, np.nan, getattr(reading, name)) for name in ("margin", "low", "high")}
                 markers = [
                     np.where(hidden[:, None, None], np.nan, at) for hidden, at in zip(dark.T, markers, strict=True)
                 ]
-                reading = replace(reading, markers_px=markers, **shown)
+                reading = replace(reading, markers_px=markers, **visible)
             self._forces.append(now.force_n)
             for (batch, gate), places in zip(self._fingers, markers, strict=True):
                 states = batch.update(places, now.time_s)
