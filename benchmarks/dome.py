@@ -11,8 +11,8 @@ mounting. Every number is of states that the calibration never saw.
 - `fitted_to_itself`: the same model calibrated on the states that it is asked about, with the load given. It has more
   weights than states, so this is no accuracy.
 - `adapted_r2` (with --adapt): R2 of F_t / F_n by a network, means over the repeats of a state, on tilts that its
-  training never saw. Friction is set to 1, so that the margin is 1 - F_t / F_n. `ten` trains on ten states (both
-  masses, upright and at 30 degrees about one axis); `mass`, `tilt` and `direction` leave out each of two halves in
+  training never saw. Friction is set to 1, so that the margin is 1 - F_t / F_n. `ten` trains on ten states (five
+  tilts of both masses); `mass`, `tilt` and `direction` leave out each of two halves in
   turn. Of each training state two repeats of ten are held out to stop the training.
 - `leave_out`: one mass, tilt or direction left out of both masses, the others calibrate.
 """
@@ -33,6 +33,8 @@ from sliplens.recordings.options import LabelSettings
 from sliplens.training import evaluate, train
 
 LIGHT_G, HEAVY_G = 135.6, 584.2
+TEN_TILTS = (0, 0), (15, 0), (0, -30), (-15, -15), (-30, 30)
+"""Tilts about x and z, in degrees, of five training states for each mass: every F_t / F_n that occurs, once."""
 
 
 def read_states(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -110,7 +112,7 @@ def halves(states: np.ndarray) -> dict[str, list[tuple[np.ndarray, np.ndarray]]]
     light, heavy = (np.abs(states[:, 0] - mass) < 0.5 for mass in (LIGHT_G, HEAVY_G))
     tilt = np.abs(states[:, 1:])
     tilted, steep, one_axis = tilt.max(axis=1) > 0, tilt.max(axis=1) == tilt.max(), tilt.min(axis=1) == 0
-    ten = (light | heavy) & one_axis & (steep | ~tilted)
+    ten = (light | heavy) & np.any([(states[:, 1:] == known).all(axis=1) for known in TEN_TILTS], axis=0)
 
     def both(half: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         return [(~asked | ~tilted, asked & tilted) for asked in (half, ~half)]
