@@ -163,13 +163,26 @@ def adapt(folder: Path, work: Path, *, start: str | None) -> dict[str, dict[str,
                 of = state[frame] == kind
                 truth.append(float(ratio[frame[of]].mean()))
                 predicted.append(float(1 - np.asarray(table.prediction)[of].mean()))
-        error = np.array(predicted) - truth
-        results[question] = {
-            "r2": float(1 - np.sum(error**2) / np.sum((np.array(truth) - np.mean(truth)) ** 2)),
-            "mae": float(np.abs(error).mean()),
-            "states": len(truth),
-        }
+        results[question] = score_ratios(np.array(predicted), np.array(truth))
     return results
+
+
+def score_ratios(predicted: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """R2 and mean absolute error of F_t / F_n."""
+    error = predicted - truth
+    r2 = 1 - np.sum(error**2) / np.sum((truth - truth.mean()) ** 2)
+    return {"r2": float(r2), "mae": float(np.abs(error).mean()), "states": len(truth)}
+
+
+def by_markers(moved_px: np.ndarray, force_n: np.ndarray, states: np.ndarray, *, given: bool) -> dict[str, object]:
+    """Scores of markers that were calibrated on the states that train the networks of `adapt`."""
+    found = {}
+    for question, folds in halves(states).items():
+        vectors = [ask(moved_px, force_n, known, asked, given=given) for known, asked in folds]
+        force = np.concatenate([force_n[asked] for _, asked in folds])
+        truth = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
+        found[question] = score_ratios(np.linalg.norm(np.concatenate(vectors), axis=1), truth)
+    return found
 
 
 def main() -> None:
@@ -206,6 +219,10 @@ def main() -> None:
     }
     if options.adapt is not None:
         starts = {"chromatouch-pair": "chromatouch-pair", "scratch": None}
+        found["markers"] = {
+            name: by_markers(moved_px, force_n, states, given=name == "load_given")
+            for name in ("markers", "load_given")
+        }
         found["adapted_r2"] = {name: adapt(options.data, options.adapt, start=start) for name, start in starts.items()}
     if options.json:
         print(json.dumps(found))
