@@ -19,7 +19,7 @@ from sliplens.images import absolute_difference, write_png
 from sliplens.markers.camera import CAMERA_REASON
 from sliplens.models import Network
 from sliplens.models.checkpoint import STRANGE_REASON
-from sliplens.models.predictions import Predictions
+from sliplens.models.predictions import Predictions, lowest_frame
 from sliplens.models.predictions import predict as predict_source
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.capture import Capture
@@ -94,9 +94,7 @@ def test_where_a_frame_is_withheld_the_table_holds_no_answer_of_the_network(
     for name in NETWORK_COLUMNS:
         assert [value is None for value in rows[name].to_pylist()] == [reason is not None for reason in reasons]
     assert predictions.withheld == Counter(filter(None, reasons))
-    (trial,) = predictions.trials()  # every frame that touches is withheld
-    assert (trial.lowest, trial.interval, trial.time_s) == (None, None, None)
-    assert trial.withheld == trial.touching == np.isnan(trial.margin).sum() > 10
+    assert lowest_frame(rows) is None  # every frame that touches is withheld
     assert None not in rows["known"].to_pylist()  # it is what the reason was found by
 
 
@@ -104,13 +102,11 @@ def test_the_lowest_margin_is_of_a_frame_that_touches(trained: Network, wet: Rec
     noise = np.random.default_rng(0).integers(-3, 4, (6, *wet.reference.shape))
     untouched = np.clip(wet.reference.astype(int) + noise, 0, 255).astype(np.uint8)
     frames = np.concatenate([untouched, wet.frames[4:]])
-    table = predict_source(trained, frames, reference=wet.reference)
-    assert table.to_arrow()["touches"].to_pylist() == [False] * 6 + [True] * 8
-    margins = table.to_arrow()["prediction"].to_numpy()
-    (told,) = table.trials()
-    assert (told.touching, told.lowest) == (8, 6 + int(margins[6:].argmin()))
-    (told,) = predict_source(trained, untouched, reference=wet.reference).trials()
-    assert (told.touching, told.lowest) == (0, int(margins[:6].argmin()))
+    rows = predict_source(trained, frames, reference=wet.reference).to_arrow()
+    assert rows["touches"].to_pylist() == [False] * 6 + [True] * 8
+    margins = rows["prediction"].to_numpy()
+    assert lowest_frame(rows) == 6 + int(margins[6:].argmin())
+    assert lowest_frame(rows[:6]) == int(margins[:6].argmin())
 
 
 def test_a_folder_of_frames_and_its_differences_are_the_same(trained: Network, wet: Recording, tmp_path: Path):
@@ -195,9 +191,6 @@ def test_rows_in_memory_are_those_of_the_file(trained: Network, small_dataset: D
     kept = predict_source(trained, small_dataset, split="test")
     assert kept.to_arrow().equals(written.to_arrow(), check_metadata=True)
     assert kept.frames == kept.to_arrow().num_rows == 24
-    margins = np.concatenate([trial.margin for trial in kept.trials()])
-    assert margins.tolist() == kept.to_arrow()["prediction"].to_pylist()
-    assert [trial.trial for trial in kept.trials()] == list(dict.fromkeys(kept.to_arrow()["trial"].to_pylist()))
 
 
 def test_another_process_writes_the_same_bytes_and_a_folder_is_a_data_set_of_them(

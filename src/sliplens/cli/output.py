@@ -12,9 +12,11 @@ from sliplens.files import RUN_FILE
 from sliplens.progress import fold_equal, number_of, open_stage, report_file, reporting
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from sliplens.doctor import Item
     from sliplens.grip.records import Grip
-    from sliplens.models.predictions import Predictions, TrialMargins
+    from sliplens.models.predictions import Predictions
     from sliplens.recordings import Dataset, TrialInfo
     from sliplens.recordings.labelling import Labelling
     from sliplens.report.page import Written
@@ -49,21 +51,34 @@ def show_predictions(predictions: "Predictions") -> None:
         ]
         print_table("Safety margins", ("frame", "safety margin", "90 % interval", *columns), cells)
         return
-    trials = predictions.trials()
-    for trial in trials[:_MOST_TRIALS]:
-        say(_course(trial))
-    if len(trials) > _MOST_TRIALS:
-        say(f"and {number_of(len(trials) - _MOST_TRIALS, 'more trial')}; -o margins.csv writes every frame")
+    import pyarrow.compute as pc
+
+    table = predictions.to_arrow()
+    names = table["trial"].unique()
+    for name in names[:_MOST_TRIALS]:
+        say(_course(table.filter(pc.equal(table["trial"], name))))
+    if len(names) > _MOST_TRIALS:
+        say(f"and {number_of(len(names) - _MOST_TRIALS, 'more trial')}; -o margins.csv writes every frame")
 
 
-def _course(trial: "TrialMargins") -> str:
-    where = f"frame {trial.lowest}" if trial.time_s is None else f"{trial.time_s:.2f} s"
-    low, high = trial.interval or (None, None)
-    interval = "" if low is None else f" ({_interval(low, high)})"
-    touching = "" if trial.touching is None else f", {trial.touching:,} touch" if trial.touching else ", none touches"
-    lowest = "none" if trial.lowest is None else f"{_percent(float(trial.margin[trial.lowest]))}{interval} at {where}"
-    withheld = f", {trial.withheld:,} withheld" if trial.withheld else ""
-    return f"{trial.trial}: lowest {lowest}, {number_of(len(trial.margin), 'frame')}{touching}{withheld}"
+def _course(rows: "pa.Table") -> str:
+    """Describe the lowest margin of a trial."""
+    import pyarrow.compute as pc
+
+    from sliplens.models.predictions import lowest_frame
+
+    words, lowest = "none", lowest_frame(rows)
+    if lowest is not None:
+        row = rows.slice(lowest, 1).to_pylist()[0]
+        interval = "" if row["low_90"] is None else f" ({_interval(row['low_90'], row['high_90'])})"
+        where = f"frame {lowest}" if row["time_s"] is None else f"{row['time_s']:.2f} s"
+        words = f"{_percent(row['prediction'])}{interval} at {where}"
+    words = f"{rows['trial'][0]}: lowest {words}, {number_of(len(rows), 'frame')}"
+    if "touches" in rows.column_names:
+        touching = pc.sum(rows["touches"]).as_py()
+        words += f", {touching:,} touch" if touching else ", none touches"
+    withheld = len(rows) - rows["withheld"].null_count
+    return f"{words}, {withheld:,} withheld" if withheld else words
 
 
 def _percent(value: float | None) -> str:

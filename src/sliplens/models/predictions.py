@@ -4,14 +4,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import islice, pairwise
+from itertools import islice
 from pathlib import Path
 from typing import TypeAlias, Unpack
 
 import numpy as np
 import pyarrow as pa
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from sliplens._version import __version__
@@ -25,7 +25,7 @@ from sliplens.models.checkpoint import Estimate, Network
 from sliplens.models.engines import Engine, make_engine
 from sliplens.models.sequence import require_frequent
 from sliplens.models.wrapping import Preprocess, open_run
-from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_progress, reporting
+from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_progress, reporting
 from sliplens.recordings import Dataset, load_dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import DATASET_FILE
@@ -33,7 +33,7 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, SourceOptions, Trials, open_trials
 from sliplens.recordings.trial import ContactState
 from sliplens.runner import LONGEST, MakePart, Work, require_new_table, run_table
-from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, range_words
+from sliplens.shear import FULL_CIRCLE, range_words
 
 _CAMERA_EVERY = 4
 """Frames of a recording of which one is compared with the reference for the camera's motion."""
@@ -61,26 +61,6 @@ _COLUMNS = {
 
 _Read: TypeAlias = Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]
 _FORCES = ("normal_force_n", "tangential_force_n")
-
-
-@dataclass(frozen=True, kw_only=True)
-class TrialMargins:
-    """Predicted margins of one trial, and the lowest of them."""
-
-    trial: str
-    margin: Float[np.ndarray, " frames"]
-    """In margin units, frame by frame; not clipped to [0, 1], NaN where it is withheld."""
-    lowest: int | None
-    """Frame of the lowest margin of those that touch, or of all frames if none touches or contact is unknown. None if
-    all margins are withheld."""
-    withheld: int
-    """Number of frames whose margin is withheld."""
-    touching: int | None
-    """Number of frames that touch; None if contact is unknown."""
-    time_s: float | None
-    """Time of the frame `lowest`; None if unknown."""
-    interval: tuple[float, float] | None
-    """Ends of its 90 % interval; None for a network without calibration, and without such a frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,14 +108,11 @@ class Predictions(Result):
     def summary(self) -> str:
         """Margins in a sentence."""
         margin = 100 * self.to_arrow()["prediction"].drop_null().to_numpy()
-        withheld = self.frames - len(margin)
-        parts = [f"{number_of(self.frames, 'frame')} by {self.engine}"]
-        parts += (
-            [f"safety margin {np.median(margin):.0f} % (median), {margin.min():.0f} % at least"] if len(margin) else []
-        )
-        parts += [f"margins from {margin.min():.0f} to {margin.max():.0f} %"] if len(margin) else []
-        parts += [f"{withheld:,} withheld"] if withheld else []
-        return ", ".join(parts)
+        words = f"{number_of(self.frames, 'frame')} by {self.engine}"
+        if len(margin):
+            lowest, highest = f"{margin.min():.0f}", f"{margin.max():.0f}"
+            words += f", safety margin {np.median(margin):.0f} % (median), from {lowest} to {highest} %"
+        return words if len(margin) == self.frames else f"{words}, {self.frames - len(margin):,} withheld"
 
     def __arrow_c_stream__(self, requested_schema: object = None) -> object:
         """Return the rows as an Arrow stream (the Arrow PyCapsule interface)."""
@@ -146,38 +123,17 @@ class Predictions(Result):
         """Number of frames whose margin is withheld, by reason."""
         return dict(Counter(reason for reason in self.to_arrow()["withheld"].to_pylist() if reason is not None))
 
-    def trials(self) -> list[TrialMargins]:
-        """Course and lowest margin of every trial."""
-        table = self.to_arrow().combine_chunks()
-        has_contact = "touches" in table.column_names
-        columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
-        names, believed = columns["trial"], table["withheld"].is_null().to_numpy(zero_copy_only=False)
-        touches = columns["touches"].astype(bool) if has_contact else np.ones(len(table), bool)
-        # the rows of a trial stand together
-        bounds = dict.fromkeys([0, *(np.flatnonzero(names[1:] != names[:-1]) + 1).tolist(), len(names)])
-        trials = []
-        for first, end in pairwise(bounds):
-            margin, time_s, low, high = (
-                columns[name][first:end].astype(np.float64) for name in ("prediction", "time_s", "low_90", "high_90")
-            )
-            touching = touches[first:end]
-            # of an untouched sensor a difference image shows noise alone, brightened
-            counted = np.where(touching | ~touching.any(), margin, np.nan)
-            lowest = int(np.nanargmin(counted)) if np.isfinite(counted).any() else None
-            known_time = lowest is not None and np.isfinite(time_s[lowest])
-            has_interval = lowest is not None and np.isfinite(low[lowest])
-            trials.append(
-                TrialMargins(
-                    trial=names[first],
-                    margin=margin,
-                    lowest=lowest,
-                    withheld=int((~believed[first:end]).sum()),
-                    touching=int(touching.sum()) if has_contact else None,
-                    time_s=float(time_s[lowest]) if known_time else None,
-                    interval=(float(low[lowest]), float(high[lowest])) if has_interval else None,
-                )
-            )
-        return trials
+
+def lowest_frame(trial: pa.Table) -> int | None:
+    """Find the frame of the lowest margin in the rows of a trial.
+
+    Only frames that touch count, or all where none touches or contact is unknown. None if all margins are withheld.
+    """
+    margin = trial["prediction"].to_numpy()
+    touches = trial["touches"].to_numpy().astype(bool) if "touches" in trial.column_names else np.ones(len(trial), bool)
+    # of an untouched sensor a difference image shows noise alone, brightened
+    counted = np.where(touches | ~touches.any(), margin, np.nan)
+    return int(np.nanargmin(counted)) if np.isfinite(counted).any() else None
 
 
 class _Options(SourceOptions, total=False):
@@ -271,15 +227,14 @@ def predict(
     if isinstance(recordings, Network | nn.Module):
         raise InputError("there is no source; name a data set, a folder of images, a video, or frames")
     prior = None if friction is None else as_friction(friction)
-    sensor = options.get("sensor")
-    if sensor is not None:
+    if (sensor := options.get("sensor")) is not None:
         source_options["sensor"] = load_profile(sensor)
     with reporting(on_progress):
         with open_stage("Opening the source"):
             trials = open_trials(recordings, on=on, resumable=path is not None, **source_options)
-        profile = _find_profile(trials, sensor)
+        profile = source_options.get("sensor") or _recorded_profile(trials.source)
         if network is None:
-            name, origin = _choose_network(trials, profile)
+            name, origin = _choose_network(trials.kinds, profile)
             add_note(f"no network was named, so {name} reads it, {origin}")
             network = open_run(name, device=device)
         kinds = [_assume_reference(network, capture) for capture in trials.kinds]
@@ -297,29 +252,20 @@ def predict(
             metadata["sliplens.sequence"] = network.manifest.sequence.weights_sha256
         schema = _schema(network, kinds, metadata)
         make = partial(make_engine, engine, network, frames=trials.frames, batch_size=batch_size)
-        work = _Prediction(network=network, trials=trials, schema=schema, friction=prior, sequence=sequence, make=make)
         recipe = {"frames": trials.frames, "batch_size": batch_size, "engine": engine, **metadata}
         recipe |= {"columns": schema.names, "device": str(network.device), "source": trials.recipe}
         recipe["friction"] = prior and prior.digest
-        parts = trials.parts(recipe, longest=None if sequence else LONGEST)
-        title = f"Predicting frames ({network.manifest.input})"
-        if path is None and on == "serial":
-            with open_stage(title):
-                written, tables = work.start()
-                made = report_each(parts, sizes=[part.frames for part in parts])
-                rows = write_tables((table for part in made for table in tables(part.item)), None, written)
-        else:
-            written, rows = run_table(
-                work,
-                parts,
-                path,
-                title=title,
-                recipe=recipe,
-                resumable=trials.travels,
-                on=on,
-                retry_failed=retry_failed,
-                overwrite=overwrite,
-            )
+        written, rows = run_table(
+            _Prediction(network=network, trials=trials, schema=schema, friction=prior, sequence=sequence, make=make),
+            trials.parts(recipe, longest=None if sequence else LONGEST),
+            path,
+            title=f"Predicting frames ({network.manifest.input})",
+            recipe=recipe,
+            resumable=trials.travels,
+            on=on,
+            retry_failed=retry_failed,
+            overwrite=overwrite,
+        )
     name = (written.metadata or {})[b"sliplens.engine"].decode()
     return Predictions(frames=trials.frames, engine=name, path=path, rows=rows, schema=path and written, notes=notes)
 
@@ -333,18 +279,17 @@ def _list_notes(
     sequence: bool,
 ) -> tuple[str, ...]:
     """Refuse recordings and options that do not fit the network; return the assumptions about those that do."""
-    notes: list[str] = []
     if friction is not None:
         network.require_ratio()
-    if sequence:
-        network.follow(friction=friction)
+    follows = sequence and network.follow(friction=friction)
+    notes: list[str] = []
     for capture in captures:
-        if sequence and capture.time_s is None:
+        if follows and capture.time_s is None:
             raise InputError(
                 f"--sequence needs the times of the frames, and those of {capture.name} are unknown; leave it out, or "
                 "name a recording with times"
             )
-        if sequence and capture.time_s is not None:
+        if follows and capture.time_s is not None:
             require_frequent(capture.time_s, what=capture.name)
         notes += [*capture.notes, *_require_comparable(network, capture)]
     notes += network.doubts(profile=profile)
@@ -355,21 +300,18 @@ def _list_notes(
     return tuple(dict.fromkeys(notes))
 
 
-def _find_profile(trials: Trials, sensor: SensorProfile | Path | str | None) -> SensorProfile | None:
-    """Load the named profile, or the one that a data set keeps of its first trial's sensor."""
-    if sensor is not None:
-        return load_profile(sensor)
-    source = trials.source
+def _recorded_profile(source: Path | Dataset | tuple[Capture, ...]) -> SensorProfile | None:
+    """Load the profile that a data set keeps of its first trial's sensor."""
     if isinstance(source, Path) and (source / DATASET_FILE).is_file():
         source = load_dataset(source)
     return source.profile(source.trials[0].sensor) if isinstance(source, Dataset) else None
 
 
-def _choose_network(trials: Trials, profile: SensorProfile | None) -> tuple[str, str]:
+def _choose_network(kinds: Sequence[Capture], profile: SensorProfile | None) -> tuple[str, str]:
     """Choose a network for a source, and say where the choice comes from."""
     if profile is not None and profile.network is not None:
         return profile.network, f"which the profile {profile.name} names"
-    if any(capture.read_reference is None and not _is_recorded(capture) for capture in trials.kinds):
+    if any(capture.read_reference is None and not _is_recorded(capture) for capture in kinds):
         return DIFFERENCE_NETWORK, "which comes with sliplens for difference images"
     return DEFAULT_NETWORK, "which comes with sliplens"
 
@@ -454,16 +396,11 @@ class _Prediction(Work):
         return self.network.device.type != "cpu"
 
     def begin(self) -> MakePart:
-        schema, tables = self.start()
-        return lambda part, path: write_tables(tables(part), path, schema)
-
-    def start(self) -> tuple[pa.Schema, Callable[[tuple[str, int, int]], Iterator[pa.Table]]]:
-        """Return the columns, and the function that predicts a part."""
         engine, read = self.make(), self.trials.reader()
         schema = self.schema.with_metadata({"sliplens.engine": engine.name, **(self.schema.metadata or {})})
-        return schema, partial(self._tables, engine, read, schema)
+        return lambda part, path: write_tables(self._tables(engine, read, part), path, schema)
 
-    def _tables(self, engine: Engine, read: _Read, schema: pa.Schema, part: tuple[str, int, int]) -> Iterator[pa.Table]:
+    def _tables(self, engine: Engine, read: _Read, part: tuple[str, int, int]) -> Iterator[pa.Table]:
         _, first, count = part
         capture, frames = read(*part)
         capture = _assume_reference(self.network, capture)
@@ -505,7 +442,7 @@ class _Prediction(Work):
                 "touches": pa.array(touches),
                 "withheld": pa.array(withheld, type=pa.string()),
             }
-            yield pa.table({name: columns[name] for name in schema.names}).cast(schema)
+            yield pa.table({name: columns[name] for name in self.schema.names}).cast(self.schema)
 
 
 def _make_check(
@@ -516,7 +453,7 @@ def _make_check(
     if reference is None:
         return lambda number, _: (not states or states[number] != ContactState.NO_CONTACT, None)
     untouched, shear, camera = soften(reference), network.shear_estimator(reference), CameraWatch(reference)
-    directions, moved = network.manifest.pull_direction_deg or FULL_CIRCLE, False
+    moved = False
 
     def check(number: int, frame: Frame) -> tuple[bool, str | None]:
         nonlocal moved
@@ -530,10 +467,7 @@ def _make_check(
             moved = motion is not None and motion.excess_px > CAMERA_LIMIT_PX
         if moved:
             return touches, CAMERA_REASON
-        pull = shear.estimate(frame) if shear is not None and touches else None
-        if pull is None or pull.excess(directions) <= DIRECTION_LIMIT:
-            return touches, None
-        return touches, network.doubt_shear(pull)
+        return touches, network.doubt_shear(shear.estimate(frame)) if shear is not None and touches else None
 
     return check
 
@@ -544,19 +478,18 @@ def _columns(
     """Make the columns of consecutive frames; NaN becomes null."""
     count, labels, ratio = len(estimate.margin), trial.labels, estimate.ratio
     low, high = estimate.interval(LEVEL) or (None, None)
-    predicted = {
+    numbers = {
         "prediction": estimate.margin,
         "sigma": estimate.sigma,
         "low_90": low,
         "high_90": high,
-        "traction_ratio": None if ratio is None else ratio.mean,
-        "traction_ratio_sigma": None if ratio is None else ratio.sigma,
+        "traction_ratio": ratio and ratio.mean,
+        "traction_ratio_sigma": ratio and ratio.sigma,
     }
+    numbers = {name: None if v is None else np.where(believed, v, np.nan) for name, v in numbers.items()}
     recorded = {"time_s": trial.time_s, "safety_margin": trial.safety_margin}
-    recorded |= {name: None if labels is None else getattr(labels, name) for name in _FORCES}
-    numbers = {name: None if v is None else np.where(believed, v, np.nan) for name, v in predicted.items()}
-    numbers |= {name: None if v is None else v[here] for name, v in recorded.items()}
-    numbers["known"] = estimate.known
+    recorded |= {name: labels and getattr(labels, name) for name in _FORCES}
+    numbers |= {name: None if v is None else v[here] for name, v in recorded.items()} | {"known": estimate.known}
     return {
         "trial": pa.array([trial.name] * count),
         "frame": pa.array(range(here.start, here.stop)),
