@@ -27,7 +27,7 @@ from sliplens.models import Network
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.simulation import CHROMATOUCH, FLAT_GEL, SimulationRecipe, simulate_dataset
 from sliplens.simulation.sensor import Glare, Sensor
-from sliplens.training import evaluate_frames, get_recipe
+from sliplens.training import RECIPES, evaluate_frames
 from sliplens.training.data import FrameSet, load_frames
 
 DOME = replace(
@@ -95,7 +95,7 @@ def recorded(data: Dataset, trials: int) -> Dataset:
 
 def train(plan: Plan, data: Dataset, start: Network) -> Network:
     """The network that the owner gets."""
-    recipe = get_recipe("adapt")
+    recipe = RECIPES["adapt"]
     changes: dict[str, Any] = {"seed": plan.seed, "image_size": plan.image_size} | plan.changes
     if plan.start == "scratch":
         as_many = {"epoch_frames": recipe.epoch_frames, "epochs": recipe.epochs, "batch_size": recipe.batch_size}
@@ -133,8 +133,8 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
                 "plan": asdict(plan),
                 "recipe": recipe.hash,
                 "start": network.manifest.weights_sha256,
-                "training": get_recipe("adapt" if start == "adapted" else "default"),
-                "as_many": get_recipe("adapt"),
+                "training": RECIPES["adapt" if start == "adapted" else "default"],
+                "as_many": RECIPES["adapt"],
             }
             part = options.cache / f"{hash_json(shaped)}.json"
             if not part.is_file():

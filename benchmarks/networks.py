@@ -402,7 +402,7 @@ def sequence_leads(read: Sequence[Followed], other: Sequence[Followed]) -> dict[
 
 def measure_known(run: Network, *, trials: int | None = None) -> dict[str, Any]:
     """How well `known` tells frames of other sensors from those of the network's kind, and how often it is low."""
-    if run.novelty is None:
+    if run.manifest.novelty is None:
         raise SystemExit("networks.py: this network does not tell how far it knows a frame")
     recipe, found, usual = fresh_days("networks, known", KNOWN_DAYS), {}, np.zeros(0)
     for name, sensor in {"own kind": recipe.sensor, **SENSORS}.items():

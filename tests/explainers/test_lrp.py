@@ -98,8 +98,8 @@ def test_works_on_networks_and_leaves_them_alone(network, images):
 def test_a_histogram_is_handed_back_through_its_logits(images):
     with torch.random.fork_rng():
         torch.manual_seed(1)  # some weights leave every channel dark
-        backbone = nn.Sequential(nn.Conv2d(3, 4, 3), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(4, 6))
-    model = HistogramRegressor(backbone, bins=6)
+        backbone = nn.Sequential(nn.Conv2d(3, 4, 3), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(4, 60))
+    model = HistogramRegressor(backbone)
     explanation = Lrp()(model, images[..., :8, :8].float())
     assert bool(explanation.relevance.isfinite().all())
     assert bool(explanation.relevance.any())

@@ -14,7 +14,7 @@ from sliplens.recordings.dataset import write_dataset_table
 from sliplens.results.evaluation import Evaluation, LearningCurve, Reliability, ScoredFrames, Training
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore
-from sliplens.training.evaluation import find_lead_times, risk_coverage, score_predictions
+from sliplens.training.evaluation import lead_times, regression_scores, risk_coverage
 
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
 MARGINS = (1.0, 0.8, 0.6, 0.4, 0.2, 0.0)
@@ -97,14 +97,13 @@ def made_up_evaluation(predictions: ScoredFrames, *, name: str = "difference", s
         input=name,
         split="test",
         known_trials=0,
-        conditions={one: score_predictions(rows) for one, rows in by_condition.items()},
-        trials={one: score_predictions(rows) for one, rows in by_trial.items()},
+        conditions={one: regression_scores(rows) for one, rows in by_condition.items()},
+        trials={one: regression_scores(rows) for one, rows in by_trial.items()},
         reliability={
             one: Reliability(coverage={"0.5": 0.48, "0.9": 0.88 if one == "dry" else 0.6} if sure else {})
             for one in by_condition
         },
-        wet_auroc=0.97 if sure else None,
-        lead_times={one: find_lead_times(rows) for one, rows in by_condition.items()},
+        lead_times={one: lead_times(rows) for one, rows in by_condition.items()},
         predictions=predictions,
         risk=risk_coverage(
             np.abs(predictions.prediction - predictions.safety_margin), {"spread": -predictions.sigma if sure else None}

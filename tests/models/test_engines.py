@@ -64,7 +64,7 @@ def test_predictions_come_in_the_order_of_the_batches(name: str, tiny: nn.Module
 
 def test_features_come_with_the_predictions(name: str):
     network = load("chromatouch-pair")
-    assert network.novelty is not None
+    assert network.manifest.novelty is not None
     images = torch.rand(5, 6, 112, 112, generator=torch.Generator().manual_seed(0))
     features = network.answers([images])[-1].double().numpy()
     [answers] = make_engine(name, network, batch_size=8).answers([images])

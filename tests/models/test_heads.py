@@ -6,7 +6,7 @@ from there import there
 
 from sliplens.errors import ModelError
 from sliplens.models import build_model
-from sliplens.models.backbones import HistogramRegressor, histogram_targets, margin_loss
+from sliplens.models.backbones import Answers, HistogramRegressor, histogram_targets, margin_loss
 from sliplens.models.calibration import Calibration, conformal_offset, fit_temperature, quantiles
 from sliplens.models.checkpoint import Estimate
 
@@ -36,7 +36,8 @@ def test_the_answer_is_the_mean_of_the_distribution_and_has_a_gradient():
     answer = model(images)
     assert isinstance(model, HistogramRegressor)
     assert answer.shape == (2, 1)
-    torch.testing.assert_close(answer[:, 0], model.probabilities(images) @ model.centres)
+    _, probabilities = Answers(model)(images)
+    torch.testing.assert_close(answer[:, 0], probabilities @ model.centres)
     answer.sum().backward()
     assert float(there(images.grad).abs().max()) > 0
 

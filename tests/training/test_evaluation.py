@@ -4,21 +4,40 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sliplens.errors import RecordingError
+from sliplens.results.evaluation import LeadTimes, RegressionScores, ScoredFrames
 from sliplens.training import lead_times, regression_scores
 from sliplens.training.evaluation import risk_coverage
+
+
+def frames(labels: np.ndarray, predictions: np.ndarray, time_s: np.ndarray | None = None) -> ScoredFrames:
+    """Frames of one trial."""
+    text, number, unknown = np.full(len(labels), ""), np.arange(len(labels)), np.full(len(labels), np.nan)
+    time_s = number / 10 if time_s is None else time_s
+    return ScoredFrames(
+        trial=text, condition=text, day=number, frame=number, time_s=time_s, safety_margin=labels,
+        prediction=predictions, sigma=unknown, low_90=unknown, high_90=unknown, withheld=text,
+    )  # fmt: skip
+
+
+def scores_of(labels: np.ndarray, predictions: np.ndarray) -> RegressionScores:
+    return regression_scores(frames(labels, predictions))
+
+
+def leads_of(time_s: np.ndarray, labels: np.ndarray, predictions: np.ndarray) -> LeadTimes:
+    return lead_times(frames(labels, predictions, time_s))
+
 
 MARGINS = arrays(np.float64, 30, elements=st.floats(0, 1))
 
 
 def test_predicting_the_mean_explains_nothing():
     labels = np.linspace(0, 1, 11)
-    assert regression_scores(labels, np.full(11, 0.5)).r2 == pytest.approx(0)
+    assert scores_of(labels, np.full(11, 0.5)).r2 == pytest.approx(0)
 
 
 @given(MARGINS, MARGINS)
 def test_bins_share_out_every_frame_and_all_of_the_error(labels: np.ndarray, predictions: np.ndarray):
-    scores = regression_scores(labels, predictions)
+    scores = scores_of(labels, predictions)
     assert sum(one.frames for one in scores.bins) == len(labels)
     total = sum(one.frames * one.mse for one in scores.bins if one.mse is not None)
     assert total == pytest.approx(len(labels) * scores.mse)
@@ -26,26 +45,21 @@ def test_bins_share_out_every_frame_and_all_of_the_error(labels: np.ndarray, pre
 
 def test_edges_of_bins_belong_to_the_bin_above_and_one_to_the_last():
     labels = np.array([0.0, 0.1, 0.3, 0.6, 0.7, 1.0])  # 0.3, 0.6 and 0.7 are not exact in binary
-    scores = regression_scores(labels, labels)
+    scores = scores_of(labels, labels)
     assert [index for index, one in enumerate(scores.bins) if one.frames] == [0, 1, 3, 6, 7, 9]
     assert scores.bins[2].mse is None
 
 
-def test_labels_in_percent_are_refused():
-    with pytest.raises(RecordingError, match=r"labels must lie in \[0, 1\]; give the safety margin as a fraction"):
-        regression_scores(np.array([80.0]), np.array([0.8]))
-
-
-def trial(seconds: float = 10.0) -> tuple[list[str], np.ndarray, np.ndarray]:
+def trial(seconds: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
     """A margin that falls evenly to 0 at `seconds` and stays there for a second, 10 frames a second."""
     time = np.arange(0, seconds + 1.05, 0.1)
     # rounded: 1 - 0.8 is not 0.2 in binary, and a threshold would tell them apart
-    return ["one"] * len(time), time, np.clip(1 - time / seconds, 0, 1).round(6)
+    return time, np.clip(1 - time / seconds, 0, 1).round(6)
 
 
 def test_a_perfect_network_warns_as_early_as_the_margin_itself():
-    name, time, labels = trial()
-    found = lead_times(name, time, labels, labels)
+    time, labels = trial()
+    found = leads_of(time, labels, labels)
     # below 0.2 from the first frame after 8 s on, at 10 s it slips
     assert found.median_ms == pytest.approx(1900)
     assert found.median_ms == found.ideal_ms
@@ -53,33 +67,33 @@ def test_a_perfect_network_warns_as_early_as_the_margin_itself():
 
 
 def test_a_network_that_reads_too_much_warns_late_and_one_that_always_does_never():
-    name, time, labels = trial()
-    late = lead_times(name, time, labels, (labels + 0.1).round(6))
+    time, labels = trial()
+    late = leads_of(time, labels, (labels + 0.1).round(6))
     # below 0.2 where the label is below 0.1: the last second
     assert late.median_ms == pytest.approx(900)
-    never = lead_times(name, time, labels, labels + 0.3)
+    never = leads_of(time, labels, labels + 0.3)
     assert (never.median_ms, never.warned, never.trials) == (None, 0, 1)
 
 
 def test_alarms_far_from_slip_are_false_and_counted_by_the_minute():
-    name, time, labels = trial()
+    time, labels = trial()
     predictions = labels.copy()
     predictions[[5, 20, 21]] = 0.1  # two stretches, at margins of 0.95 and 0.8
-    found = lead_times(name, time, labels, predictions)
+    found = leads_of(time, labels, predictions)
     # 9.9 s lie between the first frame and the last before the slip
     assert found.false_per_minute == pytest.approx(2 / (9.9 / 60))
     assert found.median_ms == pytest.approx(1900)
 
 
 def test_what_comes_after_the_slip_and_trials_that_never_slip_count_no_lead():
-    name, time, labels = trial()
+    time, labels = trial()
     held = labels >= 0.5
-    found = lead_times(["one"] * int(held.sum()), time[held], labels[held], labels[held])
+    found = leads_of(time[held], labels[held], labels[held])
     assert (found.trials, found.median_ms, found.ideal_ms) == (0, None, None)
     after = labels.copy()
     after[labels <= 0] = 0.9
     # an answer after the slip changes nothing
-    assert lead_times(name, time, labels, after) == lead_times(name, time, labels, labels)
+    assert leads_of(time, labels, after) == leads_of(time, labels, labels)
 
 
 def test_withholding_by_the_errors_themselves_is_best_and_by_chance_gains_nothing(rng: np.random.Generator):

@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from sliplens.errors import InputError, ModelError
-from sliplens.models import Network, load, save_checkpoint
+from sliplens.models import Manifest, Network, load, save_checkpoint
 from sliplens.models.encodings import ENCODINGS
 from sliplens.progress import OnProgress, reporting
 from sliplens.recordings import Dataset
 from sliplens.results.evaluation import Training
-from sliplens.training import TrainingConfig, evaluate_frames, fit, fitting, get_recipe
+from sliplens.training import RECIPES, TrainingConfig, evaluate_frames, fit, fitting
 from sliplens.training.data import FrameSet, load_frames
-from sliplens.training.fitting import DataOrigin, require_same_kind
+from sliplens.training.fitting import require_same_kind
 
 CONFIG = TrainingConfig(image_size=32, epochs=3, batch_size=11, seed=3)
 
@@ -28,9 +28,6 @@ def frames(small_dataset: Dataset) -> tuple[FrameSet, FrameSet]:
     return train, validation
 
 
-ORIGIN = DataOrigin(frame_size=(48, 48), sensor="test", data_hash="none", trained_on=("abc",))
-
-
 def run(
     folder: Path,
     frames: tuple[FrameSet, FrameSet],
@@ -41,7 +38,11 @@ def run(
 ) -> Training:
     folder.mkdir(exist_ok=True)
     with reporting(on_progress):
-        return fit(config, *frames, folder, origin=ORIGIN, start=start)
+        manifest = Manifest(
+            backbone=config.backbone, head=config.head, input="difference", image_size=config.image_size,
+            frame_size=(48, 48), sensor="test", data_hash="none", trained_on=("abc",),
+        )  # fmt: skip
+        return fit(config, *frames, folder, manifest, start=start)
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +167,7 @@ def test_it_does_not_start_from_a_network_of_another_kind(
         require_same_kind(start, CONFIG, "raw")
 
 
-ADAPT = replace(get_recipe("adapt"), head="point", image_size=32, epochs=1, batch_size=11, epoch_frames=22, seed=3)
+ADAPT = replace(RECIPES["adapt"], head="point", image_size=32, epochs=1, batch_size=11, epoch_frames=22, seed=3)
 
 
 def test_adapting_moves_weights_and_leaves_the_statistics_of_the_normalisation(
@@ -182,7 +183,7 @@ def test_adapting_moves_weights_and_leaves_the_statistics_of_the_normalisation(
     assert all(not torch.equal(value, weights[name]) for name, value in adapted.named_parameters() if value.ndim > 1)
 
 
-RATIO = replace(get_recipe("ratio"), image_size=32, epochs=30, batch_size=11, seed=3)
+RATIO = replace(RECIPES["ratio"], image_size=32, epochs=30, batch_size=11, seed=3)
 
 
 @pytest.fixture(scope="module")

@@ -51,20 +51,17 @@ def show_predictions(predictions: "Predictions") -> None:
         ]
         print_table("Safety margins", ("frame", "safety margin", "90 % interval", *columns), cells)
         return
-    import pyarrow.compute as pc
-
     table = predictions.to_arrow()
-    names = table["trial"].unique()
+    column = table["trial"].to_numpy()
+    names = list(dict.fromkeys(column))
     for name in names[:_MOST_TRIALS]:
-        say(_course(table.filter(pc.equal(table["trial"], name))))
+        say(_course(table.filter(column == name)))
     if len(names) > _MOST_TRIALS:
         say(f"and {number_of(len(names) - _MOST_TRIALS, 'more trial')}; -o margins.csv writes every frame")
 
 
 def _course(rows: "pa.Table") -> str:
     """Describe the lowest margin of a trial."""
-    import pyarrow.compute as pc
-
     from sliplens.models.predictions import lowest_frame
 
     words, lowest = "none", lowest_frame(rows)
@@ -75,7 +72,7 @@ def _course(rows: "pa.Table") -> str:
         words = f"{_percent(row['prediction'])}{interval} at {where}"
     words = f"{rows['trial'][0]}: lowest {words}, {number_of(len(rows), 'frame')}"
     if "touches" in rows.column_names:
-        touching = pc.sum(rows["touches"]).as_py()
+        touching = int(rows["touches"].to_numpy().sum())
         words += f", {touching:,} touch" if touching else ", none touches"
     withheld = len(rows) - rows["withheld"].null_count
     return f"{words}, {withheld:,} withheld" if withheld else words
@@ -234,8 +231,6 @@ def print_scores(evaluation: "Evaluation") -> None:
     if evaluation.ratio_r2:
         scores = (f"{name} {'none' if r2 is None else f'{r2:.3f}'}" for name, r2 in evaluation.ratio_r2.items())
         say(f"F_t / F_n is predicted with R2 {', '.join(scores)}")
-    if evaluation.wet_auroc is not None:
-        say(f"the network's uncertainty separates wet from dry: AUROC {evaluation.wet_auroc:.2f}")
     if evaluation.risk is not None:
         say(str(evaluation.risk))
 

@@ -18,7 +18,6 @@ from sliplens.explainers.occlusion import markers_in_frame, markers_in_recording
 from sliplens.markers import track_markers
 from sliplens.markers.estimators import affine_parts, find_hold
 from sliplens.models import Network
-from sliplens.models.wrapping import WrappedNetwork
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import SensorProfile
@@ -154,7 +153,7 @@ def frames_from_arrays(
         raise ImageError("there is no frame to explain; give one at least")
     network.require_frame_size(frames.shape[1:3])
     # images of other sources than a sensor are independent, frames of a sensor are of one trial
-    of_images = isinstance(network, WrappedNetwork)
+    of_images = network.wrapped
     encoding, image_size = network.encoding, network.manifest.image_size
     if reference is None and not encoding.empty_is_black and (encoding.compares or not of_images):
         raise InputError(

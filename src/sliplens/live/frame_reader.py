@@ -168,7 +168,7 @@ class FrameReader:
             if network is None:
                 option = "--same-object" if friction is None else "--friction"
                 raise InputError(f"{option} needs a network; name one with --network")
-            network.require_ratio(learns=friction is None)
+            network.require_ratio()
         # a new one, not emptied: the reading thread may still teach the one before
         self.learner = SlipLearner(None if friction is None else as_friction(friction), same_object=same_object)
 

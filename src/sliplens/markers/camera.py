@@ -84,24 +84,19 @@ def marker_camera_motion(markers: TrackedFrame) -> CameraMotion | None:
         return None
     place, motion = place[beyond], motion[beyond]
     contact = np.stack([1 / place.conj(), 1 / place.conj() ** 2, 1 / np.abs(place)], axis=1)
-    whole, _ = _fit(place, motion, contact)
+    similarity = np.stack([np.ones_like(place), place], axis=1)
+    whole, _ = _fit(np.concatenate([similarity, contact], axis=1), motion)
     moved_px = float(np.sqrt(np.mean(np.abs(contact @ whole[2:]) ** 2)))
     if moved_px > _LIGHT_PX:
         return _as_motion(whole, moved_px, _MARKER_SHARES, free=False)
-    camera, _ = _fit(place, motion)
-    return _as_motion(camera, 0.0, _MARKER_SHARES, free=True)
+    return _as_motion(_fit(similarity, motion)[0], 0.0, _MARKER_SHARES, free=True)
 
 
 def _fit(
-    place: Complex[np.ndarray, " places"],
-    motion: Complex[np.ndarray, " places"],
-    contact: Complex[np.ndarray, "places terms"] | None = None,
-) -> tuple[Complex[np.ndarray, " all_terms"], Float[np.ndarray, " places"]]:
-    """Fit shift and similarity, with further terms; returns the terms and the misfit of each place, in pixels."""
-    terms = np.stack([np.ones_like(place), place], axis=1)
-    if contact is not None:
-        terms = np.concatenate([terms, contact], axis=1)
-    weight, fitted, misfit = np.ones(len(place)), np.zeros(terms.shape[1], dtype=complex), np.zeros(len(place))
+    terms: Complex[np.ndarray, "places terms"], motion: Complex[np.ndarray, " places"]
+) -> tuple[Complex[np.ndarray, " terms"], Float[np.ndarray, " places"]]:
+    """Fit a motion by a robust regression; returns the factors of the terms and the misfit of each place, in pixels."""
+    weight, fitted, misfit = np.ones(len(motion)), np.zeros(terms.shape[1], dtype=complex), np.zeros(len(motion))
     for _ in range(_PASSES):
         weighted = terms.conj().T * weight
         fitted = np.linalg.solve(weighted @ terms, weighted @ motion)
@@ -174,7 +169,8 @@ class BorderMotion:
             pixels = np.pad(block_means(plane, factor), _REACH_PX, mode="edge").ravel()
             for _ in range(_STEPS):
                 shift = shift + factor * level.steps(pixels, shift / factor, similarity)
-                fitted, misfit = _fit(level.places, shift * (_HALF_PX / self._half))
+                terms = np.stack([np.ones_like(level.places), level.places], axis=1)
+                fitted, misfit = _fit(terms, shift * (_HALF_PX / self._half))
                 similarity = complex(fitted[1]) / _HALF_PX
         misfit_px, length_px = float(np.sort(misfit)[_PARTS - _STRAYS - 1]), float(np.linalg.norm(fitted))
         free = length_px < _LIGHT_PX or misfit_px < _STILL_PX + _ALIKE_SHARE * length_px
@@ -200,11 +196,6 @@ def _brightness(plane: Plane) -> float:
     return max(1.0, float(np.median(plane[::4, ::4])))
 
 
-def _green(frame: Frame) -> Plane:
-    """Return the green channel, which cameras resolve best."""
-    return frame[..., 1].astype(np.float32)
-
-
 class CameraWatch:
     """Camera's motion over the frames of one sensor.
 
@@ -224,7 +215,7 @@ class CameraWatch:
     """
 
     def __init__(self, reference: Frame) -> None:
-        self._border = BorderMotion(_green(reference))
+        self._border = BorderMotion(reference[..., 1].astype(np.float32))
         self._untouched: CameraMotion | None = None
         """Newest motion of a frame without a contact."""
 
@@ -238,7 +229,7 @@ class CameraWatch:
         if motion is not None:
             touches = not motion.free
         else:
-            plane = _green(frame)
+            plane = frame[..., 1].astype(np.float32)  # cameras resolve green best
             motion = self._border.measure(plane)
             if motion is None:
                 return None

@@ -183,8 +183,8 @@ _SLOPE_SHARE = 0.5  # of the contrast that the background may change by across a
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shapes:
-    """Measured spots; pixel coordinates are (x, y), pixel centres at whole numbers."""
+class Markers:
+    """Markers of one frame; pixel coordinates are (x, y), pixel centres at whole numbers."""
 
     centre_px: Float[np.ndarray, "spots 2"]
     radius_px: Float[np.ndarray, " spots"]
@@ -195,9 +195,18 @@ class Shapes:
     """Shorter over longer axis, 1 for a disc."""
     noise: Float[np.ndarray, " spots"]
     """Standard deviation of the background around it, in weighted grey levels."""
+    whole: Bool[np.ndarray, " spots"]
+    """False where the edge of the frame cuts a marker, so that its centre is unknown."""
+    appearance: Appearance
+    """Common look of the markers."""
 
     def __len__(self) -> int:
         return len(self.centre_px)
+
+    def only(self, chosen: Bool[np.ndarray, " spots"]) -> "Markers":
+        """Return some of the markers."""
+        arrays = {name: values for name, values in vars(self).items() if name != "appearance"}
+        return replace(self, **{name: values[chosen] for name, values in arrays.items()})
 
 
 class _Window(NamedTuple):
@@ -225,16 +234,17 @@ def _window(radius_px: float) -> _Window:
 def measure_spots(
     signal: Float32[np.ndarray, "height width"],
     near_px: Float[np.ndarray, "spots 2"],
+    appearance: Appearance,
     *,
-    radius_px: float,
     rounds: int = _ROUNDS,
-) -> Shapes:
+) -> Markers:
     """Measure the spots near places, known to a third of a radius, in a signal that is high on markers.
 
     The background is a plane, fitted in a ring around each spot. A pixel counts as marker from a quarter (not at all)
     to three quarters (wholly) of the contrast: speckle inside a marker does not move its centre, but its edge does, by
     fractions of a pixel.
     """
+    radius_px = appearance.radius_px
     window = _window(round(max(radius_px, 1.5), 1))
     height, width = signal.shape
     whole = np.clip(np.round(near_px), 0, (width - 1, height - 1)).astype(np.int64)
@@ -263,12 +273,17 @@ def measure_spots(
     mass, mean_x, mean_y, mean_xx, mean_yy, mean_xy = moments.T
     spread_x, spread_y = mean_xx - mean_x**2, mean_yy - mean_y**2
     middle, half = (spread_x + spread_y) / 2, np.hypot((spread_x - spread_y) / 2, mean_xy - mean_x * mean_y)
-    return Shapes(
-        centre_px=(whole + offset).astype(np.float64),
-        radius_px=np.sqrt(mass / np.pi).astype(np.float64),
+    centre, radius = whole + offset.astype(np.float64), np.sqrt(mass / np.pi).astype(np.float64)
+    # a pixel beyond the disc: its blurred edge counts too
+    edge = radius[:, None] + 1
+    return Markers(
+        centre_px=centre,
+        radius_px=radius,
         contrast=contrast.astype(np.float64),
         roundness=np.sqrt(np.clip((middle - half) / np.maximum(middle + half, 1e-9), 0, 1)).astype(np.float64),
         noise=noise.astype(np.float64),
+        whole=np.all((centre >= edge) & (centre <= np.array([width - 1, height - 1]) - edge), axis=1),
+        appearance=appearance,
     )
 
 
@@ -278,21 +293,6 @@ _LEAST_CONTRAST = 0.3  # of that of the markers
 _LEAST_OVER_NOISE = 4.0
 _RADII = (0.55, 1.6)  # of that of the markers
 _LEAST_ROUNDNESS = 0.4
-
-
-@dataclass(frozen=True, kw_only=True)
-class Markers(Shapes):
-    """Markers of one frame; pixel coordinates are (x, y), pixel centres at whole numbers."""
-
-    whole: Bool[np.ndarray, " spots"]
-    """False where the edge of the frame cuts a marker, so that its centre is unknown."""
-    appearance: Appearance
-    """Common look of the markers."""
-
-    def only(self, chosen: Bool[np.ndarray, " spots"]) -> "Markers":
-        """Return some of the markers."""
-        arrays = {name: values for name, values in vars(self).items() if name != "appearance"}
-        return replace(self, **{name: values[chosen] for name, values in arrays.items()})
 
 
 def detect_markers(
@@ -368,44 +368,40 @@ def measure_markers(
     A window is moved once, onto a centre that is more than a third of a radius from its place.
     """
     signal, radius = frame.astype(np.float32) @ appearance.weights, appearance.radius_px
-    shapes = measure_spots(signal, near_px, radius_px=radius, rounds=_FOLLOWED_ROUNDS)
-    centre = shapes.centre_px
-    moved = np.linalg.norm(centre - near_px, axis=1) > radius / 3
+    markers = measure_spots(signal, near_px, appearance, rounds=_FOLLOWED_ROUNDS)
+    moved = np.linalg.norm(markers.centre_px - near_px, axis=1) > radius / 3
     if moved.any():
-        again = measure_spots(signal, centre[moved], radius_px=radius, rounds=_FOLLOWED_ROUNDS)
+        again = measure_spots(signal, markers.centre_px[moved], appearance, rounds=_FOLLOWED_ROUNDS)
         for name, values in vars(again).items():
-            vars(shapes)[name][moved] = values
-    markers, keep = _keep_markers(shapes, near_px, appearance, signal.shape[::-1])
-    return markers, np.where(keep, np.cumsum(keep) - 1, -1)
+            if name != "appearance":
+                vars(markers)[name][moved] = values
+    keep = _look_alike(markers, near_px)
+    return markers.only(keep), np.where(keep, np.cumsum(keep) - 1, -1)
 
 
 def _detect(frame: UInt8[np.ndarray, "height width 3"], appearance: Appearance) -> Markers:
     signal = frame.astype(np.float32) @ appearance.weights
     near = _find_places(signal, appearance)
-    shapes = measure_spots(signal, near, radius_px=appearance.radius_px)
-    return _keep_markers(shapes, near, appearance, signal.shape[::-1])[0]
+    markers = measure_spots(signal, near, appearance)
+    return markers.only(_look_alike(markers, near))
 
 
-def _keep_markers(
-    shapes: Shapes, near: Float[np.ndarray, "spots 2"], appearance: Appearance, size: tuple[int, ...]
-) -> tuple[Markers, Bool[np.ndarray, " spots"]]:
-    """Keep the spots that look like markers, each once, in a picture of a width and height; returns which they are."""
-    low, high = (share * appearance.radius_px for share in _RADII)
+def _look_alike(spots: Markers, near: Float[np.ndarray, "spots 2"]) -> Bool[np.ndarray, " spots"]:
+    """Select the spots that look like markers, each once."""
+    look, centre = spots.appearance, spots.centre_px
+    low, high = (share * look.radius_px for share in _RADII)
     keep = (
-        (shapes.contrast > _LEAST_CONTRAST * appearance.contrast)
-        & (shapes.contrast > _LEAST_OVER_NOISE * shapes.noise)
-        & (shapes.radius_px > low)
-        & (shapes.radius_px < high)
-        & (shapes.roundness > _LEAST_ROUNDNESS)
-        & (np.linalg.norm(shapes.centre_px - near, axis=1) < 1.2 * appearance.radius_px)
+        (spots.contrast > _LEAST_CONTRAST * look.contrast)
+        & (spots.contrast > _LEAST_OVER_NOISE * spots.noise)
+        & (spots.radius_px > low)
+        & (spots.radius_px < high)
+        & (spots.roundness > _LEAST_ROUNDNESS)
+        & (np.linalg.norm(centre - near, axis=1) < 1.2 * look.radius_px)
     )
     # spots that came to lie on an earlier, stronger one are the same
-    centre, radius = shapes.centre_px, shapes.radius_px[:, None]
     apart = np.linalg.norm(centre[keep][:, None] - centre[keep][None], axis=-1)
-    keep[keep] = ~np.any((apart < appearance.radius_px) & np.tri(len(apart), k=-1, dtype=bool), axis=1)
-    # a pixel beyond the disc: its blurred edge counts too
-    whole = np.all((centre >= radius + 1) & (centre <= np.array(size) - 2 - radius), axis=1)
-    return Markers(**vars(shapes), whole=whole, appearance=appearance).only(keep), keep
+    keep[keep] = ~np.any((apart < look.radius_px) & np.tri(len(apart), k=-1, dtype=bool), axis=1)
+    return keep
 
 
 def _find_places(signal: Float32[np.ndarray, "height width"], appearance: Appearance) -> Float[np.ndarray, "places 2"]:

@@ -96,30 +96,6 @@ class Pattern:
         unless another fits clearly better, and so is a pattern that after a loss stands at its last place, or at rest,
         even if mostly hidden. Of larger steps the best is accepted only where no other fits nearly as well.
         """
-        return self._note(self._link(origins, spots_px, lost=lost))
-
-    def accept(self, origin_px: Places, spots_px: Spots, spot: Matches) -> Pairing | None:
-        """Accept spots measured at the last places of the markers, -1 for none, where the step is small and smooth."""
-        pairing = self._judge(origin_px, spots_px, spot, origin_px)
-        return self._note(pairing) if self._is_calm(pairing) else None
-
-    def _note(self, pairing: Pairing | None) -> Pairing | None:
-        """Update the usual spread and support."""
-        if pairing is not None:
-            spread, first = max(pairing.spread_px, _LEAST_SPREAD_PX / _CALM_SPREAD), not np.isfinite(self._spread_px)
-            self._spread_px = spread if first else 0.8 * self._spread_px + 0.2 * spread
-            self._support = pairing.support if first else 0.8 * self._support + 0.2 * pairing.support
-        return pairing
-
-    def _is_calm(self, step: Pairing) -> bool:
-        moved = np.linalg.norm(step.step_px, axis=1) / self._pitch
-        # the first step has no mean to be compared with
-        spread = self._spread_px if np.isfinite(self._spread_px) else 0.02 * float(np.median(self._pitch))
-        smooth = step.spread_px <= max(_CALM_SPREAD * spread, _LEAST_SPREAD_PX)
-        small = bool(step.paired.any()) and float(np.nanmedian(moved)) <= _CALM_STEP
-        return small and smooth and step.support >= _CALM_SUPPORT * self._support
-
-    def _link(self, origins: list[Places], spots_px: Spots, *, lost: bool) -> Pairing | None:
         step = self._pair_twice(origins[0], np.zeros(2), spots_px)
         if not lost and self._is_calm(step):
             return step
@@ -128,8 +104,8 @@ class Pattern:
         shifts = [(origin, shift) for origin in origins for shift in likely_shifts(origin, spots_px, pitch_px=pitch)]
         tried = [*stands, *(self._pair_twice(origin, shift, spots_px) for origin, shift in shifts)]
         count = len(self._rest)
-        fewest = _LEAST_SHARE * count
-        rivals = [match for match in tried if match.support >= _LEAST_SUPPORT and match.paired.sum() >= fewest]
+        rivals = [match for match in tried if match.support >= _LEAST_SUPPORT]
+        rivals = [match for match in rivals if match.paired.sum() >= _LEAST_SHARE * count]
         # first a pattern that hardly moved, or stands at rest again, however many markers are hidden or dragged along
         for match in stands:
             moved = np.linalg.norm(match.step_px[match.paired], axis=1) / self._pitch[match.paired]
@@ -148,22 +124,38 @@ class Pattern:
         best = max(rivals, key=lambda match: match.paired.sum() * match.support / (match.spread_px + 0.1))
         return None if any(_rules_out(other, best) for other in rivals) else best
 
-    def _pair_twice(self, origin_px: Places, shift_px: Float[np.ndarray, "2"], spots_px: Spots) -> Pairing:
-        """Pair after a common shift, then again after the steps of the neighbours."""
-        predicted = origin_px + shift_px
-        pairing = self._pair(predicted, spots_px, origin_px)
-        steps = self.predict(pairing.step_px, pairing.paired)
-        return self._pair(np.where(np.isfinite(steps), origin_px + steps, predicted), spots_px, origin_px)
+    def accept(self, origin_px: Places, spots_px: Spots, spot: Matches) -> Pairing | None:
+        """Accept spots measured at the last places of the markers, -1 for none, where the step is small and smooth."""
+        pairing = self._judge(origin_px, spots_px, spot, origin_px)
+        return pairing if self._is_calm(pairing) else None
 
-    def _pair(self, predicted_px: Places, spots_px: Spots, from_px: Places) -> Pairing:
-        """Pair markers and spots that are nearest to each other and lead back to the markers' last places.
+    def note(self, pairing: Pairing | None) -> None:
+        """Update the usual spread and support by a pairing that was accepted."""
+        if pairing is None:
+            return
+        spread, first = max(pairing.spread_px, _LEAST_SPREAD_PX / _CALM_SPREAD), not np.isfinite(self._spread_px)
+        self._spread_px = spread if first else 0.8 * self._spread_px + 0.2 * spread
+        self._support = pairing.support if first else 0.8 * self._support + 0.2 * pairing.support
+
+    def _is_calm(self, step: Pairing) -> bool:
+        moved = np.linalg.norm(step.step_px, axis=1) / self._pitch
+        # the first step has no mean to be compared with
+        spread = self._spread_px if np.isfinite(self._spread_px) else 0.02 * float(np.median(self._pitch))
+        smooth = step.spread_px <= max(_CALM_SPREAD * spread, _LEAST_SPREAD_PX)
+        small = bool(step.paired.any()) and float(np.nanmedian(moved)) <= _CALM_STEP
+        return small and smooth and step.support >= _CALM_SUPPORT * self._support
+
+    def _pair_twice(self, origin_px: Places, shift_px: Float[np.ndarray, "2"], spots_px: Spots) -> Pairing:
+        """Pair markers and spots nearest to each other after a common shift, then again after the neighbours' steps.
 
         Forward, a spot lies less than 0.45 of the pitch from the predicted place. Backward, it lies as near to the
         marker's own last place once it is moved back by the step of the marker's neighbours.
         """
-        return self._judge(
-            predicted_px, spots_px, _mutual(predicted_px, spots_px, reach_px=GATE * self._pitch), from_px
-        )
+        places, reach_px = origin_px + shift_px, GATE * self._pitch
+        pairing = self._judge(places, spots_px, _mutual(places, spots_px, reach_px=reach_px), origin_px)
+        steps = self.predict(pairing.step_px, pairing.paired)
+        places = np.where(np.isfinite(steps), origin_px + steps, places)
+        return self._judge(places, spots_px, _mutual(places, spots_px, reach_px=reach_px), origin_px)
 
     def _judge(self, predicted_px: Places, spots_px: Spots, spot: Matches, from_px: Places) -> Pairing:
         """Drop spots that do not lead back, and measure how well the others agree."""

@@ -134,6 +134,7 @@ class Tracker:
         places = self.rest.centre_px + self._shift
         detected, spot = measure_markers(frame, self.rest.appearance, places)
         pairing = self._pattern.accept(places, detected.centre_px, spot)
+        self._pattern.note(pairing)
         if pairing is None or not pairing.paired[self._followed].all():
             return None
         self._since_whole += 1
@@ -145,7 +146,9 @@ class Tracker:
         self._since_whole = 0
         detected = detect_markers(frame, appearance=self.rest.appearance)
         origins = [rest + self._shift, rest] if self._lost else [rest + self._shift]
-        return detected, self._pattern.link(origins, detected.centre_px, lost=self._lost)
+        pairing = self._pattern.link(origins, detected.centre_px, lost=self._lost)
+        self._pattern.note(pairing)
+        return detected, pairing
 
     def _tracked(self, place: Places, radius: np.ndarray, deviation: np.ndarray, status: np.ndarray) -> TrackedFrame:
         return TrackedFrame(

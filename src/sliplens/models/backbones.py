@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
 from threading import get_ident
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -46,7 +46,7 @@ _WIDTH_RATIO = 0.75
 class HistogramRegressor(nn.Module):
     """Network with a histogram over the safety margin as its output; it returns the mean (HL-Gauss).
 
-    `backbone` returns (batch, `bins`) logits, and `RATIO_BINS` more if `ratio`, for a histogram over F_t / F_n.
+    `backbone` returns (batch, `BINS`) logits, and `RATIO_BINS` more if `ratio`, for a histogram over F_t / F_n.
 
     Imani & White, *Improving Regression Performance with Distributional Losses* (2018); Farebrother et al., *Stop
     Regressing* (2024), whose width of a label is taken.
@@ -57,18 +57,10 @@ class HistogramRegressor(nn.Module):
     ratio_edges: Tensor | None
     ratio_temperature: Tensor | None
 
-    def __init__(
-        self,
-        backbone: nn.Module,
-        *,
-        bins: int = BINS,
-        lowest: float = LOWEST,
-        highest: float = HIGHEST,
-        ratio: bool = False,
-    ) -> None:
+    def __init__(self, backbone: nn.Module, *, ratio: bool = False) -> None:
         super().__init__()
         self.backbone = backbone
-        self.register_buffer("edges", torch.linspace(lowest, highest, bins + 1))
+        self.register_buffer("edges", torch.linspace(LOWEST, HIGHEST, BINS + 1))
         self.register_buffer("temperature", torch.tensor(1.0))
         # None is not part of the weights: files of networks with one output stay the same
         ratio_edges = torch.linspace(RATIO_LOWEST, RATIO_HIGHEST, RATIO_BINS + 1) if ratio else None
@@ -82,35 +74,17 @@ class HistogramRegressor(nn.Module):
 
     def forward(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, "batch 1"]:
         """Mean of the distribution: the safety margin."""
-        return (self.probabilities(images) @ self.centres)[:, None]
+        return (torch.softmax(self.split(self.backbone(images))[0] / self.temperature, dim=-1) @ self.centres)[:, None]
 
     def split(
         self, logits: Float[Tensor, "batch all_bins"]
     ) -> tuple[Float[Tensor, "batch bins"], Float[Tensor, "batch ratio_bins"]]:
         """Split logits into those over the margin and those over the ratio; the second may have no columns."""
-        bins = len(self.edges) - 1
-        return logits[:, :bins], logits[:, bins:]
+        return logits[:, :BINS], logits[:, BINS:]
 
-    def probabilities(self, images: Float[Tensor, "batch *input"]) -> Float[Tensor, "batch bins"]:
-        """Compute the distribution over the bins, at the fitted temperature."""
-        return torch.softmax(self.split(self.backbone(images))[0] / self.temperature, dim=-1)
 
-    def loss(
-        self,
-        images: Float[Tensor, "batch *input"],
-        labels: Float[Tensor, " batch"],
-        ratios: Float[Tensor, " batch"] | None = None,
-    ) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
-        """Compute the cross-entropy against each label as a Gaussian of the bins' width, and the predicted margins.
-
-        `ratios`: F_t / F_n of the frames; frames of unknown forces (NaN) count for the margin alone.
-        """
-        logits, ratio_logits = (part.float() for part in self.split(self.backbone(images)))
-        loss = functional.cross_entropy(logits, histogram_targets(labels, self.edges))
-        if self.ratio_edges is not None and ratios is not None and (finite := torch.isfinite(ratios)).any():
-            targets = histogram_targets(ratios[finite], self.ratio_edges)
-            loss = loss + functional.cross_entropy(ratio_logits[finite], targets)
-        return loss, torch.softmax(logits / self.temperature, dim=-1) @ self.centres
+RunBatches: TypeAlias = Callable[[Iterable[Tensor]], Iterator[tuple[Tensor, ...]]]
+"""Function from batches of images to the outputs of `Answers`, in the order of the batches."""
 
 
 class Answers(nn.Module):
@@ -199,11 +173,20 @@ def margin_loss(
     labels: Float[Tensor, " batch"],
     ratios: Float[Tensor, " batch"] | None = None,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, " batch"]]:
-    """Compute the training loss, cross-entropy for histograms, else mean squared error; and the predicted margins."""
-    if isinstance(model, HistogramRegressor):
-        return model.loss(images, labels, ratios)
-    margins = model(images).reshape(len(images)).float()
-    return functional.mse_loss(margins, labels), margins
+    """Compute the training loss and the predicted margins.
+
+    The loss is the mean squared error, or the cross-entropy of a histogram against each label as a Gaussian of the
+    bins' width. `ratios`: F_t / F_n of the frames; frames of unknown forces (NaN) count for the margin alone.
+    """
+    if not isinstance(model, HistogramRegressor):
+        margins = model(images).reshape(len(images)).float()
+        return functional.mse_loss(margins, labels), margins
+    logits, ratio_logits = (part.float() for part in model.split(model.backbone(images)))
+    loss = functional.cross_entropy(logits, histogram_targets(labels, model.edges))
+    if model.ratio_edges is not None and ratios is not None and (finite := torch.isfinite(ratios)).any():
+        targets = histogram_targets(ratios[finite], model.ratio_edges)
+        loss = loss + functional.cross_entropy(ratio_logits[finite], targets)
+    return loss, torch.softmax(logits / model.temperature, dim=-1) @ model.centres
 
 
 HEADS = {"point": 1, "histogram": BINS, "margin-and-ratio": BINS + RATIO_BINS}

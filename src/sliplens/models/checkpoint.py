@@ -1,5 +1,6 @@
 """Trained networks: with their manifest, on disk, and those that come with the package."""
 
+import hashlib
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -23,6 +24,7 @@ from sliplens.images import MOST_PIXELS, has_colour, require_rgb
 from sliplens.models.backbones import (
     Answers,
     HistogramRegressor,
+    RunBatches,
     answer_names,
     bin_centres,
     bin_edges,
@@ -40,6 +42,8 @@ from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, Shear, ShearEstimator, 
 
 WEIGHTS_FILE, SEQUENCE_FILE = "model.safetensors", "sequence.safetensors"
 SCHEMA_VERSION = 1
+MODULE = "module"
+"""`Manifest.head` of a wrapped module."""
 LARGEST_INPUT = 4096  # pixels along a side, several times what any backbone was made for
 
 
@@ -131,6 +135,11 @@ class Network:
         return next(self.model.parameters(), torch.empty(0)).device
 
     @property
+    def wrapped(self) -> bool:
+        """True for a module of others (`wrap`), which takes images of any size and has no intervals."""
+        return self.manifest.head == MODULE
+
+    @property
     def encoding(self) -> Encoding:
         """Encoding that the network was trained on."""
         return pick(ENCODINGS, self.manifest.input, noun="input")
@@ -147,8 +156,8 @@ class Network:
         return self.encoding.encode(frames, reference, image_size=self.manifest.image_size)
 
     def require_frame_size(self, size: tuple[int, ...], *, what: str = "frames") -> None:
-        """Refuse frames of another sensor."""
-        if tuple(size) != tuple(self.manifest.frame_size):
+        """Refuse frames of another sensor; a wrapped module takes any."""
+        if not self.wrapped and tuple(size) != tuple(self.manifest.frame_size):
             raise ImageError(
                 f"{what} are {size[0]} x {size[1]} pixels but the network was trained on "
                 f"{' x '.join(map(str, self.manifest.frame_size))}; use frames of its sensor, or fit these to it with "
@@ -160,6 +169,8 @@ class Network:
 
         A difference image is black but where something moved, a camera's is not.
         """
+        if self.wrapped:
+            return
         level, difference = float(np.median(frame)), self.encoding.empty_is_black
         if not difference and level < _DARKEST_FRAME and frame.any():
             raise ImageError(
@@ -229,9 +240,9 @@ class Network:
             return None
         return f"pulled outside the trained {range_words(trained)} (90 is down); {_TURN_CURE}"
 
-    def answers(self, batches: Iterable[Tensor]) -> tuple[Tensor, ...]:
-        """Compute the outputs (`Answers`) for batches of encoded frames, on the network's device."""
-        parts = Answers(self.model, self.feature_layer).run(batches)
+    def answers(self, batches: Iterable[Tensor], run: RunBatches | None = None) -> tuple[Tensor, ...]:
+        """Compute the outputs (`Answers`) for batches of encoded frames, on the network's device or by an engine."""
+        parts = (run or Answers(self.model, self.feature_layer).run)(batches)
         return tuple(torch.cat(answers) for answers in zip(*parts, strict=True))
 
     def predict(
@@ -255,15 +266,9 @@ class Network:
         return self.to_estimate(*self.answers(batches), friction=friction)
 
     @property
-    def novelty(self) -> Novelty | None:
-        """Measure of the strangeness of a frame; None for a network without one."""
-        novelty = self.manifest.novelty
-        return novelty if novelty is not None and novelty.strangeness else None
-
-    @property
     def feature_layer(self) -> str | None:
         """Layer whose features come with the outputs (`Answers`), for `novelty`."""
-        return None if self.novelty is None else self.novelty.layer
+        return self.manifest.novelty and self.manifest.novelty.layer
 
     def to_estimate(self, *answers: Tensor, friction: FrictionLike | None = None) -> "Estimate":
         """Make an estimate of outputs of the network (`Answers`), and of a friction if it is known."""
@@ -277,8 +282,8 @@ class Network:
             calibration=self.manifest.calibration,
             ratio=None if of_ratio is None else Ratio(probabilities=values["ratio_probabilities"], edges=of_ratio),
         )
-        if self.novelty is not None:  # before friction narrows the answer
-            estimate = replace(estimate, known=self.novelty.known(values["features"], estimate.sigma))
+        if self.manifest.novelty is not None:  # before friction narrows the answer
+            estimate = replace(estimate, known=self.manifest.novelty.known(values["features"], estimate.sigma))
         if friction is None:
             return estimate
         traction = self.require_ratio()
@@ -298,13 +303,12 @@ class Network:
             )
         return Follower(self.sequence, manifest)
 
-    def require_ratio(self, *, learns: bool = False) -> Traction:
-        """Return the calibration of F_t / F_n; `learns` says in the message that friction is learnt from slips."""
+    def require_ratio(self) -> Traction:
+        """Return the calibration of F_t / F_n, without which a friction cannot be used."""
         if self.manifest.traction is None:
-            why = "--same-object learns friction from F_t / F_n" if learns else "friction was told"
             raise InputError(
-                f"{why}, but this network answers with the margin alone and cannot use it; leave it out, or teach the "
-                "network F_t / F_n with `sliplens train DATA -o RUN --start-from NETWORK --recipe ratio`"
+                "this network answers with the margin alone and cannot use or learn a friction; leave it out, or teach "
+                "the network F_t / F_n with `sliplens train DATA -o RUN --start-from NETWORK --recipe ratio`"
             )
         return self.manifest.traction
 
@@ -362,9 +366,9 @@ class Estimate:
         """Select frames."""
         ratio = self.ratio and replace(self.ratio, probabilities=self.ratio.probabilities[rows])
         alone = self.alone and (self.alone[0][rows], self.alone[1])
-        parts = {name: getattr(self, name) for name in ("probabilities", "known")}
-        parts = {name: None if values is None else values[rows] for name, values in parts.items()}
-        return replace(self, margin=self.margin[rows], ratio=ratio, alone=alone, **parts)
+        values = {name: getattr(self, name) for name in ("margin", "probabilities", "known")}
+        parts = {name: value[rows] for name, value in values.items() if value is not None}
+        return replace(self, ratio=ratio, alone=alone, **parts)
 
     @property
     def sigma(self) -> Float[np.ndarray, " frames"] | None:
@@ -411,49 +415,50 @@ class Estimate:
 
     def with_friction(
         self,
-        friction: Friction,
+        friction: Friction | Float[np.ndarray, " frames"],
         *,
         trained_friction: Float[np.ndarray, " quantiles"],
         calibration: Calibration | None = None,
     ) -> "Estimate":
-        """Condition the margins on a friction (`condition_on_friction`); they then lie within [0, 1].
+        """Condition the margins on a friction, or that of each frame (`condition_on_friction`), within [0, 1].
 
         `calibration`: calibration of such margins; without it they have no intervals.
         """
         assert self.probabilities is not None
         assert self.edges is not None
         assert self.ratio is not None
-        probabilities = condition_on_friction(
-            self.probabilities,
-            self.ratio.probabilities,
-            edges=self.edges,
-            ratio_edges=self.ratio.edges,
-            friction=friction,
-            trained_friction=trained_friction,
-        )
-        # bins beyond 0 and 1 mean the ends
-        margin = probabilities @ np.clip(bin_centres(self.edges), 0, 1)
+        told = isinstance(friction, Friction)
+        probabilities, margin = np.empty_like(self.probabilities), np.empty_like(self.margin)
+        for value in [friction] if told else [Friction(float(value)) for value in np.unique(friction)]:
+            rows = np.full(len(margin), True) if told else friction == value.mean
+            probabilities[rows] = condition_on_friction(
+                self.probabilities[rows],
+                self.ratio.probabilities[rows],
+                edges=self.edges,
+                ratio_edges=self.ratio.edges,
+                friction=value,
+                trained_friction=trained_friction,
+            )
+            # bins beyond 0 and 1 mean the ends
+            margin[rows] = probabilities[rows] @ np.clip(bin_centres(self.edges), 0, 1)
         return replace(
-            self, margin=margin, probabilities=probabilities, calibration=calibration, friction=friction, alone=None
+            self,
+            margin=margin,
+            probabilities=probabilities,
+            calibration=calibration,
+            friction=friction if told else None,
+            alone=None,
         )
 
 
-def condition_each(
-    estimate: Estimate,
-    friction: Float[np.ndarray, " frames"],
-    *,
-    trained_friction: Float[np.ndarray, " quantiles"],
-    calibration: Calibration | None = None,
-) -> Estimate:
-    """Condition each frame on the exact friction of its trial."""
-    assert estimate.probabilities is not None
-    margin, probabilities = np.empty_like(estimate.margin), np.empty_like(estimate.probabilities)
-    for value in np.unique(friction):
-        rows = friction == value
-        part = estimate.at(rows).with_friction(Friction(float(value)), trained_friction=trained_friction)
-        assert part.probabilities is not None
-        margin[rows], probabilities[rows] = part.margin, part.probabilities
-    return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration)
+def hash_weights(model: nn.Module) -> str:
+    """Return the SHA-256 of all parameters and buffers of a network in memory."""
+    digest = hashlib.sha256()
+    for name, value in model.state_dict().items():
+        digest.update(name.encode())
+        if isinstance(value, Tensor):
+            digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
 
 
 def save_checkpoint(

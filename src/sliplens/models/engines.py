@@ -1,13 +1,11 @@
 """Engines: run a network many times, by torch or by OpenVINO, each checked against the network itself."""
 
-import hashlib
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TypeAlias
 from weakref import WeakKeyDictionary
 
 import torch
@@ -17,12 +15,10 @@ from torch import Tensor, nn
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import import_openvino, missing_packages
 from sliplens.friction import FrictionLike
-from sliplens.models.backbones import Answers, answer_names
-from sliplens.models.checkpoint import Estimate, Network
+from sliplens.models.backbones import Answers, RunBatches, answer_names
+from sliplens.models.checkpoint import Estimate, Network, hash_weights
 from sliplens.models.onnx import TOLERANCE, difference, trial_inputs
 
-RunBatches: TypeAlias = Callable[[Iterable[Tensor]], Iterator[tuple[Tensor, ...]]]
-"""Function from batches of images to the outputs of `Answers`, in the order of the batches."""
 ENGINES = ("torch", "openvino")
 """Names of the engines. `torch` runs the network itself; `openvino` a copy converted for the processor."""
 _CONVERSION_PAYS_AFTER = 1000
@@ -56,8 +52,7 @@ class Engine:
         A batch may be encoded while the one before is worked on. `network` is that of this engine.
         """
         batches = inputs.split(self.batch_size) if isinstance(inputs, Tensor) else inputs
-        answers = zip(*self.answers(batches), strict=True)
-        return network.to_estimate(*(torch.cat(parts) for parts in answers), friction=friction)
+        return network.to_estimate(*network.answers(batches, self.answers), friction=friction)
 
 
 _EXPECTED: ContextVar[int | None] = ContextVar("expected_passes", default=None)
@@ -183,7 +178,7 @@ def _openvino_engine(
     # measured on two cores: 16 images of 112 px and 4 of 224 px are the fastest, more of them leave the caches
     batch_size = batch_size or min(16, max(4, 16 * 112**2 // (images.shape[-2] * images.shape[-1])))
     threads = torch.get_num_threads()
-    settings = (batch_size, streams, layer, threads, tuple(images.shape[1:]), _hash_weights(model))
+    settings = (batch_size, streams, layer, threads, tuple(images.shape[1:]), hash_weights(model))
     if model not in _CONVERTED or _CONVERTED[model][0] != settings:
         openvino = import_openvino()
         shape = (batch_size, *images.shape[1:])
@@ -233,11 +228,3 @@ def _openvino_engine(
 
         _CONVERTED[model] = settings, Engine(name="openvino", batch_size=batch_size, answers=run)
     return _CONVERTED[model][1]
-
-
-def _hash_weights(model: nn.Module) -> str:
-    digest = hashlib.blake2b()
-    for name, tensor in model.state_dict().items():
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().contiguous().flatten().view(torch.uint8).numpy())
-    return digest.hexdigest()

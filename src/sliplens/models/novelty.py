@@ -49,9 +49,8 @@ class Novelty:
     spread_limit: float | None = None
     """Standard deviation of the prediction that the same frames stay below, in margin units; None for a network with
     one number as its output."""
-    strangeness: tuple[float, ...] = ()
-    """Values of `measure_strangeness` that 100, 80, 50, 30, 20, 10, 5, 2, 1 and 0.5 % of the validation frames reach;
-    empty if never measured (`benchmarks/health.py --fit`)."""
+    strangeness: tuple[float, ...] = _SHARES
+    """Values of `measure_strangeness` that each share of `_SHARES` of the validation frames reaches."""
 
     def __post_init__(self) -> None:
         width = len(self.mean)
@@ -59,8 +58,8 @@ class Novelty:
             raise ValueError("mean, scale and directions of features are of different lengths")
         if not min(*self.scale, *self.variances, self.rest, 1.0) > 0:
             raise ValueError("deviations and variances of features are positive")
-        if len(self.strangeness) not in {0, len(_SHARES)} or not self.limit > 0:
-            raise ValueError(f"strangeness has no or {len(_SHARES)} levels, and its limit is positive")
+        if len(self.strangeness) != len(_SHARES) or not self.limit > 0:
+            raise ValueError(f"strangeness has {len(_SHARES)} levels, and its limit is positive")
 
     def distance(self, features: Float[np.ndarray, "frames features"]) -> Float[np.ndarray, " frames"]:
         """Compute the distance of features from those of healthy frames."""

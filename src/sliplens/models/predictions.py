@@ -10,7 +10,6 @@ from typing import TypeAlias, Unpack
 
 import numpy as np
 import pyarrow as pa
-import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
@@ -227,12 +226,13 @@ def predict(
     if isinstance(recordings, Network | nn.Module):
         raise InputError("there is no source; name a data set, a folder of images, a video, or frames")
     prior = None if friction is None else as_friction(friction)
-    if (sensor := options.get("sensor")) is not None:
-        source_options["sensor"] = load_profile(sensor)
+    profile = options.get("sensor")
+    if profile is not None:
+        source_options["sensor"] = profile = load_profile(profile)
     with reporting(on_progress):
         with open_stage("Opening the source"):
             trials = open_trials(recordings, on=on, resumable=path is not None, **source_options)
-        profile = source_options.get("sensor") or _recorded_profile(trials.source)
+        profile = profile or _recorded_profile(trials.source)
         if network is None:
             name, origin = _choose_network(trials.kinds, profile)
             add_note(f"no network was named, so {name} reads it, {origin}")
@@ -365,7 +365,7 @@ def _schema(network: Network, trials: Sequence[Capture], metadata: dict[str, str
     present = {
         "file": any(trial.files is not None for trial in trials),
         "safety_margin": any(trial.safety_margin is not None for trial in trials),
-        "known": network.novelty is not None,
+        "known": network.manifest.novelty is not None,
         **dict.fromkeys(("traction_ratio", "traction_ratio_sigma"), network.manifest.traction is not None),
         "touches": all(trial.read_reference or _contact_states(trial) for trial in trials),
         **dict.fromkeys(_FORCES, any(trial.labels is not None for trial in trials)),
@@ -410,23 +410,19 @@ class _Prediction(Work):
         reference = None if capture.read_reference is None else capture.read_reference()
         check, size = _make_check(network, capture, reference), tuple(network.manifest.frame_size)
         encode = partial(network.encoding.encode, reference=reference, image_size=network.manifest.image_size)
+
+        def batches(some: Iterator[tuple[int, Frame]], checks: list[tuple[bool, str | None]]) -> Iterator[Tensor]:
+            while batch := list(islice(some, engine.batch_size)):
+                checks.extend(check(number, frame) for number, frame in batch)
+                images = np.stack([frame for _, frame in batch])
+                if images.shape[1:3] != size:
+                    network.require_frame_size(images.shape[1:3])
+                yield encode(images)
+                report_progress(batch[-1][0] + 1 - first, count)
+
         for begin in range(first, first + count, LONGEST):
             checks: list[tuple[bool, str | None]] = []
-
-            def batches(checks: list[tuple[bool, str | None]] = checks) -> Iterator[Tensor]:
-                some = islice(frames, LONGEST)
-                while batch := list(islice(some, engine.batch_size)):
-                    checks.extend(check(number, frame) for number, frame in batch)
-                    images = np.stack([frame for _, frame in batch])
-                    if images.shape[1:3] != size:
-                        network.require_frame_size(images.shape[1:3])
-                    yield encode(images)
-
-            answers = []
-            for answer in engine.answers(batches()):
-                answers.append([part.cpu() for part in answer])
-                report_progress(begin - first + len(checks), count)
-            estimate = network.to_estimate(*map(torch.cat, zip(*answers, strict=True)), friction=self.friction)
+            estimate = engine.estimate(network, batches(islice(frames, LONGEST), checks), friction=self.friction)
             touches = np.array([touch for touch, _ in checks])
             # of a strange picture the direction of the shear says nothing
             withheld = [

@@ -1,8 +1,6 @@
 """Networks of others: any PyTorch module with one number an image as its output."""
 
-import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,7 +10,7 @@ from torch import Tensor, nn
 
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import pick
-from sliplens.models.checkpoint import Manifest, Network, load
+from sliplens.models.checkpoint import Manifest, Network, hash_weights, load
 from sliplens.models.encodings import ENCODINGS
 
 Preprocess: TypeAlias = Callable[[Tensor], Tensor]
@@ -54,17 +52,6 @@ class OneOutput(nn.Module):
                 "image with output=, such as output=0"
             )
         return values.reshape(len(images))
-
-
-@dataclass(frozen=True, kw_only=True, repr=False)
-class WrappedNetwork(Network):
-    """Network of others, which takes frames of any size and has no intervals."""
-
-    def require_frame_size(self, size: tuple[int, ...], *, what: str = "frames") -> None:
-        """Accept frames of any size; they are resized."""
-
-    def require_kind(self, frame: object, *, what: str) -> None:
-        """Accept images of any brightness."""
 
 
 def wrap(
@@ -123,12 +110,12 @@ def wrap(
     try:
         with torch.no_grad():
             model(torch.zeros(2, row.colours, size, size, device=device))
-    except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError) as error:
+    except Exception as error:  # whatever a module of others raises
         raise ModelError(
             f"the module does not run on images of shape (2, {row.colours}, {size}, {size}): {error}; set size=, or "
             "preprocess= for what it needs before it"
         ) from error
-    return WrappedNetwork(
+    return Network(
         model=model,
         manifest=Manifest(
             backbone=type(module).__name__,
@@ -140,7 +127,7 @@ def wrap(
             head="module",
             target="output",
             unit=unit,
-            weights_sha256=_hash_weights(module),
+            weights_sha256=hash_weights(module),
         ),
     )
 
@@ -156,13 +143,3 @@ def open_run(run: object, *, device: str = "cpu", preprocess: Preprocess | None 
             f"{type(run).__name__} is no network; give a network, its folder, its name or a PyTorch module first"
         )
     return run if isinstance(run, Network) else load(run, device=device)
-
-
-def _hash_weights(module: nn.Module) -> str:
-    """Return the SHA-256 of all parameters and buffers, by which an explanation names its network."""
-    digest = hashlib.sha256()
-    for name, value in module.state_dict().items():
-        digest.update(name.encode())
-        if isinstance(value, Tensor):
-            digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()

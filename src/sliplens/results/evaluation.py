@@ -213,8 +213,6 @@ class Evaluation(Result):
     trials: dict[str, RegressionScores]
     reliability: dict[str, Reliability]
     """Coverage of the intervals by condition."""
-    wet_auroc: float | None
-    """How often the uncertainty of a wet frame is above that of a dry one; None without both, or without a spread."""
     lead_times: dict[str, LeadTimes]
     """Warnings by condition."""
     predictions: ScoredFrames

@@ -75,7 +75,7 @@ class TrainingConfig:
 
 
 class TrainingChanges(TypedDict, total=False):
-    """Fields of `TrainingConfig` that a call may change; None leaves a field as the recipe has it."""
+    """Options of `train`: fields of `TrainingConfig`, None for those of the recipe, and `accelerator`."""
 
     backbone: str | None
     head: str | None
@@ -92,6 +92,7 @@ class TrainingChanges(TypedDict, total=False):
     epoch_frames: int | None
     patience: int | None
     seed: int | None
+    accelerator: Literal["auto", "cpu", "gpu"]
 
 
 RECIPES = {
@@ -133,11 +134,6 @@ squared error, 25 epochs, batches of 124, 224 x 224 pixels, a learning rate of 8
 checkpoint on validation, rotation, noise and blur. `default` is ours; docs/networks.md has the reasons. `ratio` teaches
 an existing network its second output, F_t / F_n, `sequence` a head for several frames, and `adapt` another sensor from
 few trials, all in minutes."""
-
-
-def get_recipe(name: str) -> TrainingConfig:
-    """Look up a recipe by name."""
-    return pick(RECIPES, name, noun="recipe")
 
 
 PROJECT = "sliplens"

@@ -12,7 +12,7 @@ from sliplens.errors import RecordingError
 from sliplens.files import output_folder
 from sliplens.friction import Friction, FrictionLike, as_friction
 from sliplens.models import Network
-from sliplens.models.checkpoint import Estimate, condition_each
+from sliplens.models.checkpoint import Estimate
 from sliplens.models.sequence import require_frequent
 from sliplens.models.wrapping import open_run
 from sliplens.progress import OnProgress, add_note, open_stage, report_file, reporting
@@ -141,7 +141,7 @@ def evaluate_frames(
             raise RecordingError("not every trial has a coefficient of friction; set it with --friction")
         quantiles = np.array(traction.friction)
         estimate = network.estimate(batches)
-        estimate = condition_each(estimate, frames.friction, trained_friction=quantiles, calibration=traction.told)
+        estimate = estimate.with_friction(frames.friction, trained_friction=quantiles, calibration=traction.told)
     else:
         estimate = network.estimate(batches, friction=friction)
     if sequence:
@@ -166,10 +166,9 @@ def evaluate_frames(
     labels = predictions.safety_margin
     conditions = {name: predictions.condition == name for name in sorted(set(frames.condition))}
     trials = {name: predictions.trial == name for name in dict.fromkeys(frames.trial)}
-    wet, dry = conditions.get("wet"), conditions.get("dry")
 
     def score(groups: dict[str, Bool[np.ndarray, " frames"]]) -> dict[str, RegressionScores]:
-        return {name: score_predictions(predictions.where(rows)) for name, rows in groups.items()}
+        return {name: regression_scores(predictions.where(rows)) for name, rows in groups.items()}
 
     def reliability(rows: Bool[np.ndarray, " frames"]) -> Reliability:
         covered = {level: (low <= labels) & (labels <= high) for level, (low, high) in intervals.items()}
@@ -182,8 +181,7 @@ def evaluate_frames(
         conditions=score(conditions),
         trials=score(trials),
         reliability={name: reliability(rows) for name, rows in conditions.items()},
-        wet_auroc=None if sigma is None or wet is None or dry is None else auroc(sigma[wet], sigma[dry]),
-        lead_times={name: find_lead_times(predictions.where(rows)) for name, rows in conditions.items()},
+        lead_times={name: lead_times(predictions.where(rows)) for name, rows in conditions.items()},
         predictions=predictions,
         risk=risk_coverage(
             np.abs(predictions.prediction - predictions.safety_margin),
@@ -215,12 +213,14 @@ def _follow_trials(
 
 def _ratio_r2(ratio: Float[np.ndarray, " frames"], frames: FrameSet) -> dict[str, float | None]:
     truth, condition = frames.traction_ratio.double().numpy(), np.array(frames.condition)
-    scores: dict[str, float | None] = {}
-    for name in sorted(set(frames.condition)):
-        rows = (condition == name) & np.isfinite(truth)
-        variance = float(truth[rows].var()) if rows.any() else 0.0
-        scores[name] = 1 - float(np.mean((ratio - truth)[rows] ** 2)) / variance if variance > 0 else None
-    return scores
+    rows = {name: (condition == name) & np.isfinite(truth) for name in sorted(set(frames.condition))}
+    return {name: _r2(truth[here], ratio[here]) for name, here in rows.items()}
+
+
+def _r2(truth: Float[np.ndarray, " _"], predicted: Float[np.ndarray, " _"]) -> float | None:
+    """Compute the share of the variance that is explained; None where nothing varies."""
+    spread = np.sum((truth - truth.mean()) ** 2) if len(truth) else 0.0
+    return float(1 - np.sum((predicted - truth) ** 2) / spread) if spread > 0 else None
 
 
 def auroc(positive: Float[np.ndarray, " _"], negative: Float[np.ndarray, " _"]) -> float | None:
@@ -269,21 +269,14 @@ _FALSE_ABOVE = 2.0
 """An alarm that begins while the true margin is above so many thresholds is false, not early."""
 
 
-def lead_times(
-    trial: Sequence[str],
-    time_s: Float[np.ndarray, " frames"],
-    labels: Float[np.ndarray, " frames"],
-    predictions: Float[np.ndarray, " frames"],
-    *,
-    threshold: float = THRESHOLD,
-) -> LeadTimes:
+def lead_times(predictions: ScoredFrames, *, threshold: float = THRESHOLD) -> LeadTimes:
     """Measure warnings, predictions below a threshold in margin units, on the labelled frames of some trials.
 
     A slip is the first frame of a trial with margin 0; what comes after is left out.
     """
-    names = np.array(trial)
+    names, time_s, labels = predictions.trial, predictions.time_s, predictions.safety_margin
     leads, ideals, slips, false, minutes = [], [], 0, 0, 0.0
-    for name in dict.fromkeys(trial):
+    for name in dict.fromkeys(names.tolist()):
         rows = np.flatnonzero(names == name)
         order = rows[np.argsort(time_s[rows], kind="stable")]
         slipped = labels[order] <= 0
@@ -291,7 +284,7 @@ def lead_times(
         before = order if slips_at is None else order[:slips_at]
         if not len(before):
             continue
-        alarms = predictions[before] < threshold
+        alarms = predictions.prediction[before] < threshold
         begins = np.flatnonzero(alarms & ~np.insert(alarms[:-1], 0, False))
         is_false = labels[before][begins] > _FALSE_ABOVE * threshold
         false += int(is_false.sum())
@@ -319,42 +312,21 @@ def lead_times(
 _BINS = 10
 
 
-def regression_scores(
-    labels: Float[np.ndarray, " frames"], predictions: Float[np.ndarray, " frames"], *, trials: int = 1
-) -> RegressionScores:
-    """MSE, R2, MAE and the MSE in ten bins of the safety margin (Polak, Table 1 and Fig. 7).
-
-    `RecordingError` if there is no frame, or a label lies outside [0, 1].
-    """
-    if len(labels) == 0:
-        raise RecordingError("there is no labelled frame to evaluate; check the split and the condition")
-    if not np.all((labels >= 0) & (labels <= 1)):
-        raise RecordingError("labels must lie in [0, 1]; give the safety margin as a fraction, not in percent")
-    squared = (predictions - labels) ** 2
-    spread = np.sum((labels - labels.mean()) ** 2)
+def regression_scores(predictions: ScoredFrames) -> RegressionScores:
+    """MSE, R2, MAE and the MSE in ten bins of the safety margin (Polak, Table 1 and Fig. 7)."""
+    labels, error = predictions.safety_margin, predictions.prediction - predictions.safety_margin
     # times ten, rounded: 0.3 * 10 must fall in bin 3 although 0.3 is not exact in binary
     bins = np.minimum(np.floor(np.round(labels * _BINS, 9)), _BINS - 1)
-    errors = [squared[bins == index] for index in range(_BINS)]
+    errors = [error[bins == index] ** 2 for index in range(_BINS)]
     means = [float(inside.mean()) if len(inside) else None for inside in errors]
     return RegressionScores(
         frames=len(labels),
-        trials=trials,
-        mse=float(squared.mean()),
-        r2=float(1 - squared.sum() / spread) if spread > 0 else None,
-        mae=float(np.abs(predictions - labels).mean()),
+        trials=len(set(predictions.trial.tolist())),
+        mse=float((error**2).mean()),
+        r2=_r2(labels, predictions.prediction),
+        mae=float(np.abs(error).mean()),
         bins=tuple(
             BinScore(low=index / _BINS, high=(index + 1) / _BINS, frames=len(errors[index]), mse=means[index])
             for index in range(_BINS)
         ),
     )
-
-
-def score_predictions(predictions: ScoredFrames) -> RegressionScores:
-    """Errors of some predictions against their labels."""
-    count = len(set(predictions.trial.tolist()))
-    return regression_scores(predictions.safety_margin, predictions.prediction, trials=count)
-
-
-def find_lead_times(predictions: ScoredFrames) -> LeadTimes:
-    """Warnings of some predictions, see `lead_times`."""
-    return lead_times(predictions.trial.tolist(), predictions.time_s, predictions.safety_margin, predictions.prediction)

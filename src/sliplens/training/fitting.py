@@ -2,11 +2,11 @@
 
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from typing import Literal, Unpack
+from typing import Unpack
 
 import lightning
 import numpy as np
@@ -32,7 +32,7 @@ from sliplens.models.backbones import (
     with_reference,
 )
 from sliplens.models.calibration import Calibration, Traction, calibrate_histogram, conformal_calibration
-from sliplens.models.checkpoint import Estimate, Ratio, condition_each, sensor_kind
+from sliplens.models.checkpoint import Estimate, Ratio, sensor_kind
 from sliplens.models.encodings import ENCODINGS, Encoding
 from sliplens.models.novelty import fit_novelty
 from sliplens.progress import OnProgress, add_note, open_stage, report_each, report_file, reporting
@@ -41,7 +41,7 @@ from sliplens.recordings.dataset import load_dataset
 from sliplens.recordings.trial import Recording
 from sliplens.results.evaluation import Training
 from sliplens.shear import FULL_CIRCLE, Shear, ShearEstimator, enclosing_range
-from sliplens.training.config import TrainingChanges, TrainingConfig, get_recipe, open_logger
+from sliplens.training.config import RECIPES, TrainingChanges, TrainingConfig, open_logger
 from sliplens.training.data import (
     EpochShuffle,
     FrameSet,
@@ -55,7 +55,7 @@ from sliplens.training.module import (
     Patience,
     Progress,
     Regressor,
-    learning_curve,
+    describe_training,
     make_trainer,
     run_trainer,
 )
@@ -70,6 +70,8 @@ _KIND = {
     "sequence": ("backbone", "head", "image_size"),
 }
 """Properties that a network keeps from the network it starts from, by `TrainingConfig.learns`."""
+_KEEP_PREDICTIONS = {"ratio", "sequence"}
+"""Values of `learns` that leave the predictions of the network to start from as they are."""
 _SEQUENCE_TAKES = {"epochs", "batch_size", "learning_rate", "weight_decay", "seed"}
 """Settings that apply to the training of a head for several frames."""
 _DIRECTION_TRIALS, _DIRECTION_FRAMES, _LEAST_DIRECTIONS = 40, 5, 3
@@ -79,24 +81,6 @@ _PULLED, _SURE, _DIRECTION_MARGIN_DEG = 0.6, 5.0, 10.0
 11 degrees; and what a range is widened by at both ends, for that and for directions that no trial had."""
 _NOVELTY_FRAMES = 2000
 """Largest number of frames that `Novelty` is fitted on."""
-
-
-class _Options(TrainingChanges, total=False):
-    """Options of `train` besides its own parameters."""
-
-    accelerator: Literal["auto", "cpu", "gpu"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class DataOrigin:
-    """Facts of the training data, for the manifest of a network."""
-
-    frame_size: tuple[int, int]
-    sensor: str
-    data_hash: str
-    colour: bool | None = None
-    pull_direction_deg: tuple[float, float] | None = None
-    trained_on: tuple[str, ...] = ()
 
 
 def train(
@@ -110,7 +94,7 @@ def train(
     logger: str = "csv",
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
-    **options: Unpack[_Options],
+    **options: Unpack[TrainingChanges],
 ) -> Network:
     """Train a network on a data set, and keep the weights that are best on its validation trials.
 
@@ -162,7 +146,12 @@ def train(
         raise InputError("a head of several frames writes metrics.csv alone; leave out --logger")
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = pick(ENCODINGS, input, noun="input"), _choose_trials(data, condition)
-    if start is not None and "head" not in changes and config.head == "margin-and-ratio" and not _stays(config):
+    if (
+        start is not None
+        and "head" not in changes
+        and config.head == "margin-and-ratio"
+        and config.learns not in _KEEP_PREDICTIONS
+    ):
         # the second output is left out where the labels do not show the ratio
         labelled = all(any(has_ratio(data.read_labels(info)) for info in some) for some in trials)
         config = config if labelled else replace(config, head="histogram")
@@ -180,7 +169,12 @@ def train(
             with open_stage(f"Reading validation trials ({encoding.name})"):
                 validation = load_some(trials[1])
             info = trials[0][0]
-            facts = DataOrigin(
+            manifest = Manifest(
+                backbone=config.backbone,
+                head=config.head,
+                recipe=config.recipe,
+                input=encoding.name,
+                image_size=config.image_size,
                 frame_size=(info.height, info.width),
                 sensor=info.sensor,
                 data_hash=data.hash,
@@ -189,7 +183,7 @@ def train(
                 trained_on=tuple(trial.sha256[:12] for some in trials for trial in some),
             )
             training = fit(
-                config, train_frames, validation, folder, origin=facts, start=start, trainer=trainer, logger=opened
+                config, train_frames, validation, folder, manifest, start=start, trainer=trainer, logger=opened
             )
         return replace(training, condition=condition)
 
@@ -218,13 +212,13 @@ def train(
 
 def _configure(recipe: str, changes: TrainingChanges, start: Network | None) -> TrainingConfig:
     """Apply changes to a recipe; properties of a network to start from stay unless they are changed."""
-    config = replace(get_recipe(recipe), **changes)
+    config = replace(pick(RECIPES, recipe, noun="recipe"), **changes)
     if start is None:
         if config.learns != "all":
             raise InputError(f"the recipe {recipe} teaches an existing network; name it with --start-from")
         return config
     fixed = {name: getattr(start.manifest, name) for name in _KIND[config.learns]}
-    for name, value in sorted(changes.items()) if _stays(config) else ():
+    for name, value in sorted(changes.items()) if config.learns in _KEEP_PREDICTIONS else ():
         expected = fixed.get(name, value)
         if value != expected or (config.learns == "sequence" and name not in _SEQUENCE_TAKES | fixed.keys()):
             why = f"whose {name} is {expected}" if name in fixed else "and takes no such option"
@@ -233,11 +227,6 @@ def _configure(recipe: str, changes: TrainingChanges, start: Network | None) -> 
                 f"the recipe {recipe} leaves the network of --start-from as it is, {why}; leave out {option}"
             )
     return replace(config, **fixed | changes)
-
-
-def _stays(config: TrainingConfig) -> bool:
-    """Return True if the predictions of the network to start from stay as they are."""
-    return config.learns in {"ratio", "sequence"}
 
 
 def _choose_trials(data: Dataset, condition: str | None) -> tuple[tuple[TrialInfo, ...], tuple[TrialInfo, ...]]:
@@ -266,7 +255,7 @@ def trained_directions(
 
     None where too few trials show a direction: no margin is then withheld for its direction.
     """
-    if start is not None and _stays(config):
+    if start is not None and config.learns in _KEEP_PREDICTIONS:
         return start.manifest.pull_direction_deg
     augmentation = get_augmentation(config.augmentation)
     turned_deg = getattr(augmentation, "rotation_deg", 0.0)
@@ -354,7 +343,7 @@ def calibrate(
         calibration=None,
         ratio=Ratio(probabilities=ratio_probabilities, edges=model.ratio_edges.double().cpu().numpy()),
     )
-    estimate = condition_each(estimate, validation.friction[rows], trained_friction=friction)
+    estimate = estimate.with_friction(validation.friction[rows], trained_friction=friction)
     with_friction = conformal_calibration(
         estimate.margin, estimate.probabilities, edges, labels[finite], temperature=calibration.temperature
     )
@@ -366,8 +355,8 @@ def fit(
     train: FrameSet,
     validation: FrameSet,
     folder: Path,
+    manifest: Manifest,
     *,
-    origin: DataOrigin,
     start: Network | None = None,
     trainer: lightning.Trainer | None = None,
     logger: Logger | None = None,
@@ -376,13 +365,15 @@ def fit(
 
     Parameters
     ----------
-    config, origin
-        Settings of the training, and facts of the data for the manifest.
+    config
+        Settings of the training.
     train, validation
         Encoded frames, of trials that do not overlap.
     folder
         Gets `model.safetensors`, `manifest.json` and `metrics.csv`; while training runs also checkpoints, from which a
         call with the same folder continues.
+    manifest
+        Facts of the data and the network, to be completed by calibration and origin.
     start
         Network whose weights it starts from, instead of random ones; it is left as it is.
     trainer, logger
@@ -446,13 +437,9 @@ def fit(
             )
         else:  # the last layer alone was trained: the early layers stay as they were
             novelty = learnt.novelty
-        manifest = Manifest(
-            backbone=config.backbone,
-            head=config.head,
-            recipe=config.recipe,
-            input=train.encoding.name,
-            image_size=config.image_size,
-            **{**vars(origin), "trained_on": (*origin.trained_on, *(start.manifest.trained_on if start else ()))},
+        complete = replace(
+            manifest,
+            trained_on=(*manifest.trained_on, *(start.manifest.trained_on if start else ())),
             started_from=start.manifest.weights_sha256 if start else "",
             versions=versions(),
             metrics={"validation_mse": calibration.mse},
@@ -460,7 +447,7 @@ def fit(
             traction=traction,
             novelty=novelty,
         )
-        save_checkpoint(folder, model, manifest)
+        save_checkpoint(folder, model, complete)
         # as the file itself has it: after a crash between two files the callback may remember an older one
         return float(checkpoint["callbacks"][best.state_key]["current_score"])
 
@@ -474,20 +461,15 @@ def fit(
             f"{error} (the best network so far, of validation MSE {save_best():.4g}, is in {folder})"
         ) from None
     late = config.max_minutes is not None and progress.step < progress.steps
-    training = Training(
-        input=train.encoding.name,
-        backbone=config.backbone,
-        image_size=config.image_size,
-        frame_size=origin.frame_size,
-        train_frames=len(train),
-        validation_frames=len(validation),
-        seed=config.seed,
-        best_validation_mse=save_best(),
-        epochs=progress.rows[-1][0],
+    training = describe_training(
+        manifest,
+        config,
+        progress.rows,
+        frames=(len(train), len(validation)),
+        parameters=sum(value.numel() for value in model.parameters()),
         minutes=progress.minutes,
         stopped_by="no gain" if early and early[0].stopped_epoch else "time limit" if late else "epochs",
-        parameters=sum(value.numel() for value in model.parameters()),
-        curve=learning_curve(progress.rows),
+        best_validation_mse=save_best(),
     )
     shutil.rmtree(folder / "checkpoints")
     return training
@@ -529,7 +511,7 @@ def require_same_kind(start: Network, config: TrainingConfig, encoding: str) -> 
         existing = getattr(start.manifest, name)
         # a second answer can be learnt beside the first or left out, and the reference be seen beside the frame; not
         # by a last layer alone: the first answer would stay as it was for other images
-        paired = value == "pair" and existing in REFERENCE_SIGNS and not _stays(config)
+        paired = value == "pair" and existing in REFERENCE_SIGNS and config.learns not in _KEEP_PREDICTIONS
         changed = {existing, value} == {"histogram", "margin-and-ratio"}
         if existing != value and not (paired or changed):
             raise ModelError(

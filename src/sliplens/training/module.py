@@ -25,8 +25,9 @@ from torch.utils.data import DataLoader
 from sliplens.errors import InputError, ModelError
 from sliplens.files import whole_file
 from sliplens.models.backbones import BINS, Answers, bin_centres, last_layer, margin_loss, ratio_edges
+from sliplens.models.checkpoint import Manifest
 from sliplens.progress import report_progress
-from sliplens.results.evaluation import LearningCurve
+from sliplens.results.evaluation import LearningCurve, Training
 from sliplens.training.config import TrainingConfig
 from sliplens.training.data import Augmentation
 
@@ -193,10 +194,34 @@ def add_row(rows: list[list[float]], row: list[float], file: Path) -> None:
     part.replace(file)
 
 
-def learning_curve(rows: list[list[float]]) -> LearningCurve:
-    """Make the record of rows of epoch, training MSE, validation MSE and minutes."""
-    epoch, train, validation, minutes = np.array(rows, dtype=np.float64).reshape(-1, 4).T
-    return LearningCurve(epoch=epoch, train_mse=train, validation_mse=validation, minutes=minutes)
+def describe_training(
+    manifest: Manifest,
+    config: TrainingConfig,
+    rows: list[list[float]],
+    *,
+    frames: tuple[int, int],
+    parameters: int,
+    minutes: float,
+    best_validation_mse: float,
+    stopped_by: str = "epochs",
+) -> Training:
+    """Make the record of a training; `frames`: numbers of training and validation frames, `rows` those of `add_row`."""
+    epoch, train, validation, until = np.array(rows, dtype=np.float64).reshape(-1, 4).T
+    return Training(
+        input=manifest.input,
+        backbone=manifest.backbone,
+        image_size=manifest.image_size,
+        frame_size=manifest.frame_size,
+        train_frames=frames[0],
+        validation_frames=frames[1],
+        seed=config.seed,
+        epochs=rows[-1][0],
+        minutes=minutes,
+        stopped_by=stopped_by,
+        best_validation_mse=best_validation_mse,
+        parameters=parameters,
+        curve=LearningCurve(epoch=epoch, train_mse=train, validation_mse=validation, minutes=until),
+    )
 
 
 class Patience(EarlyStopping):

@@ -32,7 +32,7 @@ from sliplens.progress import open_stage, report_each
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.results.evaluation import Training
 from sliplens.training.config import TrainingConfig
-from sliplens.training.module import add_row, learning_curve
+from sliplens.training.module import add_row, describe_training
 
 _MOST_GRADIENT = 1.0
 """Largest norm of a gradient, as recurrent networks want it."""
@@ -48,11 +48,14 @@ class TrialOutputs:
     label: Float[np.ndarray, " frames"]
     time_s: Float[np.ndarray, " frames"]
 
+    def at(self, rows: slice | list[int]) -> "TrialOutputs":
+        """Return some frames."""
+        return TrialOutputs(**{name: values[rows] for name, values in vars(self).items()})
+
     def before_gap(self) -> "TrialOutputs":
         """Return the frames before the first gap; the frames after it keep the predictions of single frames."""
         gaps = np.flatnonzero(np.diff(self.time_s) > GAP_S + ROUNDING_S)
-        end = gaps[0] + 1 if len(gaps) else None
-        return TrialOutputs(**{name: values[:end] for name, values in vars(self).items()})
+        return self.at(slice(gaps[0] + 1 if len(gaps) else None))
 
     def steps(self, step_s: float = STEP_S, *, late_s: float = 0.0) -> "TrialOutputs":
         """Return the frames at which memory takes its steps; the first step is `late_s` after the beginning.
@@ -65,7 +68,7 @@ class TrialOutputs:
             if now_s >= next_s - ROUNDING_S or then_s > ends_s:
                 rows.append(row)
                 next_s, ends_s = now_s + step_s, now_s + GAP_S + ROUNDING_S
-        return TrialOutputs(**{name: values[rows] for name, values in vars(self).items()})
+        return self.at(rows)
 
     def sample(self, rng: np.random.Generator) -> "TrialOutputs":
         """Draw steps of a random rate, half of them from a later frame on.
@@ -130,20 +133,14 @@ def fit_sequence(
     )
     save_checkpoint(folder, model, manifest, sequence=head)
     shutil.rmtree(folder / "outputs")
-    return Training(
-        input=manifest.input,
-        backbone=manifest.backbone,
-        image_size=manifest.image_size,
-        frame_size=manifest.frame_size,
-        train_frames=sum(len(trial.label) for trial in train),
-        validation_frames=len(labels),
-        seed=config.seed,
-        epochs=float(config.epochs),
-        minutes=rows[-1][3],
-        stopped_by="epochs",
-        best_validation_mse=min(row[2] for row in rows),
+    return describe_training(
+        manifest,
+        config,
+        rows,
+        frames=(sum(len(trial.label) for trial in train), len(labels)),
         parameters=sum(values.numel() for values in head.parameters()),
-        curve=learning_curve(rows),
+        minutes=rows[-1][3],
+        best_validation_mse=min(row[2] for row in rows),
     )
 
 
