@@ -19,7 +19,7 @@ import sliplens as sl
 from sliplens.errors import ImageError
 from sliplens.live.contract import LiveSource
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
-from sliplens.markers import TrackedFrame, Tracker
+from sliplens.markers import Tracker, Tracks
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.source import open_source
 
@@ -169,7 +169,7 @@ class Strict:
     def __init__(self, reference: np.ndarray) -> None:
         assert reference.shape == (48, 48, 3)
 
-    def check(self, frame: LiveFrame, _: TrackedFrame | None) -> tuple[Check, ...]:
+    def check(self, frame: LiveFrame, _: Tracks | None) -> tuple[Check, ...]:
         odd = frame.number % 2
         return (Check(name="even", value=float(odd), limit=0.0, ok=not odd, sentence="odd; wait for the next"),)
 
@@ -191,7 +191,7 @@ class Lenient:
     def __init__(self, reference: np.ndarray) -> None:
         self.reference = reference
 
-    def check(self, _: LiveFrame, __: TrackedFrame | None) -> tuple[Check, ...]:
+    def check(self, _: LiveFrame, __: Tracks | None) -> tuple[Check, ...]:
         return ()
 
 

@@ -18,7 +18,7 @@ from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.health import HealthMonitor, check_direction, check_novelty, margin_risk
 from sliplens.live.reading import OFF, Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
 from sliplens.live.slip import SlipDetector
-from sliplens.markers import TrackedFrame, Tracker
+from sliplens.markers import Tracker, Tracks
 from sliplens.models.checkpoint import Network
 from sliplens.models.engines import Engine
 from sliplens.models.predictions import LEVEL
@@ -33,7 +33,7 @@ from sliplens.shear import ShearEstimator
 class HealthWatch(Protocol):
     """Checks frames against a reference."""
 
-    def check(self, frame: LiveFrame, markers: TrackedFrame | None, /) -> tuple[Check, ...]:
+    def check(self, frame: LiveFrame, markers: Tracks | None, /) -> tuple[Check, ...]:
         """Check a frame, and its markers where they are tracked; a check that fails withholds its margin."""
         ...
 

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32
 
 from sliplens.images import LEAST_TOUCH, picture_change, soften
 from sliplens.live.reading import Check, LiveFrame, small_picture
-from sliplens.markers import MarkerStatus, TrackedFrame
+from sliplens.markers import MarkerStatus, Tracks
 from sliplens.markers.camera import CAMERA_CURE, CAMERA_LIMIT_PX, CameraWatch, block_means
 from sliplens.models.checkpoint import STRANGE, Estimate, Network
 from sliplens.recordings.capture import Forces, Frame
@@ -90,7 +90,7 @@ class _FrameView:
     """A frame beside the reference, as the checks need it."""
 
     frame: LiveFrame
-    markers: TrackedFrame | None
+    markers: Tracks | None
     change: float
     """Change of the picture against the reference at equal brightness, in grey levels."""
     gain: float
@@ -137,7 +137,7 @@ class HealthMonitor:
         self._numbers: deque[tuple[float, int]] = deque()
         self._last: dict[str, tuple[float, Check]] = {}
 
-    def check(self, frame: LiveFrame, markers: TrackedFrame | None = None, /) -> tuple[Check, ...]:
+    def check(self, frame: LiveFrame, markers: Tracks | None = None, /) -> tuple[Check, ...]:
         """Check a frame of the reference's size, and its markers where they are tracked.
 
         The first check that fails names the cause: faults of the camera come before what they change in the picture.
@@ -160,7 +160,7 @@ class HealthMonitor:
         # at the same time it may be another frame, of a source without a clock
         return [name for name in names if not 0 < age_s[name] < _OLDEST_S] or [max(names, key=lambda name: age_s[name])]
 
-    def _compare(self, frame: LiveFrame, markers: TrackedFrame | None) -> _FrameView:
+    def _compare(self, frame: LiveFrame, markers: Tracks | None) -> _FrameView:
         soft = soften(frame.small)
         both = (self._soft > _DIM) & (soft > _DIM) & (self._soft < _WHITE) & (soft < _WHITE)
         ratio = np.log2(np.where(both, soft, 1) / np.where(both, self._soft, 1))

@@ -2,9 +2,9 @@
 
 from sliplens.markers.detect import KINDS, Appearance, MarkerKind, Markers, detect_markers
 from sliplens.markers.estimators import MarkerTraction, TractionModel, calibrate_traction
-from sliplens.markers.tracker import MarkerStatus, TrackedFrame, Tracker, Tracks, track_markers
+from sliplens.markers.tracker import MarkerStatus, Tracker, Tracks, track_markers
 
 __all__ = [
-    "KINDS", "Appearance", "MarkerKind", "MarkerStatus", "MarkerTraction", "Markers", "TrackedFrame", "Tracker",
-    "Tracks", "TractionModel", "calibrate_traction", "detect_markers", "track_markers",
+    "KINDS", "Appearance", "MarkerKind", "MarkerStatus", "MarkerTraction", "Markers", "Tracker", "Tracks",
+    "TractionModel", "calibrate_traction", "detect_markers", "track_markers",
 ]  # fmt: skip

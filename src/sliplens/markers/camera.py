@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Float32
 
 from sliplens.images import LEAST_TOUCH
-from sliplens.markers.tracker import TrackedFrame
+from sliplens.markers.tracker import Tracks
 from sliplens.recordings.capture import Frame
 
 Plane = Float32[np.ndarray, "height width"]
@@ -61,7 +61,7 @@ class CameraMotion:
         return abs(radians(self.turn_deg)) * _HALF_PX
 
 
-def marker_camera_motion(markers: TrackedFrame) -> CameraMotion | None:
+def marker_camera_motion(markers: Tracks) -> CameraMotion | None:
     """Measure the camera's motion by markers beyond the contact; None where fewer than 10 are seen there.
 
     With places p and displacements d as complex numbers about the middle of the picture, the camera moves
@@ -77,8 +77,9 @@ def marker_camera_motion(markers: TrackedFrame) -> CameraMotion | None:
     height, width = markers.size
     half = min(height, width) / 2
     middle = np.array([width - 1, height - 1]) / 2
-    place = (markers.position_px - markers.motion_px - middle) @ (1, 1j) / half
-    motion = markers.motion_px @ (1, 1j) * (_HALF_PX / half)
+    motion_px = markers.position_px - markers.rest_px
+    place = (markers.position_px - motion_px - middle) @ (1, 1j) / half
+    motion = motion_px @ (1, 1j) * (_HALF_PX / half)
     beyond = np.isfinite(motion) & (np.abs(place) > _LEAST_RADIUS)
     if beyond.sum() < _FEWEST:
         return None
@@ -219,7 +220,7 @@ class CameraWatch:
         self._untouched: CameraMotion | None = None
         """Newest motion of a frame without a contact."""
 
-    def update(self, frame: Frame, markers: TrackedFrame | None = None, *, touches: bool) -> CameraMotion | None:
+    def update(self, frame: Frame, markers: Tracks | None = None, *, touches: bool) -> CameraMotion | None:
         """Measure the motion in the next frame; None where neither markers nor the border show any.
 
         `touches`: True where the frame differs from the reference as by a contact. A camera that moved makes it differ,

@@ -1,7 +1,7 @@
 """Tracking of markers from the untouched sensor through a trial."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -34,41 +34,28 @@ class MarkerStatus(IntEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrackedFrame:
-    """Markers of one frame, in the order of the reference frame."""
-
-    position_px: Float[np.ndarray, "markers 2"]
-    """x, y; NaN where a marker was not detected whole."""
-    motion_px: Float[np.ndarray, "markers 2"]
-    """Displacement from the place at rest."""
-    size: tuple[int, int]
-    """Height and width of the picture, in pixels."""
-    radius_px: Float[np.ndarray, " markers"]
-    deviation_px: Float[np.ndarray, " markers"]
-    """Distance of a marker's displacement from that of the skin around it; NaN where either is unknown."""
-    status: UInt8[np.ndarray, " markers"]
-    """`MarkerStatus` of each."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class Tracks:
-    """Markers of a trial; pixel coordinates are (x, y), pixel centres at whole numbers."""
+    """Markers of a frame, or of consecutive frames; pixel coordinates are (x, y), pixel centres at whole numbers."""
 
     rest_px: Float[np.ndarray, "markers 2"]
     """Places in the reference frame T_0."""
-    position_px: Float[np.ndarray, "frames markers 2"]
+    position_px: Float[np.ndarray, "*frames markers 2"]
     """NaN where a marker was not detected whole."""
-    radius_px: Float[np.ndarray, "frames markers"]
-    deviation_px: Float[np.ndarray, "frames markers"]
-    status: UInt8[np.ndarray, "frames markers"]
+    size: tuple[int, int]
+    """Height and width of the picture, in pixels."""
+    radius_px: Float[np.ndarray, "*frames markers"]
+    deviation_px: Float[np.ndarray, "*frames markers"]
+    """Distance of a marker's displacement from that of the skin around it; NaN where either is unknown."""
+    status: UInt8[np.ndarray, "*frames markers"]
+    """`MarkerStatus` of each."""
 
     @property
-    def followed(self) -> Bool[np.ndarray, "frames markers"]:
-        """Markers that have a displacement, frame by frame."""
+    def followed(self) -> Bool[np.ndarray, "*frames markers"]:
+        """Markers that have a displacement."""
         return self.status == MarkerStatus.FOLLOWED
 
     @property
-    def displacement_px(self) -> Float[np.ndarray, "frames markers 2"]:
+    def displacement_px(self) -> Float[np.ndarray, "*frames markers 2"]:
         """T_n less T_0, x and y; NaN where a marker was not followed."""
         return np.where(self.followed[..., None], self.position_px - self.rest_px, np.nan)
 
@@ -89,7 +76,7 @@ class Tracker:
         self._shift, self._lost = np.zeros_like(self.rest.centre_px), False
         self._followed, self._since_whole = np.zeros(len(self.rest), dtype=bool), _WHOLE_EVERY
 
-    def update(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> TrackedFrame:
+    def update(self, frame: UInt8[np.ndarray, "_ _ 3"]) -> Tracks:
         """Follow the markers into the next frame T_n, of the reference's size.
 
         Markers are measured around their last places. The whole frame is searched every tenth time, and at once where
@@ -150,14 +137,10 @@ class Tracker:
         self._pattern.note(pairing)
         return detected, pairing
 
-    def _tracked(self, place: Places, radius: np.ndarray, deviation: np.ndarray, status: np.ndarray) -> TrackedFrame:
-        return TrackedFrame(
-            position_px=place,
-            motion_px=place - self.rest.centre_px,
-            size=self._size,
-            radius_px=radius,
-            deviation_px=deviation,
-            status=status,
+    def _tracked(self, place: Places, radius: np.ndarray, deviation: np.ndarray, status: np.ndarray) -> Tracks:
+        rest = self.rest.centre_px
+        return Tracks(
+            rest_px=rest, position_px=place, size=self._size, radius_px=radius, deviation_px=deviation, status=status
         )
 
     def _select_sound(self, detected: Markers, spot: Int[np.ndarray, " markers"]) -> tuple[np.ndarray, ...]:
@@ -197,8 +180,7 @@ def track_markers(
     if not tracked:
         raise RecordingError("there is no frame to track markers in; give one or more beside the reference")
     names = ("position_px", "radius_px", "deviation_px", "status")
-    columns = {name: np.stack([getattr(frame, name) for frame in tracked]) for name in names}
-    return Tracks(rest_px=tracker.rest.centre_px, **columns)
+    return replace(tracked[0], **{name: np.stack([getattr(frame, name) for frame in tracked]) for name in names})
 
 
 def _at_spots(values: np.ndarray, spot: Int[np.ndarray, " markers"]) -> np.ndarray:

@@ -7,7 +7,6 @@ from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Float
 
 from sliplens._version import __version__
 from sliplens.codec import Result, read_written, regrouped, write_tables
@@ -15,7 +14,7 @@ from sliplens.errors import InputError
 from sliplens.extras import import_cv2, pick
 from sliplens.images import Images
 from sliplens.markers.detect import KINDS
-from sliplens.markers.tracker import MarkerStatus, TrackedFrame, Tracker
+from sliplens.markers.tracker import MarkerStatus, Tracker, Tracks
 from sliplens.progress import OnProgress, add_note, number_of, report_progress, reporting
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
@@ -23,8 +22,8 @@ from sliplens.recordings.sensor import load_profile
 from sliplens.recordings.source import Frame, SourceOptions, Trials, open_trials
 from sliplens.runner import MakePart, Work, require_new_table, run_table
 
-OnTracked: TypeAlias = Callable[[Frame, TrackedFrame, Float[np.ndarray, "markers 2"]], None]
-"""Takes a frame, its markers and their places at rest, in pixels."""
+OnTracked: TypeAlias = Callable[[Frame, Tracks], None]
+"""Takes a frame and its markers."""
 
 _ROW_GROUP = 50_000
 _NUMBERS = ("x_px", "y_px", "rest_x_px", "rest_y_px", "dx_px", "dy_px", "radius_px", "deviation_px")
@@ -189,13 +188,12 @@ class _Following(Work):
 
     def _tables(self, trial: Capture, frames: Iterator[tuple[int, Frame]]) -> Iterator[pa.Table]:
         tracker = Tracker((trial.read_reference or (lambda: next(trial.read_frames())))(), self.markers)
-        rest = tracker.rest.centre_px
         for number, frame in frames:
             tracked = tracker.update(frame)
             time_s = None if trial.time_s is None else float(trial.time_s[number])
-            yield _frame_table(trial.name, number, tracked, rest_px=rest, time_s=time_s)
+            yield _frame_table(trial.name, number, tracked, time_s=time_s)
             if self.on_tracked is not None:
-                self.on_tracked(frame, tracked, rest)
+                self.on_tracked(frame, tracked)
             report_progress(number + 1, trial.frames)
 
 
@@ -215,12 +213,10 @@ def _outcome(rows: pa.Table) -> TrialTracking:
     )
 
 
-def _frame_table(
-    trial: str, frame: int, tracked: TrackedFrame, *, rest_px: Float[np.ndarray, "markers 2"], time_s: float | None
-) -> pa.Table:
+def _frame_table(trial: str, frame: int, tracked: Tracks, *, time_s: float | None) -> pa.Table:
     count = len(tracked.status)
-    shift = np.where((tracked.status == MarkerStatus.FOLLOWED)[:, None], tracked.motion_px, np.nan)
-    numbers = np.column_stack([tracked.position_px, rest_px, shift, tracked.radius_px, tracked.deviation_px])
+    places = tracked.position_px, tracked.rest_px, tracked.displacement_px
+    numbers = np.column_stack([*places, tracked.radius_px, tracked.deviation_px])
     columns: dict[str, Any] = {
         "trial": pa.array([trial] * count),
         "frame": pa.array(np.full(count, frame, dtype=np.int32)),

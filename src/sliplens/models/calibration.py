@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor
 
-from sliplens.errors import ModelError
 from sliplens.friction import Friction
 from sliplens.models.backbones import bin_centres, histogram_targets
 
@@ -29,7 +30,7 @@ class Calibration:
     (2019); Guo et al., *On Calibration of Modern Neural Networks* (2017), for the temperature.
     """
 
-    temperature: float
+    temperature: Annotated[float, Meta(gt=0)]
     """Divisor of the logits; 1 for a network with one number as its output."""
     offsets: dict[str, float]
     """Widening of each level's interval, in margin units; negative where quantiles were too far apart."""
@@ -37,10 +38,6 @@ class Calibration:
     """Validation frames."""
     mse: float
     """Mean squared error of the answers to them, at this temperature (it moves the mean of a distribution a little)."""
-
-    def __post_init__(self) -> None:
-        if not self.temperature > 0:
-            raise ModelError(f"the temperature of a calibration must be positive, got {self.temperature:g}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,13 +48,9 @@ class Traction:
     """Of the ratio; its errors are ratios, not margins."""
     told: Calibration
     """Calibration of the margin under each validation trial's known friction; the temperature is that of the margin."""
-    friction: tuple[float, ...]
+    friction: Annotated[tuple[Annotated[float, Meta(gt=0)], ...], Meta(min_length=1)]
     """Evenly spaced quantiles of the coefficient of friction over the training frames, from the least to the largest:
     the prior of the network where no friction is known."""
-
-    def __post_init__(self) -> None:
-        if not self.friction or min(self.friction) <= 0 or list(self.friction) != sorted(self.friction):
-            raise ValueError("quantiles of friction are positive and rise")
 
 
 def standard_deviation(

@@ -6,11 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from math import cos, erfc, radians, sin, sqrt
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from msgspec import Meta
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor, nn
@@ -53,7 +54,7 @@ class Manifest:
 
     backbone: str
     input: str
-    image_size: int
+    image_size: Annotated[int, Meta(ge=1, le=LARGEST_INPUT)]
     frame_size: tuple[int, int]
     sensor: str
     data_hash: str
@@ -85,9 +86,8 @@ class Manifest:
 
     def __post_init__(self) -> None:
         height, width = self.frame_size
-        if not 1 <= self.image_size <= LARGEST_INPUT or min(height, width) <= 0 or height * width > MOST_PIXELS:
-            sizes = f"frames of {height} x {width} pixels at {self.image_size}"
-            raise ValueError(f"{sizes} are too small or too large for a network")
+        if min(height, width) <= 0 or height * width > MOST_PIXELS:
+            raise ValueError(f"frames of {height} x {width} pixels are too small or too large for a network")
         low, high = self.pull_direction_deg or FULL_CIRCLE
         if not 0 <= low <= high <= low + 360 or low > 360:
             raise ValueError(f"pull_direction_deg is {[low, high]}; give a low from 0 to 360, then a high")
@@ -172,16 +172,16 @@ class Network:
         if self.wrapped:
             return
         level, difference = float(np.median(frame)), self.encoding.empty_is_black
+        median = f"(median {level:.0f} of 255 grey levels)"
         if not difference and level < _DARKEST_FRAME and frame.any():
             raise ImageError(
-                f"{what} is as dark as a difference image (median {level:.0f} of 255 grey levels), and this network "
-                f"reads camera frames; give those, or a network on difference images such as {DIFFERENCE_NETWORK}"
+                f"{what} is as dark as a difference image {median}, and this network reads camera frames; give those, "
+                f"or a network on difference images such as {DIFFERENCE_NETWORK}"
             )
         if difference and level > _BRIGHTEST_DIFFERENCE:
             raise ImageError(
-                f"{what} is as bright as a camera frame (median {level:.0f} of 255 grey levels), and without the "
-                "untouched sensor this network takes it for a difference image; name it with --reference IMAGE or "
-                "--reference-frame N"
+                f"{what} is as bright as a camera frame {median}, and without the untouched sensor this network takes "
+                "it for a difference image; name it with --reference IMAGE or --reference-frame N"
             )
 
     def doubts(
@@ -199,14 +199,13 @@ class Network:
         trained, directions, doubts = self.manifest, self.manifest.pull_direction_deg, []
         if sensor and trained.sensor and sensor_kind(sensor) != sensor_kind(trained.sensor):
             doubts.append(
-                f"the network was trained on {trained.sensor} and reads frames of {sensor}: its intervals were not "
-                "measured on that sensor, so take the margins for a trend until `sliplens evaluate` on trials with "
-                "forces measures them"
+                f"the network was trained on {trained.sensor} and reads frames of {sensor}: take margins for a trend "
+                "until `sliplens evaluate` on trials with forces measures its intervals there"
             )
         if frame is not None and trained.colour and not has_colour(frame):
             doubts.append(
                 "the frames are grey, and the network was trained on colours: its intervals were not measured on such "
-                "frames, so read those of a colour camera, or train it on frames of this one (`sliplens train`)"
+                "frames; use a colour camera, or train it on frames of this one (`sliplens train`)"
             )
         if friction is not None and trained.traction is not None:
             low, high = trained.traction.friction[0], trained.traction.friction[-1]
@@ -217,13 +216,13 @@ class Network:
                     f"the friction {friction.mean:.3g} lies outside that of the network's training, {low:.2g} to "
                     f"{high:.2g}: its intervals were not measured there, so {cure}, or take the margins for a trend"
                 )
-        if profile is not None and profile.pull_direction_deg is not None and directions is not None:
-            pull = radians(profile.pull_direction_deg)
-            if Shear(x_px=cos(pull), y_px=sin(pull), sigma_px=1.0).excess(directions):
+        pull_deg = None if profile is None else profile.pull_direction_deg
+        if profile is not None and pull_deg is not None and directions is not None:
+            pull = Shear(x_px=cos(radians(pull_deg)), y_px=sin(radians(pull_deg)), sigma_px=1.0)
+            if pull.excess(directions):
                 doubts.append(
-                    f"the profile {profile.name} says that the sensor is pulled at {profile.pull_direction_deg:g} "
-                    f"degrees in the image, and the network was trained on {range_words(directions)} (90 is down): "
-                    f"its margins will be withheld, so {_TURN_CURE}"
+                    f"the profile {profile.name} says that the sensor is pulled at {pull_deg:g} degrees, and the "
+                    f"network was trained on {range_words(directions)} (90 is down): margins will be withheld, so {_TURN_CURE}"
                 )
         return tuple(doubts)
 

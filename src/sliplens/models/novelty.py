@@ -2,10 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Annotated, TypeAlias
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from msgspec import Meta
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
@@ -18,6 +20,9 @@ _MOST_DIRECTIONS = 12
 _LEAST_FRAMES = 40
 _SHARES = (1.0, 0.8, 0.5, 0.3, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005)
 """Shares of the validation frames, for each of which `Novelty` keeps the strangeness that so many reach."""
+
+
+_Positive: TypeAlias = Annotated[float, Meta(gt=0)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,14 +40,14 @@ class Novelty:
     layer: str
     """Path in the network of the module whose output is used."""
     mean: tuple[float, ...]
-    scale: tuple[float, ...]
+    scale: tuple[_Positive, ...]
     """Standard deviation of each feature."""
     directions: tuple[tuple[float, ...], ...]
     """Unit vectors, in scaled features."""
-    variances: tuple[float, ...]
-    rest: float
+    variances: tuple[_Positive, ...]
+    rest: _Positive
     """Variance along every other direction, a ratio to that of the feature."""
-    limit: float
+    limit: _Positive
     """Distance, a ratio to the usual one, that all but 0.5 % of the validation frames stay below."""
     frames: int
     """Validation frames."""
@@ -56,10 +61,8 @@ class Novelty:
         width = len(self.mean)
         if {len(self.scale), *map(len, self.directions)} - {width} or len(self.variances) != len(self.directions):
             raise ValueError("mean, scale and directions of features are of different lengths")
-        if not min(*self.scale, *self.variances, self.rest, 1.0) > 0:
-            raise ValueError("deviations and variances of features are positive")
-        if len(self.strangeness) != len(_SHARES) or not self.limit > 0:
-            raise ValueError(f"strangeness has {len(_SHARES)} levels, and its limit is positive")
+        if len(self.strangeness) != len(_SHARES):
+            raise ValueError(f"strangeness has {len(_SHARES)} levels")
 
     def distance(self, features: Float[np.ndarray, "frames features"]) -> Float[np.ndarray, " frames"]:
         """Compute the distance of features from those of healthy frames."""

@@ -15,7 +15,7 @@ from scipy.ndimage import binary_dilation
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2
 from sliplens.images import absolute_difference
-from sliplens.markers.tracker import MarkerStatus, TrackedFrame
+from sliplens.markers.tracker import MarkerStatus, Tracks
 from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
 from sliplens.plots.style import BLACK, SKY, VERMILLION, YELLOW, percent, written_whole
 from sliplens.progress import report_each
@@ -110,7 +110,7 @@ _MAGNIFIED = 3  # arrows, so that a pixel of motion shows
 
 
 def draw_tracked(
-    frame: UInt8[np.ndarray, "height width 3"], tracked: TrackedFrame, rest_px: np.ndarray, scale: int
+    frame: UInt8[np.ndarray, "height width 3"], tracked: Tracks, scale: int
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Draw a ring round every detected marker of an enlarged frame, and a magnified arrow along its displacement.
 
@@ -125,7 +125,9 @@ def draw_tracked(
         radius = round(float(tracked.radius_px[index]) * scale)
         cv2.circle(picture, start.tolist(), radius, _bytes(_COLOURS[status]), scale)
         if status == MarkerStatus.FOLLOWED:
-            end = start + np.rint((tracked.position_px[index] - rest_px[index]) * scale * _MAGNIFIED).astype(int)
+            end = start + np.rint((tracked.position_px[index] - tracked.rest_px[index]) * scale * _MAGNIFIED).astype(
+                int
+            )
             # dark below bright: visible on any ground
             for colour, width in ((BLACK, scale + 2), ("white", scale)):
                 cv2.arrowedLine(picture, start.tolist(), end.tolist(), _bytes(colour), width, tipLength=0.3)
@@ -135,16 +137,16 @@ def draw_tracked(
 @contextmanager
 def clip_writer(
     path: Path, *, size: tuple[int, int], frames_per_s: float
-) -> Iterator[Callable[[UInt8[np.ndarray, "height width 3"], TrackedFrame, Float[np.ndarray, "markers 2"]], None]]:
+) -> Iterator[Callable[[UInt8[np.ndarray, "height width 3"], Tracks], None]]:
     """Write an MP4 of frames with their markers; it appears when complete.
 
-    Gives a function that adds a frame of that height and width, its markers and their places at rest. Lossy video moves
+    Gives a function that adds a frame of that height and width, and its markers. Lossy video moves
     markers: measure in the table, never in its clip.
     """
     scale = max(1, _LEAST_SIDE // max(size))
     rows, columns = (side * scale // 2 * 2 for side in size)
     with _open_clip(path, (rows, columns), frames_per_s) as add:
-        yield lambda frame, tracked, rest_px: add(draw_tracked(frame, tracked, rest_px, scale)[:rows, :columns])
+        yield lambda frame, tracked: add(draw_tracked(frame, tracked, scale)[:rows, :columns])
 
 
 @contextmanager

@@ -218,14 +218,11 @@ def _configure(recipe: str, changes: TrainingChanges, start: Network | None) -> 
             raise InputError(f"the recipe {recipe} teaches an existing network; name it with --start-from")
         return config
     fixed = {name: getattr(start.manifest, name) for name in _KIND[config.learns]}
-    for name, value in sorted(changes.items()) if config.learns in _KEEP_PREDICTIONS else ():
-        expected = fixed.get(name, value)
-        if value != expected or (config.learns == "sequence" and name not in _SEQUENCE_TAKES | fixed.keys()):
-            why = f"whose {name} is {expected}" if name in fixed else "and takes no such option"
-            option = f"--{name.replace('_', '-')}"
-            raise InputError(
-                f"the recipe {recipe} leaves the network of --start-from as it is, {why}; leave out {option}"
-            )
+    allowed = changes if config.learns != "sequence" else _SEQUENCE_TAKES | fixed.keys()
+    wrong = [name for name, value in changes.items() if name not in allowed or value != fixed.get(name, value)]
+    if wrong and config.learns in _KEEP_PREDICTIONS:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(wrong))
+        raise InputError(f"the recipe {recipe} leaves the network of --start-from as it is; leave out {options}")
     return replace(config, **fixed | changes)
 
 
@@ -274,11 +271,10 @@ def pull_direction(trial: Recording) -> float | None:
     pulled = np.flatnonzero(trial.labelled & (trial.safety_margin < _PULLED))
     lowest = pulled[np.argsort(trial.safety_margin[pulled], kind="stable")][:_DIRECTION_FRAMES]
     estimator = ShearEstimator(trial.reference, sensor_kind(trial.sensor))
-    shears = [estimator.estimate(trial.frames[frame]) for frame in lowest]
+    shears = [vars(estimator.estimate(trial.frames[frame])) for frame in lowest]
     if not shears:
         return None
-    means = {name: float(np.mean([getattr(shear, name) for shear in shears])) for name in ("x_px", "y_px", "sigma_px")}
-    mean = Shear(**means)
+    mean = Shear(**{name: float(np.mean([shear[name] for shear in shears])) for name in shears[0]})
     return mean.direction_deg if np.hypot(mean.x_px, mean.y_px) > _SURE * mean.sigma_px else None
 
 
