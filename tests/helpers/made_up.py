@@ -11,7 +11,7 @@ from sliplens.codec import save_record, save_result
 from sliplens.files import Machine, Provenance
 from sliplens.recordings import TrialInfo
 from sliplens.recordings.dataset import write_dataset_table
-from sliplens.results.evaluation import Evaluation, LearningCurve, Reliability, ScoredFrames, Training
+from sliplens.results.evaluation import Evaluation, LearningCurve, ScoredFrames, Training
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore
 from sliplens.training.evaluation import lead_times, regression_scores, risk_coverage
@@ -88,7 +88,7 @@ def write_training(workspace: Path, name: str, *, size: int, rng: np.random.Gene
 
 
 def made_up_evaluation(predictions: ScoredFrames, *, name: str = "difference", sure: bool = False) -> Evaluation:
-    """Scores of some predictions, reliability apart, which is made up too."""
+    """Scores of some predictions, coverage apart, which is made up too."""
     by_condition = {
         one: predictions.where(predictions.condition == one) for one in np.unique(predictions.condition).tolist()
     }
@@ -99,10 +99,7 @@ def made_up_evaluation(predictions: ScoredFrames, *, name: str = "difference", s
         known_trials=0,
         conditions={one: regression_scores(rows) for one, rows in by_condition.items()},
         trials={one: regression_scores(rows) for one, rows in by_trial.items()},
-        reliability={
-            one: Reliability(coverage={"0.5": 0.48, "0.9": 0.88 if one == "dry" else 0.6} if sure else {})
-            for one in by_condition
-        },
+        coverage={one: {"0.5": 0.48, "0.9": 0.88 if one == "dry" else 0.6} if sure else {} for one in by_condition},
         lead_times={one: lead_times(rows) for one, rows in by_condition.items()},
         predictions=predictions,
         risk=risk_coverage(

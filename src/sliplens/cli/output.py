@@ -237,7 +237,7 @@ def print_scores(evaluation: "Evaluation") -> None:
 
 def _score_row(condition: str, evaluation: "Evaluation") -> tuple[str, ...]:
     scores, lead = evaluation.conditions[condition], evaluation.lead_times[condition]
-    coverage = evaluation.reliability[condition].coverage.get("0.9")
+    coverage = evaluation.coverage[condition].get("0.9")
     return (
         condition,
         f"{scores.frames:,}",

@@ -222,7 +222,7 @@ class Network:
             if pull.excess(directions):
                 doubts.append(
                     f"the profile {profile.name} says that the sensor is pulled at {pull_deg:g} degrees, and the "
-                    f"network was trained on {range_words(directions)} (90 is down): margins will be withheld, so {_TURN_CURE}"
+                    f"network was trained on {range_words(directions)}: margins will be withheld, so {_TURN_CURE}"
                 )
         return tuple(doubts)
 

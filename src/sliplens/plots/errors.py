@@ -34,7 +34,6 @@ from sliplens.plots.style import (
 from sliplens.results.evaluation import (
     BinScore,
     Evaluation,
-    Reliability,
     RiskCoverage,
     ScoredFrames,
     Training,
@@ -151,7 +150,7 @@ def draw_evaluation(evaluation: Evaluation, path: Path, *, title: str) -> None:
         plot_bins({name: evaluation.conditions[name].bins for name in conditions}, ax=errors)
         errors.set_title("Error by margin")
         _plot_trials(predictions, conditions, ax=biases)
-        _plot_coverage(evaluation.reliability, conditions, ax=coverage)
+        _plot_coverage(evaluation.coverage, conditions, ax=coverage)
         _plot_risk(evaluation.risk, ax=risk)
         ranked = sorted(trials, key=lambda name: trials[name].mse)
         rows = predictions.where(predictions.trial == ranked[(len(ranked) - 1) // 2])
@@ -173,8 +172,8 @@ def _plot_trials(predictions: ScoredFrames, conditions: list[str], *, ax: Axes) 
     ax.set_yticks(range(len(conditions)), conditions)
 
 
-def _plot_coverage(reliability: Mapping[str, Reliability], conditions: list[str], *, ax: Axes) -> None:
-    calibrated = {name: reliability[name].coverage for name in conditions if reliability[name].coverage}
+def _plot_coverage(coverage: Mapping[str, Mapping[str, float]], conditions: list[str], *, ax: Axes) -> None:
+    calibrated = {name: coverage[name] for name in conditions if coverage[name]}
     for name, shares in calibrated.items():
         nominal, actual = zip(
             *sorted((100 * float(level), 100 * share) for level, share in shares.items()), strict=True

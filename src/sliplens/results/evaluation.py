@@ -127,14 +127,6 @@ class RegressionScores:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Reliability:
-    """How far the network's own uncertainty can be believed, in one condition."""
-
-    coverage: dict[str, Annotated[float, SHARE]]
-    """Share of the labels inside the interval of each level; empty without a calibration."""
-
-
-@dataclass(frozen=True, kw_only=True)
 class LeadTimes:
     """Warnings before the first gross slip of each trial."""
 
@@ -144,8 +136,6 @@ class LeadTimes:
     """Trials that slip after a true alarm."""
     median_ms: float | None
     """From the first true alarm to the slip, over the warned trials; None if there is none."""
-    ideal_ms: float | None
-    """Median time from the first alarm of the true margin to the slip, over the trials that slip."""
     false_per_minute: Annotated[float, AMOUNT]
     """Alarms that begin while the true margin is above twice the threshold, by the minute of labelled touch."""
     threshold: Annotated[float, MARGIN]
@@ -211,8 +201,8 @@ class Evaluation(Result):
     """Trials that trained or validated this network; its scores flatter it where there are any."""
     conditions: dict[str, RegressionScores]
     trials: dict[str, RegressionScores]
-    reliability: dict[str, Reliability]
-    """Coverage of the intervals by condition."""
+    coverage: dict[str, dict[str, Annotated[float, SHARE]]]
+    """Share of the labels inside the interval of each level, by condition; empty without a calibration."""
     lead_times: dict[str, LeadTimes]
     """Warnings by condition."""
     predictions: ScoredFrames

@@ -23,7 +23,6 @@ from sliplens.results.evaluation import (
     Evaluation,
     LeadTimes,
     RegressionScores,
-    Reliability,
     RiskCoverage,
     ScoredFrames,
 )
@@ -170,17 +169,17 @@ def evaluate_frames(
     def score(groups: dict[str, Bool[np.ndarray, " frames"]]) -> dict[str, RegressionScores]:
         return {name: regression_scores(predictions.where(rows)) for name, rows in groups.items()}
 
-    def reliability(rows: Bool[np.ndarray, " frames"]) -> Reliability:
-        covered = {level: (low <= labels) & (labels <= high) for level, (low, high) in intervals.items()}
-        return Reliability(coverage={level: float(inside[rows].mean()) for level, inside in covered.items()})
-
+    covered = {level: (low <= labels) & (labels <= high) for level, (low, high) in intervals.items()}
     return Evaluation(
         input=network.manifest.input,
         split=split,
         known_trials=0,
         conditions=score(conditions),
         trials=score(trials),
-        reliability={name: reliability(rows) for name, rows in conditions.items()},
+        coverage={
+            name: {level: float(inside[rows].mean()) for level, inside in covered.items()}
+            for name, rows in conditions.items()
+        },
         lead_times={name: lead_times(predictions.where(rows)) for name, rows in conditions.items()},
         predictions=predictions,
         risk=risk_coverage(
@@ -275,7 +274,7 @@ def lead_times(predictions: ScoredFrames, *, threshold: float = THRESHOLD) -> Le
     A slip is the first frame of a trial with margin 0; what comes after is left out.
     """
     names, time_s, labels = predictions.trial, predictions.time_s, predictions.safety_margin
-    leads, ideals, slips, false, minutes = [], [], 0, 0, 0.0
+    leads, slips, false, minutes = [], 0, 0, 0.0
     for name in dict.fromkeys(names.tolist()):
         rows = np.flatnonzero(names == name)
         order = rows[np.argsort(time_s[rows], kind="stable")]
@@ -297,13 +296,10 @@ def lead_times(predictions: ScoredFrames, *, threshold: float = THRESHOLD) -> Le
         due = alarms & (labels[before] <= _FALSE_ABOVE * threshold)
         if due.any():
             leads.append(1e3 * (slip_s - float(time_s[before[np.argmax(due)]])))
-        low = labels[before] < threshold
-        ideals.append(1e3 * (slip_s - float(time_s[before[np.argmax(low)]])) if low.any() else 0.0)
     return LeadTimes(
         trials=slips,
         warned=len(leads),
         median_ms=float(np.median(leads)) if leads else None,
-        ideal_ms=float(np.median(ideals)) if ideals else None,
         false_per_minute=false / minutes if minutes > 0 else 0.0,
         threshold=threshold,
     )
