@@ -69,15 +69,6 @@ _BRIGHT, _DARK, _EXPOSED = 250, 5, 0.5
 _GREY = np.array([1, 1, 1], dtype=np.float32) / 3
 
 
-class _Spots(NamedTuple):
-    """Round spots that stand out in one way."""
-
-    labels: Int[np.ndarray, "height width"]  # number of the component that each pixel belongs to
-    chosen: Int[np.ndarray, " spots"]  # components that are round
-    radius_px: float
-    score: float  # agreement with markers: many, alike, and little else
-
-
 def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind) -> Appearance:
     """Estimate colour, size and contrast of a frame's markers: round spots of one size over Otsu's threshold."""
     for what, pixels in (("saturated", frame.min(axis=-1) >= _BRIGHT), ("black", frame.max(axis=-1) <= _DARK)):
@@ -86,24 +77,19 @@ def find_appearance(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind
                 f"{100 * np.mean(pixels):.0f} % of the frame is {what}, so that markers do not show; correct the "
                 "exposure or choose another frame"
             )
-    tries: dict[Contrast, _Spots] = {
-        contrast: spots for contrast in kind.contrasts if (spots := _find_spots(frame, kind, contrast))
-    }
+    tries = [look for contrast in kind.contrasts if (look := _find_spots(frame, kind, contrast))]
     if not tries:
         raise ImageError(
             f"fewer than {FEWEST} markers of kind {kind.name} were found in a frame of {frame.shape[0]} x "
             f"{frame.shape[1]} pixels; choose another kind, or use a frame that shows the markers"
         )
-    contrast, spots = max(tries.items(), key=lambda item: item[1].score)
-    weights = _weights(frame, spots, kind, contrast)
-    signal = frame.astype(np.float32) @ weights
-    inside = np.isin(spots.labels, spots.chosen)
-    level = float(np.median(signal[inside]) - np.median(signal[spots.labels == 0]))
-    # spots end where they pass the threshold, markers where half of their contrast is left: measured when refined
-    return Appearance(weights=weights, radius_px=spots.radius_px, contrast=max(level, 1.0))
+    return max(tries, key=lambda look: look[0])[1]
 
 
-def _find_spots(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind, contrast: Contrast) -> _Spots | None:
+def _find_spots(
+    frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind, contrast: Contrast
+) -> tuple[float, Appearance] | None:
+    """Find round spots that stand out in one way; return their look, and how like markers they are."""
     cv2 = import_cv2()
     height, width = frame.shape[:2]
     pixels = frame.astype(np.float32)
@@ -135,13 +121,24 @@ def _find_spots(frame: UInt8[np.ndarray, "height width 3"], kind: MarkerKind, co
         return None
     spread = float(np.std(np.log(area[chosen])))
     share = float(area[chosen].sum() / area[1:].sum())
-    outstanding = float(np.median(over[np.isin(labels, chosen)]) / (np.median(over[mask == 0]) + 1))
-    return _Spots(
-        labels=labels.astype(np.int64),
-        chosen=chosen,
-        radius_px=float(np.sqrt(np.median(area[chosen]) / np.pi)),
-        score=np.sqrt(len(chosen)) * share * outstanding / (0.1 + spread),
-    )
+    inside, outside = np.isin(labels, chosen), labels == 0
+    outstanding = float(np.median(over[inside]) / (np.median(over[outside]) + 1))
+    radius_px = float(np.sqrt(np.median(area[chosen]) / np.pi))
+    if kind.channels is not None and contrast != "colour":
+        weights = np.array(kind.channels) / (sum(kind.channels) if contrast == "light" else -sum(kind.channels))
+    else:
+        reach = 2 * round(radius_px) + 1
+        near = cv2.dilate(inside.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+        colour = np.median(frame[inside], axis=0) - np.median(frame[near & outside], axis=0)
+        # shadows change the brightness alone, so it does not count
+        colour = colour - colour.mean() if contrast == "colour" else colour
+        # a step from background to marker keeps its size in grey levels; spots that differ in nothing have no colour
+        weights = colour / max(np.abs(colour).sum(), 1e-6)
+    signal = pixels @ weights.astype(np.float32)
+    level = float(np.median(signal[inside]) - np.median(signal[outside]))
+    # spots end where they pass the threshold, markers where half of their contrast is left: measured when refined
+    look = Appearance(weights=weights.astype(np.float32), radius_px=radius_px, contrast=max(level, 1.0))
+    return np.sqrt(len(chosen)) * share * outstanding / (0.1 + spread), look
 
 
 def _round(stats: np.ndarray, kind: MarkerKind, size: tuple[int, int]) -> Bool[np.ndarray, " components"]:
@@ -152,25 +149,6 @@ def _round(stats: np.ndarray, kind: MarkerKind, size: tuple[int, int]) -> Bool[n
     inside = (x > 0) & (y > 0) & (x + width < size[1]) & (y + height < size[0])
     shape = (np.maximum(width, height) < 1.7 * np.minimum(width, height)) & (fill > 0.55) & (fill < 0.95)
     return inside & shape & (radius >= low) & (radius <= min(high, min(size) / 8)) & (np.arange(len(stats)) > 0)
-
-
-def _weights(
-    frame: UInt8[np.ndarray, "height width 3"], spots: _Spots, kind: MarkerKind, contrast: Contrast
-) -> Float32[np.ndarray, "3"]:
-    cv2 = import_cv2()
-    if kind.channels is not None and contrast != "colour":
-        weights = np.array(kind.channels) / sum(kind.channels)
-        return (weights if contrast == "light" else -weights).astype(np.float32)
-    core = np.isin(spots.labels, spots.chosen).astype(np.uint8)
-    reach = 2 * round(spots.radius_px) + 1
-    near = cv2.dilate(core, np.ones((reach, reach), np.uint8)) > 0
-    around = near & (spots.labels == 0)
-    colour = np.median(frame[core > 0], axis=0) - np.median(frame[around], axis=0)
-    if contrast == "colour":
-        # shadows change the brightness alone, so it does not count
-        colour = colour - colour.mean()
-    # a step from background to marker keeps its size in grey levels
-    return (colour / max(np.abs(colour).sum(), 1e-6)).astype(np.float32)  # spots that differ in nothing have no colour
 
 
 _INNER, _OUTER = 1.55, 2.1  # radii of the ring in which the background is seen
