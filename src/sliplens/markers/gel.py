@@ -150,19 +150,20 @@ def _find_markers(
     part = frame[y : y + down, x : x + across]
     low = max(2.0, min(across, down) / _SMALL_SHARE)
     sized = MarkerKind(name="auto", contrasts=("dark", "light", "colour"), radius_px=(low, max(40.0, low + 1)))
+    nothing = None, np.empty((0, 2)), np.nan
     try:
         markers = detect_markers(part, sized)
     except ImageError:
-        return None, np.empty((0, 2)), np.nan
+        return nothing
     centres = markers.centre_px[markers.whole & (markers.roundness > 0.6)]
     if len(centres) < FEWEST + 2:
-        return None, np.empty((0, 2)), np.nan
+        return nothing
     distance = KDTree(centres).query(centres, k=2)[0][:, 1]
     spacing = float(np.median(distance))
     # dirt lies anywhere; the markers of a pattern have a neighbour at its spacing
     centres = centres[(distance > 0.6 * spacing) & (distance < 1.7 * spacing)]
     if len(centres) < FEWEST + 2:
-        return None, np.empty((0, 2)), np.nan
+        return nothing
     return _kind(part, centres, markers.appearance), centres + np.array([x, y]), spacing
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias, Unpack
+from typing import TypeAlias, Unpack
 
 import numpy as np
 import pyarrow as pa
@@ -191,7 +191,18 @@ class _Following(Work):
         for number, frame in frames:
             tracked = tracker.update(frame)
             time_s = None if trial.time_s is None else float(trial.time_s[number])
-            yield _frame_table(trial.name, number, tracked, time_s=time_s)
+            count = len(tracked.status)
+            places = tracked.position_px, tracked.rest_px, tracked.displacement_px
+            numbers = np.column_stack([*places, tracked.radius_px, tracked.deviation_px]).astype(np.float32)
+            columns: dict[str, pa.Array] = {
+                "trial": pa.array([trial.name] * count),
+                "frame": pa.array(np.full(count, number, dtype=np.int32)),
+                "time_s": pa.array([time_s] * count, pa.float64()),
+                "marker": pa.array(np.arange(count, dtype=np.int32)),
+                "status": pa.DictionaryArray.from_arrays(pa.array(tracked.status.astype(np.int8)), _STATUS),
+                **{name: pa.array(numbers[:, at], from_pandas=True) for at, name in enumerate(_NUMBERS)},
+            }
+            yield pa.table(columns, schema=pa.schema(_COLUMNS))
             if self.on_tracked is not None:
                 self.on_tracked(frame, tracked)
             report_progress(number + 1, trial.frames)
@@ -211,18 +222,3 @@ def _outcome(rows: pa.Table) -> TrialTracking:
         followed_share=int(followed.sum()) / max(1, int(in_view.sum())),
         lost_frames=int((lost == markers).sum()),
     )
-
-
-def _frame_table(trial: str, frame: int, tracked: Tracks, *, time_s: float | None) -> pa.Table:
-    count = len(tracked.status)
-    places = tracked.position_px, tracked.rest_px, tracked.displacement_px
-    numbers = np.column_stack([*places, tracked.radius_px, tracked.deviation_px])
-    columns: dict[str, Any] = {
-        "trial": pa.array([trial] * count),
-        "frame": pa.array(np.full(count, frame, dtype=np.int32)),
-        "time_s": pa.nulls(count, pa.float64()) if time_s is None else pa.array(np.full(count, time_s)),
-        "marker": pa.array(np.arange(count, dtype=np.int32)),
-        "status": pa.DictionaryArray.from_arrays(pa.array(tracked.status.astype(np.int8)), _STATUS),
-        **{name: pa.array(numbers[:, at].astype(np.float32), from_pandas=True) for at, name in enumerate(_NUMBERS)},
-    }
-    return pa.table(columns, schema=pa.schema(_COLUMNS))
