@@ -93,6 +93,7 @@ class Manifest:
             raise ValueError(f"pull_direction_deg is {[low, high]}; give a low from 0 to 360, then a high")
 
 
+_BATCH = 64
 _TURN_CURE = (
     "turn the sensor, or train on this direction with `sliplens train DATA -o RUN --augmentation all-directions`"
 )
@@ -244,24 +245,21 @@ class Network:
         parts = (run or Answers(self.model, self.feature_layer).run)(batches)
         return tuple(torch.cat(answers) for answers in zip(*parts, strict=True))
 
-    def predict(
-        self, inputs: Float[Tensor, "batch colours size size"], *, batch_size: int = 64
-    ) -> Float[Tensor, " batch"]:
+    def predict(self, inputs: Float[Tensor, "batch colours size size"]) -> Float[Tensor, " batch"]:
         """Predict the safety margin of encoded frames; not clipped to [0, 1]."""
-        return self.answers(inputs.split(batch_size))[0].cpu()
+        return self.answers(inputs.split(_BATCH))[0].cpu()
 
     def estimate(
         self,
         inputs: Float[Tensor, "batch colours size size"] | Iterable[Tensor],
         *,
         friction: FrictionLike | None = None,
-        batch_size: int = 64,
     ) -> "Estimate":
         """Predict the safety margin of encoded frames, or batches of them, with its uncertainty.
 
         `friction` as `predict` takes it.
         """
-        batches = inputs.split(batch_size) if isinstance(inputs, Tensor) else inputs
+        batches = inputs.split(_BATCH) if isinstance(inputs, Tensor) else inputs
         return self.to_estimate(*self.answers(batches), friction=friction)
 
     @property

@@ -58,9 +58,7 @@ class SequenceHead(nn.Module):
 
     edges: Tensor
 
-    def __init__(
-        self, edges: Float[Tensor, " edges"], ratio_edges: Float[Tensor, " ratio_edges"], *, dropout: float = 0.1
-    ) -> None:
+    def __init__(self, edges: Float[Tensor, " edges"], ratio_edges: Float[Tensor, " ratio_edges"]) -> None:
         super().__init__()
         self.register_buffer("edges", edges.clone(), persistent=False)
         self.centres = bin_centres(edges).numpy()
@@ -70,7 +68,7 @@ class SequenceHead(nn.Module):
         self.seen = nn.Linear(8, WIDTH)
         self.memory = nn.GRU(WIDTH, WIDTH, batch_first=True)
         self.correction = nn.Linear(2 * WIDTH, len(edges) - 1)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = nn.Dropout(0.1)
         nn.init.zeros_(self.correction.weight)
         nn.init.zeros_(self.correction.bias)
 

@@ -122,7 +122,6 @@ def evaluate_frames(
     split: str = "test",
     friction: FrictionLike | None = None,
     sequence: bool = False,
-    batch_size: int = 64,
 ) -> Evaluation:
     """Predict the frames of `load_frames`, and score the predictions for each condition and trial.
 
@@ -133,7 +132,7 @@ def evaluate_frames(
     names = np.array(frames.trial)
     for name in np.unique(names) if sequence else ():
         require_frequent(np.sort(frames.time_s[names == name]), what=f"the trial {name}")
-    batches = frames.batches(batch_size, report=True)
+    batches = frames.batches(64, report=True)
     if friction == EACH:
         traction = network.require_ratio()
         if not np.isfinite(frames.friction).all():
@@ -268,8 +267,8 @@ _FALSE_ABOVE = 2.0
 """An alarm that begins while the true margin is above so many thresholds is false, not early."""
 
 
-def lead_times(predictions: ScoredFrames, *, threshold: float = THRESHOLD) -> LeadTimes:
-    """Measure warnings, predictions below a threshold in margin units, on the labelled frames of some trials.
+def lead_times(predictions: ScoredFrames) -> LeadTimes:
+    """Measure warnings, predictions below `THRESHOLD`, on the labelled frames of some trials.
 
     A slip is the first frame of a trial with margin 0; what comes after is left out.
     """
@@ -283,9 +282,9 @@ def lead_times(predictions: ScoredFrames, *, threshold: float = THRESHOLD) -> Le
         before = order if slips_at is None else order[:slips_at]
         if not len(before):
             continue
-        alarms = predictions.prediction[before] < threshold
+        alarms = predictions.prediction[before] < THRESHOLD
         begins = np.flatnonzero(alarms & ~np.insert(alarms[:-1], 0, False))
-        is_false = labels[before][begins] > _FALSE_ABOVE * threshold
+        is_false = labels[before][begins] > _FALSE_ABOVE * THRESHOLD
         false += int(is_false.sum())
         minutes += float(time_s[before[-1]] - time_s[before[0]]) / 60
         if slips_at is None:
@@ -293,7 +292,7 @@ def lead_times(predictions: ScoredFrames, *, threshold: float = THRESHOLD) -> Le
         slips += 1
         slip_s = float(time_s[order[slips_at]])
         # an alarm that began in vain and never ended is true from where the margin is low on
-        due = alarms & (labels[before] <= _FALSE_ABOVE * threshold)
+        due = alarms & (labels[before] <= _FALSE_ABOVE * THRESHOLD)
         if due.any():
             leads.append(1e3 * (slip_s - float(time_s[before[np.argmax(due)]])))
     return LeadTimes(
@@ -301,7 +300,7 @@ def lead_times(predictions: ScoredFrames, *, threshold: float = THRESHOLD) -> Le
         warned=len(leads),
         median_ms=float(np.median(leads)) if leads else None,
         false_per_minute=false / minutes if minutes > 0 else 0.0,
-        threshold=threshold,
+        threshold=THRESHOLD,
     )
 
 
