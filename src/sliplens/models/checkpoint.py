@@ -424,10 +424,10 @@ class Estimate:
         assert self.probabilities is not None
         assert self.edges is not None
         assert self.ratio is not None
-        told = isinstance(friction, Friction)
+        common = isinstance(friction, Friction)
         probabilities, margin = np.empty_like(self.probabilities), np.empty_like(self.margin)
-        for value in [friction] if told else [Friction(float(value)) for value in np.unique(friction)]:
-            rows = np.full(len(margin), True) if told else friction == value.mean
+        parts = [(Friction(float(value)), friction == value) for value in ([] if common else np.unique(friction))]
+        for value, rows in [(friction, slice(None))] if common else parts:
             probabilities[rows] = condition_on_friction(
                 self.probabilities[rows],
                 self.ratio.probabilities[rows],
@@ -443,7 +443,7 @@ class Estimate:
             margin=margin,
             probabilities=probabilities,
             calibration=calibration,
-            friction=friction if told else None,
+            friction=friction if common else None,
             alone=None,
         )
 

@@ -189,9 +189,8 @@ def add_row(rows: list[list[float]], row: list[float], file: Path) -> None:
     rows.append(row)
     lines = ["epoch,train_mse,validation_mse,minutes"]
     lines += [f"{r[0]:.3f},{r[1]:.6g},{r[2]:.6g},{r[3]:.4f}" for r in rows]
-    part = file.with_name(file.name + ".part")
-    part.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    part.replace(file)
+    with whole_file(file) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def describe_training(
