@@ -281,15 +281,11 @@ def _list_notes(
     """Refuse recordings and options that do not fit the network; return the assumptions about those that do."""
     if friction is not None:
         network.require_ratio()
-    follows = sequence and network.follow(friction=friction)
+    if sequence:
+        network.follow(friction=friction)
     notes: list[str] = []
     for capture in captures:
-        if follows and capture.time_s is None:
-            raise InputError(
-                f"--sequence needs the times of the frames, and those of {capture.name} are unknown; leave it out, or "
-                "name a recording with times"
-            )
-        if follows and capture.time_s is not None:
+        if sequence:
             require_frequent(capture.time_s, what=capture.name)
         notes += [*capture.notes, *_require_comparable(network, capture)]
     notes += network.doubts(profile=profile)
@@ -405,7 +401,7 @@ class _Prediction(Work):
         capture, frames = read(*part)
         capture = _assume_reference(self.network, capture)
         network, follower = self.network, self.network.follow() if self.sequence else None
-        if self.sequence and capture.time_s is not None:
+        if self.sequence:
             require_frequent(capture.time_s, what=capture.name)  # `_list_notes` saw one trial of each sensor
         reference = None if capture.read_reference is None else capture.read_reference()
         check, size = _make_check(network, capture, reference), tuple(network.manifest.frame_size)

@@ -121,8 +121,13 @@ def _moments(
     return mean, np.sqrt((probabilities * (centres - mean[:, None]) ** 2).sum(axis=-1))
 
 
-def require_frequent(time_s: Float[np.ndarray, " frames"], *, what: str) -> None:
-    """Refuse a recording whose frames are mostly too far apart to be predicted in order."""
+def require_frequent(time_s: Float[np.ndarray, " frames"] | None, *, what: str) -> None:
+    """Refuse a recording whose frames have no times, or are mostly too far apart to be predicted in order."""
+    if time_s is None:
+        raise InputError(
+            f"--sequence needs the times of the frames, and those of {what} are unknown; leave it out, or name a "
+            "recording with times"
+        )
     step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     if step_s > GAP_S + ROUNDING_S:
         raise InputError(
