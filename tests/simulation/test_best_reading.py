@@ -9,6 +9,7 @@ from sliplens.simulation import CHROMATOUCH, Nuisances, SimulationRecipe, plan_t
 from sliplens.simulation.intervention import (
     MARGIN,
     NOISE_PX,
+    UNKNOWNS,
     FilmedTrial,
     marker_readings,
     marker_sensitivity,
@@ -48,14 +49,13 @@ def test_with_priors_the_reading_is_the_mean_of_the_conditioned_gaussian(jacobia
 
 def test_the_error_is_the_bound_of_the_sensor_too():
     touch, prior = Touch(grasp=Grasp(normal_force_n=1.2)), prior_sigma(Nuisances(), wet=False)
-    sensitivity = marker_sensitivity(np.array([0.2, 0.5, 0.8]), sensor=CHROMATOUCH, touch=touch)
-    for jacobian in sensitivity.jacobian:
-        bound = least_sigma(jacobian, sensitivity.unknowns, noise_px=0.1, prior=prior)
-        gain = reading_gain(jacobian, sensitivity.unknowns, noise_px=0.1, prior=prior)
+    for jacobian in marker_sensitivity(np.array([0.2, 0.5, 0.8]), sensor=CHROMATOUCH, touch=touch):
+        bound = least_sigma(jacobian, UNKNOWNS, noise_px=0.1, prior=prior)
+        gain = reading_gain(jacobian, UNKNOWNS, noise_px=0.1, prior=prior)
         passed = gain @ jacobian
         # columns from metres to radians: digits are lost to their angles, not to their lengths
         assert passed[0] == pytest.approx(1, rel=1e-6)
-        spread = sum((passed[sensitivity.unknowns.index(name)] * sigma) ** 2 for name, sigma in prior.items())
+        spread = sum((passed[UNKNOWNS.index(name)] * sigma) ** 2 for name, sigma in prior.items())
         assert np.sqrt(0.1**2 * gain @ gain + spread) == pytest.approx(bound, rel=1e-6)
 
 
@@ -65,10 +65,10 @@ def test_a_markers_effect_is_what_the_reading_loses_with_it(trial):
     seen, effects = marker_readings(trial, frame)
     np.testing.assert_array_equal(seen, visible_markers(CHROMATOUCH))
     # slow: the normal equations, and each marker put back by hand
-    one = marker_sensitivity(np.array([margin]), sensor=CHROMATOUCH, touch=trial.touch(frame))
+    [one] = marker_sensitivity(np.array([margin]), sensor=CHROMATOUCH, touch=trial.touch(frame))
     prior = prior_sigma(trial.plan.recipe.nuisances, wet=True)
-    jacobian = one.jacobian[0] / NOISE_PX
-    precision = np.diag([0.0, *(1 / prior[name] ** 2 for name in one.unknowns[1:])])
+    jacobian = one / NOISE_PX
+    precision = np.diag([0.0, *(1 / prior[name] ** 2 for name in UNKNOWNS[1:])])
     gain = np.linalg.solve(jacobian.T @ jacobian + precision, jacobian.T)[0] / NOISE_PX
     moved = (trial.film.motion.centres_px[frame] - trial.film.motion.rest_px)[seen]
     for marker in range(0, len(seen), 7):

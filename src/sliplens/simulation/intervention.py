@@ -58,15 +58,8 @@ NUISANCES: dict[str, Callable[[Touch, float], Touch]] = {
     "marker_depth": lambda touch, step: replace(touch, marker_depth=touch.marker_depth + step),
 }
 """Shift of a touch by each nuisance; lengths in radii of the contact's sphere, angles in radians, `log_` relative."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sensitivity:
-    """Derivatives of the marker positions at each margin, in pixels per unit of the unknown."""
-
-    unknowns: tuple[str, ...]
-    """Names, the margin first."""
-    jacobian: Float[np.ndarray, "frames coordinates unknowns"]
+UNKNOWNS = (MARGIN, *NUISANCES)
+"""Names of the columns of `marker_sensitivity`."""
 
 
 def visible_markers(sensor: Sensor) -> Int[np.ndarray, " markers"]:
@@ -78,8 +71,11 @@ def visible_markers(sensor: Sensor) -> Int[np.ndarray, " markers"]:
 
 def marker_sensitivity(
     margins: Float[np.ndarray, " frames"], *, sensor: Sensor, touch: Touch, displacement: str | None = None
-) -> Sensitivity:
-    """Compute the shift of the visible markers with the margin and with every nuisance, by central differences."""
+) -> Float[np.ndarray, "frames coordinates unknowns"]:
+    """Compute the shift of the visible markers with each of `UNKNOWNS`, by central differences.
+
+    In pixels per unit of the unknown.
+    """
     if not np.all((margins > 0) & (margins < 1)):
         raise ContactError("safety margins must lie inside (0, 1), where the derivative exists; leave out the ends")
     visible, step = visible_markers(sensor), _STEP * np.minimum(margins, 1 - margins)
@@ -96,7 +92,7 @@ def marker_sensitivity(
     for shift in NUISANCES.values():
         there, back = (positions(margins, shift(start, side * _STEP)) for side in (1, -1))
         columns.append((there - back) / (2 * _STEP))
-    return Sensitivity(unknowns=(MARGIN, *NUISANCES), jacobian=np.stack(columns, axis=-1))
+    return np.stack(columns, axis=-1)
 
 
 def prior_sigma(nuisances: Nuisances, *, wet: bool) -> dict[str, float]:
@@ -133,7 +129,7 @@ def reading_gain(
     """Compute the gain of the best linear estimator of the margin: its change with each coordinate, per pixel.
 
     The margin's row of (J^T J / sigma^2 + diag(1 / prior^2))^-1 J^T / sigma^2: with infinite priors the best linear
-    unbiased estimator, else the posterior mean. `jacobian` and `unknowns` are as in `Sensitivity`.
+    unbiased estimator, else the posterior mean. `jacobian` is that of a frame, with the names of its columns.
     """
     rows, scale = observations(jacobian, unknowns, noise_px, prior)
     return np.linalg.pinv(rows / scale)[0, : len(jacobian)] / (scale[0] * noise_px)
@@ -272,14 +268,14 @@ def marker_readings(
         raise ContactError(
             f"frame {frame} of {trial.plan.trial} has no contact, and so no margin; choose another frame"
         )
-    sensitivity = marker_sensitivity(
+    [jacobian] = marker_sensitivity(
         np.array([np.clip(margin, _NEAREST_END, 1 - _NEAREST_END)]),
         sensor=recipe.sensor,
         touch=trial.touch(frame),
         displacement=recipe.displacement,
     )
     prior = prior_sigma(recipe.nuisances, wet=trial.plan.condition == "wet")
-    gain = reading_gain(sensitivity.jacobian[0], sensitivity.unknowns, noise_px=NOISE_PX, prior=prior)
+    gain = reading_gain(jacobian, UNKNOWNS, noise_px=NOISE_PX, prior=prior)
     motion, visible = trial.film.motion, visible_markers(recipe.sensor)
     moved = (motion.centres_px[frame] - motion.rest_px)[visible]
     return visible, (gain.reshape(-1, 2) * moved).sum(axis=1)
