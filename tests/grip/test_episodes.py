@@ -251,7 +251,7 @@ def test_a_slip_narrows_what_was_told_of_friction(table):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        ({"latency_s": -1.0}, "latency and error scale must not be negative"),
+        ({"latency_s": -1.0}, "the latency must not be negative"),
         ({"friction": 0.6, "network": "thesis-raw"}, "F_t / F_n"),
     ],
 )

@@ -57,8 +57,6 @@ class EpisodeOptions:
     readings: ReadingTable | None = None
     """Measured errors of the network; None loads those of a network that comes with sliplens, and measures those of
     any other first (minutes)."""
-    error_scale: float = 1.0
-    """Factor on the network's errors, where they are looked up."""
     friction: FrictionLike | Literal["each"] | None = None
     """Friction that predictions use, as in `predict`, for a network that predicts F_t / F_n; `each` uses that of each
     episode as it begins. Slips narrow a range down."""
@@ -66,8 +64,8 @@ class EpisodeOptions:
     """Time from an image to the command by it."""
 
     def __post_init__(self) -> None:
-        if self.error_scale < 0 or self.latency_s < 0:
-            raise InputError("latency and error scale must not be negative; give 0 or more")
+        if self.latency_s < 0:
+            raise InputError("the latency must not be negative; give 0 or more")
 
 
 def run_episodes(
@@ -178,7 +176,6 @@ def run_episodes(
         table = options.readings
         config = to_builtins(setup) | {
             "episodes": episodes,
-            "error_scale": options.error_scale,
             "script": dict(script or {}),
             "readings": None if table is None else (table.network, table.seed, len(table)),
         }
@@ -241,7 +238,6 @@ class _Job:
                 options.readings,
                 fingertips=scripts.fingertips,
                 rng=np.random.default_rng(seed),
-                error_scale=options.error_scale,
                 learners=learners,
             )
         if isinstance(self.controller, str):

@@ -164,8 +164,6 @@ class RecipeChanges(TypedDict, total=False):
     """Least and largest coefficient of friction of the dry object."""
     nuisances: Nuisances | None
     """Ranges of everything that varies beside the margin."""
-    series: str | None
-    """Name that is part of the seed, so that presets never share random numbers."""
     seed: int | None
     """Seed: the same seed gives the same bytes on the same machine."""
 
