@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from realism.scene import nominal_unit, without_noise
+from simulated_data import simulate_recipe
 
 from sliplens.errors import InputError
 from sliplens.files import output_folder
-from sliplens.recordings import Dataset, Recording, load_dataset
+from sliplens.recordings import Dataset, Recording
 from sliplens.simulation import (
     CHROMATOUCH,
     FLAT_GEL,
@@ -18,7 +19,6 @@ from sliplens.simulation import (
     Nuisances,
     Pulls,
     SimulationRecipe,
-    simulate_dataset,
 )
 from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.intervention import (
@@ -34,15 +34,9 @@ from sliplens.simulation.plan import read_recipe
 RECIPE = SimulationRecipe(dry_trials=3, wet_trials=1, frames_per_trial=24, seed=5)
 
 
-def simulate(folder: Path, recipe: SimulationRecipe) -> Dataset:
-    with output_folder(folder, stage="simulate", config={"recipe": recipe.to_json(), "device": "cpu"}) as out:
-        simulate_dataset(out.folder, recipe)
-    return load_dataset(folder)
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Dataset:
-    return simulate(tmp_path_factory.mktemp("simulated") / "data", RECIPE)
+    return simulate_recipe(tmp_path_factory.mktemp("simulated") / "data", RECIPE)
 
 
 @pytest.fixture(scope="module")

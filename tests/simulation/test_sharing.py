@@ -6,29 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from data_sets import save_dataset
+from simulated_data import simulate_recipe
 
 from sliplens.cli import main
-from sliplens.files import output_folder
-from sliplens.recordings import Dataset, Recording, import_recordings, load_dataset
-from sliplens.simulation import SimulationRecipe, simulate_dataset
+from sliplens.recordings import Dataset, Recording, import_recordings
+from sliplens.simulation import SimulationRecipe
 from sliplens.simulation.trials import compare_datasets
 
 RECIPE = SimulationRecipe(dry_trials=4, wet_trials=0, days=2, frames_per_trial=20, sensors=2, seed=3)
 
 
-def simulated(folder: Path, recipe: SimulationRecipe) -> Dataset:
-    with output_folder(folder, stage="simulate", config={"recipe": recipe}) as out:
-        simulate_dataset(out.folder, recipe)
-    return load_dataset(folder)
-
-
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Dataset:
-    return simulated(tmp_path_factory.mktemp("first") / "data", RECIPE)
+    return simulate_recipe(tmp_path_factory.mktemp("first") / "data", RECIPE)
 
 
 def test_the_same_seed_shares_what_both_have_though_no_file_is_the_same(data: Dataset, tmp_path: Path):
-    other = simulated(tmp_path / "other", replace(RECIPE, dry_trials=3, frames_per_trial=22, sensors=1))
+    other = simulate_recipe(tmp_path / "other", replace(RECIPE, dry_trials=3, frames_per_trial=22, sensors=1))
     shared = compare_datasets(data, other)
     assert not {trial.sha256 for trial in data.trials} & {trial.sha256 for trial in other.trials}
     names = {trial.trial for trial in data.trials} & {trial.trial for trial in other.trials}

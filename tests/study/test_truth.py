@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.stats import pearsonr
+from simulated_data import simulate_recipe
 from torch import Tensor, nn
 
 from sliplens.codec import load_result, save_result
@@ -16,12 +17,11 @@ from sliplens.explainers.explain import explain_frames, network_inputs
 from sliplens.explainers.frames import FrameSelection, frames_from_dataset
 from sliplens.faithfulness.controls import control_maps
 from sliplens.faithfulness.removal import SHARES, unit_means
-from sliplens.files import output_folder
 from sliplens.models import Manifest, Network
-from sliplens.recordings import Dataset, load_dataset
+from sliplens.recordings import Dataset
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.results.study import Truth
-from sliplens.simulation import CHROMATOUCH, SimulationRecipe, simulate_dataset
+from sliplens.simulation import CHROMATOUCH, SimulationRecipe
 from sliplens.simulation.intervention import marker_readings, put_markers_back, visible_markers
 from sliplens.study.truth import (
     FrameEffects,
@@ -69,10 +69,7 @@ CONTROLS = ("change", "local-change", "centre", "edges", "random")
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Dataset:
-    folder = tmp_path_factory.mktemp("simulated") / "data"
-    with output_folder(folder, stage="simulate", config={"recipe": RECIPE}) as out:
-        simulate_dataset(out.folder, RECIPE)
-    return load_dataset(folder)
+    return simulate_recipe(tmp_path_factory.mktemp("simulated") / "data", RECIPE)
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from io import FileIO
@@ -336,7 +337,7 @@ class DryRun:
         """Do nothing."""
 
 
-class GuardedGripper:
+class GuardedGripper(AbstractContextManager["GuardedGripper"]):
     """A gripper behind a guard: a ceiling that no force exceeds, and a watchdog that holds.
 
     When no command comes for `watchdog_s`, or the gripper fails at one in whatever way, the guard repeats the last
@@ -384,9 +385,6 @@ class GuardedGripper:
         """Stop guarding, and close the connection."""
         self.stop()
         self._gripper.close()
-
-    def __enter__(self) -> "GuardedGripper":
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
