@@ -338,14 +338,10 @@ class Holder:
         self._gates, self._slip = [SlipGate() for _ in range(fingers)], False
         self._past: deque[tuple[float, float, float, float]] = deque(maxlen=_MEMORY)
         """Times of commands, forces and loads measured then, and the command until then."""
-        self._touched_s: float | None = None
+        self.touched_s: float | None = None
+        """Time of the first measured grip force."""
         self._follows_s, self._trouble = -np.inf, None
         self.choose(controller)
-
-    @property
-    def touched(self) -> bool:
-        """True after the first measured grip force."""
-        return self._touched_s is not None
 
     def choose(self, controller: str | Controller) -> None:
         """Use another controller from now on."""
@@ -367,7 +363,7 @@ class Holder:
             self._slip |= bool(
                 self._gates[finger].update(
                     reading.slip is SlipState.SLIP,
-                    since_touch_s=-1.0 if self._touched_s is None else taken_s - self._touched_s,
+                    since_touch_s=-1.0 if self.touched_s is None else taken_s - self.touched_s,
                     force_n=self._at(taken_s)[2],
                     earlier_n=self._at(taken_s - SPRINGS_BACK_S)[2],
                 )
@@ -387,8 +383,8 @@ class Holder:
         """Return the grip force to command now, from the force measured now; NaN where none is measured."""
         with self._lock:
             since_s = min(time_s - self._past[-1][0], _LONGEST_S) if self._past else PERIOD_S
-            if self._touched_s is None and force_n > _TOUCH_N:
-                self._touched_s = self._follows_s = time_s
+            if self.touched_s is None and force_n > _TOUCH_N:
+                self.touched_s = self._follows_s = time_s
             differs = self._compare(time_s, force_n)
             trouble = None if np.isnan(force_n) else self._trouble
             if differs:
@@ -412,7 +408,7 @@ class Holder:
                 )  # fmt: skip
             slip, self._slip = self._slip, False
             observation = Observation(
-                time_s=0.0 if self._touched_s is None else time_s - self._touched_s,
+                time_s=0.0 if self.touched_s is None else time_s - self.touched_s,
                 force_n=np.array([force_n if np.isnan(then_n) else then_n]),
                 command_n=np.array([self._command_n]),
                 load_n=np.array([load_n]),
@@ -434,7 +430,7 @@ class Holder:
 
     def _compare(self, time_s: float, force_n: float) -> bool:
         """Return True where the measured force differs from the command; note a fault that lasts in `_trouble`."""
-        if self._touched_s is None or np.isnan(force_n):
+        if self.touched_s is None or np.isnan(force_n):
             return False
         differs = abs(force_n - self._command_n) > max(_DIFFERS * self._command_n, _DIFFERS_N)
         if not differs:

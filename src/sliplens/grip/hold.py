@@ -308,7 +308,7 @@ class HoldLoop:
         """Refuse a gripper that measures no force from the start although its fingers have stopped."""
         if math.isnan(state.width_m):
             return
-        if self._holder.touched or not self.steps:
+        if self._holder.touched_s is not None or not self.steps:
             self._closing = None
             return
         since_s, low_m, high_m = self._closing or (now_s, state.width_m, state.width_m)
