@@ -366,7 +366,7 @@ def test_a_mode_that_a_camera_has_not_is_told(camera: FakeCamera, options: LiveO
     [(errno.EBUSY, "close that one"), (errno.EACCES, "group video"), (errno.EIO, "plug it in again")],
 )
 def test_a_camera_that_cannot_be_opened_says_why(camera: FakeCamera, number: int, words: str):
-    camera.fails = [OSError(number, os.strerror(number))] * 2
+    camera.fails.extend(OSError(number, os.strerror(number)) for _ in range(2))
     with pytest.raises(SourceError, match=words):
         open_live("0").__enter__()
 

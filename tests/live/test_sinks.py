@@ -189,25 +189,25 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> Slow:
 
 def test_a_slow_sink_loses_the_oldest_and_nobody_waits_for_it(slow: Slow):
     sender = Sender("slow")
-    sender.put(replace(READING, number=0), None)
+    sender.take(replace(READING, number=0), None)
     assert slow.began.wait(10)
     for number in range(1, 8):
-        sender.put(replace(READING, number=number), None)
+        sender.take(replace(READING, number=number), None)
     slow.go.set()
-    sender.close()
+    sender.close(5.0)
     assert slow.taken == [0, 5, 6, 7]
     assert slow.closed
-    assert (sender.state.sent, sender.state.lost, sender.state.trouble) == (4, 4, None)
+    assert (sender.progress.sent, sender.progress.lost, sender.progress.trouble) == (4, 4, None)
 
 
-def test_a_sink_that_hangs_is_left_after_a_while(slow: Slow, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("sliplens.live.sinks._FLUSH_S", 0.05)
+def test_a_sink_that_hangs_is_left_after_a_while(slow: Slow):
     sender = Sender("slow")
     for number in range(2):
-        sender.put(replace(READING, number=number), None)
+        sender.take(replace(READING, number=number), None)
     assert slow.began.wait(10)
-    sender.close()  # the first is still being sent
-    assert (sender.state.sent, sender.state.lost) == (0, 1)
+    assert not sender.close(0.05)  # the first is still being sent
+    sender.discard()
+    assert (sender.progress.sent, sender.progress.lost) == (0, 1)
     slow.go.set()
 
 
@@ -217,7 +217,7 @@ def test_a_sink_that_breaks_off_says_so_and_the_reading_goes_on(slow: Slow):
     source = ReplaySource(open_source(frames)[0], rate_hz=500.0)
     reader = sl.LiveReader(source, reference=frames[0], health=None, slip=None)
     reader.send_to("slow")
-    reader.senders[0].put(replace(READING, number=99), None)
+    reader.senders[0].take(replace(READING, number=99), None)
     assert slow.began.wait(10)  # before any other reading, which might push it out unsent
     with reader:
         numbers = [reading.number for reading in reader.readings()]

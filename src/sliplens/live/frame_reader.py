@@ -1,15 +1,14 @@
 """From a frame to its reading: reference, markers, health, and network, in one thread."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Protocol, TypeAlias, TypedDict, Unpack, runtime_checkable
+from typing import Protocol, TypedDict, Unpack, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
 from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
@@ -98,32 +97,22 @@ class _ReferenceTaker:
     """Search for a moment in which the picture is still and well exposed."""
 
     def __init__(self) -> None:
-        self._since: LiveFrame | None = None
-        self._soft: np.ndarray | None = None
-        self._frames = 0
+        self._begun_s, self._soft, self._frames = 0.0, None, 0
 
     def offer(self, frame: LiveFrame) -> bool:
         """Take the next frame; True once the picture was still for long enough and can be the reference."""
         soft = soften(frame.image)
-        moved = self._soft is None or float(np.abs(soft - self._soft).mean()) > _STILL_GREY
-        if moved or self._since is None:
-            self._since, self._soft, self._frames = frame, soft, 1
-            return False
+        if self._soft is None or float(np.abs(soft - self._soft).mean()) > _STILL_GREY:
+            self._begun_s, self._soft, self._frames = frame.time_s, soft, 0
         self._frames += 1
-        still = self._frames >= _STILL_FRAMES and frame.time_s - self._since.time_s >= _STILL_S
+        still = self._frames >= _STILL_FRAMES and frame.time_s - self._begun_s >= _STILL_S
         return still and _DARK < float(soft.mean()) < _BRIGHT
-
-
-_Output: TypeAlias = tuple[tuple[Tensor, ...], Latency]
-"""Output of the network for a frame, and the time that it took."""
 
 
 class FrameReader:
     """Reads frames one after another, each against the untouched sensor; `read` is called in one thread.
 
-    The frame is checked while the network runs, as long as the frame before had a margin: the output is dropped where
-    the checks then withhold it. An engine with threads of its own, as OpenVINO, needs no second thread of Python for
-    that, which would wait for the first.
+    A frame is checked first; the network runs only where no check withholds the margin.
 
     Parameters are those of `LiveReader`.
     """
@@ -157,7 +146,6 @@ class FrameReader:
         self._tracker: Tracker | None = None
         self._smaller = 1
         self._taker: _ReferenceTaker | None = None
-        self._has_margin = False
         self._last: LiveFrame | None = None
         self._dropped = 0
 
@@ -213,12 +201,10 @@ class FrameReader:
         )
         if (why := self._unready(last, frame)) is not None:
             return self._withhold(begin, frame, why)
-        checked: list[tuple[Reading, str | None]] = []
-        output = self._predict(frame, lambda: checked.append(self._check(begin, frame))) if self._has_margin else None
-        [(reading, withheld)] = checked or [self._check(begin, frame)]
+        reading, withheld = self._check(begin, frame)
         if self.network is None or withheld is not None:
             return self._withhold(reading, frame, withheld)
-        return self._estimate(reading, frame, output or self._predict(frame))
+        return self._estimate(reading, frame)
 
     def _unready(self, last: LiveFrame | None, frame: LiveFrame) -> str | None:
         """Explain why a frame cannot be compared with a reference, after taking a new one where that is due."""
@@ -269,44 +255,28 @@ class FrameReader:
         return reading, withheld
 
     def _withhold(self, reading: Reading, frame: LiveFrame, why: str | None) -> Reading:
-        self._has_margin = False
         latency = replace(reading.latency, decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
         return replace(reading, withheld=why, latency=latency)
 
-    def _predict(self, frame: LiveFrame, meanwhile: Callable[[], None] = lambda: None) -> _Output:
-        """Run the network on a frame, and something else meanwhile."""
+    def _estimate(self, reading: Reading, frame: LiveFrame) -> Reading:
         assert self.network is not None
         assert self.engine is not None
         assert self.reference is not None
-        begun = time.perf_counter()
-        inputs = self.network.encode(frame.image[None], self.reference)
-        encoded, spent_s = time.perf_counter(), 0.0
-
-        def batches() -> Iterator[Tensor]:
-            nonlocal spent_s
-            yield inputs
-            before = time.perf_counter()
-            meanwhile()  # the batch is under way: an engine looks for the next one before it waits
-            spent_s = time.perf_counter() - before
-
-        [parts] = self.engine.answers(batches())
-        waited_s = time.perf_counter() - encoded - spent_s
-        return parts, Latency(encode_ms=1e3 * (encoded - begun), network_ms=1e3 * waited_s)
-
-    def _estimate(self, reading: Reading, frame: LiveFrame, output: _Output) -> Reading:
-        assert self.network is not None
         friction = self.learner.friction
         follower = self._follower if friction is None else None  # it takes no friction
-        parts, took = output
+        begun = time.perf_counter()
+        inputs = self.network.encode(frame.image[None], self.reference)
+        encoded = time.perf_counter()
+        [parts] = self.engine.answers(iter([inputs]))
         estimate = self.network.to_estimate(*parts, friction=friction)
-        latency = replace(reading.latency, encode_ms=took.encode_ms, network_ms=took.network_ms)
+        network_ms = 1e3 * (time.perf_counter() - encoded)
+        latency = replace(reading.latency, encode_ms=1e3 * (encoded - begun), network_ms=network_ms)
         reading = replace(reading, latency=latency)
         novelty = None if self._health is None else check_novelty(estimate)
         if novelty is not None:
             reading = replace(reading, health=(*reading.health, novelty))
             if not novelty.ok:
                 return self._withhold(reading, frame, novelty.sentence)
-        self._has_margin = True
         if follower is not None:
             estimate = follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
@@ -347,7 +317,11 @@ class FrameReader:
         self.markers_px = None
         if self._make_slip is not None and self.reference is not None:
             try:
-                self._tracker, self._smaller = _follow(self.reference)
+                self._tracker, self._smaller = Tracker(self.reference), small_factor(self.reference.shape)
+                if self._smaller == 1 or self._tracker.rest.appearance.radius_px < _WIDE_PX * self._smaller:
+                    self._smaller = 1
+                else:  # a disc as wide as several pixels is measured as well in block means, in a third of the time
+                    self._tracker = Tracker(small_picture(self.reference))
                 self._slip = self._make_slip(self._in_frame(self._tracker.rest.centre_px))
             except (ImageError, InputError):
                 self._tracker = self._slip = None  # it shows no markers, or too few
@@ -355,17 +329,6 @@ class FrameReader:
     def _in_frame(self, places_px: Float[np.ndarray, "markers 2"]) -> Float[np.ndarray, "markers 2"]:
         """Convert places of the picture in which markers are tracked to the frame; pixel centres are whole numbers."""
         return (places_px + 0.5) * self._smaller - 0.5
-
-
-def _follow(reference: Frame) -> tuple[Tracker, int]:
-    """Make a tracker of a sensor's markers, and the factor by which its pictures are reduced.
-
-    A disc as wide as several pixels is measured as well in block means, in a third of the time.
-    """
-    tracker, factor = Tracker(reference), small_factor(reference.shape)
-    if factor == 1 or tracker.rest.appearance.radius_px < _WIDE_PX * factor:
-        return tracker, 1
-    return Tracker(small_picture(reference)), factor
 
 
 def _in_pixels(size: tuple[int, ...]) -> str:

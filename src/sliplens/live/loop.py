@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from threading import Event, Lock, Thread
+from threading import Condition, Event, Lock, Thread
 from typing import TypeAlias, Unpack
-from weakref import WeakSet
 
 import numpy as np
 import torch
@@ -42,48 +41,45 @@ _MOST_FRAMES = 10**6
 _RETRY_S = 1.0  # between two tries to open a source that was lost
 _PATIENCE_S = 3.0
 _SWITCH_S = 5e-4
+_FLUSH_S = 5.0
 
 
-_cores_lock = Lock()
-_cores: list[ExitStack] = []
-"""An entry for each reader that is entered; the first, which leaves last, undoes the thread limits."""
+_cores_lock, _readers = Lock(), list[object]()
+_limits = ExitStack()
+"""Thread limits of the process while a reader is entered; the last one that leaves undoes them."""
 
 
 @contextmanager
 def _share_cores() -> Iterator[None]:
-    """Limit the threads of the whole process from when the first reader is entered until the last one is left.
+    """Limit the threads of the whole process while any reader is entered.
 
-    A frame is checked in one thread while the network runs in another, and the page draws beside them. Threads that
-    share one step of that wait for each other: a matrix of markers takes ten times as long by two as by one.
+    Threads that share one step wait for each other: a matrix of markers takes ten times as long by two as by one.
     """
+    reader = object()
     with _cores_lock:
-        stack = ExitStack()
-        if not _cores:
-            _limit_threads(stack.callback)
-        _cores.append(stack)
+        if not _readers:
+            restore, threads = _limits.callback, torch.get_num_threads()
+            restore(threadpool_limits(1, user_api="blas").restore_original_limits)
+            restore(torch.set_num_threads, threads)
+            torch.set_num_threads(max(1, threads - 1))  # the checks have a core
+            # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
+            restore(sys.setswitchinterval, sys.getswitchinterval())
+            sys.setswitchinterval(_SWITCH_S)
+            # existing objects stay: to search all of them for garbage takes as long as half a frame
+            restore(gc.unfreeze)
+            gc.freeze()
+            if not missing_packages("cv2", extra="markers"):
+                cv2 = import_cv2()
+                restore(cv2.setNumThreads, cv2.getNumThreads())
+                cv2.setNumThreads(1)
+        _readers.append(reader)
     try:
         yield
     finally:
         with _cores_lock:
-            _cores.pop().close()
-
-
-def _limit_threads(restore: Callable[..., object]) -> None:
-    """Limit the threads of NumPy, torch and OpenCV; `restore` takes calls that undo it."""
-    restore(threadpool_limits(1, user_api="blas").restore_original_limits)
-    threads = torch.get_num_threads()
-    restore(torch.set_num_threads, threads)
-    torch.set_num_threads(max(1, threads - 1))  # the checks have a core
-    # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
-    restore(sys.setswitchinterval, sys.getswitchinterval())
-    sys.setswitchinterval(_SWITCH_S)
-    # existing objects stay: to search all of them for garbage takes as long as half a frame
-    restore(gc.unfreeze)
-    gc.freeze()
-    if not missing_packages("cv2", extra="markers"):
-        cv2 = import_cv2()
-        restore(cv2.setNumThreads, cv2.getNumThreads())
-        cv2.setNumThreads(1)
+            _readers.remove(reader)
+            if not _readers:
+                _limits.close()
 
 
 LiveInput: TypeAlias = "str | Path | Images | Capture | LiveSource"
@@ -153,9 +149,9 @@ class LiveReader(FrameReader):
         self._engine_name, self._stall_s = settings.get("engine", "auto"), settings.get("stall_s", 1.0)
         self._forces = None if forces is None else ForceStream(forces)
         self._frames: Mailbox[LiveFrame] = Mailbox()
-        self._lock = Lock()
+        self._news = Condition()
         self._newest: Reading | None = None
-        self._mailboxes: WeakSet[Mailbox[Reading]] = WeakSet()  # until nobody takes from them any more
+        self._published = 0
         self._subscribers: list[Subscriber] = []
         self._stopped, self._over = Event(), Event()
         self._error: BaseException | None = None
@@ -167,7 +163,7 @@ class LiveReader(FrameReader):
     def outputs(self) -> tuple[OutputState, ...]:
         """Progress of the newest recording and of each sink."""
         recorder = self._last_recorder
-        return (*(() if recorder is None else (recorder.state,)), *(sender.state for sender in self.senders))
+        return (*(() if recorder is None else (recorder.state,)), *(sender.progress for sender in self.senders))
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -256,17 +252,19 @@ class LiveReader(FrameReader):
         """
         if not self._threads:
             raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
-        place: Mailbox[Reading] = Mailbox()
-        with self._lock:  # from now on, not from the first `next`
-            if self._newest is not None:
-                place.put(self._newest)
-            if self._over.is_set():
-                place.close()
-            self._mailboxes.add(place)
-        return self._take_all(place)
+        with self._news:  # from now on, not from the first `next`; the newest reading counts as news
+            seen = max(0, self._published - 1)
+        return self._follow_news(seen)
 
-    def _take_all(self, place: Mailbox[Reading]) -> Iterator[Reading]:
-        while (reading := place.take()) is not None:
+    def _follow_news(self, seen: int) -> Iterator[Reading]:
+        while True:
+            with self._news:
+                while self._published == seen and not self._over.is_set():
+                    self._news.wait()
+                if self._published == seen:
+                    break
+                seen, reading = self._published, self._newest
+            assert reading is not None
             yield reading
         if self._error is not None:
             raise self._error
@@ -334,7 +332,7 @@ class LiveReader(FrameReader):
         for name in sinks:
             sender = Sender(name)
             self.senders.append(sender)
-            self.subscribe(sender.put)
+            self.subscribe(sender.take)
 
     def record(self, folder: Path | str, *, facts: TrialFacts | None = None) -> Recorder:
         """Record every frame from now on, read or not, into a data set, a new one or one that is there.
@@ -370,7 +368,8 @@ class LiveReader(FrameReader):
 
     def _end_outputs(self) -> None:
         for sender in self.senders:
-            sender.close()
+            if not sender.close(_FLUSH_S):
+                sender.discard()
         self.stop_recording()
 
     def _make_engine(self, network: Network) -> Engine:
@@ -449,17 +448,15 @@ class LiveReader(FrameReader):
 
     def _finish(self) -> None:
         self._end()
-        with self._lock:
+        with self._news:
             self._over.set()
-            for place in self._mailboxes:
-                place.close()
+            self._news.notify_all()
 
     def _publish(self, reading: Reading, frame: LiveFrame | None) -> None:
         self.source.update_reading(reading)
-        with self._lock:
-            self._newest = reading
-            for place in self._mailboxes:
-                place.put(reading)
+        with self._news:
+            self._newest, self._published = reading, self._published + 1
+            self._news.notify_all()
         for callback in tuple(self._subscribers):
             callback(reading, frame)
 

@@ -65,12 +65,12 @@ class OutputState:
     """Why it failed, with the cure; None while it works."""
 
     def __str__(self) -> str:
-        span = f"{number_of(self.sent, 'reading')} sent"
+        sent = number_of(self.sent, "reading") + " sent"
         if self.seconds is not None:
-            span = f"{number_of(self.sent, 'frame')} in {self.seconds:.1f} s"
+            sent = f"{number_of(self.sent, 'frame')} in {self.seconds:.1f} s"
         lost = f", {self.lost:,} lost" if self.lost else ""
         trouble = f"; {self.trouble}" if self.trouble else ""
-        return f"{self.name}: {span}{lost}{trouble}"
+        return f"{self.name}: {sent}{lost}{trouble}"
 
 
 class Outlet(Generic[Item]):

@@ -372,10 +372,9 @@ def open_sink(name: str) -> Sink:
 
 _MOST_WAITING_BYTES = 64 * 2**20  # a second or two of a camera
 _READING_BYTES = 4096
-_FLUSH_S = 5.0
 
 
-class Sender:
+class Sender(Outlet[tuple[Reading, Frame | None]]):
     """Sends readings to a sink in a thread of its own: a slow sink loses readings, and delays none.
 
     Parameters
@@ -385,31 +384,18 @@ class Sender:
     """
 
     def __init__(self, name: str) -> None:
-        self._name, sink = name, open_sink(name)
-        self._outlet = Outlet[tuple[Reading, Frame | None]](
-            lambda item: sink.send(*item), sink.close, most_bytes=_MOST_WAITING_BYTES
-        )
+        self.name, sink = name, open_sink(name)
+        super().__init__(lambda item: sink.send(*item), sink.close, most_bytes=_MOST_WAITING_BYTES)
 
     @property
-    def state(self) -> OutputState:
+    def progress(self) -> OutputState:
         """Current progress."""
-        return self._outlet.state(self._name, broke=f"--sink {self._name} broke off", cure="begin it anew")
+        return self.state(self.name, broke=f"--sink {self.name} broke off", cure="begin it anew")
 
-    @property
-    def error(self) -> Exception | None:
-        """Error of the sink, after which nothing more is sent."""
-        return self._outlet.error
-
-    def put(self, reading: Reading, frame: LiveFrame | None) -> None:
+    def take(self, reading: Reading, frame: LiveFrame | None) -> None:
         """Take a reading and its frame, without waiting."""
         image = None if frame is None else frame.image
-        size_bytes = _READING_BYTES + (0 if image is None else image.nbytes)
-        self._outlet.put((reading, image), size_bytes=size_bytes)
-
-    def close(self) -> None:
-        """Send what waits, for 5 seconds at most, and end the sink."""
-        if not self._outlet.close(_FLUSH_S):
-            self._outlet.discard()
+        self.put((reading, image), size_bytes=_READING_BYTES + (0 if image is None else image.nbytes))
 
 
 __all__ = [
