@@ -11,14 +11,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from matplotlib.colors import to_rgba
 
 from sliplens.codec import Result, open_parquet
@@ -26,10 +25,9 @@ from sliplens.errors import InputError
 from sliplens.files import require_new_file
 from sliplens.images import absolute_difference
 from sliplens.live.sinks import RerunSink
-from sliplens.plots.audit import end_of_ratio, force_ratio
-from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
+from sliplens.plots.contact_sheet import TIMES, brighten
 from sliplens.plots.saliency import full_colour, overlay_relevance
-from sliplens.plots.style import BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name, written_whole
+from sliplens.plots.style import BLUE, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW, method_name, written_whole
 from sliplens.progress import OnProgress, open_stage, report_each, reporting
 from sliplens.recordings import Recording, TrialFacts, load_dataset
 from sliplens.recordings.capture import Capture, Frame
@@ -168,21 +166,17 @@ _LINES = {
     "force/normal": ("F_n (N)", BLUE),
     "force/tangential": ("F_t (N)", VERMILLION),
     "force/limit": ("μ F_n (N)", GREY),
-    "ratio/tangential_to_normal": ("F_t / F_n", BLUE),
-    "ratio/friction": ("friction coefficient", GREEN),
     "label/margin": ("true Γ", SKY),
     "label/high": ("true Γ + \N{GREEK SMALL LETTER SIGMA}", PURPLE),
     "label/low": ("true Γ \N{MINUS SIGN} \N{GREEK SMALL LETTER SIGMA}", PURPLE),
-    "label/stick_ratio": ("stick ratio", ORANGE),
     "margin": ("predicted Γ", VERMILLION),
     "interval/high": ("upper end of its 90 % interval", VERMILLION),
     "interval/low": ("lower end of its 90 % interval", VERMILLION),
 }
 """Name and colour of the numbers of a frame, by entity."""
-_STATE_COLOURS = {str(state): GREY if colour == "white" else colour for state, colour in STATE_COLOURS.items()}
-_STATE_COLOURS |= {"valid": GREEN, "not valid": GREY}
+_BRIGHTER = 4.0
+"""Factor of the brightness of differences."""
 _ZONE_OPACITY = 0.3
-_SAMPLED_FRAMES = 32  # from which the brightness of all differences is chosen
 _HALF_PX = 0.5  # a pixel's centre is a whole number here, and a half more in Rerun
 
 
@@ -199,111 +193,86 @@ def _play(
     tracks: Path | str | None,
 ) -> None:
     """Send a trial, the results beside it and the viewer's layout to a sink, a frame in memory at a time."""
-    trial, rerun, stream = viewed.trial, sink.rerun, sink.stream
-    lines = {entity: (np.arange(len(trial)), values) for entity, values in _frame_numbers(trial).items()}
+    trial, rerun, stream, numbers = viewed.trial, sink.rerun, sink.stream, np.arange(len(viewed.trial))
+    margin, normal, sigma = trial.safety_margin, trial.normal_force_n, trial.safety_margin_sigma
+    lines = {
+        "force/normal": (numbers, normal),
+        "force/tangential": (numbers, trial.tangential_force_n),
+        "force/limit": (numbers, trial.friction_coefficient * normal),
+        "label/margin": (numbers, margin),
+    }
+    if sigma is not None:
+        lines |= {"label/high": (numbers, margin + sigma), "label/low": (numbers, margin - sigma)}
     if predictions is not None:
         columns = {"prediction": "margin", "low_90": "interval/low", "high_90": "interval/high"}
         rows = _rows_of(trial, Path(predictions), ("frame", *columns), command="sliplens predict")
-        lines |= {
-            entity: (_numbers(rows, "frame").astype(int), _numbers(rows, name)) for name, entity in columns.items()
-        }
-    followed = {}
+        lines |= {entity: (rows["frame"].astype(int), rows[name]) for name, entity in columns.items()}
+    markers = {}
     if tracks is not None:
         rows = _rows_of(trial, Path(tracks), ("frame", "x_px", "y_px"), command="sliplens track")
-        number, points = _numbers(rows, "frame"), np.stack([_numbers(rows, f"{axis}_px") for axis in "xy"], axis=-1)
-        seen = np.isfinite(points).all(axis=1)
-        followed = {at: points[seen & (number == at)] + _HALF_PX for at in np.unique(number).astype(int).tolist()}
+        points = np.stack([rows["x_px"], rows["y_px"]], axis=-1)[np.isfinite(rows["x_px"])]
+        number = rows["frame"][np.isfinite(rows["x_px"])].astype(int)
+        markers = {at: points[number == at] for at in np.unique(number).tolist()}
+    elif trial.truth is not None:
+        markers = dict(enumerate(trial.truth.marker_px))
     drawn = {} if maps is None else _draw_maps(viewed, maps)
-    sampled = np.stack(list(islice(viewed.read_frames(), 0, None, -(-len(trial) // _SAMPLED_FRAMES))))
-    factor = brightening([absolute_difference(sampled, trial.reference)])
 
     stream.send_recording_name(trial.trial)
-    friction = lines["ratio/friction"][1]
-    stream.send_blueprint(_lay_out(rerun.blueprint, trial, factor, friction, () if maps is None else maps.methods))
+    stream.send_blueprint(_lay_out(rerun.blueprint, trial, () if maps is None else maps.methods))
     sink.log_image("reference", trial.reference, static=True)
-    _play_facts(trial, sink, lines)
-    _play_frames(viewed, sink, factor, followed, drawn)
-
-
-def _play_facts(
-    trial: Recording, sink: RerunSink, lines: dict[str, tuple[Int[np.ndarray, " rows"], Float[np.ndarray, " rows"]]]
-) -> None:
-    """Send numbers with their frames, contact states, and the looks of all."""
-    rerun, stream = sink.rerun, sink.stream
     for entity, (frames, values) in lines.items():
         name, colour = _LINES[entity]
-        width = 1.0 if entity.endswith(("high", "low")) else 2.0
-        stream.log(entity, rerun.SeriesLines(names=name, colors=[_rgba(colour)], widths=width), static=True)
+        stream.log(entity, rerun.SeriesLines(names=name, colors=[_rgba(colour)]), static=True)
         if np.isfinite(values).any():
             clock = rerun.TimeColumn("time", duration=sink.in_ns(trial.time_s[frames]))
             times = [clock, rerun.TimeColumn("frame", sequence=frames)]
             stream.send_columns(entity, times, rerun.Scalars.columns(scalars=values))
-    for entity, colour, radius in (("frame/followed", GREEN, 2.5), ("frame/markers", YELLOW, 2.0)):
-        style = rerun.Points2D.from_fields(colors=[_rgba(colour)], radii=[rerun.Radius.ui_points(radius)])
-        stream.log(entity, style, static=True)
-    if trial.truth is not None:
-        arrows = rerun.Arrows2D.from_fields(colors=[_rgba(YELLOW)], radii=[rerun.Radius.ui_points(1.0)])
-        stream.log("frame/displacements", arrows, static=True)
-        zones = [(OUTSIDE, "no contact", [0] * 4), (SLIPS, "slips", _rgba(ORANGE)), (STICKS, "sticks", _rgba(SKY))]
-        stream.log("frame/zones", rerun.AnnotationContext(zones), static=True)
-    lanes = {"state/contact": [str(state) for state in trial.contact_state]}
-    if trial.valid is not None:
-        lanes["state/label"] = ["valid" if valid else "not valid" for valid in trial.labelled]
-    colours = [_rgba(colour) for colour in _STATE_COLOURS.values()]
-    for entity, states in lanes.items():
-        stream.log(entity, rerun.StateConfiguration(values=list(_STATE_COLOURS), colors=colours), static=True)
-        for number, (before, state) in enumerate(pairwise(["", *states])):
-            if state != before:
-                sink.set_frame(number, float(trial.time_s[number]))
-                stream.log(entity, rerun.StateChange(state=state))
-
-
-def _play_frames(
-    viewed: ViewedTrial,
-    sink: RerunSink,
-    factor: float,
-    followed: dict[int, Float[np.ndarray, "markers 2"]],
-    drawn: dict[int, dict[str, Frame]],
-) -> None:
-    """Send images, markers and zones; `followed` are tracked places and `drawn` maps, by frame."""
-    trial, rerun, stream = viewed.trial, sink.rerun, sink.stream
+    zones = [(OUTSIDE, "no contact", [0] * 4), (SLIPS, "slips", _rgba(ORANGE)), (STICKS, "sticks", _rgba(SKY))]
+    stream.log("frame/zones", rerun.AnnotationContext(zones), static=True)
     for number, frame in zip(report_each(range(len(trial))), viewed.read_frames(), strict=True):
         sink.set_frame(number, float(trial.time_s[number]))
         sink.log_image("frame", frame)
-        sink.log_image("difference", brighten(absolute_difference(frame, trial.reference), factor))
-        if number in followed:
-            stream.log("frame/followed", rerun.Points2D(followed[number]))
+        sink.log_image("difference", brighten(absolute_difference(frame, trial.reference), _BRIGHTER))
+        if number in markers:
+            points = rerun.Points2D(markers[number] + _HALF_PX, colors=_rgba(YELLOW), radii=rerun.Radius.ui_points(2))
+            stream.log("frame/markers", points)
         if trial.truth is not None:
-            places, rest = trial.truth.marker_px[number], trial.truth.marker_rest_px
             zones = rerun.SegmentationImage(trial.truth.contact_map[number], opacity=_ZONE_OPACITY)
             stream.log("frame/zones", zones)
-            stream.log("frame/markers", rerun.Points2D(places + _HALF_PX))
-            arrows = rerun.Arrows2D(vectors=places - rest, origins=rest + _HALF_PX)
-            stream.log("frame/displacements", arrows)
         for method in () if number in drawn else drawn.get(number - 1, {}):  # a map describes its own frame alone
             stream.log(f"map/{method}", rerun.Clear(recursive=False))
         for method, image in drawn.get(number, {}).items():
             sink.log_image(f"map/{method}", image)
 
 
-def _frame_numbers(trial: Recording) -> dict[str, Float[np.ndarray, " frames"]]:
-    """Forces and labels of every frame, by entity."""
-    normal, margin, sigma = trial.normal_force_n, trial.safety_margin, trial.safety_margin_sigma
-    basis = trial.labelling.basis if trial.labelling else None
-    if trial.truth is not None:
-        friction = trial.truth.static_friction
-    else:
-        friction = trial.friction_coefficient if basis is None else np.full(len(trial), basis.friction.mu)
-    numbers = {
-        "force/normal": normal,
-        "force/tangential": trial.tangential_force_n,
-        "force/limit": trial.friction_coefficient * normal,
-        "ratio/tangential_to_normal": force_ratio(trial),
-        "ratio/friction": friction,
-        "label/margin": margin,
-        "label/stick_ratio": trial.stick_ratio,
-    }
-    return numbers if sigma is None else numbers | {"label/high": margin + sigma, "label/low": margin - sigma}
+def _lay_out(rrb: Any, trial: Recording, methods: Iterable[str]) -> "Blueprint":
+    """Lay out the views of a trial."""
+    height, width = trial.reference.shape[:2]
+    view = partial(rrb.Spatial2DView, visual_bounds=rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height)))
+    chart = partial(rrb.TimeSeriesView, axis_x=rrb.TimeAxis(link="LinkToGlobal"))
+    # a map is as large as the network's image, whatever the camera's
+    maps = {method: f"map by {method_name(method)}, at its frame" for method in methods}
+    margins, contents = "safety margin Γ (1 sticks, 0 slips)", ["/margin", "/interval/**", "/label/**"]
+    charts = [chart(name=margins, contents=contents, axis_y=rrb.ScalarAxis(range=(-0.05, 1.05)))]
+    if np.isfinite(trial.normal_force_n).any():
+        charts.append(chart(origin="force", name="forces (N)"))
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(
+                view(origin="frame", name=f"camera T_n{': contact, stick zone, markers' if trial.truth else ''}"),
+                view(origin="difference", name=f"difference |T_n \N{MINUS SIGN} T_0| {TIMES} {_BRIGHTER:g}"),
+                rrb.Tabs(
+                    *(rrb.Spatial2DView(origin=f"map/{method}", name=name) for method, name in maps.items()),
+                    view(origin="reference", name="reference T_0"),
+                ),
+            ),
+            rrb.Vertical(*charts),
+            column_shares=[2, 3],
+        ),
+        # the first frame shows an untouched fingertip, so it plays
+        rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="off"),
+        collapse_panels=True,
+    )
 
 
 def _source_of(table: Path) -> tuple[Path, str | None]:
@@ -319,8 +288,10 @@ def _source_of(table: Path) -> tuple[Path, str | None]:
     return Path(source), None if trials is None else trials["trial"][0].as_py()
 
 
-def _rows_of(trial: Recording, path: Path, columns: Sequence[str], *, command: str) -> pa.Table:
-    """Load the rows of a table that belong to a trial, in the order of its frames."""
+def _rows_of(
+    trial: Recording, path: Path, columns: Sequence[str], *, command: str
+) -> dict[str, Float[np.ndarray, " rows"]]:
+    """Load columns of the rows that belong to a trial, in the order of its frames; NaN where there is no number."""
     kinds = dict.fromkeys(columns, "numbers") | {"trial": "texts", "frame": "whole numbers"}
     with open_parquet(path, kinds, cure=f"name a table that {command} wrote") as file:
         table = file.read(columns=list(kinds))
@@ -331,11 +302,7 @@ def _rows_of(trial: Recording, path: Path, columns: Sequence[str], *, command: s
     last = rows["frame"][-1].as_py()
     if rows["frame"][0].as_py() < 0 or last >= len(trial):
         raise InputError(f"{path} has frame {last} of {trial.trial}, which has {len(trial)}; predict it anew")
-    return rows
-
-
-def _numbers(rows: pa.Table, name: str) -> Float[np.ndarray, " rows"]:
-    return rows[name].cast(pa.float64()).to_numpy()
+    return {name: rows[name].cast(pa.float64()).to_numpy() for name in columns}
 
 
 def _draw_maps(viewed: ViewedTrial, maps: Explanation) -> dict[int, dict[str, Frame]]:
@@ -355,46 +322,6 @@ def _draw_maps(viewed: ViewedTrial, maps: Explanation) -> dict[int, dict[str, Fr
         }
         for number, row in rows.items()
     }
-
-
-def _lay_out(
-    rrb: Any, trial: Recording, factor: float, friction: Float[np.ndarray, " frames"], methods: Iterable[str]
-) -> "Blueprint":
-    """Lay out the views of a trial; `factor` multiplies the brightness of its differences."""
-    height, width = trial.reference.shape[:2]
-    view = partial(rrb.Spatial2DView, visual_bounds=rrb.VisualBounds2D(x_range=(0, width), y_range=(0, height)))
-    # a map is as large as the network's image, whatever the camera's
-    maps = [
-        rrb.Spatial2DView(origin=f"map/{method}", name=f"map by {method_name(method)}, at its frame")
-        for method in methods
-    ]
-    chart = partial(rrb.TimeSeriesView, axis_x=rrb.TimeAxis(link="LinkToGlobal"))
-    charts = [
-        chart(
-            name="safety margin Γ (1 sticks, 0 slips), stick ratio",
-            contents=["/margin", "/interval/**", "/label/**"],
-            axis_y=rrb.ScalarAxis(range=(-0.05, 1.05)),
-        )
-    ]
-    if np.isfinite(trial.normal_force_n).any():
-        highest = float(np.max(friction, where=np.isfinite(friction), initial=0))
-        span = rrb.ScalarAxis(range=(0.0, end_of_ratio(force_ratio(trial), highest)))
-        charts.append(chart(origin="force", name="forces (N)"))
-        charts.append(chart(origin="ratio", name="F_t / F_n in contact, beside friction", axis_y=span))
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(
-                view(origin="frame", name=f"camera T_n{': contact, stick zone, markers' if trial.truth else ''}"),
-                view(origin="difference", name=f"difference |T_n \N{MINUS SIGN} T_0| {TIMES} {factor:g}"),
-                rrb.Tabs(*maps, view(origin="reference", name="reference T_0")),
-            ),
-            rrb.Vertical(rrb.StateTimelineView(origin="state", name="contact state"), *charts),
-            column_shares=[2, 3],
-        ),
-        # the first frame shows an untouched fingertip, so it plays
-        rrb.TimePanel(state="collapsed", timeline="time", play_state="playing", loop_mode="off"),
-        collapse_panels=True,
-    )
 
 
 _LOOPBACK = "127.0.0.1"
