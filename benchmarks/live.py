@@ -90,7 +90,7 @@ class TimedPage(LivePage):
         for viewer in tuple(self.feed.clients):
             self.asked_s = min(self.asked_s, time.monotonic())
             viewer.shows_map = maps
-            if np.isinf(self.opens_s) and viewer.takes_s > 0:
+            if np.isinf(self.opens_s) and viewer.answered > 0:
                 self.opens_s = time.monotonic() - self.asked_s
 
 
@@ -195,7 +195,7 @@ def measure(
         for reading in reader.readings():
             if page is not None:
                 page.look(maps=maps)
-                pictures |= set() if page.feed.picture is None else {page.feed.picture.moment.frame.number}
+                pictures |= set() if page.feed.picture is None else {page.feed.picture.frame.number}
                 explained |= set() if page.feed.map is None else {page.feed.map.facts.number}
             if np.isinf(begins_s[0]) and (page is None or page.feed.picture is not None):
                 begins_s[0] = reading.time_s + WARM_S

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosedOK
 
 import sliplens as sl
 from sliplens.app.client import Client
-from sliplens.app.feed import Feed, Moment, PageFrame
+from sliplens.app.feed import Feed, PageFrame
 from sliplens.live import MarkerReading, SimulatedSource, SlipState
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.sensor import SensorProfile
@@ -59,8 +59,8 @@ def frame(number: int) -> LiveFrame:
 
 
 def picture(number: int) -> PageFrame:
-    moment = Moment(replace(READING, number=number), frame(number), None)
-    return PageFrame(moment=moment, reference=None, jpeg=bytes([number]), arrows=())
+    reading, image = replace(READING, number=number), bytes([number])
+    return PageFrame(reading=reading, frame=frame(number), start=None, reference=None, jpeg=image, arrows=())
 
 
 def with_client(act, **reader) -> None:
@@ -106,7 +106,7 @@ def test_a_slow_client_sees_the_picture_move():
             owed.append(await wire.next())
         assert all(message["picture_bytes"] for message in owed)  # pictures that are new
         assert feed.picture is not None
-        assert feed.picture.moment.frame.number >= 4
+        assert feed.picture.frame.number >= 4
 
     with_client(act)
 
@@ -165,7 +165,6 @@ def test_a_slider_moves_no_further_than_its_end_and_a_mistake_is_told():
 def test_its_threads_have_ended_when_it_is_closed():
     class Looks:
         wants_picture = shows_map = ready = True
-        takes_s = 0.0
 
         def wake(self) -> None: ...
 
@@ -206,4 +205,5 @@ def test_the_start_of_a_grip_is_its_last_frame_without_shear_at_its_largest_marg
         markers = MarkerReading(state=SlipState.STICKING, contact=shear_px is not None, shear_px=shear_px)
         feed._take(replace(READING, number=number, margin=margin, markers=markers), frame(number))
         assert feed._newest is not None
-        assert (feed._newest.start and feed._newest.start.number) == start
+        *_, before = feed._newest
+        assert (before and before.number) == start

@@ -45,7 +45,7 @@ class ClientMessage(msgspec.Struct, forbid_unknown_fields=True):
     act: str
     """`drawn`, a row of `_SHORT` or `_LONG`."""
     serial: int = -1
-    """Message that was drawn, or passed over in a hidden window (act `passed`)."""
+    """Message that was drawn."""
     method: str = RECOMMENDED_METHOD
     map: bool = True
     markers: bool = True
@@ -66,8 +66,8 @@ class Client:
         self.explained: Map | None = None
         """Map of the frozen picture."""
         self.shows_map = self.shows_arrows = True
-        self.takes_s = 0.0
-        """Time from sending a message to its answer, over the last few, in seconds."""
+        self.answered = 0
+        """Messages that it has drawn."""
         self._waiting = ""
         """Work in progress for this client, in words."""
         self._notices: deque[str] = deque(maxlen=4)
@@ -75,8 +75,8 @@ class Client:
         self._changed = asyncio.Event()
         self._has_news = True
         self._serial = 0
-        self._unanswered: dict[int, tuple[float, float]] = {}
-        self._sent_until_s, self._drawn_ms = -np.inf, None
+        self._unanswered: set[int] = set()
+        self._sent_until_s = -np.inf
         self._picture: PageFrame | None = None
         self._map: Map | None = None
         self._sent_arrows = True
@@ -114,12 +114,9 @@ class Client:
 
     async def _obey(self, command: ClientMessage) -> None:
         """Take an answer, or do what a button asks for; what takes long is not begun twice at once."""
-        if command.act in {"drawn", "passed"}:
-            captured_s, sent_s = self._unanswered.pop(command.serial, (np.nan, np.nan))
-            if command.act == "drawn" and np.isfinite(captured_s):
-                now_s = time.monotonic()
-                self._drawn_ms = 1e3 * (now_s - captured_s)
-                self.takes_s += 0.2 * (now_s - sent_s - self.takes_s)
+        if command.act == "drawn":
+            self._unanswered.discard(command.serial)
+            self.answered += 1
             self._changed.set()
         elif command.act not in _LONG:
             await self._act(command)
@@ -162,7 +159,7 @@ class Client:
         self.frozen = picture = self.frozen or self._picture or self.feed.picture
         if picture is None:
             return
-        self._waiting = f"explaining frame {picture.moment.frame.number}"
+        self._waiting = f"explaining frame {picture.frame.number}"
         self.wake()
         try:
             explained = await self.feed.explain(picture, command.method)
@@ -216,11 +213,10 @@ class Client:
         cells = overlay.cells if overlay is not None and overlay is not self._map else b""
         facts = frozen = None
         if picture is not None and jpeg:
-            height, width = picture.moment.frame.size
+            height, width = picture.frame.size
             facts = {"width": width, "height": height, "arrows": picture.arrows if self.shows_arrows else ()}
         if self.frozen is not None:
-            moment = self.frozen.moment
-            frozen = f"frame {moment.frame.number}, {describe_reading(moment.reading)}"
+            frozen = f"frame {self.frozen.frame.number}, {describe_reading(self.frozen.reading)}"
         points = feed.points_since(self._sent_until_s)
         notices = [self._notices.popleft() for _ in range(len(self._notices))]
         self._serial += 1
@@ -232,7 +228,6 @@ class Client:
             "controls": self._controls(),
             "points": points,  # readings since the message before
             "rate_hz": len(feed.points_since(now_s - _RATE_S)) / _RATE_S,
-            "drawn_ms": self._drawn_ms,  # from the capture of a frame until this client had drawn it
             "viewers": len(feed.clients),
             "waiting": self._waiting or feed.waiting,
             "notices": notices,
@@ -247,9 +242,7 @@ class Client:
             "map": overlay.facts if overlay is not None and cells else None,
             "map_bytes": len(cells),
         }
-        # a picture that was drawn before says nothing of how long drawing takes
-        captured_s = picture.moment.frame.captured_s if jpeg and picture is not None else np.nan
-        self._unanswered[self._serial] = captured_s, now_s
+        self._unanswered.add(self._serial)
         self._picture, self._map, self._sent_arrows = picture, overlay, self.shows_arrows
         self._sent_until_s = points[-1].at_s if points else self._sent_until_s
         return _join(header, jpeg, cells)

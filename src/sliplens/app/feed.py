@@ -36,7 +36,7 @@ CHART_S = 30.0
 """Time that the chart of the page spans, in seconds."""
 LIVE_METHOD = "grad-cam"
 """Explainer of the running picture, one of the fastest; any other explains a frozen one."""
-_PICTURES_HZ, _LEAST_HZ, _MAPS_HZ = 30.0, 5.0, 2.0
+_PICTURES_HZ, _MAPS_HZ = 30.0, 2.0
 _LONGEST_PX = 800
 _QUALITY = 85
 _START_SHEAR, _STICK_SHARE, _LEAST_STICK = 0.0025, 0.97, 0.9
@@ -61,19 +61,14 @@ class Point(msgspec.Struct, frozen=True, kw_only=True):
     """Least grip force that holds, of the same."""
 
 
-class Moment(NamedTuple):
-    """A reading with its frame, and the last frame of the same contact before the pull, where that is known."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PageFrame:
+    """Frame as the page shows it, with its reading."""
 
     reading: Reading
     frame: LiveFrame
     start: LiveFrame | None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PageFrame:
-    """Frame as the page shows it."""
-
-    moment: Moment
+    """Last frame of the same contact before the pull, where that is known."""
     reference: Frame | None
     """The sensor untouched, with which the frame was compared."""
     jpeg: bytes
@@ -137,7 +132,8 @@ class Feed:
         """Why no more readings come; None while they may."""
         self._points: deque[Point] = deque()
         self._lock = Lock()
-        self._newest: Moment | None = None
+        self._newest: tuple[Reading, LiveFrame, LiveFrame | None] | None = None
+        """Newest reading with its frame, and the last frame of the same contact before the pull."""
         self._start: LiveFrame | None = None
         self._largest = 0.0
         self._closed = Event()
@@ -215,9 +211,7 @@ class Feed:
         self.reading = reading
         if frame is not None:
             self._note_start(reading, frame)
-            self._newest = Moment(reading, frame, self._start)
-        else:
-            self._newest = None
+        self._newest = None if frame is None else (reading, frame, self._start)
 
     def _note_start(self, reading: Reading, frame: LiveFrame) -> None:
         """Keep the last frame of the contact before the pull: its markers show no shear, its margin is the largest."""
@@ -236,15 +230,12 @@ class Feed:
             for _ in self.reader.readings():
                 if self._closed.is_set():
                     return
-                # twice what the fastest client takes to draw one, on cores that may be ours
-                takes_s = min((client.takes_s for client in tuple(self.clients)), default=0.0)
-                # frames that come as fast as pictures are drawn are never early
-                if time.monotonic() - drawn_s < max(0.7 / _PICTURES_HZ, min(2 * takes_s, 1 / _LEAST_HZ)):
+                if time.monotonic() - drawn_s < 0.7 / _PICTURES_HZ:  # frames that come as fast are never early
                     continue
                 drawn_s = time.monotonic()
                 newest = self._newest
                 if newest is not None and any(client.wants_picture for client in tuple(self.clients)):
-                    self.picture = self._draw(newest)
+                    self.picture = self._draw(*newest)
                 self._wake()
             self.ended = f"{self.reader.source.name} has ended"
         except Exception as error:  # whatever it was: the page must not show the last margin as a new one
@@ -258,12 +249,14 @@ class Feed:
         with suppress(RuntimeError):  # the server has gone
             self._loop.call_soon_threadsafe(lambda: [client.wake() for client in tuple(self.clients)])
 
-    def _draw(self, moment: Moment) -> PageFrame:
-        thumbnail, markers_px = Image.fromarray(moment.frame.image), self.reader.markers_px
+    def _draw(self, reading: Reading, frame: LiveFrame, start: LiveFrame | None) -> PageFrame:
+        thumbnail, markers_px = Image.fromarray(frame.image), self.reader.markers_px
         thumbnail.thumbnail((_LONGEST_PX, _LONGEST_PX), reducing_gap=1.0)
         ways = [] if markers_px is None else np.column_stack(markers_px).round(1).tolist()
         return PageFrame(
-            moment=moment,
+            reading=reading,
+            frame=frame,
+            start=start,
             reference=self.reader.reference,
             jpeg=encode_jpeg(np.asarray(thumbnail), _QUALITY),
             arrows=tuple((x, y, to_x, to_y) for x, y, to_x, to_y in ways if np.isfinite(to_x)),
@@ -278,8 +271,8 @@ class Feed:
             is_wanted = any(client.shows_map and client.ready for client in self.clients)
             if self.ended is not None or not is_wanted or picture is None or picture is explained:
                 continue
-            explained, self.map = picture, None if picture.moment.reading.margin is None else self.map
-            if picture.moment.reading.margin is not None:  # without a margin there is nothing to explain
+            explained, self.map = picture, None if picture.reading.margin is None else self.map
+            if picture.reading.margin is not None:  # without a margin there is nothing to explain
                 try:
                     is_first, self.map = self.map is None, await self.explain(picture, LIVE_METHOD)
                 except (SliplensError, RuntimeError):
@@ -292,7 +285,7 @@ class Feed:
 
     def _explain(self, picture: PageFrame, method: str) -> Map:
         assert self._network is not None
-        (_, frame, start), reference = picture.moment, picture.reference
+        frame, start, reference = picture.frame, picture.start, picture.reference
         baseline = "untouched" if start is None else start.image
         chosen = frames_from_arrays(self._network, frame.image[None], reference, baseline=baseline)
         methods = None if method == RECOMMENDED_METHOD else method

@@ -64,8 +64,7 @@ async function take(data) {
   header.notices.forEach(notify);
   update = header;
   heardAt = performance.now();
-  owed.forEach((answer) => (answer.act = "passed")); // by this one
-  owed.push({ act: document.hidden ? "passed" : "drawn", serial: header.serial });
+  owed.push({ act: "drawn", serial: header.serial });
   schedule();
 }
 
@@ -399,13 +398,13 @@ function tellHealth() {
 }
 
 function tellFacts() {
-  const { reading, words, rate_hz, drawn_ms, viewers, recording, ended, sinks, troubles } = update;
+  const { reading, words, rate_hz, viewers, recording, ended, sinks, troubles } = update;
   const ms = (value) => (value === null || value === undefined ? "–" : `${Math.round(value)} ms`);
   const latency = reading?.latency ?? {};
   const parts = ["decode", "checks", "encode", "network"].map((part) => `${part} ${ms(latency[`${part}_ms`])}`);
   const rows = {
     readings: ended ? "ended" : `${rate_hz.toFixed(1)} a second, ${reading?.dropped ?? 0} frames dropped`,
-    latency: `${ms(latency.total_ms)} to the reading (${parts.join(", ")}), drawn after ${ms(drawn_ms)}`,
+    latency: `${ms(latency.total_ms)} to the reading (${parts.join(", ")})`,
     contact: words?.contact ?? "unknown",
     friction: reading?.friction ? `taken for ${reading.friction}` : "",
     "read in order": reading?.sequence ? "earlier frames of the contact count" : "",
@@ -506,7 +505,6 @@ document.addEventListener("keydown", ({ key, target, repeat, ctrlKey, altKey, me
   const name = KEYS[key.toLowerCase()];
   if (name && !repeat && !ctrlKey && !altKey && !metaKey && !target.matches("select")) act(name);
 });
-document.addEventListener("visibilitychange", () => document.hidden && owed.forEach((answer) => (answer.act = "passed")));
 document.addEventListener("input", ({ target }) => target.type === "range" && move(target));
 $.map.onchange = $.arrows.onchange = show;
 $.wet.onchange = $.controller.onchange = () => send({ act: "hold", wet: $.wet.checked, controller: $.controller.value });
