@@ -31,61 +31,6 @@ that rounding makes, in squared grey levels."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class CheckKind:
-    """Row of `CHECKS`: limit and cure of one check."""
-
-    limit: float
-    """Bound of healthy values, in the unit of `unit`: seconds, newtons, pixels, grey levels, or a ratio."""
-    unit: str
-    cure: str
-    harm: tuple[float, float] = (0.0, 0.0)
-    """Chance that the fault puts the margin off however strong it is, and its growth with severity."""
-    is_minimum: bool = False
-    """True where healthy values lie above the limit."""
-
-
-CHECKS = {
-    "repeated": CheckKind(limit=0.25, unit="s", cure="start the camera again", harm=(0.92, 1.06)),
-    "halves": CheckKind(limit=4.0, unit="ratio", cure="start the camera again", harm=(0.15, 0.02)),
-    "frozen": CheckKind(limit=0.15, unit="N", cure="start the camera again", harm=(0.91, 0.56)),
-    "late": CheckKind(limit=0.5, unit="s", cure="close what else uses the processor, or lower --rate"),
-    "drops": CheckKind(limit=0.8, unit="share", cure="lower --rate or --size, or use another port"),
-    "saturation": CheckKind(limit=0.06, unit="share", cure="mend the exposure or the lamps", harm=(0.16, 0.36)),
-    "exposure": CheckKind(
-        limit=0.2, unit="powers of 2", cure="fix exposure and gain of the camera, or take a new reference",
-        harm=(0.47, 1.13),
-    ),
-    "focus": CheckKind(
-        limit=0.25, unit="share", cure="clean or focus the lens, and take a new reference", harm=(0.31, 0.11)
-    ),
-    "light": CheckKind(
-        limit=0.2, unit="powers of 2", cure="look after the lamps, or take a new reference", harm=(0.28, 0.11)
-    ),
-    "camera": CheckKind(limit=CAMERA_LIMIT_PX, unit="px", cure=CAMERA_CURE, harm=(0.56, 0.38)),
-    "markers": CheckKind(
-        limit=0.15, unit="share", cure="clean the skin and the lens, let go, and take a new reference",
-        harm=(0.33, 1.18),
-    ),
-    "touch": CheckKind(
-        limit=LEAST_TOUCH, unit="grey levels", cure="press it on something", harm=(0.97, 1.20), is_minimum=True
-    ),
-    "direction": CheckKind(limit=DIRECTION_LIMIT, unit="standard deviations", cure="", harm=(0.96, 0.67)),
-    "novelty": CheckKind(
-        limit=-float(np.log10(STRANGE)), unit="powers of 10", harm=(0.06, 0.31),
-        cure="use the sensor that the network was trained on, or train it on this one",
-    ),
-}  # fmt: skip
-"""Checks by name. A frame beyond a limit has no margin.
-
-The limits lie above all values of 80 healthy frames in contact on 16 simulated validation days: exposure, focus and
-light at four times the largest and more (`benchmarks/health.py --choose`), halves and frozen at twice the largest of 48
-simulated sequences of 0.7 s, camera, direction and novelty as where `predict` withholds. Those of markers, touch and
-time are chosen by hand. `harm` was fitted by `benchmarks/health.py --choose --trials 6 --frames 3`; too few of these
-show no touch, whose growth is of an earlier fit to twice as many trials.
-"""
-
-
-@dataclass(frozen=True, kw_only=True)
 class _FrameView:
     """A frame beside the reference, as the checks need it."""
 
@@ -145,20 +90,16 @@ class HealthMonitor:
         view, checks = self._compare(frame, markers), []
         self._stillness.update(block_means(_green(frame.small), _BLOCK_PX), frame.forces)
         slow = _SLOW if markers is None else _SLOW[:2]  # markers show the camera's motion at once, the border slowly
-        due = self._due(slow, frame.time_s)
-        for name, measure in _MEASURES.items():
+        age_s = {name: frame.time_s - self._last[name][0] if name in self._last else np.inf for name in slow}
+        # too old ones are due, else the oldest; at the same time it may be another frame, of a source without a clock
+        due = [name for name in slow if not 0 < age_s[name] < _OLDEST_S] or [max(slow, key=lambda name: age_s[name])]
+        for name, kind in CHECKS.items():
             if name in slow and name not in due:
                 checks.append(self._last[name][1])
-            elif (measured := measure(self, view)) is not None:
+            elif kind.measure is not None and (measured := kind.measure(self, view)) is not None:
                 checks.append(make_check(name, *measured))
                 self._last[name] = frame.time_s, checks[-1]
         return tuple(checks)
-
-    def _due(self, names: tuple[str, ...], time_s: float) -> list[str]:
-        """Name the slow checks that are too old, or the oldest of them."""
-        age_s = {name: time_s - self._last[name][0] if name in self._last else np.inf for name in names}
-        # at the same time it may be another frame, of a source without a clock
-        return [name for name in names if not 0 < age_s[name] < _OLDEST_S] or [max(names, key=lambda name: age_s[name])]
 
     def _compare(self, frame: LiveFrame, markers: Tracks | None) -> _FrameView:
         soft = soften(frame.small)
@@ -263,21 +204,74 @@ def _absent_markers(_: HealthMonitor, view: _FrameView) -> Measured | None:
     return value, f"{value:.0%} of the markers are not seen where they should be"
 
 
-_MEASURES: dict[str, Callable[[HealthMonitor, _FrameView], Measured | None]] = {
-    "repeated": HealthMonitor._repeated,
-    "halves": HealthMonitor._halves,
-    "frozen": HealthMonitor._frozen,
-    "late": HealthMonitor._late,
-    "drops": HealthMonitor._drops,
-    "saturation": HealthMonitor._saturation,
-    "exposure": HealthMonitor._exposure,
-    "focus": HealthMonitor._focus,
-    "light": _light,
-    "camera": HealthMonitor._camera_motion,
-    "markers": _absent_markers,
-    "touch": HealthMonitor._touch,
-}
-"""Functions that measure the checks of `CHECKS`, in the order of causes; None where there is nothing to measure."""
+@dataclass(frozen=True, kw_only=True)
+class CheckKind:
+    """Row of `CHECKS`: what one check measures, its limit and its cure."""
+
+    measure: Callable[[HealthMonitor, _FrameView], Measured | None] | None = None
+    """Measures a frame; returns None where there is nothing to measure. None of a check of the network."""
+    limit: float
+    """Bound of healthy values, in the unit of `unit`: seconds, newtons, pixels, grey levels, or a ratio."""
+    unit: str
+    cure: str
+    harm: tuple[float, float] = (0.0, 0.0)
+    """Chance that the fault puts the margin off however strong it is, and its growth with severity."""
+    is_minimum: bool = False
+    """True where healthy values lie above the limit."""
+
+
+_RESTART = "start the camera again"
+CHECKS = {
+    "repeated": CheckKind(measure=HealthMonitor._repeated, limit=0.25, unit="s", cure=_RESTART, harm=(0.92, 1.06)),
+    "halves": CheckKind(measure=HealthMonitor._halves, limit=4.0, unit="ratio", cure=_RESTART, harm=(0.15, 0.02)),
+    "frozen": CheckKind(measure=HealthMonitor._frozen, limit=0.15, unit="N", cure=_RESTART, harm=(0.91, 0.56)),
+    "late": CheckKind(
+        measure=HealthMonitor._late, limit=0.5, unit="s", cure="close what else uses the processor, or lower --rate"
+    ),
+    "drops": CheckKind(
+        measure=HealthMonitor._drops, limit=0.8, unit="share", cure="lower --rate or --size, or use another port"
+    ),
+    "saturation": CheckKind(
+        measure=HealthMonitor._saturation, limit=0.06, unit="share", cure="mend the exposure or the lamps",
+        harm=(0.16, 0.36),
+    ),
+    "exposure": CheckKind(
+        measure=HealthMonitor._exposure, limit=0.2, unit="powers of 2",
+        cure="fix exposure and gain of the camera, or take a new reference", harm=(0.47, 1.13),
+    ),
+    "focus": CheckKind(
+        measure=HealthMonitor._focus, limit=0.25, unit="share", harm=(0.31, 0.11),
+        cure="clean or focus the lens, and take a new reference",
+    ),
+    "light": CheckKind(
+        measure=_light, limit=0.2, unit="powers of 2", cure="look after the lamps, or take a new reference",
+        harm=(0.28, 0.11),
+    ),
+    "camera": CheckKind(
+        measure=HealthMonitor._camera_motion, limit=CAMERA_LIMIT_PX, unit="px", cure=CAMERA_CURE, harm=(0.56, 0.38)
+    ),
+    "markers": CheckKind(
+        measure=_absent_markers, limit=0.15, unit="share", harm=(0.33, 1.18),
+        cure="clean the skin and the lens, let go, and take a new reference",
+    ),
+    "touch": CheckKind(
+        measure=HealthMonitor._touch, limit=LEAST_TOUCH, unit="grey levels", cure="press it on something",
+        harm=(0.97, 1.20), is_minimum=True,
+    ),
+    "direction": CheckKind(limit=DIRECTION_LIMIT, unit="standard deviations", cure="", harm=(0.96, 0.67)),
+    "novelty": CheckKind(
+        limit=-float(np.log10(STRANGE)), unit="powers of 10", harm=(0.06, 0.31),
+        cure="use the sensor that the network was trained on, or train it on this one",
+    ),
+}  # fmt: skip
+"""Checks by name, in the order of causes. A frame beyond a limit has no margin.
+
+The limits lie above all values of 80 healthy frames in contact on 16 simulated validation days: exposure, focus and
+light at four times the largest and more (`benchmarks/health.py --choose`), halves and frozen at twice the largest of 48
+simulated sequences of 0.7 s, camera, direction and novelty as where `predict` withholds. Those of markers, touch and
+time are chosen by hand. `harm` was fitted by `benchmarks/health.py --choose --trials 6 --frames 3`; too few of these
+show no touch, whose growth is of an earlier fit to twice as many trials.
+"""
 _SLOW = "focus", "light", "camera"
 
 
