@@ -56,7 +56,11 @@ def test_what_changes_slowly_takes_turns_and_is_told_within_a_tenth_of_a_second(
     monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator, rate_hz: float, frames: int
 ):
     for number in range(4):
-        assert failed(monitor.check(shot(untouched, rng, number=number, time_s=number / rate_hz))) == set()
+        checks = monitor.check(shot(untouched, rng, number=number, time_s=number / rate_hz))
+        assert failed(checks) == set()
+        ages_s = {check.name: check.age_s for check in checks}
+        assert max(ages_s.values()) < 0.1
+        assert {name for name, age_s in ages_s.items() if age_s > 0} <= {"focus", "light", "camera"}
     bare = np.roll(untouched, 3, axis=1)  # of an untouched sensor: in a contact a shift does not count
     times_s = (4 + np.arange(frames)) / rate_hz
     told = [failed(monitor.check(shot(bare, rng, time_s=time_s, touches=False))) for time_s in times_s]

@@ -3,7 +3,7 @@
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -95,7 +95,7 @@ class HealthMonitor:
         due = [name for name in slow if not 0 < age_s[name] < _OLDEST_S] or [max(slow, key=lambda name: age_s[name])]
         for name, kind in CHECKS.items():
             if name in slow and name not in due:
-                checks.append(self._last[name][1])
+                checks.append(replace(self._last[name][1], age_s=age_s[name]))
             elif kind.measure is not None and (measured := kind.measure(self, view)) is not None:
                 checks.append(make_check(name, *measured))
                 self._last[name] = frame.time_s, checks[-1]

@@ -83,6 +83,8 @@ class Check:
     ok: bool
     sentence: str
     """Statement of the measured value, and the cure where the check fails."""
+    age_s: float = 0.0
+    """Time since the frame that was measured, in seconds: some checks take turns."""
 
 
 class SlipState(StrEnum):
