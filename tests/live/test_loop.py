@@ -2,12 +2,13 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from threading import Semaphore
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +21,7 @@ from sliplens.errors import ImageError
 from sliplens.live.contract import LiveSource
 from sliplens.live.reading import Check, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.markers import Tracker, Tracks
+from sliplens.models.checkpoint import Network
 from sliplens.recordings import ContactState, Dataset, Recording
 from sliplens.recordings.source import open_source
 
@@ -44,8 +46,8 @@ class Burst(LiveSource):
 class Patient(Burst):
     """A burst in which each frame waits until the one before it was read."""
 
-    def __init__(self, images: np.ndarray, numbers: list[int]) -> None:
-        super().__init__(images, numbers)
+    def __init__(self, images: np.ndarray, numbers: list[int] | None = None) -> None:
+        super().__init__(images, list(range(len(images))) if numbers is None else numbers)
         self.read = Semaphore(1)
 
     def frames(self) -> Iterator[LiveFrame]:
@@ -53,17 +55,34 @@ class Patient(Burst):
             assert self.read.acquire(timeout=10)
             yield replace(frame, captured_s=time.monotonic())
 
-    def all_readings(self, reader: sl.LiveReader) -> list[Reading]:
+    def all_readings(self, reader: sl.LiveReader | Network | Path | str | None, **settings: Any) -> list[Reading]:
+        """Readings of a reader, or of a network without checks but those of the settings."""
         heard: list[Reading] = []
 
         def next_one(reading: Reading, _: LiveFrame | None) -> None:
             heard.append(reading)
             self.read.release()
 
+        if not isinstance(reader, sl.LiveReader):
+            reader = plain_reader(self, reader, engine="torch", **settings)
         reader.subscribe(next_one)
         with reader:
             list(reader.readings())
         return heard
+
+
+def watch(read: Callable[[float], MarkerReading]) -> type:
+    """Make a slip detector that says of each time what it is given to say."""
+
+    class Watch:
+        def __init__(self, rest_px: np.ndarray) -> None:
+            self.markers = len(rest_px)
+
+        def update(self, positions_px: np.ndarray, time_s: float) -> MarkerReading:
+            assert len(positions_px) == self.markers
+            return read(time_s)
+
+    return Watch
 
 
 @pytest.fixture
@@ -74,10 +93,7 @@ def recording(small_dataset: Dataset) -> Recording:
 def test_a_reading_is_what_predict_says_of_the_frame(recording: Recording, difference_run: Path):
     table = sl.predict(difference_run, recording.frames, reference=recording.reference).to_arrow()
     told = table.column("prediction").to_numpy()
-    source = Patient(recording.frames, list(range(12)))
-    readings = source.all_readings(
-        plain_reader(source, difference_run, reference=recording.reference, engine="torch", stall_s=10.0)
-    )
+    readings = Patient(recording.frames).all_readings(difference_run, reference=recording.reference)
     assert len(readings) == 12
     for reading in readings:
         assert reading.withheld is None
@@ -90,9 +106,7 @@ def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, 
     recording, [capture] = small_dataset.load(info), open_source(small_dataset, trial=info.trial)
     table = sl.predict(run, [replace(capture, frame_time_s=0.05 * np.arange(12))], sequence=True).to_arrow()
     source = Patient(recording.frames[1:], list(range(1, 12)))  # nothing touches the first, and it is forgotten
-    readings = source.all_readings(
-        plain_reader(source, run, reference=recording.reference, sequence=True, engine="torch", stall_s=10.0)
-    )
+    readings = source.all_readings(run, reference=recording.reference, sequence=True)
     assert [reading.number for reading in readings] == list(range(1, 12))
     assert all(reading.sequence for reading in readings)
     # one frame at a time or eight: the network's float32 sums differ by 1e-7, and the head's weights of about 1 add 64
@@ -104,9 +118,9 @@ def test_frames_are_read_in_order_as_predict_reads_them(small_dataset: Dataset, 
 
 def test_frames_after_a_gap_are_read_by_themselves_and_say_so(recording: Recording, sequence_run: Path):
     numbers = [1, 2, 3, 20, 21, 22]  # 0.85 s were withheld, or lost
-    source = Patient(recording.frames[[1, 2, 3, 4, 5, 6]], numbers)
-    reader = plain_reader(source, sequence_run, reference=recording.reference, sequence=True, engine="torch")
-    assert [reading.sequence for reading in source.all_readings(reader)] == [True] * 3 + [False] * 3
+    source = Patient(recording.frames[1:7], numbers)
+    readings = source.all_readings(sequence_run, reference=recording.reference, sequence=True)
+    assert [reading.sequence for reading in readings] == [True] * 3 + [False] * 3
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 0.01])
@@ -140,7 +154,7 @@ def test_who_asks_late_gets_the_newest_and_is_not_left_waiting(recording: Record
 def test_without_a_reference_the_first_still_picture_is_taken(recording: Recording, rng: np.random.Generator):
     moving = rng.integers(0, 255, (6, 48, 48, 3), dtype=np.uint8)
     still = np.repeat(recording.reference[None] + np.uint8(40), 10, axis=0)
-    source = Patient(np.concatenate([moving, still]), list(range(16)))
+    source = Patient(np.concatenate([moving, still]))
     reader = plain_reader(source)
     readings = source.all_readings(reader)
     assert "no reference frame yet" in str(readings[0].withheld)
@@ -150,7 +164,7 @@ def test_without_a_reference_the_first_still_picture_is_taken(recording: Recordi
 
 def test_a_new_reference_is_taken_on_request(recording: Recording):
     light = recording.reference + np.uint8(60)
-    source = Patient(np.repeat(light[None], 30, axis=0), list(range(30)))
+    source = Patient(np.repeat(light[None], 30, axis=0))
     reader = plain_reader(source, reference=recording.reference)
 
     def ask(reading: Reading, _: LiveFrame | None) -> None:
@@ -175,10 +189,7 @@ class Strict:
 
 
 def test_a_margin_is_withheld_where_a_check_fails(recording: Recording, difference_run: Path):
-    source = Patient(recording.frames, list(range(12)))
-    readings = source.all_readings(
-        plain_reader(source, difference_run, reference=recording.reference, engine="torch", health=Strict, stall_s=10.0)
-    )
+    readings = Patient(recording.frames).all_readings(difference_run, reference=recording.reference, health=Strict)
     assert {(reading.number % 2 == 1, reading.margin is None, bool(reading.withheld)) for reading in readings} == {
         (False, False, False),
         (True, True, True),
@@ -205,12 +216,7 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
     known = sl.predict(network, frames, reference=trial.reference).to_arrow()["known"].to_numpy()
     assert (known[1::2] < 0.01).any()
     assert (known[::2] > 0.01).any()
-    source = Patient(frames, list(range(len(frames))))
-    readings = source.all_readings(
-        sl.LiveReader(
-            source, network, reference=trial.reference, engine="torch", health=Lenient, slip=None, stall_s=10.0
-        )
-    )
+    readings = Patient(frames).all_readings(network, reference=trial.reference, health=Lenient)
     for reading, share in zip(readings, known, strict=True):
         if not all(check.ok for check in reading.health if check.name == "direction"):
             continue  # the network was not run
@@ -221,24 +227,14 @@ def test_every_margin_has_the_novelty_of_its_very_frame(trials: dict[str, Record
 
 
 def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording]):
-    trial, seen = trials["chromatouch"], []
-
-    class Watch:
-        def __init__(self, rest_px: np.ndarray) -> None:
-            self.markers = len(rest_px)
-
-        def update(self, positions_px: np.ndarray, time_s: float) -> MarkerReading:
-            assert len(positions_px) == self.markers
-            seen.append(positions_px)
-            assert time_s >= 0
-            return MarkerReading(state=SlipState.STICKING)
-
-    source = Patient(trial.frames[:3], [0, 1, 2])
-    readings = source.all_readings(plain_reader(source, reference=trial.reference, slip=Watch, stall_s=10.0))
-    assert [reading.slip for reading in readings] == [SlipState.STICKING] * 3
+    trial, source = trials["chromatouch"], Patient(trials["chromatouch"].frames[:1])
+    sticks = watch(lambda _: MarkerReading(state=SlipState.STICKING))
+    reader = plain_reader(source, reference=trial.reference, slip=sticks)
+    assert [reading.slip for reading in source.all_readings(reader)] == [SlipState.STICKING]
     assert trial.truth is not None
+    assert reader.markers_px is not None
     # markers of the untouched sensor, seen within a pixel
-    nearest = np.linalg.norm(trial.truth.marker_px[0][:, None] - seen[0][None], axis=-1).min(axis=0)
+    nearest = np.linalg.norm(trial.truth.marker_px[0][:, None] - reader.markers_px[1][None], axis=-1).min(axis=0)
     assert np.nanmax(nearest) < 1
 
 
@@ -246,19 +242,9 @@ def test_markers_are_followed_for_whoever_tells_slip(trials: dict[str, Recording
 def test_without_a_contact_there_is_no_margin(trials: dict[str, Recording], named: bool):
     trial = trials["chromatouch"]
 
-    class Watch:
-        def __init__(self, rest_px: np.ndarray) -> None:
-            self.markers = len(rest_px)
-
-        def update(self, positions_px: np.ndarray, time_s: float) -> MarkerReading:
-            assert len(positions_px) == self.markers
-            return MarkerReading(state=SlipState.CANNOT_TELL, contact=time_s > 0)
-
-    source = Patient(trial.frames[:2], [0, 1])
-    network = "chromatouch-difference" if named else None
-    first, second = source.all_readings(
-        plain_reader(source, network, reference=trial.reference, engine="torch", slip=Watch, stall_s=10.0)
-    )
+    touched = watch(lambda time_s: MarkerReading(state=SlipState.CANNOT_TELL, contact=time_s > 0))
+    source, network = Patient(trial.frames[:2]), "chromatouch-difference" if named else None
+    first, second = source.all_readings(network, reference=trial.reference, slip=touched)
     assert first.contact_state is ContactState.NO_CONTACT
     assert first.margin is None
     assert (first.withheld is not None) == named
@@ -271,20 +257,11 @@ def test_what_is_told_of_friction_shapes_the_margin_and_a_slip_narrows_it(
 ):
     trial, network = trials["chromatouch"], sl.load(ratio_run)
 
-    class Watch:
-        def __init__(self, rest_px: np.ndarray) -> None:
-            self.markers = len(rest_px)
-
-        def update(self, positions_px: np.ndarray, time_s: float) -> MarkerReading:
-            assert len(positions_px) == self.markers
-            slipping_s = 0.06 if time_s > 0.12 else None
-            return MarkerReading(state=SlipState.STICKING, contact=True, slipped_s=slipping_s)
-
-    told, source = sl.Friction.between(0.3, 0.9), Patient(trial.frames[10:14], [0, 1, 2, 3])
-    reader = sl.LiveReader(
-        source, network, reference=trial.reference, friction=told, engine="torch", slip=Watch, health=None, stall_s=10.0
+    slips = watch(
+        lambda time_s: MarkerReading(state=SlipState.STICKING, contact=True, slipped_s=0.06 if time_s > 0.12 else None)
     )
-    readings = source.all_readings(reader)
+    told, source = sl.Friction.between(0.3, 0.9), Patient(trial.frames[10:14])
+    readings = source.all_readings(network, reference=trial.reference, friction=told, slip=slips)
     estimates = [network.estimate(network.encode(frame[None], trial.reference)) for frame in trial.frames[10:14]]
     ratios = [one.ratio for one in estimates if one.ratio is not None]
     assert len(ratios) == 4
@@ -317,7 +294,7 @@ def test_a_slip_teaches_the_next_grasp_of_the_same_object_until_there_is_another
 ):
     trial = trials["chromatouch"]
     images = np.tile(trial.frames[10:15], (3, 1, 1, 1))
-    source, friction, kept = Patient(images, list(range(15))), list[str | None](), list[bool]()
+    source, friction, kept = Patient(images), list[str | None](), list[bool]()
     options = {"same_object": same_object, "sequence": sequence, "slip": Grasps, "health": None, "engine": "torch"}
     reader = sl.LiveReader(source, "chromatouch-difference", reference=trial.reference, stall_s=10.0, **options)
 
@@ -350,7 +327,7 @@ def test_by_default_health_and_slip_are_watched_and_no_touch_has_no_margin(trial
     trial = trials["chromatouch"]
     untouched = np.flatnonzero(np.isnan(trial.safety_margin))[:2]
     touched = np.flatnonzero(np.isfinite(trial.safety_margin))[20:22]
-    source = Patient(trial.frames[np.concatenate([untouched, touched])], [0, 1, 2, 3])
+    source = Patient(trial.frames[np.concatenate([untouched, touched])])
     readings = source.all_readings(sl.LiveReader(source, reference=trial.reference, stall_s=10.0))
     assert [reading.contact_state is ContactState.NO_CONTACT for reading in readings] == [True, True, False, False]
     assert "nothing touches the sensor; press it on something" in str(readings[0].withheld)
@@ -361,7 +338,7 @@ def test_by_default_health_and_slip_are_watched_and_no_touch_has_no_margin(trial
 def test_markers_of_a_large_frame_are_told_in_its_own_pixels(trials: dict[str, Recording]):
     trial = trials["chromatouch"]
     large = [np.kron(image, np.ones((2, 2, 1), dtype=np.uint8)) for image in (trial.reference, trial.frames[20])]
-    source = Patient(np.stack([large[1]]), [0])
+    source = Patient(np.stack([large[1]]))
     reader = sl.LiveReader(source, reference=large[0], stall_s=10.0)
     source.all_readings(reader)
     assert reader.markers_px is not None

@@ -135,7 +135,7 @@ class FrameReader:
         self.learner: SlipLearner
         """Friction that was set, and that slips teach."""
         friction, sequence = settings.get("friction"), settings.get("sequence", False)
-        self.begin_object(friction, same_object=settings.get("same_object", False))
+        self.new_object(friction, same_object=settings.get("same_object", False))
         if sequence and network is None:
             raise InputError("--sequence needs a network; name one with --network")
         self._follower = network.follow(friction=friction) if network is not None and sequence else None
@@ -149,9 +149,23 @@ class FrameReader:
         self._last: LiveFrame | None = None
         self._dropped = 0
 
-    def begin_object(self, friction: FrictionLike | None, *, same_object: bool) -> None:
-        """Take the friction of an object; that of the one before is dropped."""
+    def new_object(self, friction: FrictionLike | None = None, *, same_object: bool | None = None) -> None:
+        """Begin another object: the friction that was set or learnt is dropped.
+
+        Parameters
+        ----------
+        friction
+            Friction of the new one, as `LiveReader` takes it; unknown if None.
+        same_object
+            As `LiveReader` takes it; as before if None.
+
+        Raises
+        ------
+        InputError
+            If the friction is none, or the network takes none.
+        """
         network = self.network
+        same_object = self.learner.same_object if same_object is None else same_object
         if friction is not None or same_object:
             if network is None:
                 option = "--same-object" if friction is None else "--friction"

@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from sliplens.errors import InputError, RecordingError, SourceError
 from sliplens.extras import import_cv2, missing_packages
-from sliplens.friction import Friction, FrictionLike
+from sliplens.friction import Friction
 from sliplens.images import read_image
 from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.frame_reader import FrameReader, HealthWatch, ReaderSettings, SlipWatch
@@ -26,7 +26,7 @@ from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.sinks import Sender
 from sliplens.live.sources import Images, open_live
 from sliplens.models.checkpoint import Network
-from sliplens.models.engines import Engine, make_engine
+from sliplens.models.engines import make_engine
 from sliplens.models.wrapping import open_run
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture
@@ -218,7 +218,10 @@ class LiveReader(FrameReader):
                 size, untouched = profile.output_size(size), None if untouched is None else profile.apply(untouched)
             if self.network is not None:
                 self.network.require_frame_size(size, what=f"the frames of {self.source.name}")
-                engine = self._make_engine(self.network)
+                # before any thread runs: torch's tracing changes what every thread calls
+                frames = min(self.source.count or np.inf, (self.source.rate_hz or 30.0) * (self._seconds or np.inf))
+                frames = round(min(frames, _MOST_FRAMES))
+                engine = make_engine(self._engine_name, self.network, frames=frames, batch_size=1, streams=1)
             self.begin(engine, untouched, size=size)
             self._stack = stack.pop_all()
         jobs = (self._capture, self._frames.close), (self._infer, self._finish)
@@ -299,21 +302,6 @@ class LiveReader(FrameReader):
             f"set it when you hold the same again, with --friction {learner.learnt.text}"
         )
 
-    def new_object(self, friction: FrictionLike | None = None) -> None:
-        """Begin another object: the friction that was set or learnt is dropped.
-
-        Parameters
-        ----------
-        friction
-            Friction of the new one, as `LiveReader` takes it; unknown if None.
-
-        Raises
-        ------
-        InputError
-            If the friction is none, or the network takes none.
-        """
-        self.begin_object(friction, same_object=self.learner.same_object)
-
     def take_reference(self) -> None:
         """Take a new reference as soon as the picture is still; the old one holds until then."""
         self.new_reference.set()
@@ -371,13 +359,6 @@ class LiveReader(FrameReader):
             if not sender.close(_FLUSH_S):
                 sender.discard()
         self.stop_recording()
-
-    def _make_engine(self, network: Network) -> Engine:
-        """Make the chosen engine, or the fastest that pays for the frames to come."""
-        rate_hz, seconds = self.source.rate_hz or 30.0, self._seconds or np.inf
-        frames = min(self.source.count or np.inf, rate_hz * seconds, _MOST_FRAMES)
-        # before any thread runs: torch's tracing changes what every thread calls
-        return make_engine(self._engine_name, network, frames=round(frames), batch_size=1, streams=1)
 
     def _end(self) -> None:
         self._stopped.set()
