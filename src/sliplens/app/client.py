@@ -233,7 +233,7 @@ class Client:
             "notices": notices,
             "ended": feed.ended,
             "recording": None if (recorder := reader.recorder) is None else recorder.state,
-            "sinks": [sender.progress for sender in reader.senders],
+            "sinks": [sender.state for sender in reader.senders],
             "troubles": (*reader.doubts, *reader.troubles),
             "frozen": frozen,
             "has_map": overlay is not None,  # this one, or the one sent before

@@ -3,14 +3,12 @@
 import asyncio
 import gc
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from itertools import takewhile
-from threading import Event, Lock, Thread
+from threading import Event, Thread
 from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
@@ -130,8 +128,7 @@ class Feed:
         """Newest map of the running picture."""
         self.ended: str | None = None
         """Why no more readings come; None while they may."""
-        self._points: deque[Point] = deque()
-        self._lock = Lock()
+        self._points: list[Point] = []
         self._newest: tuple[Reading, LiveFrame, LiveFrame | None] | None = None
         """Newest reading with its frame, and the last frame of the same contact before the pull."""
         self._start: LiveFrame | None = None
@@ -172,9 +169,7 @@ class Feed:
 
     def points_since(self, at_s: float) -> tuple[Point, ...]:
         """Return the points of the chart after a time, as `time.monotonic` counts."""
-        with self._lock:  # the newest first: the thread that reads waits for this lock
-            newest = tuple(takewhile(lambda point: point.at_s > at_s, reversed(self._points)))
-        return newest[::-1]
+        return tuple(point for point in self._points if point.at_s > at_s)
 
     def take_reference(self) -> None:
         """Have the reader take a new reference, and show that until it has."""
@@ -204,10 +199,8 @@ class Feed:
             force_n=None if grip is None else grip.force_n,
             least_force_n=None if grip is None else grip.least_force_n,
         )  # fmt: skip
-        with self._lock:
-            self._points.append(point)
-            while self._points[0].at_s < now_s - CHART_S:
-                self._points.popleft()
+        # another list, for threads that walk through this one
+        self._points = [*(point for point in self._points if point.at_s >= now_s - CHART_S), point]
         self.reading = reading
         if frame is not None:
             self._note_start(reading, frame)

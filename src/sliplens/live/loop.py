@@ -163,7 +163,7 @@ class LiveReader(FrameReader):
     def outputs(self) -> tuple[OutputState, ...]:
         """Progress of the newest recording and of each sink."""
         recorder = self._last_recorder
-        return (*(() if recorder is None else (recorder.state,)), *(sender.progress for sender in self.senders))
+        return (*(() if recorder is None else (recorder.state,)), *(sender.state for sender in self.senders))
 
     @property
     def doubts(self) -> tuple[str, ...]:

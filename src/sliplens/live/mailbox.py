@@ -78,16 +78,24 @@ class Outlet(Generic[Item]):
 
     Parameters
     ----------
+    name
+        What it feeds, in messages.
     send
         Called with each item; after an exception nothing more is sent, and `error` is set.
     end
         Called once, in the same thread, when no more will be sent.
     most_bytes
         Size of the items that may wait; of more, the oldest is lost.
+    cure
+        Cure where it fails.
     """
 
-    def __init__(self, send: Callable[[Item], None], end: Callable[[], None], *, most_bytes: int) -> None:
-        self._send, self._end, self._most_bytes = send, end, most_bytes
+    def __init__(
+        self, name: str, send: Callable[[Item], None], end: Callable[[], None], *, most_bytes: int, cure: str
+    ) -> None:
+        self.name, self._send, self._end, self._most_bytes, self._cure = name, send, end, most_bytes, cure
+        self.seconds: float | None = None
+        """Time that recorded frames span, in seconds; None of a sink."""
         self._box: Mailbox[Item] = Mailbox()
         self.sent = 0
         """Items that were handed on."""
@@ -96,14 +104,15 @@ class Outlet(Generic[Item]):
         self._thread = Thread(target=self._run, daemon=True)
         self._thread.start()
 
-    def state(self, name: str, *, broke: str, cure: str, seconds: float | None = None) -> OutputState:
-        """Describe the progress; where it failed, begin the trouble with `broke` and end it with `cure`."""
+    @property
+    def state(self) -> OutputState:
+        """Current progress."""
         trouble, error = None, self.error
         if error is not None:
             reason = (error.strerror if isinstance(error, OSError) else None) or error
-            items = number_of(self.sent, "reading" if seconds is None else "frame")
-            trouble = f"{broke} after {items} ({reason}); {cure}"
-        return OutputState(name=name, sent=self.sent, lost=self._box.lost, seconds=seconds, trouble=trouble)
+            items = number_of(self.sent, "reading" if self.seconds is None else "frame")
+            trouble = f"{self.name} stopped after {items} ({reason}); {self._cure}"
+        return OutputState(name=self.name, sent=self.sent, lost=self._box.lost, seconds=self.seconds, trouble=trouble)
 
     def put(self, item: Item, *, size_bytes: int) -> None:
         """Take an item, without waiting."""

@@ -71,17 +71,19 @@ class Recorder:
         self._taken = set(taken)
         self._journal: Journal | None = None
         self._last: LiveFrame | None = None
-        self._first_s = self._seconds = 0.0
+        self._first_s = 0.0
         self._trial_reference: Frame | None = None
         self._closed = False
-        self._outlet = Outlet(self._append, self._end_trial, most_bytes=_MOST_WAITING_BYTES)
+        cure = "make room, and record again: what is there stays"
+        self._outlet = Outlet(
+            str(self.folder), self._append, self._end_trial, most_bytes=_MOST_WAITING_BYTES, cure=cure
+        )
+        self._outlet.seconds = 0.0
 
     @property
     def state(self) -> OutputState:
         """Current progress."""
-        broke = f"recording into {self.folder} stopped"
-        cure = "make room, and record again: what is there stays"
-        return self._outlet.state(str(self.folder), broke=broke, cure=cure, seconds=self._seconds)
+        return self._outlet.state
 
     def set_reference(self, image: Frame) -> None:
         """Begin a new trial with the next frame, with this image of the untouched sensor."""
@@ -126,7 +128,8 @@ class Recorder:
             forces = replace(forces, time_s=forces.time_s - self._first_s)
         time_s = frame.time_s - self._first_s
         self._journal.append(frame.image, time_s=time_s, safety_margin=frame.safety_margin, forces=forces)
-        self._seconds += frame.time_s - last.time_s if last is not None and time_s > 0 else 0.0
+        if last is not None and time_s > 0:
+            self._outlet.seconds = (self._outlet.seconds or 0.0) + frame.time_s - last.time_s
         self._last = frame
 
     def _end_trial(self) -> None:

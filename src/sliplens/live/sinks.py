@@ -21,7 +21,7 @@ from sliplens.errors import InputError
 from sliplens.extras import Table, require_packages
 from sliplens.files import to_builtins
 from sliplens.images import encode_jpeg, encode_png
-from sliplens.live.mailbox import Outlet, OutputState
+from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import LiveFrame, Reading, ReadingWords, describe_reading
 from sliplens.recordings.capture import Frame
 
@@ -384,13 +384,9 @@ class Sender(Outlet[tuple[Reading, Frame | None]]):
     """
 
     def __init__(self, name: str) -> None:
-        self.name, sink = name, open_sink(name)
-        super().__init__(lambda item: sink.send(*item), sink.close, most_bytes=_MOST_WAITING_BYTES)
-
-    @property
-    def progress(self) -> OutputState:
-        """Current progress."""
-        return self.state(self.name, broke=f"--sink {self.name} broke off", cure="begin it anew")
+        sink = open_sink(name)
+        most_bytes, cure = _MOST_WAITING_BYTES, "begin it anew"
+        super().__init__(name, lambda item: sink.send(*item), sink.close, most_bytes=most_bytes, cure=cure)
 
     def take(self, reading: Reading, frame: LiveFrame | None) -> None:
         """Take a reading and its frame, without waiting."""
