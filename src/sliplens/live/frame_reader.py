@@ -1,7 +1,7 @@
 """From a frame to its reading: reference, markers, health, and network, in one thread."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -9,6 +9,7 @@ from typing import Protocol, TypedDict, Unpack, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
 from sliplens.errors import ImageError, InputError
 from sliplens.friction import FrictionLike, SlipLearner, as_friction
@@ -112,7 +113,7 @@ class _ReferenceTaker:
 class FrameReader:
     """Reads frames one after another, each against the untouched sensor; `read` is called in one thread.
 
-    A frame is checked first; the network runs only where no check withholds the margin.
+    A frame is checked while the network runs, whose output is dropped where a check withholds the margin.
 
     Parameters are those of `LiveReader`.
     """
@@ -212,13 +213,28 @@ class FrameReader:
             captured_s=frame.captured_s,
             dropped=self._dropped,
             true_margin=frame.safety_margin,
+            latency=Latency(decode_ms=frame.decode_ms),
         )
         if (why := self._unready(last, frame)) is not None:
-            return self._withhold(begin, frame, why)
-        reading, withheld = self._check(begin, frame)
-        if self.network is None or withheld is not None:
-            return self._withhold(reading, frame, withheld)
-        return self._estimate(reading, frame)
+            return self._withhold(begin, why)
+        if self.network is None or self.engine is None or self.reference is None:
+            return self._withhold(*self._check(begin, frame))
+        checked, begun = [], time.perf_counter()
+        inputs = self.network.encode(frame.image[None], self.reference)
+        encoded = time.perf_counter()
+
+        def batches() -> Iterator[Tensor]:
+            yield inputs
+            checked.append(self._check(begin, frame))  # the batch is under way: an engine looks for the next one first
+
+        [parts] = self.engine.answers(batches())
+        [(reading, withheld)] = checked
+        network_ms = 1e3 * (time.perf_counter() - encoded) - reading.latency.checks_ms
+        latency = replace(reading.latency, encode_ms=1e3 * (encoded - begun), network_ms=network_ms)
+        reading = replace(reading, latency=latency)
+        if withheld is not None:
+            return self._withhold(reading, withheld)
+        return self._estimate(reading, frame, self.network, parts)
 
     def _unready(self, last: LiveFrame | None, frame: LiveFrame) -> str | None:
         """Explain why a frame cannot be compared with a reference, after taking a new one where that is due."""
@@ -254,7 +270,7 @@ class FrameReader:
         health = () if self._health is None else self._health.check(frame, tracked)
         if self._shear is not None and self.network is not None and all(check.ok for check in health):
             health = (*health, check_direction(self.network, self._shear.estimate(frame.image)))
-        latency = Latency(decode_ms=frame.decode_ms, checks_ms=1e3 * (time.perf_counter() - begun))
+        latency = replace(begin.latency, checks_ms=1e3 * (time.perf_counter() - begun))
         withheld = next((check.sentence for check in health if not check.ok), None)
         reading = replace(begin, slip=markers and markers.state, markers=markers, health=health, latency=latency)
         untouched = any(check.name == "touch" and not check.ok for check in health)
@@ -268,29 +284,19 @@ class FrameReader:
         self.learner.update(frame.time_s, slipping_s=slipping_s, touches=touches)
         return reading, withheld
 
-    def _withhold(self, reading: Reading, frame: LiveFrame, why: str | None) -> Reading:
-        latency = replace(reading.latency, decode_ms=frame.decode_ms, total_ms=_since_ms(frame.captured_s))
+    def _withhold(self, reading: Reading, why: str | None) -> Reading:
+        latency = replace(reading.latency, total_ms=_since_ms(reading.captured_s))
         return replace(reading, withheld=why, latency=latency)
 
-    def _estimate(self, reading: Reading, frame: LiveFrame) -> Reading:
-        assert self.network is not None
-        assert self.engine is not None
-        assert self.reference is not None
+    def _estimate(self, reading: Reading, frame: LiveFrame, network: Network, parts: tuple[Tensor, ...]) -> Reading:
         friction = self.learner.friction
         follower = self._follower if friction is None else None  # it takes no friction
-        begun = time.perf_counter()
-        inputs = self.network.encode(frame.image[None], self.reference)
-        encoded = time.perf_counter()
-        [parts] = self.engine.answers(iter([inputs]))
-        estimate = self.network.to_estimate(*parts, friction=friction)
-        network_ms = 1e3 * (time.perf_counter() - encoded)
-        latency = replace(reading.latency, encode_ms=1e3 * (encoded - begun), network_ms=network_ms)
-        reading = replace(reading, latency=latency)
+        estimate = network.to_estimate(*parts, friction=friction)
         novelty = None if self._health is None else check_novelty(estimate)
         if novelty is not None:
             reading = replace(reading, health=(*reading.health, novelty))
             if not novelty.ok:
-                return self._withhold(reading, frame, novelty.sentence)
+                return self._withhold(reading, novelty.sentence)
         if follower is not None:
             estimate = follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
@@ -312,7 +318,7 @@ class FrameReader:
             sequence=follower is not None and not follower.lost,
             risk=margin_risk(reading.health, float(estimate.beyond(OFF)[0])) if reading.health else None,
             contact_state=state,
-            latency=replace(latency, total_ms=_since_ms(frame.captured_s)),
+            latency=replace(reading.latency, total_ms=_since_ms(frame.captured_s)),
         )
 
     def _set_reference(self, image: Frame) -> None:
