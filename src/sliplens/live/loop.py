@@ -256,17 +256,17 @@ class LiveReader(FrameReader):
         if not self._threads:
             raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
         with self._news:  # from now on, not from the first `next`; the newest reading counts as news
-            seen = max(0, self._published - 1)
-        return self._follow_news(seen)
+            count = max(0, self._published - 1)
+        return self._follow_news(count)
 
-    def _follow_news(self, seen: int) -> Iterator[Reading]:
+    def _follow_news(self, count: int) -> Iterator[Reading]:
         while True:
             with self._news:
-                while self._published == seen and not self._over.is_set():
+                while self._published == count and not self._over.is_set():
                     self._news.wait()
-                if self._published == seen:
+                if self._published == count:
                     break
-                seen, reading = self._published, self._newest
+                count, reading = self._published, self._newest
             assert reading is not None
             yield reading
         if self._error is not None:
