@@ -8,8 +8,8 @@ from matplotlib.colors import to_rgb
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
-from sliplens.plots.clip import clip_frames, paint_outlines, write_clip
-from sliplens.plots.contact_sheet import brighten, brightening
+from sliplens.plots.clip import clip_frames, write_clip
+from sliplens.plots.contact_sheet import brighten, brightening, paint_outlines
 from sliplens.plots.style import SKY
 from sliplens.progress import reporting
 from sliplens.recordings import ContactState, Recording

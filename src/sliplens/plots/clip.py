@@ -8,23 +8,26 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from matplotlib.colors import to_rgb
 from PIL import Image, ImageDraw, ImageFont
-from scipy.ndimage import binary_dilation
 
 from sliplens.errors import InputError
 from sliplens.extras import import_cv2
 from sliplens.images import absolute_difference
 from sliplens.markers.tracker import MarkerStatus, Tracks
-from sliplens.plots.contact_sheet import STATE_COLOURS, TIMES, brighten, brightening
-from sliplens.plots.style import BLACK, SKY, VERMILLION, YELLOW, percent, written_whole
+from sliplens.plots.contact_sheet import (
+    STATE_COLOURS,
+    TIMES,
+    brighten,
+    brightening,
+    enlarge,
+    paint_outlines,
+    to_bytes,
+)
+from sliplens.plots.style import BLACK, VERMILLION, YELLOW, percent, written_whole
 from sliplens.progress import report_each
 from sliplens.recordings import Recording
-from sliplens.recordings.trial import OUTSIDE, STICKS
 
 _SAMPLES = 32  # frames that set the brightness of all
-# pixels; pictures are enlarged up to the first size and reduced down to the second one, given as (height, width)
-_SMALL, _LARGE = (480, 640), (720, 960)
 _FOOT, _LETTERS = 60, 20
 
 
@@ -60,10 +63,10 @@ def clip_frames(time_s: Float[np.ndarray, " frames"], frames_per_s: float) -> In
 def _draw_frame(recording: Recording, index: int, factor: float) -> UInt8[np.ndarray, "rows columns 3"]:
     """Draw a camera frame, its difference image, and a line of numbers below both."""
     frame, margin, state = recording.frames[index], recording.safety_margin[index], recording.contact_state[index]
-    camera = _resize(frame)
+    camera = enlarge(frame)
     if recording.truth is not None:
         paint_outlines(camera, recording.truth.contact_map[index])
-    difference = _resize(brighten(absolute_difference(frame, recording.reference), factor))
+    difference = enlarge(brighten(absolute_difference(frame, recording.reference), factor))
     pixels = np.concatenate([camera, difference], axis=1)
     height, width = (side // 2 * 2 for side in pixels.shape[:2])  # H.264 keeps one colour for two by two pixels
     image = Image.new("RGB", (max(width, 640), height + _FOOT), "white")
@@ -78,30 +81,6 @@ def _draw_frame(recording: Recording, index: int, factor: float) -> UInt8[np.nda
     words = f"Fₙ {force:.2f} N   Fₜ {pull:.2f} N   difference {TIMES} {factor:g}"
     draw.text((28, height + 30), words, fill=BLACK, font=font)
     return np.asarray(image)
-
-
-def _scale(height: int, width: int) -> tuple[int, int]:
-    """Choose whole factors to enlarge and to reduce a picture by, one of them 1."""
-    return max(1, min(_SMALL[0] // height, _SMALL[1] // width)), max(-(-height // _LARGE[0]), -(-width // _LARGE[1]))
-
-
-def _resize(pixels: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
-    up, down = _scale(*pixels.shape[:2])
-    image = Image.fromarray(pixels).reduce(down)
-    return np.array(image.resize((image.width * up, image.height * up), Image.Resampling.LANCZOS))
-
-
-def paint_outlines(camera: UInt8[np.ndarray, "rows columns 3"], contact: UInt8[np.ndarray, "height width"]) -> None:
-    """Paint white around the contact, and blue inside its stick zone, both with a dark rim: neither hides the other."""
-    up, down = _scale(*contact.shape)
-    contact = contact[::down, ::down].repeat(up, axis=0).repeat(up, axis=1)
-    touches, loose = contact != OUTSIDE, contact != STICKS
-    for zone, steps, colour in ((touches, 3, BLACK), (touches, 2, "white"), (loose, 3, BLACK), (loose, 2, SKY)):
-        camera[binary_dilation(zone, iterations=steps) & ~zone] = _bytes(colour)
-
-
-def _bytes(colour: str) -> tuple[int, ...]:
-    return tuple(round(255 * level) for level in to_rgb(colour))
 
 
 _COLOURS = {MarkerStatus.FOLLOWED: YELLOW, MarkerStatus.BROKEN: VERMILLION}
@@ -123,14 +102,14 @@ def draw_tracked(
             continue
         start = np.rint((tracked.position_px[index] + 0.5) * scale - 0.5).astype(int)
         radius = round(float(tracked.radius_px[index]) * scale)
-        cv2.circle(picture, start.tolist(), radius, _bytes(_COLOURS[status]), scale)
+        cv2.circle(picture, start.tolist(), radius, to_bytes(_COLOURS[status]), scale)
         if status == MarkerStatus.FOLLOWED:
             end = start + np.rint((tracked.position_px[index] - tracked.rest_px[index]) * scale * _MAGNIFIED).astype(
                 int
             )
             # dark below bright: visible on any ground
             for colour, width in ((BLACK, scale + 2), ("white", scale)):
-                cv2.arrowedLine(picture, start.tolist(), end.tolist(), _bytes(colour), width, tipLength=0.3)
+                cv2.arrowedLine(picture, start.tolist(), end.tolist(), to_bytes(colour), width, tipLength=0.3)
     return picture
 
 

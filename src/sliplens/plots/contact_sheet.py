@@ -3,18 +3,20 @@
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from textwrap import fill
+from textwrap import shorten
 
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.patheffects import Normal, Stroke
+from PIL import Image
+from scipy.ndimage import binary_dilation
 
 from sliplens.errors import InputError
 from sliplens.images import absolute_difference
+from sliplens.plots.saliency import PictureRow, draw_pictures
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -22,13 +24,10 @@ from sliplens.plots.style import (
     ORANGE,
     SKY,
     VERMILLION,
-    drawing_style,
     percent,
     require_picture_path,
     save_page,
-    write_over,
 )
-from sliplens.progress import number_of
 from sliplens.recordings import ContactState, Recording
 from sliplens.recordings.trial import OUTSIDE, STICKS
 from sliplens.results.explanation import MARGIN_LEVELS
@@ -53,18 +52,6 @@ def brighten(difference: UInt8[np.ndarray, "*any"], factor: float) -> UInt8[np.n
     return np.minimum(np.round(np.float32(factor) * difference), 255).astype(np.uint8)
 
 
-def plot_forces(recording: Recording, *, ax: Axes) -> Axes:
-    """Draw F_n, F_t and the friction limit mu F_n over time, in newtons, with a legend above."""
-    time_s, normal = recording.time_s, recording.normal_force_n
-    ax.plot(time_s, normal, color=BLUE, label="$F_n$")
-    ax.plot(time_s, recording.tangential_force_n, color=VERMILLION, linestyle="--", label="$F_t$")
-    limit = recording.friction_coefficient * normal
-    ax.plot(time_s, limit, color=GREY, linestyle=":", linewidth=1.3, label=r"$\mu F_n$")
-    ax.set(ylabel="Force (N)", xmargin=0)
-    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, borderaxespad=0.1, columnspacing=1.2)
-    return ax
-
-
 def plot_margin(recording: Recording, *, ax: Axes) -> Axes:
     """Draw the safety margin over time, in percent, on the colours of the contact states."""
     states = recording.contact_state
@@ -84,45 +71,73 @@ def state_patches() -> list[Patch]:
 
 _REACHED_WITHIN = 0.1 - 1e-9  # half the distance between two columns: no frame stands in both
 _ALIKE = 0.005  # margins that are equal in whole percents
+# pixels; pictures are enlarged up to the first size and reduced down to the second one, given as (height, width)
+_SMALL, _LARGE = (480, 640), (720, 960)
+
+
+def _scale(height: int, width: int) -> tuple[int, int]:
+    """Choose whole factors to enlarge and to reduce a picture by, one of them 1."""
+    return max(1, min(_SMALL[0] // height, _SMALL[1] // width)), max(-(-height // _LARGE[0]), -(-width // _LARGE[1]))
+
+
+def enlarge(pixels: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Enlarge or reduce a picture by a whole factor to a size to look at."""
+    up, down = _scale(*pixels.shape[:2])
+    image = Image.fromarray(pixels).reduce(down)
+    return np.array(image.resize((image.width * up, image.height * up), Image.Resampling.LANCZOS))
+
+
+def paint_outlines(camera: UInt8[np.ndarray, "rows columns 3"], contact: UInt8[np.ndarray, "height width"]) -> None:
+    """Paint white around the contact, and blue inside its stick zone, both with a dark rim: neither hides the other."""
+    up, down = _scale(*contact.shape)
+    contact = contact[::down, ::down].repeat(up, axis=0).repeat(up, axis=1)
+    touches, loose = contact != OUTSIDE, contact != STICKS
+    for zone, steps, colour in ((touches, 3, BLACK), (touches, 2, "white"), (loose, 3, BLACK), (loose, 2, SKY)):
+        camera[binary_dilation(zone, iterations=steps) & ~zone] = to_bytes(colour)
+
+
+def to_bytes(colour: str) -> tuple[int, ...]:
+    """Return the levels of a colour."""
+    return tuple(round(255 * level) for level in to_rgb(colour))
 
 
 def draw_contact_sheet(recordings: Sequence[Recording], *, title: str | None = None) -> Figure:
-    """Draw two rows a trial: frames from the untouched sensor to full slip, and their differences; forces at the right.
+    """Draw two rows a trial: frames from the untouched sensor to full slip, and their differences.
 
     Frames are those of `choose_untouched` and `choose_margins`; difference images are brightened by one factor, so that
-    trials compare. Outlines of the true contact and stick zone lie over the frames of simulated trials.
+    trials compare. Outlines of the true contact (white) and stick zone (blue) lie over the frames of simulated trials.
     """
     if not recordings:
         raise InputError("a contact sheet needs a trial; give at least one recording")
-    rows = [[choose_untouched(recording), *choose_margins(recording)] for recording in recordings]
+    chosen = [[choose_untouched(recording), *choose_margins(recording)] for recording in recordings]
     factor = brightening(
         [
             absolute_difference(recording.frames[[at for at in row if at is not None]], recording.reference)
-            for recording, row in zip(recordings, rows, strict=True)
+            for recording, row in zip(recordings, chosen, strict=True)
         ]
     )
-    with drawing_style():
-        figure = Figure(figsize=(16, 3.9 * len(recordings) + 0.9), layout="constrained")
-        figure.suptitle(title or "", x=0.01, ha="left", fontsize=14, fontweight="bold", parse_math=False)
-        grid = figure.add_gridspec(2 * len(rows), len(rows[0]) + 1, width_ratios=[*[1.0] * len(rows[0]), 1.8])
-        for band, (recording, row) in enumerate(zip(recordings, rows, strict=True)):
-            for column, index in enumerate(row):
-                pair = [figure.add_subplot(grid[2 * band + line, column]) for line in (0, 1)]
-                _draw_pictures(recording, index, pair, factor=factor, nominal=[None, *MARGIN_LEVELS][column])
-            for line, plot in enumerate((plot_forces, plot_margin)):
-                ax = plot(recording, ax=figure.add_subplot(grid[2 * band + line, -1]))
-                for time_s in recording.time_s[[at for at in row if at is not None]]:
-                    ax.axvline(time_s, color=BLACK, linewidth=0.7, alpha=0.45, zorder=1)
-        models = [recording.truth.displacement for recording in recordings if recording.truth is not None]
-        stick = "outline of its stick zone" + (" (nominal)" if "calibrated" in models else "")
-        rim = [Stroke(linewidth=3.4, foreground=BLACK), Normal()]
-        outlines = [
-            Line2D([], [], color=colour, linewidth=1.8, path_effects=rim, label=label)
-            for colour, label in ((("white", "outline of the contact"), (SKY, stick)) if models else ())
-        ]
-        mark = Line2D([], [], color=BLACK, linewidth=0.7, label="frame shown")
-        figure.legend(handles=[*outlines, mark, *state_patches()], ncols=7, loc="outside lower left")
-    return figure
+    rows = []
+    for recording, row in zip(recordings, chosen, strict=True):
+        cameras, differences, words = [], [], []
+        for column, index in enumerate(row):
+            frame = recording.reference if index is None else recording.frames[index]
+            camera, difference = enlarge(frame), brighten(absolute_difference(frame, recording.reference), factor)
+            if index is None and column:
+                camera, difference = (np.full_like(picture, 255) for picture in (camera, difference))
+                words.append("no frame")
+            elif index is None:
+                words.append("reference")
+            else:
+                words.append(f"{recording.time_s[index]:.1f} s, {recording.contact_state[index]}")
+                if recording.truth is not None:
+                    paint_outlines(camera, recording.truth.contact_map[index])
+            cameras.append(camera)
+            differences.append(difference)
+        name = f"{shorten(recording.trial, 36, placeholder='…')}, {recording.condition}, day {recording.day}"
+        rows.append(PictureRow(name=name, pictures=cameras, words=words))
+        rows.append(PictureRow(name=f"difference {TIMES} {factor:g}", pictures=differences))
+    heads = ["untouched", *(f"Γ {percent(level)}" for level in MARGIN_LEVELS)]
+    return draw_pictures(rows, heads=heads, title=title)
 
 
 def write_contact_sheet(recordings: Sequence[Recording], path: Path, *, title: str | None = None) -> None:
@@ -157,38 +172,3 @@ def choose_untouched(recording: Recording) -> int | None:
     """Choose the middle frame of those without contact; None without any."""
     free = [index for index, state in enumerate(recording.contact_state) if state == ContactState.NO_CONTACT]
     return free[len(free) // 2] if free else None
-
-
-def _draw_pictures(
-    recording: Recording, index: int | None, axes: Sequence[Axes], *, factor: float, nominal: float | None
-) -> None:
-    """Draw a frame and its difference image; the first column, without a nominal margin, has the facts of the trial."""
-    for ax in axes:
-        ax.set(xticks=[], yticks=[])
-        ax.spines[:].set_visible(False)
-    camera, below = axes
-    if index is None and nominal is not None:
-        write_over(camera, f"no frame\nnear {percent(nominal)}")
-        return
-    frame = recording.reference if index is None else recording.frames[index]
-    camera.imshow(frame)
-    below.imshow(brighten(absolute_difference(frame, recording.reference), factor))
-    when = "reference" if index is None else f"{recording.time_s[index]:.1f} s, {recording.contact_state[index]}"
-    if nominal is None:
-        name = fill(recording.trial, 26, max_lines=2, placeholder="…")
-        length = f"{number_of(len(recording), 'frame')} in {np.ptp(recording.time_s):.1f} s"
-        facts = f"{name}\n{recording.condition}, day {recording.day}, {recording.sensor}\n{length}"
-        # a dollar sign in a name begins no formula
-        camera.set_ylabel(facts, fontsize=8, parse_math=False)
-        below.set_ylabel(f"difference {TIMES} {factor:g}", fontsize=8)
-        camera.set_title(f"untouched\n{when}", fontsize=8.5)
-    elif index is not None:
-        camera.set_title(f"Γ {percent(float(recording.safety_margin[index]))}\n{when}", fontsize=8.5)
-    if index is not None and recording.truth is not None:
-        contact = recording.truth.contact_map[index]
-        touches, sticks = contact != OUTSIDE, contact == STICKS
-        # dark rims first, then wide under narrow, so that outlines that run together both show
-        lines = ((touches, BLACK, 2.2), (sticks, BLACK, 1.6), (touches, "white", 1.5), (sticks, SKY, 0.9))
-        for zone, colour, width in lines:
-            if zone.any() and not zone.all():  # else there is no line to draw
-                camera.contour(zone, levels=[0.5], colors=[colour], linewidths=width)

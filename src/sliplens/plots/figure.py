@@ -1,6 +1,6 @@
 """One figure for each kind of result, and one of a proposed sensor profile."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from textwrap import fill as wrap
 from typing import Any
@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -23,7 +22,7 @@ from sliplens.markers.gel import SensorProposal, propose_profile
 from sliplens.plots.contact_sheet import plot_margin
 from sliplens.plots.errors import plot_faithfulness, plot_learning_curves, plot_predictions, plot_removal
 from sliplens.plots.margins import column, plot_grip_force, plot_hold, plot_margins, plot_readings
-from sliplens.plots.saliency import POINTS, SIGN_COLOURS, FrameU8, full_points, overlay_points
+from sliplens.plots.saliency import POINTS, SIGN_COLOURS, full_points, overlay_points
 from sliplens.plots.style import (
     BLACK,
     BLUE,
@@ -33,7 +32,6 @@ from sliplens.plots.style import (
     drawing_style,
     fill_name,
     input_name,
-    method_colour,
     method_name,
     methods_in_order,
     written_whole,
@@ -42,7 +40,7 @@ from sliplens.recordings.sensor import profile_text
 from sliplens.recordings.source import Frames
 from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.faithfulness import Faithfulness, is_control
-from sliplens.results.study import Randomisation, States, Study, Truth, UntrainedMaps
+from sliplens.results.study import Study, Truth
 
 
 def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Figure:
@@ -103,7 +101,16 @@ def _explanation(explanation: Explanation, ax: Axes, index: int | None) -> None:
     frame, method, baseline = explanation.frames[row], explanation.method, explanation.baseline_words(row)
     scale, of_margin = explanation.scale, explanation.unit == "margin"
     unit = POINTS if of_margin else f"{explanation.unit_words} per 1 % of the image"
-    _draw_map(explanation.pictures[row], explanation.relevance[method][row], scale=scale, unit=unit, ax=ax)
+    relevance = explanation.relevance[method][row, None]
+    full = full_points(relevance, scale=scale) / (1 if of_margin else 100)
+    ax.imshow(overlay_points([explanation.pictures[row]], relevance, scale=scale)[0])
+    ax.set(xticks=[], yticks=[])
+    ax.spines[:].set_visible(False)
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    bar = figure.colorbar(ScalarMappable(Normalize(-full, full), SIGN_COLOURS), ax=ax, shrink=0.9)
+    bar.set_label(f"orange lowers the prediction, blue raises it\n({unit})", fontsize=8)
+    bar.ax.tick_params(labelsize=8)
     predicted = "withheld" if frame.withheld else amount(frame.prediction, explanation.unit)
     compared, close = amount(frame.reference_prediction, explanation.unit), CLOSE * explanation.scale
     why = f"{frame.id}: why {predicted} rather than {compared}, that of {baseline}"
@@ -112,26 +119,6 @@ def _explanation(explanation: Explanation, ax: Axes, index: int | None) -> None:
         why = f"{frame.id}: nothing to explain, for {predicted} is within {near} of that of {baseline}"
     ax.set_title(f"{method_name(method)}\n{wrap(why, 46)}", fontsize=9, parse_math=False)
     ax.set_xlabel(wrap("; ".join(explanation.methods[method].warnings), 62), fontsize=7.5, loc="left", color=VERMILLION)
-
-
-def _draw_map(
-    picture: FrameU8,
-    relevance: Float[np.ndarray, "rows columns"],
-    *,
-    ax: Axes,
-    scale: float = 1.0,
-    unit: str = POINTS,
-) -> None:
-    """Draw a signed map over its picture, with a bar of its colours."""
-    full = full_points(relevance[None], scale=scale) / (1 if unit == POINTS else 100)
-    ax.imshow(overlay_points([picture], relevance[None], scale=scale)[0])
-    ax.set(xticks=[], yticks=[])
-    ax.spines[:].set_visible(False)
-    figure = ax.get_figure(root=True)
-    assert figure is not None
-    bar = figure.colorbar(ScalarMappable(Normalize(-full, full), SIGN_COLOURS), ax=ax, shrink=0.9)
-    bar.set_label(f"orange lowers the prediction, blue raises it\n({unit})", fontsize=8)
-    bar.ax.tick_params(labelsize=8)
 
 
 def _faithfulness(faithfulness: Faithfulness, ax: Axes, _: int | None) -> None:
@@ -158,34 +145,12 @@ def _truth(truth: Truth, ax: Axes, _: int | None) -> None:
     ax.set_title(input_name(truth.input))
 
 
-def _randomisation(record: Randomisation, ax: Axes, _: int | None) -> None:
-    for name in methods_in_order(record.methods):
-        method = record.methods[name]
-        values = np.array(method.similarity, dtype=float)
-        ax.plot(method.layers, values, marker="o", color=method_colour(name), label=method_name(name))
-    ax.set(xlabel="Layers with new weights", ylabel="Similarity to the map of the network", ylim=(-1.05, 1.05))
-    ax.legend(fontsize=8)
-
-
 def _untrained(record: UntrainedMaps, ax: Axes, index: int | None) -> None:
     name, maps = next(iter(record.maps.items()))
-    row = _of(len(maps), index or 0)
-    _draw_map(np.full((*maps.shape[1:], 3), 128, dtype=np.uint8), maps[row], ax=ax)
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    figure.colorbar(ax.imshow(maps[index or 0], cmap="gray"), ax=ax, label="relevance in the output's unit")
     ax.set_title(method_name(name))
-
-
-def _states(states: States, ax: Axes, index: int | None) -> None:
-    names = list(states.markers)
-    if not names:
-        raise InputError(f"no marker was followed; {'; '.join(states.untracked) or 'choose frames of other trials'}")
-    name = names[_of(len(names), index or 0)]
-    markers = states.markers[name]
-    ax.plot(*markers.rest_px.T, ".", color=GREY, label="at rest")
-    ax.plot(*markers.now_px.T, "o", mfc="none", color=BLUE, label="now")
-    ax.set(xlabel="x (px)", ylabel="y (px)", aspect="equal")
-    ax.invert_yaxis()
-    ax.set_title(name, parse_math=False)
-    ax.legend()
 
 
 def _rows(result: Any, ax: Axes, _: int | None) -> None:
@@ -208,19 +173,15 @@ def _rows(result: Any, ax: Axes, _: int | None) -> None:
 
 
 def _plot_methods(values: Mapping[str, Difference], ax: Axes) -> None:
-    """Draw a value of each method with its interval, controls in grey."""
+    """Draw the value of each method with its interval, the first on top, controls in grey."""
     names = methods_in_order(values)
-    _plot_gaps([(method_name(name), values[name], GREY if is_control(name) else BLUE) for name in names], ax)
-
-
-def _plot_gaps(rows: Sequence[tuple[str, Difference, str]], ax: Axes, *, scale: float = 1) -> None:
-    """Draw estimates with their intervals, each with a name and colour, the first on top."""
-    for place, (_, gap, colour) in enumerate(rows):
-        if gap.low is not None and gap.high is not None:
-            ax.plot([scale * gap.low, scale * gap.high], [place, place], color=colour)
-        ax.plot([scale * gap.estimate], [place], color=colour, marker="o")
+    for place, name in enumerate(names):
+        value, colour = values[name], GREY if is_control(name) else BLUE
+        if value.low is not None and value.high is not None:
+            ax.plot([value.low, value.high], [place, place], color=colour)
+        ax.plot([value.estimate], [place], color=colour, marker="o")
     ax.axvline(0, color=BLACK, linewidth=0.8, linestyle=":")
-    ax.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    ax.set_yticks(range(len(names)), [method_name(name) for name in names])
     ax.invert_yaxis()
 
 
@@ -271,8 +232,6 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "Network": _network,
     "Explanation": _explanation,
     "UntrainedMaps": _untrained,
-    "Randomisation": _randomisation,
-    "States": _states,
     "DeletionScores": lambda result, ax, _: plot_faithfulness(result.curves, ax=ax).set_title(input_name(result.input)),
     "Faithfulness": _faithfulness,
     "Study": _study,

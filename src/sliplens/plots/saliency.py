@@ -43,6 +43,7 @@ POINTS = "points of margin per 1 % of the image"
 _BAR_WORDS = f"orange lowers the prediction, blue raises it\n(full colour beside each row, in {POINTS})"
 _CELL_IN, _SIDE_IN, _HEAD_IN = 1.5, 1.35, 0.45
 _BAR_IN = 4.0  # as wide as the label of the colour bar
+_SHARP_PX = 256
 _WIDEST = 12
 """Frames of a panel at most, which can still be seen on a screen."""
 _LEAST = 0.2
@@ -108,7 +109,12 @@ class PictureRow:
 
 
 def draw_pictures(
-    rows: Sequence[PictureRow], *, heads: Sequence[str], bar: bool = False, words: str = _BAR_WORDS
+    rows: Sequence[PictureRow],
+    *,
+    heads: Sequence[str],
+    bar: bool = False,
+    words: str = _BAR_WORDS,
+    title: str | None = None,
 ) -> Figure:
     """Draw rows of pictures under heads, and the bar of their colours with words below."""
     step = _CELL_IN + 0.06
@@ -118,12 +124,14 @@ def draw_pictures(
     with drawing_style():
         # placed by hand: laying out a hundred axes takes seconds
         figure = Figure(figsize=(_SIDE_IN + max(step * len(heads), _BAR_IN), bottoms[-1] + (0.8 if bar else 0.1)))
+        place_text(figure, 0.1, 0.05, title or "", fontsize=11, fontweight="bold", parse_math=False)
         for row, top in zip(rows, [_HEAD_IN, *bottoms], strict=False):
             name = row.name if row.full is None else f"{row.name}\nfull colour: {row.full:.2g}"
             place_text(figure, _SIDE_IN - 0.1, top + _CELL_IN / 2, fill(name, 20, replace_whitespace=False), **aside)
             for column, picture in enumerate(row.pictures):
                 ax = place_axes(figure, _SIDE_IN + column * step, top, _CELL_IN, _CELL_IN)
-                ax.imshow(picture, interpolation="none")
+                # large pictures are smoothed, so that thin outlines do not break
+                ax.imshow(picture, interpolation="none" if len(picture) <= _SHARP_PX else "antialiased")
                 ax.set_axis_off()
             for column, text in enumerate(row.words):
                 place_text(figure, _SIDE_IN + column * step + _CELL_IN / 2, top + _CELL_IN + 0.03, text, **small)
