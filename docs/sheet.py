@@ -36,4 +36,4 @@ if __name__ == "__main__":
         draw_contact_sheet(recordings).savefig(buffer, format="png", dpi=150)
     picture = Image.open(buffer).convert("RGB")
     size = (WIDTH_PX, round(picture.height * WIDTH_PX / picture.width))
-    picture.resize(size, Image.Resampling.LANCZOS).save(output, quality=90, subsampling=0, optimize=True)
+    picture.resize(size, Image.Resampling.LANCZOS).save(output, quality=80, subsampling=0, optimize=True)

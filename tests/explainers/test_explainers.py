@@ -282,9 +282,9 @@ def filled(value: float, *, shape=(2, 3, 8, 8)):
 
 BAD_IMAGES = [
     (filled(0.5, shape=(3, 8, 8)), r"shape \(3, 8, 8\), which is not \(batch, 3, height, width\); add a batch axis"),
-    (filled(0.5, shape=(0, 3, 8, 8)), "there is no image to explain, the batch is empty; pass at least one image"),
+    (filled(0.5, shape=(0, 3, 8, 8)), r"images of shape \(0, 3, 8, 8\) are empty; pass at least one image"),
     (filled(0.5, shape=(2, 1, 8, 8)), "images have 1 channels instead of 3; pass RGB images"),
-    (filled(0.5, shape=(2, 3, 0, 8)), "images of 0 x 8 pixels are empty; pass images with at least one pixel"),
+    (filled(0.5, shape=(2, 3, 0, 8)), r"images of shape \(2, 3, 0, 8\) are empty; pass at least one image"),
     (filled(0.5).to(torch.uint8), "image values are torch.uint8 instead of float; divide 8-bit images by 255"),
     (filled(torch.nan), "image 0 holds NaN or infinity in 192 of 192 values; read the frame again"),
     (filled(37.0), r"image 0 has values from 37 to 37, outside \[0, 1\]; scale it as"),

@@ -5,17 +5,18 @@ import pytest
 import torch
 
 from sliplens.errors import InputError
+from sliplens.explainers.occlusion import tile_regions
 from sliplens.faithfulness.fills import get_fill
 from sliplens.faithfulness.removal import (
     random_unit_order,
     removal_curves,
     score_maps,
-    tile_units,
     unit_order,
 )
 
 SIZE = 20
 IMAGES = 3
+PIXELS = tile_regions((SIZE, SIZE), tile_px=1).numpy()
 EVERY = tuple(np.linspace(0, 1, SIZE * SIZE + 1))
 UP = np.ones(IMAGES)
 
@@ -41,7 +42,7 @@ def contributions(images: torch.Tensor, weights: torch.Tensor) -> np.ndarray:
 
 def test_the_curve_of_a_linear_network_is_the_sum_of_what_went(images: torch.Tensor, weights: torch.Tensor):
     values = contributions(images, weights)
-    units = tile_units((SIZE, SIZE), size=1)
+    units = PIXELS
     orders = np.stack([[unit_order(one, units, least_first=least) for one in values] for least in (False, True)])
     curves = removal_curves(linear(weights), images, orders, fill=get_fill("black"), areas=EVERY, batch_size=37)
     lost = curves.lost(UP)
@@ -53,7 +54,7 @@ def test_the_curve_of_a_linear_network_is_the_sum_of_what_went(images: torch.Ten
 
 def test_what_contributes_is_the_best_map_there_is(images: torch.Tensor, weights: torch.Tensor, rng):
     values = contributions(images, weights)
-    units = [tile_units((SIZE, SIZE), size=1)] * IMAGES
+    units = [PIXELS] * IMAGES
     maps = {"truth": values, "noisy": values + rng.normal(0, values.std(), values.shape), "opposite": -values}
     scores = score_maps(linear(weights), images, maps, units, fill=get_fill("black"), rng=rng, towards=UP, areas=EVERY)
     truth, noisy, opposite = (scores[name] for name in maps)
@@ -77,7 +78,7 @@ def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Ten
     values = contributions(images, mixed)
     towards = np.sign(values.sum(axis=(1, 2)))
     assert np.all(towards == -1)
-    units = [tile_units((SIZE, SIZE), size=1)] * IMAGES
+    units = [PIXELS] * IMAGES
     shuffled = values.reshape(IMAGES, -1).copy()
     half = rng.permutation(SIZE**2)[: SIZE**2 // 2]
     shuffled[:, half] = shuffled[:, rng.permutation(half)]
@@ -97,7 +98,7 @@ def test_along_the_target_a_signed_map_is_scored_as_what_it_is(images: torch.Ten
 
 
 def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Tensor, rng):
-    orders = np.stack([[random_unit_order(tile_units((SIZE, SIZE), size=1), rng=rng)] * IMAGES for _ in range(3)])
+    orders = np.stack([[random_unit_order(PIXELS, rng=rng)] * IMAGES for _ in range(3)])
     found = [
         removal_curves(
             lambda batch: linear(weights)(batch).sin(), images, orders, fill=get_fill(fill), batch_size=size, seed=4
@@ -113,7 +114,7 @@ def test_the_batch_size_changes_nothing(images: torch.Tensor, weights: torch.Ten
 
 
 def test_a_network_that_answers_always_alike_moves_by_nothing(images: torch.Tensor, rng):
-    orders = np.stack([[random_unit_order(tile_units((SIZE, SIZE), size=1), rng=rng)] * IMAGES])
+    orders = np.stack([[random_unit_order(PIXELS, rng=rng)] * IMAGES])
     curves = removal_curves(lambda batch: torch.full((len(batch),), 0.3), images, orders, fill=get_fill("grey"))
     assert np.all(curves.lost(UP) == 0)
 

@@ -180,21 +180,18 @@ def _require_finite(predictions: Tensor, name: str) -> Tensor:
 
 def _require_images(images: Batch) -> None:
     """Refuse images that are not float, finite, in [0, 1] and shaped (batch, 3, height, width)."""
-    match tuple(images.shape):
-        case (0, _, _, _):
-            raise ImageError("there is no image to explain, the batch is empty; pass at least one image")
-        case (_, 3 | 6, height, width) if 0 in (height, width):
-            raise ImageError(f"images of {height} x {width} pixels are empty; pass images with at least one pixel")
-        case (_, 3 | 6, _, _):
-            _require_unit_interval(images, name="image")
-        case (_, channels, _, _):
-            raise ImageError(
-                f"images have {channels} channels instead of 3; pass RGB images with the channels on the second axis"
-            )
-        case shape:
-            raise ImageError(
-                f"images have shape {shape}, which is not (batch, 3, height, width); add a batch axis with images[None]"
-            )
+    shape = tuple(images.shape)
+    if len(shape) != 4:
+        raise ImageError(
+            f"images have shape {shape}, which is not (batch, 3, height, width); add a batch axis with images[None]"
+        )
+    if shape[1] not in {3, 6}:
+        raise ImageError(
+            f"images have {shape[1]} channels instead of 3; pass RGB images with the channels on the second axis"
+        )
+    if 0 in shape:
+        raise ImageError(f"images of shape {shape} are empty; pass at least one image with at least one pixel")
+    _require_unit_interval(images, name="image")
 
 
 def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:

@@ -132,10 +132,8 @@ def try_stick_frame(
     try:
         return find_stick_frame(frames, reference, margin), ()
     except SliplensError as error:  # no stick, no markers, or no OpenCV
-        text = (
-            f"{trial}: the last frame before the pull was not found, so frames are compared with the untouched sensor"
-        )
-        return None, (f"{text}: {error}",)
+        compared = "so frames are compared with the untouched sensor"
+        return None, (f"{trial}: the last frame before the pull was not found, {compared}: {error}",)
 
 
 def frames_from_arrays(

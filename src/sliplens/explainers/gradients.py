@@ -70,8 +70,7 @@ class IntegratedGradients(Method):
                 f"integrated gradients has steps = {self.steps} and max_steps = {self.max_steps}; "
                 "give 1 <= steps <= max_steps"
             )
-        if self.batch_size < 1:
-            raise InputError(f"integrated gradients' batch_size is {self.batch_size}; give at least 1")
+        require_at_least_one("integrated gradients", batch_size=self.batch_size)
         if not self.tolerance > 0:
             raise InputError(f"integrated gradients' tolerance is {self.tolerance}; give a share above 0")
 
@@ -176,22 +175,18 @@ class ExpectedGradients(Method):
     """How each line is integrated."""
 
     def _explain(self, comparison: Comparison) -> Attribution:
-        def background_of(index: int) -> Comparison:
-            """Return the background of an image as images of the network's type, after checking them."""
-            image = comparison.images[index]
-            if self.background is None:
-                alone = replace(comparison, images=comparison.reference[index, None])
-                return alone.with_predictions(*[comparison.reference_prediction[index, None]] * 2)
-            with freeze(comparison.model, self.background, reference=None) as background:
-                return replace(background, images=with_reference_of(background.images, image))
-
+        backgrounds = comparison.reference[:, None]
+        if self.background is not None:
+            with freeze(comparison.model, self.background, reference=None) as checked:
+                frames = checked.images
+            backgrounds = torch.stack([with_reference_of(frames, image) for image in comparison.images])
         predictions = comparison.prediction  # its errors are reported first
-        heights = torch.stack([background_of(index).prediction for index in range(len(predictions))])
+        heights = torch.stack([replace(comparison, images=background).prediction for background in backgrounds])
         comparison = comparison.with_predictions(predictions, heights.mean(dim=1))
 
         def mean_over(index: int) -> Tensor:
             image, prediction = comparison.images[index], comparison.prediction[index]
-            pairs = zip(background_of(index).images, heights[index], strict=True)
+            pairs = zip(backgrounds[index], heights[index], strict=True)
             lines = [self.integrated.integrate(comparison, image, frame, prediction, height) for frame, height in pairs]
             return torch.stack([relevance for relevance, _ in lines]).mean(dim=0)
 

@@ -85,6 +85,8 @@ FindPlaces: TypeAlias = Callable[
 
 def tile_regions(size: tuple[int, int], *, tile_px: int) -> Int[Tensor, "height width"]:
     """Number of the square tile in which each pixel lies; tiles at the right and lower border may be smaller."""
+    if tile_px < 1:
+        raise InputError(f"tiles of {tile_px} pixels are impossible; choose 1 or more")
     rows, columns = (torch.arange(length) // tile_px for length in size)
     return rows[:, None] * (int(columns.max()) + 1) + columns
 
@@ -96,6 +98,8 @@ def marker_regions(
 
     A marker reaches, by default, half of the median distance between neighbours; pixel centres lie at whole numbers.
     """
+    if not len(centres_px):
+        raise InputError("there is no marker to remove; choose pixels or tiles")
     rows, columns = (torch.arange(length, dtype=torch.float64) for length in size)
     pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), dim=-1).reshape(-1, 2)
     centres = centres_px.double()

@@ -32,7 +32,7 @@ from sliplens.explainers.attribution import (
     top_overlap,
 )
 from sliplens.explainers.cam import Layer, capture, find_layers, find_published_layers
-from sliplens.explainers.contract import Comparison, Method, black_frames
+from sliplens.explainers.contract import Comparison, Method, black_frames, require_at_least_one
 from sliplens.models.engines import Engine
 from sliplens.progress import report_progress
 
@@ -172,8 +172,7 @@ class PolyCam(Method):
     def __post_init__(self) -> None:
         if self.score not in SCORES:
             raise InputError(f"Poly-CAM has no score {self.score!r}; choose among {', '.join(SCORES)}")
-        if self.batch_size is not None and self.batch_size < 1:
-            raise InputError(f"Poly-CAM's batch_size is {self.batch_size}; give at least 1")
+        require_at_least_one("Poly-CAM", batch_size=1 if self.batch_size is None else self.batch_size)
         if not 0 < self.budget <= 1:
             raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
         if self.likeness is not None and not all(0 <= value <= 1 for value in self.likeness):

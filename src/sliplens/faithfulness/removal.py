@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.occlusion import marker_regions, tile_regions
 from sliplens.faithfulness.fills import Fill, Painter
 from sliplens.models.engines import Engine
 from sliplens.progress import report_each, report_progress
@@ -31,20 +30,6 @@ AREAS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0
 SHARES = (0.0, 0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Shares of the markers that are put back: each is drawn anew, and of 42 markers one is 2 %."""
 RANDOM_ORDERS = 20
-
-
-def tile_units(shape: tuple[int, int], *, size: int) -> Units:
-    """Square tiles, of 1 for single pixels; those at the right and lower border may be smaller."""
-    if size < 1:
-        raise InputError(f"tiles of {size} pixels are impossible; choose 1 or more")
-    return tile_regions(shape, tile_px=size).numpy()
-
-
-def marker_units(shape: tuple[int, int], centres_px: Float[np.ndarray, "markers 2"], *, reach_px: float) -> Units:
-    """Each pixel goes to the nearest marker; those farther from all than `reach_px` are one unit, the last."""
-    if not len(centres_px):
-        raise InputError("there is no marker to remove; choose pixels or tiles")
-    return marker_regions(shape, torch.from_numpy(centres_px), radius_px=reach_px).numpy()
 
 
 def unit_means(values: Float[np.ndarray, "height width"], units: Units) -> Float[np.ndarray, " units"]:

@@ -1,11 +1,11 @@
 """Scores of explanations: removal under several fills, the deletion score of the thesis, and alarms."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor
 
 from sliplens.errors import CheckpointError, InputError, SaliencyError
@@ -102,6 +102,14 @@ class SettingCurves:
     """Predictions where all of the frame is removed; NaN where the setting has no fill."""
 
 
+def frame_columns(explanation: Explanation, steps: int) -> dict[str, np.ndarray]:
+    """Make the columns that name the frame of each row, for so many rows a frame."""
+    return {
+        column: np.repeat([getattr(frame, name) for frame in explanation.frames], steps)
+        for column, name in (("frame_id", "id"), ("day", "day"), ("trial", "trial"))
+    }
+
+
 def score_curves(
     explanation: Explanation, curves: Mapping[Setting, SettingCurves], *, random_orders: int, seed: int
 ) -> Faithfulness:
@@ -114,37 +122,28 @@ def score_curves(
         for setting, part in curves.items()
     }
     rng, clusters, frames = np.random.default_rng(seed), explanation.clusters, explanation.frames
+    labels = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
     scores, comparisons, tables = [], [], []
     for setting, of_setting in by_method.items():
         gains = {name: curve.symmetric_gain for name, curve in of_setting.items()}
         controls = {name: gain for name, gain in gains.items() if is_control(name)}
         methods = [name for name in gains if name not in controls]
+        where = {"fill": setting.fill, "unit": setting.unit}
         for name, gain in gains.items():
-            score = RemovalScore(
-                fill=setting.fill,
-                unit=setting.unit,
-                method=name,
-                control=name in controls,
-                srg=mean_interval(gain, clusters=clusters, rng=rng),
-                lead_over_controls=None
-                if name in controls
-                else lead_over_controls(gain, controls, clusters=clusters, rng=rng),
-            )
-            scores.append(score)
+            of_control, srg = name in controls, mean_interval(gain, clusters=clusters, rng=rng)
+            lead = None if of_control else lead_over_controls(gain, controls, clusters=clusters, rng=rng)
+            scores.append(RemovalScore(**where, method=name, control=of_control, srg=srg, lead_over_controls=lead))
         for first, second in combinations(methods, 2):
             gap = paired_difference(gains[first], gains[second], clusters=clusters, rng=rng)
-            comparisons.append(RemovalGap(fill=setting.fill, unit=setting.unit, first=first, second=second, gap=gap))
+            comparisons.append(RemovalGap(**where, first=first, second=second, gap=gap))
         for name, curve in of_setting.items():
             rows, steps = curve.most_first.size, len(curve.areas)
-            labels = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
             tables.append(
                 RemovalTable(
                     fill=np.repeat(setting.fill, rows),
                     unit=np.repeat(setting.unit, rows),
                     method=np.repeat(name, rows),
-                    frame_id=np.repeat([frame.id for frame in frames], steps),
-                    day=np.repeat([frame.day for frame in frames], steps),
-                    trial=np.repeat([frame.trial for frame in frames], steps),
+                    **frame_columns(explanation, steps),
                     safety_margin=np.repeat(labels, steps),
                     area=np.tile(curve.areas, len(frames)),
                     most_first=curve.most_first.ravel(),
@@ -270,9 +269,7 @@ def score_deletion(
     tables = [
         DeletionTable(
             method=np.repeat(name, rows),
-            frame_id=np.repeat([frame.id for frame in frames], steps),
-            day=np.repeat([frame.day for frame in frames], steps),
-            trial=np.repeat([frame.trial for frame in frames], steps),
+            **frame_columns(explanation, steps),
             step=np.tile(np.arange(steps), len(frames)),
             pixels_removed=np.tile(removed, len(frames)),
             prediction=explanation.scale * answers[name][:, 1:].ravel(),
@@ -300,21 +297,20 @@ def score_deletion(
             # the fill decides where the filled image is predicted like the whole one
             *fill_decides(chance[:, 0], chance[:, -1], fill=fill),
             *(saturated(chance[:, 0]) if explanation.unit == "margin" else ()),
-            *deletion_alarms(scores),
+            *(
+                alarm
+                for name, values in scores.items()
+                for alarm in follows_last_step(values.mean(axis=1), values[:, -1], name=f"D of {name}")
+                if name != CHANCE
+            ),
+            *(
+                f"{name} does not beat a random order ({values.mean():.3f} against {scores[CHANCE].mean():.3f})"
+                for name, values in scores.items()
+                if name != CHANCE and values.mean() >= scores[CHANCE].mean()
+            ),
         ),
         table=DeletionTable.joined(tables),
     )
-
-
-def deletion_alarms(scores: Mapping[str, Float64[np.ndarray, "frames steps"]]) -> Iterator[str]:
-    """Warn where the score does not measure the map: one that does not beat a random order shows nothing."""
-    chance = float(scores[CHANCE].mean(axis=1).mean())
-    for name, values in scores.items():
-        if name != CHANCE:
-            means = values.mean(axis=1)
-            yield from follows_last_step(means, values[:, -1], name=f"D of {name}")
-            if means.mean() >= chance:
-                yield f"{name} does not beat a random order ({means.mean():.3f} against {chance:.3f})"
 
 
 FILL_DECIDES = 0.05
@@ -325,14 +321,18 @@ _SAME_ORDER = 0.5
 _FEWEST = 3
 
 
+def count_alarm(frames: Bool[np.ndarray, " images"], sentence: str) -> list[str]:
+    """Return the sentence with the number of these frames, and of all, for its two `{}`; none without any."""
+    return [sentence.format(int(frames.sum()), len(frames))] if frames.any() else []
+
+
 def fill_decides(whole: Float[np.ndarray, " images"], filled: Float[np.ndarray, " images"], *, fill: str) -> list[str]:
     """Warn of images whose fill alone is predicted like the whole image: there no map can change the prediction."""
-    near = int(np.sum(np.abs(whole - filled) < FILL_DECIDES))
-    sentence = (
-        f"the fill decides in {near} of {len(whole)} frames: an image of nothing but {fill} is answered within "
-        f"{FILL_DECIDES:.0%} of the whole frame"
+    return count_alarm(
+        np.abs(whole - filled) < FILL_DECIDES,
+        f"the fill decides in {{}} of {{}} frames: an image of nothing but {fill} is answered within "
+        f"{FILL_DECIDES:.0%} of the whole frame",
     )
-    return [sentence] if near else []
 
 
 def follows_last_step(
@@ -349,29 +349,30 @@ def follows_last_step(
 
 def little_to_explain(change: Float[np.ndarray, " images"], *, baseline: str) -> list[str]:
     """Warn of frames predicted nearly like the baseline, whose direction is chance."""
-    few = int(np.sum(np.abs(change) < CLOSE))
-    sentence = (
-        f"next to nothing to explain in {few} of {len(change)} frames: the answer lies within {CLOSE} of that on "
-        f"{baseline}, less than networks err by, and the direction that a gain counts along is chance; leave them "
-        "out"
+    return count_alarm(
+        np.abs(change) < CLOSE,
+        f"next to nothing to explain in {{}} of {{}} frames: the answer lies within {CLOSE} of that on {baseline}, "
+        "less than networks err by, and the direction that a gain counts along is chance; leave them out",
     )
-    return [sentence] if few else []
 
 
 def saturated(answers: Float[np.ndarray, " images"]) -> list[str]:
     """Warn of predictions at an end of [0, 1] or outside: they can move one way only."""
-    ends = int(np.sum((answers < _SATURATED) | (answers > 1 - _SATURATED)))
-    return [f"{ends} of {len(answers)} answers lie at an end of the margin: they can move one way only"] if ends else []
+    return count_alarm(
+        (answers < _SATURATED) | (answers > 1 - _SATURATED),
+        "{} of {} answers lie at an end of the margin: they can move one way only",
+    )
 
 
 def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> list[str]:
     """Warn of constant maps and maps with NaN, which rank nothing."""
     alarms = []
     for method, values in maps.items():
-        bad = int(np.sum(~np.isfinite(values).all(axis=(1, 2))))
-        flat = int(np.sum(values.max(axis=(1, 2)) == values.min(axis=(1, 2))))
-        alarms += [f"{method}: {bad} of {len(values)} maps hold NaN or infinity"] if bad else []
-        alarms += [f"{method}: {flat} of {len(values)} maps are constant and rank nothing"] if flat else []
+        alarms += count_alarm(
+            ~np.isfinite(values).all(axis=(1, 2)), f"{method}: {{}} of {{}} maps hold NaN or infinity"
+        )
+        flat = values.max(axis=(1, 2)) == values.min(axis=(1, 2))
+        alarms += count_alarm(flat, f"{method}: {{}} of {{}} maps are constant and rank nothing")
     return alarms
 
 

@@ -40,7 +40,7 @@ from sliplens.recordings.sensor import profile_text
 from sliplens.recordings.source import Frames
 from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.faithfulness import Faithfulness, is_control
-from sliplens.results.study import Study, Truth
+from sliplens.results.study import Study, Truth, UntrainedMaps
 
 
 def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Figure:

@@ -286,7 +286,6 @@ def write_over(ax: Axes, words: str, **settings: Any) -> None:
 
 
 _CSS_PIXELS_PER_INCH = 96
-_COLOURS, _WHITE, _NEARLY_WHITE = 256, 255, 250
 _DOTS_PER_INCH = 144  # photographs of 224 pixels shown 1.5 inches wide, about pixel for pixel
 
 
@@ -308,22 +307,16 @@ def figure_picture(figure: Figure, *, alt: str, pixels: bool = False) -> Picture
         if pixels:
             # as bare pixels: encoding a PNG to decode it again takes as long as drawing
             figure.savefig(buffer, format="rgba", dpi=_DOTS_PER_INCH)
-            width, height = (int(side * _DOTS_PER_INCH) for side in figure.get_size_inches())
-            buffer = _fewer_colours(Image.frombytes("RGBA", (width, height), buffer.getvalue()))
+            size = [int(side * _DOTS_PER_INCH) for side in figure.get_size_inches()]
+            image = Image.frombytes("RGBA", (size[0], size[1]), buffer.getvalue()).convert("RGB")
+            # 256 colours are a fourth of the size; by octree they are spread evenly, not given to the noise of a map
+            reduced = image.quantize(256, method=Image.Quantize.FASTOCTREE)
+            # colours are means: paper would not be quite white
+            reduced.putpalette([255 if level > 250 else level for level in reduced.getpalette() or []])
+            reduced.save(buffer := io.BytesIO(), "png")
         else:
             # no date: the same results make the same page
             figure.savefig(buffer, format="svg", dpi=200, metadata={"Date": None, "Creator": None})
     width, height = (round(side * _CSS_PIXELS_PER_INCH) for side in figure.get_size_inches())
     uri = f"data:image/{'png' if pixels else 'svg+xml'};base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
     return Picture(uri=uri, alt=alt, width=width, height=height)
-
-
-def _fewer_colours(image: Image.Image) -> io.BytesIO:
-    """Reduce a picture to 256 colours, a fourth of the size; the PDF beside the page has all of them."""
-    smaller = io.BytesIO()
-    # by octree: evenly spread colours, where the median cut would give most of them to the noise of a map
-    reduced = image.convert("RGB").quantize(_COLOURS, method=Image.Quantize.FASTOCTREE)
-    # colours are means: paper would not be quite white
-    reduced.putpalette([_WHITE if level > _NEARLY_WHITE else level for level in reduced.getpalette() or []])
-    reduced.save(smaller, "png")
-    return smaller

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -13,10 +14,10 @@ from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import network_inputs, network_references, with_markers
 from sliplens.explainers.frames import MARGIN_LEVELS as LEVELS
 from sliplens.explainers.frames import nearest_frame
-from sliplens.explainers.occlusion import RegionMethod, to_network_px
+from sliplens.explainers.occlusion import RegionMethod, marker_regions, tile_regions, to_network_px
 from sliplens.explainers.poly_cam import Likeness
 from sliplens.explainers.table import EXPLAINERS, get_explainer
-from sliplens.faithfulness.removal import Units, marker_units, tile_units
+from sliplens.faithfulness.removal import Units
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.markers import track_markers
 from sliplens.models import Network
@@ -270,11 +271,11 @@ class Material:
         """Units of removal of each frame: pixels, tiles, and markers where they are known in every frame."""
         shape = (self.inputs.shape[-2], self.inputs.shape[-1])
         count = len(self.inputs)
-        tile = max(1, round(_TILE_PX * shape[0] / 224))
-        records = {"pixel": [tile_units(shape, size=1)] * count, "tile": [tile_units(shape, size=tile)] * count}
+        sides = {"pixel": 1, "tile": max(1, round(_TILE_PX * shape[0] / 224))}
+        records = {name: [tile_regions(shape, tile_px=side).numpy()] * count for name, side in sides.items()}
         if all(frame.id in self.markers for frame in self.explained.frames):
             records["marker"] = [
-                marker_units(shape, centres, reach_px=reach)
+                marker_regions(shape, torch.from_numpy(centres), radius_px=reach).numpy()
                 for centres, reach in (self.places(frame.id) for frame in self.explained.frames)
             ]
         return records

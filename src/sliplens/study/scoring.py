@@ -14,8 +14,9 @@ from torch import nn
 from sliplens.codec import load_result, save_result
 from sliplens.errors import InputError, SaliencyError
 from sliplens.explainers.explain import network_inputs, network_references
+from sliplens.explainers.occlusion import tile_regions
 from sliplens.faithfulness.fills import get_fill
-from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Units, answer_whole, score_maps, tile_units
+from sliplens.faithfulness.removal import AREAS, RANDOM_ORDERS, Units, answer_whole, score_maps
 from sliplens.faithfulness.scoring import (
     SettingCurves,
     delete_pixels,
@@ -123,7 +124,7 @@ def score(
     explanation = _to_score(network, frames, maps, reference, signed=signed)
     require_same_network(network, explanation)
     shape = (explanation.image_size, explanation.image_size)
-    units = tile_units(shape, size=1 if unit == "pixel" else max(1, shape[0] // _TILES_ACROSS))
+    units = tile_regions(shape, tile_px=1 if unit == "pixel" else max(1, shape[0] // _TILES_ACROSS)).numpy()
     removal = Removal(
         trained=network,
         explained=explanation,
