@@ -370,3 +370,15 @@ def test_cams_name_the_layers_there_are(explainer, network, images):
 def test_impossible_options_are_refused(make, options, message):
     with pytest.raises(InputError, match=message):
         make(**options)
+
+
+class WithoutGradient(nn.Module):
+    @torch.no_grad()
+    def forward(self, images):
+        return images.mean(dim=(1, 2, 3))
+
+
+@pytest.mark.parametrize("name", ["integrated-gradients", "expected-gradients", "smooth-grad", "shapley"])
+def test_a_model_without_gradients_is_refused_with_its_cure(name):
+    with pytest.raises(ModelError, match="has no gradient; take torch"):
+        QUICK[name](WithoutGradient(), filled(0.5))

@@ -36,7 +36,7 @@ def test_a_pixel_of_a_linear_model_loses_what_it_adds(linear, small):
 @pytest.mark.parametrize("tile_px", [5, 7, 100])  # none divides 12
 def test_tiles_are_replaced_one_by_one(tile_px, network, small):
     model = network("gap")
-    occluded = Occlusion(tile_px=tile_px, batch_size=2)(model, small[:1], reference=small[1])
+    occluded = Occlusion(tile_px=tile_px)(model, small[:1], reference=small[1])
     expected = torch.zeros(12, 12)
     with torch.no_grad():
         for row in range(0, 12, tile_px):

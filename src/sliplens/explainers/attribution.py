@@ -139,9 +139,14 @@ def local_change(
     return functional.avg_pool2d(padded, 2 * reach + 1, stride=1)[0, 0]
 
 
+def widest(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+    """Return values in float64, or in float32 on devices that have no other (Apple's MPS)."""
+    return values.float() if values.device.type == "mps" else values.double()
+
+
 def pearson_r(first: Float[Tensor, "height width"], second: Float[Tensor, "height width"]) -> float:
     """Correlation of two maps over their pixels; NaN where one of them is constant."""
-    first, second = (values.flatten().double() - values.double().mean() for values in (first, second))
+    first, second = (values.flatten() - values.mean() for values in (widest(first), widest(second)))
     return float(first @ second / (first.norm() * second.norm()))
 
 
@@ -152,7 +157,7 @@ def top_overlap(
     count = max(1, round(share * first.numel()))
     strongest = torch.zeros(first.numel(), dtype=torch.bool, device=first.device)
     strongest[first.flatten().topk(count).indices] = True
-    return float(strongest[second.flatten().topk(count).indices].double().mean())
+    return float(strongest[second.flatten().topk(count).indices].sum()) / count
 
 
 @dataclass(frozen=True, kw_only=True)

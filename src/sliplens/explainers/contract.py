@@ -69,6 +69,11 @@ class Comparison:
                 f"the model's output has shape {tuple(output.shape)} for {len(images)} image(s), not one number an "
                 "image; end it with one output, such as Linear(features, 1)"
             )
+        if images.requires_grad and torch.is_grad_enabled() and not output.requires_grad:
+            raise ModelError(
+                "the model's output has no gradient; take torch.no_grad() or detach() out of its forward pass, or use "
+                "occlusion, which needs none"
+            )
         return output.reshape(len(images))
 
     @cached_property

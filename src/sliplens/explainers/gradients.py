@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sliplens.errors import InputError
-from sliplens.explainers.attribution import Attribution, check_slopes, frame_of, with_reference_of
+from sliplens.explainers.attribution import Attribution, check_slopes, frame_of, widest, with_reference_of
 from sliplens.explainers.contract import Comparison, Method, black_frames, freeze, require_at_least_one
 
 _NODES = 4  # of a piece; the slope along the path has kinks, on which more nodes to a piece are wasted
@@ -130,12 +130,12 @@ class IntegratedGradients(Method):
                 pieces.append(contributions.detach().sum(dim=1))
             return torch.cat(pieces)
 
-        edges = torch.linspace(0, 1, pieces + 1, dtype=torch.float64, device=image.device)
-        heights = torch.cat([ends[0][None], predict(edges[1:-1]), ends[1][None]]).double()
+        edges = torch.linspace(0, 1, pieces + 1, dtype=widest(image).dtype, device=image.device)
+        heights = widest(torch.cat([ends[0][None], predict(edges[1:-1]), ends[1][None]]))
         starts, stops, rises = edges[:-1], edges[1:], heights.diff()
         parts, used = integrals(starts, stops), pieces * nodes
         while True:
-            gaps = parts.sum(dim=(1, 2)).double() - rises
+            gaps = widest(parts.sum(dim=(1, 2))) - rises
             rooms = (self.max_steps - used) // (2 * nodes)
             if abs(float(gaps.sum())) <= allowed or rooms == 0:
                 last = int(stops.argmax())
@@ -146,7 +146,7 @@ class IntegratedGradients(Method):
             count = min(int((shares.cumsum(0) < shares.sum() / 2).sum()) + 1, rooms)
             split, rest = order[:count], order[count:]
             middles = (starts[split] + stops[split]) / 2
-            rise = predict(middles).double() - predict(starts[split]).double()
+            rise = widest(predict(middles)) - widest(predict(starts[split]))
             new_starts, new_stops = torch.cat([starts[split], middles]), torch.cat([middles, stops[split]])
             starts, stops = torch.cat([starts[rest], new_starts]), torch.cat([stops[rest], new_stops])
             rises = torch.cat([rises[rest], rise, rises[split] - rise])

@@ -20,6 +20,7 @@ from sliplens.models.backbones import HistogramRegressor
 from sliplens.progress import report_each
 
 _TOLERANCE = 0.1  # share of f(x) by which the relevance may miss it without a warning
+_BATCH = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +41,6 @@ class Lrp(Method):
     """
 
     method: ClassVar[str] = "lrp"
-    batch_size: int = 32
 
     def _explain(self, comparison: Comparison) -> Attribution:
         require_packages("zennit", extra="lrp", purpose="LRP")
@@ -49,7 +49,7 @@ class Lrp(Method):
         for module in copy.modules():
             if isinstance(module, fx.GraphModule):
                 _name_functions(module)
-        parts = comparison.images.split(self.batch_size)
+        parts = comparison.images.split(_BATCH)
         relevance = torch.cat(
             [_propagate(copy, part) for part in report_each(parts, sizes=[len(part) for part in parts])]
         )

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import Attribution, frame_of
-from sliplens.explainers.contract import Comparison, Method, require_at_least_one
+from sliplens.explainers.contract import Comparison, Method
 from sliplens.markers import detect_markers
 from sliplens.recordings import Recording
 
@@ -158,6 +158,9 @@ class RegionMethod(Method):
             )
 
 
+_BATCH = 32  # images made at once, which bounds the memory
+
+
 @dataclass(frozen=True, kw_only=True)
 class Occlusion(RegionMethod):
     """Occlusion by tile, or by marker where the markers' places are given, signed, in margin units.
@@ -170,12 +173,6 @@ class Occlusion(RegionMethod):
     ----------
     Zeiler and Fergus, *Visualizing and understanding convolutional networks*, ECCV 2014, section 4.2; by Captum.
     """
-
-    batch_size: int = 32
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require_at_least_one(self._name, batch_size=self.batch_size)
 
     @torch.no_grad()
     def _explain(self, comparison: Comparison) -> Attribution:
@@ -191,7 +188,7 @@ class Occlusion(RegionMethod):
             image, empty = comparison.images[index, None], comparison.reference[index, None]
             regions = self._regions(image[0], empty[0])
             effects = attr.FeatureAblation(predict).attribute(
-                image, baselines=empty, feature_mask=regions[None, None], perturbations_per_eval=self.batch_size
+                image, baselines=empty, feature_mask=regions[None, None], perturbations_per_eval=_BATCH
             )
             # Captum gives every pixel and channel the whole effect of its region
             return effects[0, 0] / regions.flatten().bincount()[regions]

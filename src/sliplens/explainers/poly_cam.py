@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from statistics import fmean
 from typing import ClassVar, TypeAlias
 
@@ -30,8 +30,9 @@ from sliplens.explainers.attribution import (
     scale_to,
     to_masks,
     top_overlap,
+    widest,
 )
-from sliplens.explainers.cam import Layer, capture, find_layers, find_published_layers
+from sliplens.explainers.cam import capture, find_layers, find_published_layers
 from sliplens.explainers.contract import Comparison, Method, black_frames, require_at_least_one
 from sliplens.models.engines import Engine
 from sliplens.progress import report_progress
@@ -181,7 +182,11 @@ class PolyCam(Method):
     @torch.no_grad()
     def _explain(self, comparison: Comparison) -> Attribution:
         change, published = comparison.change.tolist(), self.score == "thesis"
-        layers = self._find_layers(comparison)
+        find = find_published_layers if published and self.layers is None else partial(find_layers, names=self.layers)
+        layers = find(comparison.model, comparison.images[:1])
+        if not 0 <= self.level < len(layers):
+            raise InputError(f"Poly-CAM has no level {self.level} for {len(layers)} layers; count from 0, the finest")
+        layers = layers[self.level :]  # a level is made of its own layer and the coarser ones
         channels = sum(layer.channels for layer in layers)
         done = 0
 
@@ -231,17 +236,6 @@ class PolyCam(Method):
         )
         return replace(attribution, approximations=tuple(approximations), engine=engine.name)
 
-    def _find_layers(self, comparison: Comparison) -> tuple[Layer, ...]:
-        image = comparison.images[:1]
-        if self.layers is None and self.score == "thesis":
-            layers = find_published_layers(comparison.model, image)
-        else:
-            layers = find_layers(comparison.model, image, names=self.layers)
-        if not 0 <= self.level < len(layers):
-            raise InputError(f"Poly-CAM has no level {self.level} for {len(layers)} layers; count from 0, the finest")
-        # a level is made of its own layer and the coarser ones
-        return layers[self.level :]
-
 
 _GRID = 14  # cells a side on which masks are compared; more cells change nothing
 _LENGTH = 3.0  # of the kernel, in median distances between masks
@@ -262,10 +256,10 @@ def _mask_kernel(frame: _Frame) -> Float[Tensor, "active active"]:
     Williams, *Gaussian processes for machine learning* (2006), eq. 4.18.
     """
     contrast = change_of(frame.image, frame.empty)
-    weights = functional.adaptive_avg_pool2d(contrast[None], _GRID).flatten().double()
+    weights = functional.adaptive_avg_pool2d(contrast[None], _GRID).flatten()
     # cells smaller than the grid's are averaged, larger ones repeated
     pooled = [functional.adaptive_avg_pool2d(maps[:, None], _GRID).flatten(1) for maps in frame.masks]
-    features = torch.cat(pooled)[frame.active].double() * weights
+    features = widest(torch.cat(pooled)[frame.active]) * widest(weights)
     distance = torch.cdist(features, features)
     return torch.exp(-distance / (_LENGTH * distance.median().clamp_min(1e-12)))
 
@@ -346,7 +340,7 @@ def _search(
     def explore(until: int) -> None:
         if (count := until - len(process.chosen)) < 1:
             return
-        chosen = process.choose(count, importance=_importance(frame, process).double())
+        chosen = process.choose(count, importance=widest(_importance(frame, process)))
         order = chosen.argsort()
         process.learn(frame.measure(frame.active[chosen[order]])[order.argsort()])
 

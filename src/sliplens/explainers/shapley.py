@@ -174,7 +174,7 @@ class Shapley(RegionMethod):
             image, empty = comparison.images[index], comparison.reference[index]
             with torch.enable_grad():
                 predictions = comparison.prediction[index], comparison.reference_prediction[index]
-                gradients = _GUESS.integrate(comparison, image, empty, *predictions).relevance.float().double().cpu()
+                gradients = _GUESS.integrate(comparison, image, empty, *predictions).relevance.float().cpu().double()
             regions = self._regions(image, empty)
             # a number that no pixel has, such as that of what lies between markers which cover the image, is no player
             numbers, players = regions.unique(return_inverse=True)
@@ -182,7 +182,7 @@ class Shapley(RegionMethod):
             def worth(members: Bool[np.ndarray, "coalitions players"]) -> Float64[np.ndarray, " coalitions"]:
                 taking_part = torch.from_numpy(members).to(image.device).split(engine.batch_size)
                 batches = (torch.where(part[:, players][:, None], image, empty) for part in taking_part)
-                return torch.cat(list(engine.run(batches))).double().cpu().numpy()
+                return torch.cat(list(engine.run(batches))).cpu().double().numpy()
 
             rng = np.random.default_rng((self.seed, index))
             guess = players.cpu().flatten().bincount(weights=gradients.flatten()).numpy()

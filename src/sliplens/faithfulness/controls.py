@@ -142,7 +142,7 @@ def control_maps(model: nn.Module, images: Images, references: Images) -> dict[s
     }
     with suppress(ModelError):
         maps["weights-1"] = even_channels(model, images, references)
-    return {name: values.double().cpu().numpy() for name, values in maps.items()}
+    return {name: values.cpu().double().numpy() for name, values in maps.items()}
 
 
 def lead_over_controls(

@@ -92,7 +92,7 @@ def _answer(
     answers = []
     with torch.no_grad():
         for margins in run(batches):
-            answers.append(margins.double().cpu().numpy())
+            answers.append(margins.cpu().double().numpy())
             on_batch(len(margins))
     return np.concatenate(answers) if answers else np.empty(0)
 

@@ -143,13 +143,13 @@ def answer_names(model: nn.Module, layer: str | None = None) -> tuple[str, ...]:
 
 def bin_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
     """Return the edges of the bins of a histogram, in margin units; None for a single number."""
-    return model.edges.double().cpu().numpy() if isinstance(model, HistogramRegressor) else None
+    return model.edges.cpu().double().numpy() if isinstance(model, HistogramRegressor) else None
 
 
 def ratio_edges(model: nn.Module) -> Float[np.ndarray, " edges"] | None:
     """Return the edges of the bins over F_t / F_n; None for a network that predicts the margin alone."""
     edges = model.ratio_edges if isinstance(model, HistogramRegressor) else None
-    return None if edges is None else edges.double().cpu().numpy()
+    return None if edges is None else edges.cpu().double().numpy()
 
 
 _Edges = TypeVar("_Edges", Tensor, np.ndarray)

@@ -131,7 +131,7 @@ def calibrate_histogram(
     if calibration is None:
         temperature.fill_(fit_temperature(logits, histogram_targets(labels, edges.cpu())))
     probabilities = torch.softmax(logits / temperature.cpu(), dim=-1).double().numpy()
-    numbers = edges.double().cpu().numpy()
+    numbers = edges.cpu().double().numpy()
     values = probabilities @ bin_centres(numbers)
     if calibration is None:
         calibration = conformal_calibration(values, probabilities, numbers, labels, temperature=float(temperature))

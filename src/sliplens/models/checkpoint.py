@@ -270,7 +270,7 @@ class Network:
     def to_estimate(self, *answers: Tensor, friction: FrictionLike | None = None) -> "Estimate":
         """Make an estimate of outputs of the network (`Answers`), and of a friction if it is known."""
         names = answer_names(self.model, self.feature_layer)
-        values = {name: answer.double().cpu().numpy() for name, answer in zip(names, answers, strict=True)}
+        values = {name: answer.cpu().double().numpy() for name, answer in zip(names, answers, strict=True)}
         of_ratio = ratio_edges(self.model)
         estimate = Estimate(
             margin=values["margin"],

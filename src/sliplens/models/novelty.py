@@ -127,7 +127,7 @@ def fit_novelty(model: nn.Module, train: Iterable[Tensor], validation: Iterable[
     if layer is None or min(sum(map(len, batches)), sum(map(len, others))) < _LEAST_FRAMES:
         return None
     (*_, features), (margins, *probabilities, validation_features) = (
-        [torch.cat(part).double().cpu().numpy() for part in zip(*Answers(model, layer).run(some), strict=True)]
+        [torch.cat(part).cpu().double().numpy() for part in zip(*Answers(model, layer).run(some), strict=True)]
         for some in (batches, others)
     )
     edges = bin_edges(model)

@@ -170,7 +170,7 @@ class Randomising(_MaterialStage[Randomisation]):
             explainer, before = _shortened(material.explainers[method]), material.explained.influence(method)[:_REDRAWN]
             layers, similarity = [], []
             for count, network in cascade(model, seed=self.seed, stages=CASCADE, images=inputs):
-                after = explainer(network, inputs, reference=references).influence.double().cpu().numpy()
+                after = explainer(network, inputs, reference=references).influence.cpu().double().numpy()
                 layers.append(count)
                 similarity.append(mean_of_known(stability(before, after)))
             return RandomisedMethod(layers=tuple(layers), similarity=tuple(similarity))

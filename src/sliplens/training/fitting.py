@@ -333,11 +333,11 @@ def calibrate(
         bin_edges(model),
     )
     estimate = Estimate(
-        margin=probabilities[rows] @ model.centres.double().cpu().numpy(),
+        margin=probabilities[rows] @ model.centres.cpu().double().numpy(),
         probabilities=probabilities[rows],
         edges=edges,
         calibration=None,
-        ratio=Ratio(probabilities=ratio_probabilities, edges=model.ratio_edges.double().cpu().numpy()),
+        ratio=Ratio(probabilities=ratio_probabilities, edges=model.ratio_edges.cpu().double().numpy()),
     )
     estimate = estimate.with_friction(validation.friction[rows], trained_friction=friction)
     with_friction = conformal_calibration(
