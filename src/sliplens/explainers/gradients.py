@@ -175,13 +175,13 @@ class ExpectedGradients(Method):
     """How each line is integrated."""
 
     def _explain(self, comparison: Comparison) -> Attribution:
-        backgrounds = comparison.reference[:, None]
+        predictions = comparison.prediction  # its errors are reported first
+        backgrounds, heights = comparison.reference[:, None], comparison.reference_prediction[:, None]
         if self.background is not None:
             with freeze(comparison.model, self.background, reference=None) as checked:
                 frames = checked.images
             backgrounds = torch.stack([with_reference_of(frames, image) for image in comparison.images])
-        predictions = comparison.prediction  # its errors are reported first
-        heights = torch.stack([replace(comparison, images=background).prediction for background in backgrounds])
+            heights = torch.stack([replace(comparison, images=background).prediction for background in backgrounds])
         comparison = comparison.with_predictions(predictions, heights.mean(dim=1))
 
         def mean_over(index: int) -> Tensor:

@@ -32,6 +32,7 @@ from sliplens.plots.style import (
     drawing_style,
     fill_name,
     input_name,
+    method_colour,
     method_name,
     methods_in_order,
     written_whole,
@@ -40,7 +41,7 @@ from sliplens.recordings.sensor import profile_text
 from sliplens.recordings.source import Frames
 from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.faithfulness import Faithfulness, is_control
-from sliplens.results.study import Study, Truth, UntrainedMaps
+from sliplens.results.study import Randomisation, Study, Truth, UntrainedMaps
 
 
 def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Figure:
@@ -145,6 +146,15 @@ def _truth(truth: Truth, ax: Axes, _: int | None) -> None:
     ax.set_title(input_name(truth.input))
 
 
+def _randomisation(record: Randomisation, ax: Axes, _: int | None) -> None:
+    for name in methods_in_order(record.methods):
+        method = record.methods[name]
+        values = np.array(method.similarity, dtype=float)
+        ax.plot(method.layers, values, marker="o", color=method_colour(name), label=method_name(name))
+    ax.set(xlabel="Layers with new weights", ylabel="Similarity to the map of the network", ylim=(-1.05, 1.05))
+    ax.legend(fontsize=8)
+
+
 def _untrained(record: UntrainedMaps, ax: Axes, index: int | None) -> None:
     name, maps = next(iter(record.maps.items()))
     figure = ax.get_figure(root=True)
@@ -232,6 +242,7 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "Network": _network,
     "Explanation": _explanation,
     "UntrainedMaps": _untrained,
+    "Randomisation": _randomisation,
     "DeletionScores": lambda result, ax, _: plot_faithfulness(result.curves, ax=ax).set_title(input_name(result.input)),
     "Faithfulness": _faithfulness,
     "Study": _study,
