@@ -182,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{key:20} {'not measured' if value is None else format(value, '.4g')}")
     if options.json:
         more = {"budget": options.budget, "threads": torch.get_num_threads(), "load_average": load_average}
-        print(json.dumps({**result, **more, "networks": found, "machine": vars(machine()), "versions": versions()}))
+        print(json.dumps({**result, **more, "networks": found, "machine": machine(), "versions": versions()}))
 
 
 if __name__ == "__main__":

@@ -194,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "size": options.size,
         "head": options.head,
         "threads": options.threads,
-        "machine": vars(machine()),
+        "machine": machine(),
         "versions": versions(),
     }
     print(f"{'engine':12s} {'p50 ms':>8s} {'p99 ms':>8s} {'of torch':>9s} {'off torch':>10s} {'ready s':>8s}")

@@ -83,11 +83,11 @@ def test_a_result_comes_back_as_it_was(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('"raw"', "7", "expected `str`, got `int` at input"),
-        ('"error": 0.25', '"error": "x"', "at parts\\[1\\].error"),
+        ('"raw"', "7", r"Expected `str`, got `int` - at `\$.input`"),
+        ('"error": 0.25', '"error": "x"', r"at `\$.parts\[1\].error"),
         ('"input"', '"output"', "missing required field `input`"),
         ('"error": 0.25', '"error": NaN', "not valid JSON"),
-        ("0.0,\n", '"x",\n', "at parts\\[0\\].curve"),
+        ("0.0,\n", '"x",\n', r"at `\$.parts\[0\].curve"),
         ("{", "[", "not valid JSON"),
     ],
 )
@@ -167,13 +167,13 @@ class Bound:
 @pytest.mark.parametrize(
     ("place", "held", "said"),
     [
-        ("share", 1.5, "1.5 as 'share', which must be at least 0 and at most 1; make it again with `sliplens x`"),
-        ("share", np.nan, "nan as 'share', which must be at least 0"),
-        ("guess", 0.0, "0 as 'guess', which must be above 0 and below 2"),
-        ("guess", 2.0, "2 as 'guess', which"),
+        ("share", 1.5, "1.5 as 'share' (Expected `float` <= 1.0); make it again with `sliplens x`"),
+        ("share", np.nan, "nan as 'share' (Expected"),
+        ("guess", 0.0, "0 as 'guess' (Expected `float` > 0.0"),
+        ("guess", 2.0, "2 as 'guess' (Expected `float` < 2.0"),
         ("maps", np.inf, ""),
-        ("maps", np.nan, "nan as 'maps/a', which must be at least -1"),
-        ("error", -1e-9, "expected `float` >= 0.0 at error"),
+        ("maps", np.nan, "nan as 'maps/a' (Expected `float` >= -1.0"),
+        ("error", -1e-9, "Expected `float` >= 0.0 - at `$.error`"),
         ("guess", np.nan, ""),
     ],
 )

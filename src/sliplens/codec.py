@@ -48,12 +48,12 @@ class _Described:
 
     def __repr__(self) -> str:
         head = getattr(self, "summary", None) or (type(self).__doc__ or "").partition("\n")[0]
-        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "summary"}  # pyright: ignore[reportArgumentType]
         short, long = [], []
-        for name, value in values.items():
-            if text := _words(value, _unit(type(self), name)):
+        for field in fields(self):  # pyright: ignore[reportArgumentType]
+            value = getattr(self, field.name)
+            if field.name != "summary" and (text := _words(value, _unit(type(self), field.name))):
+                label = _UNIT_ENDING.sub("", field.name).replace("_", " ")
                 lines = short if isinstance(value, _SCALARS) else long
-                label = _UNIT_ENDING.sub("", name).replace("_", " ")
                 lines.append(shorten(f"{label}: {text}", 110, placeholder=" ..."))
         lines = [*wrap(", ".join(short), 110, max_lines=3), *long]
         if (over := len(lines) - _MOST_LINES + 2) > 1:
@@ -132,7 +132,7 @@ def _words(value: object, unit: str = "") -> str:
             pass
         case float() | np.floating():
             text = f"{value:.3g} {unit}".rstrip()
-        case int() if value is not True and value is not False:
+        case int() if not isinstance(value, bool):
             text = f"{value:,} {unit}".rstrip()
         case np.ndarray():
             text = f"{' x '.join(map(str, value.shape))} {value.dtype}"
@@ -145,10 +145,10 @@ def _words(value: object, unit: str = "") -> str:
             text = "; ".join(_words(each, unit) for each in value[:3])
             text = text if len(value) < 4 else f"{len(value)}: {text}; ..."
         case _ if is_dataclass(value) and type(value).__str__ is object.__str__:
-            parts = ((field.name, getattr(value, field.name)) for field in fields(value))
-            simple = (part for part in parts if not isinstance(part[1], tuple | Mapping | np.ndarray))
-            texts = ((name, _words(part, _unit(type(value), name))) for name, part in simple)
-            text = ", ".join(f"{name} {words}" for name, words in islice(texts, 5) if words)
+            kind = type(value)
+            simple = {name: part for name, part in vars(value).items() if isinstance(part, _SCALARS)}
+            texts = (f"{name} {_words(part, _unit(kind, name))}" for name, part in islice(simple.items(), 5))
+            text = ", ".join(texts)
         case _:
             text = f"{value} {unit}".rstrip() if is_dataclass(value) else str(value)
     return text
@@ -233,23 +233,17 @@ def from_builtins(values: object, kind: type[Record], *, where: Path | str, comm
     >>> @dataclass(frozen=True)
     ... class Grip:
     ...     normal_force_n: float
-    >>> from_builtins({"normal_force_n": "much"}, Grip, where="grip.json", command="sliplens grip")
+    >>> from_builtins({"normal_force_n": "much"}, Grip, where="a.json", command="sliplens grip")
     Traceback (most recent call last):
         ...
-    sliplens.errors.InputError: grip.json is not what was written: expected `float`, got `str` at normal_force_n; ...
+    sliplens.errors.InputError: a.json is not what was written (Expected `float`, got `str` - at `$.normal_force_n`); ...
     """
     try:
         return msgspec.convert(values, kind, dec_hook=_decode, str_keys=True)
     except SliplensError as error:  # of a record that checks itself
         raise type(error)(f"{where}: {error}") from None
-    except OverflowError:
-        raise InputError(f"{where} holds a number that is too large; {_cure(command)}") from None
-    except msgspec.ValidationError as error:
-        # in the words of this package: "expected `str`, got `int` at trials[2].day"
-        text, _, place = str(error).partition(" - at ")
-        place = place.strip("`").removeprefix("$").removeprefix(".") or "its top"
-        message = f"is not what was written: {text[0].lower()}{text[1:]} at {place}"
-        raise InputError(f"{where} {message}; {_cure(command)}") from None
+    except (OverflowError, msgspec.ValidationError) as error:
+        raise InputError(f"{where} is not what was written ({error}); {_cure(command)}") from None
 
 
 def save_result(result: object, folder: Path) -> None:
@@ -288,8 +282,11 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     if not isinstance(content, dict):
         raise InputError(f"{path} holds no JSON object; {cure}")
     declared = get_type_hints(kind, include_extras=True)
-    arrays = {name: field for name, hint in declared.items() if (field := _array_field(hint))}
-    tables = {name: table for name, hint in declared.items() if (table := _columns_type(hint))}
+    arrays = _array_hints(kind)
+    kinds = {name: get_args(hint) or (hint,) for name, hint in declared.items()}  # of `X` or `X | None`
+    tables = {
+        name: each[0] for name, each in kinds.items() if isinstance(each[0], type) and issubclass(each[0], Columns)
+    }
     # one dataclass of what is in the JSON, so that msgspec checks it as declared; defaults are kept
     inside = [field for field in fields(kind) if field.name not in {*arrays, *tables}]  # pyright: ignore[reportArgumentType]
     partial = make_dataclass(kind.__name__, [(field.name, declared[field.name], copy(field)) for field in inside])
@@ -302,14 +299,14 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     path = folder / ARRAYS_FILE
     stored = _load_arrays(path, cure) if arrays else {}
     with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
-        for name, field in arrays.items():
-            keys = [key for key in stored if key.startswith(f"{name}/")] if field.mapping else [name]
+        for name, hint in arrays.items():
+            mapping = _inner(hint) is not hint
+            keys = [key for key in stored if key.startswith(f"{name}/")] if mapping else [name]
             for key in keys:
                 if key not in stored:
                     raise InputError(f"{path} lacks {key!r}; {cure}")
-                fits = isinstance(stored[key], field.kind)
-                field.require(stored[key], fits=fits, name=key, path=path, cure=cure)
-            values[name] = {key[len(name) + 1 :]: stored[key] for key in keys} if field.mapping else stored[name]
+                _require_array(stored[key], _inner(hint), name=key, path=path, cure=cure)
+            values[name] = {key[len(name) + 1 :]: stored[key] for key in keys} if mapping else stored[name]
     try:
         return kind(**values)
     except ValueError as error:  # of a record that checks what its fields have to do with one another
@@ -332,7 +329,6 @@ def keep_part(part: Path | None, kind: type[Record], make: Callable[[], Record])
 MOST_EXPANDED, MOST_TIMES = 256 * 2**20, 100
 """Bytes that a compressed table may hold, or how many times its size; ours hold some ten times theirs."""
 _MOST_ROWS, _MOST_REPEATED = 2**25, 2**31  # rows, and bytes of values that are written once and counted often
-_MOST_TEXT = 2**27  # characters, were all texts of a column as long as the longest, as NumPy keeps them
 COLUMN_KINDS: dict[str, Callable[[pa.DataType], bool]] = {
     "numbers": lambda kind: pa.types.is_floating(kind) or pa.types.is_integer(kind),
     "whole numbers": pa.types.is_integer,
@@ -372,10 +368,7 @@ def open_parquet(
     InputError
         If the file is missing or no Parquet, lacks a column or holds another kind in it, or expands too far.
     """
-    try:
-        size = require_file(path, missing=cure)
-    except InputError as raised:
-        raise error(str(raised)) from None
+    size = require_file(path, missing=cure, error=error)
     with parquet_errors(path, cure=cure, error=error):
         file = open_table(path)
         schema, rows = file.schema_arrow, file.metadata.num_rows
@@ -389,13 +382,15 @@ def open_parquet(
         if not COLUMN_KINDS[kind](kinds[name][0]):
             raise error(f"{path} holds {kinds[name][0]} as {name!r} where {kind} belong; {cure}")
     expanded = sum(chunk.total_uncompressed_size for chunk in chunks)
-    dictionaries = [
-        chunk.total_uncompressed_size * chunk.num_values
-        for chunk in chunks
-        if columns.get(chunk.path_in_schema) in {"bytes", "values"} and any("DICT" in each for each in chunk.encodings)
-    ]
-    too_far = expanded > max(MOST_EXPANDED, MOST_TIMES * size) or max(dictionaries, default=0) > _MOST_REPEATED
-    if rows > _MOST_ROWS or too_far:
+    repeated = max(
+        (
+            chunk.total_uncompressed_size * chunk.num_values
+            for chunk in chunks
+            if columns.get(chunk.path_in_schema) in {"bytes", "values"} and "DICT" in str(chunk.encodings)
+        ),
+        default=0,
+    )
+    if rows > _MOST_ROWS or expanded > max(MOST_EXPANDED, MOST_TIMES * size) or repeated > _MOST_REPEATED:
         raise error(f"{path} has {size:,} bytes and claims {rows:,} rows of {expanded:,} bytes; {cure}")
     return file
 
@@ -404,116 +399,92 @@ def read_parquet(
     path: Path, columns: Mapping[str, str], *, cure: str, error: type[InputError] = InputError
 ) -> pa.Table:
     """Read columns of a Parquet file that `open_parquet` accepts, with no value missing."""
-    open_parquet(path, columns, cure=cure, error=error).close()
-    texts = [name for name, kind in columns.items() if kind == "texts"]
-    with parquet_errors(path, cure=cure, error=error):
-        # repeated texts stay in memory once until their length is known
-        with pq.ParquetFile(path, memory_map=True, read_dictionary=texts) as file:
-            table = file.read(columns=list(columns))
-        for name in texts:
-            column = table.column(name)
-            lengths = [len(text or "") for part in column.chunks for text in part.dictionary.to_pylist()]
-            longest = max(lengths, default=0)
-            if longest * len(table) > _MOST_TEXT:
-                raise ValueError(f"{len(table):,} texts of {longest:,} characters in {name!r}")
-            table = table.set_column(table.column_names.index(name), name, column.cast(pa.string()))
+    with open_parquet(path, columns, cure=cure, error=error) as file, parquet_errors(path, cure=cure, error=error):
+        table = file.read(columns=list(columns))
     if gaps := [name for name in columns if table.column(name).null_count]:
         raise error(f"{path} has gaps in the column {gaps[0]!r}; {cure}")
     return table
 
 
-_SIDES: dict[str, tuple[str, Callable[..., np.ndarray]]] = {
-    "ge": ("at least", np.less), "gt": ("above", np.less_equal), "le": ("at most", np.greater),
-    "lt": ("below", np.greater_equal),
-}  # fmt: skip
-"""Bounds of `msgspec.Meta`: their words, and the comparison that is True for a number outside."""
 _LARGEST = 1e12  # no stage measures more of anything, infinity among them; seconds since 1970 are 2e9
 
 
-@dataclass(frozen=True, kw_only=True)
-class _ArrayField:
-    """Declaration of an array."""
+def _array_hints(kind: type) -> dict[str, Any]:
+    """Return the declarations of the fields of arrays, `X` or `Mapping[str, X]`."""
 
-    kind: Any
-    bounds: msgspec.Meta | None
-    may_lack: bool  # NaN stands where a number is unknown
-    mapping: bool  # of several arrays by their names
+    def is_array(hint: object) -> bool:
+        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+        return isinstance(kind, type) and (issubclass(kind, AbstractArray) or kind is np.ndarray)
 
-    @property
-    def words(self) -> str:
-        return getattr(self.kind, "__name__", str(self.kind)).replace("ndarray, ", "")
-
-    @property
-    def column(self) -> str:
-        """Kind of a column in a Parquet file."""
-        if self.kind is np.ndarray or self.words.startswith("Shaped"):
-            return "texts"
-        return "true and false" if "Bool" in self.words else "whole numbers" if "Int" in self.words else "numbers"
-
-    def require(self, values: np.ndarray, *, fits: bool, name: str, path: Path, cure: str) -> None:
-        """Check type and shape, which the caller compares in its own context of sizes, and bounds."""
-        if not fits:
-            actual = f"{values.dtype} of shape {values.shape}"
-            raise InputError(f"{path} holds {actual} as {name!r} where {self.words} belongs; {cure}")
-        if self.bounds is None:
-            return
-        sides = {side: limit for side in _SIDES if (limit := getattr(self.bounds, side)) is not None}
-        wrong = np.zeros(values.shape, dtype=np.bool_) if self.may_lack else np.isnan(values)
-        for side, limit in sides.items():
-            wrong |= _SIDES[side][1](values, limit)
-        if wrong.any():
-            belong = " and ".join(f"{_SIDES[side][0]} {limit:g}" for side, limit in sides.items())
-            raise InputError(f"{path} holds {values[wrong][0]:g} as {name!r}, which must be {belong}; {cure}")
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hint for name, hint in hints.items() if is_array(_inner(hint))}
 
 
-def _array_field(hint: object) -> _ArrayField | None:
-    """Return the declaration of a field of arrays, `X` or `Mapping[str, X]`; None for another field."""
-    mapping = get_origin(hint) in {dict, Mapping}
-    hint = get_args(hint)[1] if mapping else hint
+def _inner(hint: Any) -> Any:
+    """Return the declaration of the values of a mapping, or the declaration itself."""
+    return get_args(hint)[1] if get_origin(hint) in {dict, Mapping} else hint
+
+
+def _words_of(hint: Any) -> str:
+    kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    return getattr(kind, "__name__", str(kind)).replace("ndarray, ", "")
+
+
+def _require_array(values: np.ndarray, hint: Any, *, name: str, path: Path, cure: str) -> None:
+    """Check type, shape (in the caller's context of sizes) and bounds of an array against its declaration."""
     kind, *facts = get_args(hint) if get_origin(hint) is Annotated else [hint]
-    if not (isinstance(kind, type) and (issubclass(kind, AbstractArray) or kind is np.ndarray)):
-        return None
+    if not isinstance(values, kind):
+        actual = f"{values.dtype} of shape {values.shape}"
+        raise InputError(f"{path} holds {actual} as {name!r} where {_words_of(hint)} belongs; {cure}")
     bounds = next((fact for fact in facts if isinstance(fact, msgspec.Meta)), None)
-    return _ArrayField(kind=kind, bounds=bounds, may_lack=UNKNOWN in facts, mapping=mapping)
-
-
-def _columns_type(hint: object) -> type[Columns] | None:
-    """Return the kind of columns that a field declares, `X` or `X | None`."""
-    kinds = [kind for kind in get_args(hint) or (hint,) if kind is not NoneType]
-    return kinds[0] if len(kinds) == 1 and isinstance(kinds[0], type) and issubclass(kinds[0], Columns) else None
+    if bounds is None:
+        return
+    numbers = values[~np.isnan(values)] if UNKNOWN in facts else values
+    for extreme in (numbers.min(), numbers.max()) if numbers.size else ():  # NaN where one is
+        try:
+            msgspec.convert(float(extreme), Annotated[float, bounds])
+        except msgspec.ValidationError as error:
+            raise InputError(f"{path} holds {extreme:g} as {name!r} ({error}); {cure}") from None
 
 
 def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
-    hints = get_type_hints(kind, include_extras=True)
-    declared = {name: field for name, hint in hints.items() if (field := _array_field(hint))}
-    table = read_parquet(path, {name: field.column for name, field in declared.items()}, cure=cure)
+    hints = _array_hints(kind)
+    words = {name: _words_of(hint) for name, hint in hints.items()}
+    columns = {
+        name: "true and false" if "Bool" in text else "whole numbers" if "Int" in text else "numbers"
+        if "Float" in text else "texts"
+        for name, text in words.items()
+    }  # fmt: skip
+    table = read_parquet(path, columns, cure=cure)
     values = {}
-    for name, field in declared.items():
+    for name, hint in hints.items():
         column = table[name]
-        value = np.array(column.to_pylist(), dtype=str) if field.column == "texts" else column.to_numpy()
+        value = np.array(column.to_pylist(), dtype=str) if columns[name] == "texts" else column.to_numpy()
         # a context of its own: "rows" of one table need not be as many as "rows" of another
         with jaxtyped("context"):
-            field.require(value, fits=isinstance(value, field.kind), name=name, path=path, cure=cure)
+            _require_array(value, hint, name=name, path=path, cure=cure)
         if value.dtype.kind == "f" and (np.abs(value) > _LARGEST).any():
             raise InputError(f"{path} holds {value[np.nanargmax(np.abs(value))]:g} as {name!r}; {cure}")
         values[name] = value
     return kind(**values)
 
 
-_DAMAGE = (EOFError, zipfile.BadZipFile, zlib.error, tokenize.TokenError)  # of an archive, and of old headers in it
+ARRAY_DAMAGE = (
+    EOFError, OSError, ValueError, LookupError, MemoryError, SyntaxError, TypeError, zipfile.BadZipFile, zlib.error,
+    tokenize.TokenError,
+)  # fmt: skip
+"""Errors of NumPy on a damaged array or archive."""
 
 
 def _load_arrays(path: Path, cure: str) -> dict[str, np.ndarray]:
     room = max(_MOST_REPEATED, MOST_TIMES * require_file(path, missing=cure))
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            expanded = sum(info.file_size for info in archive.zip.infolist())
-            arrays = dict(archive) if expanded <= room else {}
-    except (*_DAMAGE, OSError, ValueError, LookupError, MemoryError) as error:
+            if (expanded := sum(info.file_size for info in archive.zip.infolist())) > room:
+                raise InputError(f"{path} claims arrays of {expanded:,} bytes; {cure}")
+            return dict(archive)
+    except ARRAY_DAMAGE as error:
         raise InputError(f"{path} cannot be read as arrays ({one_line(error)}); {cure}") from None
-    if expanded > room:
-        raise InputError(f"{path} claims arrays of {expanded:,} bytes; {cure}")
-    return arrays
 
 
 TABLE_SUFFIXES = (".parquet", ".csv", ".json")  #: Endings of the tables that can be written.

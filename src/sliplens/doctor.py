@@ -91,7 +91,7 @@ def _try(name: str, part: Callable[[], str]) -> Item:
 def _versions() -> str:
     here = machine()
     packages = ", ".join(f"{name} {version}" for name, version in versions().items())
-    return f"{packages}; {here.system} {here.processor}, {here.cores} cores"
+    return f"{packages}; {here['system']} {here['processor']}, {here['cores']} cores"
 
 
 def _store() -> str:

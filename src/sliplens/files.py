@@ -51,20 +51,10 @@ def versions() -> dict[str, str]:
     return versions_by_name
 
 
-@dataclass(frozen=True, kw_only=True)
-class Machine:
-    """System, processor and cores of a machine."""
-
-    system: str
-    processor: str
-    cores: int | None
-    implementation: str  #: Implementation of Python.
-
-
-def machine() -> Machine:
-    """Describe this machine."""
+def machine() -> Mapping[str, str | int | None]:
+    """Describe this machine: system, processor, cores, and implementation of Python."""
     system, processor, implementation = platform.system(), platform.machine(), sys.implementation.name
-    return Machine(system=system, processor=processor, cores=os.cpu_count(), implementation=implementation)
+    return {"system": system, "processor": processor, "cores": os.cpu_count(), "implementation": implementation}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +65,7 @@ class Provenance:
     config: object  #: All that shaped the result, as JSON holds it: to be shown and compared.
     config_hash: str
     versions: Mapping[str, str]
-    machine: Machine
+    machine: Mapping[str, str | int | None]
     finished: str  #: Date and time in UTC, as ISO 8601.
 
 
@@ -160,7 +150,9 @@ MOST_TEXT = 64 * 2**20  #: Bytes of a JSON or TOML file; the table of a hundred 
 _DEEPEST = 64  # lists and objects in one another; ours are less than ten deep
 
 
-def require_file(path: Path, *, missing: str = "check the path", most: int | None = None) -> int:
+def require_file(
+    path: Path, *, missing: str = "check the path", most: int | None = None, error: type[InputError] = InputError
+) -> int:
     """Return the size in bytes of a regular file, at most `most`; to open a pipe or a device may wait for ever.
 
     Raises
@@ -171,14 +163,14 @@ def require_file(path: Path, *, missing: str = "check the path", most: int | Non
     try:
         status = path.stat()
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"{path} does not exist; {missing}") from None
-    except (OSError, ValueError) as error:  # a name that is too long, or holds what no name can
-        raise InputError(f"{path} cannot be read ({getattr(error, 'strerror', None) or error}); {missing}") from None
+        raise error(f"{path} does not exist; {missing}") from None
+    except (OSError, ValueError) as raised:  # a name that is too long, or holds what no name can
+        raise error(f"{path} cannot be read ({getattr(raised, 'strerror', None) or raised}); {missing}") from None
     if not stat.S_ISREG(status.st_mode):
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
-        raise InputError(f"{path} is {kind}, not a file; {missing}")
+        raise error(f"{path} is {kind}, not a file; {missing}")
     if most is not None and status.st_size > most:
-        raise InputError(f"{path} has {status.st_size:,} bytes, and no such file has more than {most:,}; {missing}")
+        raise error(f"{path} has {status.st_size:,} bytes, and no such file has more than {most:,}; {missing}")
     return status.st_size
 
 

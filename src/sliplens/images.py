@@ -19,6 +19,7 @@ from sliplens.files import require_file, require_folder
 
 __all__ = ["absolute_difference", "as_frames", "list_images", "read_image", "signed_difference", "write_png"]
 
+Buffer: TypeAlias = Any  #: Bytes of a file in memory.
 Images: TypeAlias = Any  #: Images in memory that `as_frames` takes: an array, a PyTorch tensor, or a list of them.
 
 IMAGE_SUFFIXES = frozenset({".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp"})
@@ -30,17 +31,6 @@ _TAGGED = frozenset({"exif", "Raw profile type exif", "XML:com.adobe.xmp", "xmp"
 MOST_PIXELS = 100_000_000
 """Largest number of pixels: more mean a damaged header, and would need gigabytes."""
 _DAMAGE = (OSError, SyntaxError, ValueError, MemoryError, Image.DecompressionBombError)  # what Pillow raises
-
-
-@contextmanager
-def telling_damage(words: str, cure: str, *, kind: type[InputError] = ImageError) -> Iterator[None]:
-    """Convert errors of Pillow on damaged or too large images to an `InputError` with a message and a cure."""
-    try:
-        yield
-    except _DAMAGE as error:
-        raise kind(f"{words} ({error}); {cure}") from None
-
-
 _LEAST_COLOUR = 16
 """Grey levels by which channels of a colour differ: more than by a camera's noise on grey objects."""
 
@@ -51,27 +41,38 @@ def has_colour(image: UInt8[np.ndarray, "height width 3"]) -> bool:
     return bool(np.mean(spread >= _LEAST_COLOUR) >= 0.01)
 
 
-def require_image(path: Path) -> None:
-    """Check that a path is a file that can be opened; raises `ImageError`."""
-    try:
-        require_file(path)
-    except InputError as error:
-        raise ImageError(str(error)) from None
+def _require_plain(image: Image.Image, where: str) -> None:
+    """Refuse an image that is not one of 8 bits a channel: of 16, Pillow keeps the upper 8, and of 12 these are 4."""
+    bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))
+    if image.mode.startswith("I;16") or any(";16" in str(tile.args) for tile in getattr(image, "tile", ())):
+        bits = 16
+    if bits > 8:
+        raise ImageError(f"{where} has {bits} bits a channel; {_REDUCE}, and save it as 8-bit RGB")
+    if image.mode not in {"RGB", "L"}:
+        cure = "drop the alpha channel" if image.mode == "RGBA" else "convert it to 8-bit RGB or grey"
+        raise ImageError(f"{where} has the colours {image.mode}, not RGB; {cure}")
+    if (pages := getattr(image, "n_frames", 1)) > 1:
+        raise ImageError(f"{where} holds {pages} images; save one image a file")
 
 
 @contextmanager
-def open_image(
-    source: Path | io.BytesIO, *, formats: tuple[str, ...] = ("PNG", "TIFF", "JPEG", "BMP")
-) -> Iterator[Image.Image]:
-    """Open an image without reading its pixels; raises `ValueError` where it claims more than any camera has."""
-    with warnings.catch_warnings():
-        # Pillow warns near the limit that is checked below
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        image = Image.open(source, formats=formats)
-    with image:
-        if image.width * image.height > MOST_PIXELS:
-            raise ValueError(f"{image.width} x {image.height} pixels are more than any camera has")
-        yield image
+def _open_image(source: Path | Buffer, where: str, cure: str = "") -> Iterator[Image.Image]:
+    """Open an 8-bit RGB or grey image of a file or in memory; pixels are read inside, or never."""
+    if isinstance(source, Path):
+        require_file(source, error=ImageError)
+    try:
+        with warnings.catch_warnings():
+            # Pillow warns near the limit that is checked below
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            stream = source if isinstance(source, Path) else io.BytesIO(source)
+            image = Image.open(stream, formats=("PNG", "TIFF", "JPEG", "BMP"))
+        with image:
+            if image.width * image.height > MOST_PIXELS:
+                raise ValueError(f"{image.width} x {image.height} pixels are more than any camera has")
+            _require_plain(image, where)
+            yield image
+    except _DAMAGE as error:
+        raise ImageError(f"{where} cannot be read as an image ({error}); {cure or 'copy or export it again'}") from None
 
 
 def _orientation(image: Image.Image) -> int:
@@ -81,38 +82,40 @@ def _orientation(image: Image.Image) -> int:
     return image.getexif().get(ExifTags.Base.Orientation, 1)
 
 
-def upright_size(image: Image.Image) -> tuple[int, int]:
-    """Return height and width of an image after the turn of its orientation tag, in pixels, from its header."""
-    height, width = image.size[::-1]
-    return (width, height) if _orientation(image) >= 5 else (height, width)
+def _upright_size(image: Image.Image) -> tuple[int, int]:
+    return image.size if _orientation(image) >= 5 else image.size[::-1]
 
 
-def upright_pixels(image: Image.Image) -> UInt8[np.ndarray, "height width *channels"]:
-    """Decode an image, turned and mirrored by its orientation tag."""
-    return np.array(image if _orientation(image) == 1 else ImageOps.exif_transpose(image))
+def image_size(source: Path | Buffer, *, where: str = "") -> tuple[int, int]:
+    """Read height and width of an image after the turn of its orientation tag, in pixels, from its header."""
+    with _open_image(source, where or str(source)) as image:
+        return _upright_size(image)
 
 
-def require_eight_bits(image: Image.Image, *, where: object) -> None:
-    """Refuse an image with more than 8 bits a channel.
+def read_image(
+    source: Path | Buffer,
+    *,
+    size: tuple[int, int] | None = None,
+    where: str = "",
+    cure: str = "",
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Read an 8-bit image (PNG, TIFF, JPEG or BMP), of a size (height, width) in pixels unless that is None.
 
-    Pillow keeps the upper 8 bits of 16, which hold four of a camera with 12 bits.
-    """
-    bits = max(getattr(image, "tag_v2", {}).get(_BITS_PER_SAMPLE, (8,)))
-    if image.mode.startswith("I;16") or any(";16" in str(tile.args) for tile in getattr(image, "tile", ())):
-        bits = 16
-    if bits > 8:
-        raise ImageError(f"{where} has {bits} bits a channel; {_REDUCE}, and save it as 8-bit RGB")
+    Images with an orientation tag (EXIF) are turned upright; grey is repeated in all three channels.
 
-
-def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an 8-bit RGB image (PNG, TIFF, JPEG or BMP), of a size (height, width) in pixels unless that is None.
-
-    Images with an orientation tag (EXIF) are turned upright.
+    Parameters
+    ----------
+    source
+        File, or its bytes in memory.
+    size
+        Height and width that it must have, in pixels.
+    where, cure
+        Name and cure in messages.
 
     Raises
     ------
     ImageError
-        If the file is missing, truncated or no image, is not 8-bit RGB, or has another size.
+        If the file is missing, truncated or no image, is neither 8-bit RGB nor grey, or has another size.
 
     Examples
     --------
@@ -125,19 +128,14 @@ def read_image(path: Path, *, size: tuple[int, int] | None = None) -> UInt8[np.n
     ...     read_image(Path(folder) / "frame.png").shape
     (4, 6, 3)
     """
-    require_image(path)
-    with telling_damage(f"{path} cannot be read as an image", "copy or export it again"), open_image(path) as image:
-        height, width = upright_size(image)
-        if size is not None and (height, width) != tuple(size):
+    with _open_image(source, where := where or str(source), cure) as image:
+        if size is not None and (actual := _upright_size(image)) != tuple(size):
             raise ImageError(
-                f"{path} is {height} x {width} pixels, {size[0]} x {size[1]} are needed; "
+                f"{where} is {actual[0]} x {actual[1]} pixels, {size[0]} x {size[1]} are needed; "
                 "use frames of the sensor the network was trained for"
             )
-        require_eight_bits(image, where=path)
-        if image.mode != "RGB":
-            cure = "drop the alpha channel" if image.mode == "RGBA" else "convert it to 8-bit RGB"
-            raise ImageError(f"{path} has the colours {image.mode}, not RGB; {cure}")
-        return upright_pixels(image)
+        pixels = np.array(image if _orientation(image) == 1 else ImageOps.exif_transpose(image))
+        return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
 
 
 def write_png(path: Path, pixels: UInt8[np.ndarray, "height width *channels"]) -> None:
@@ -159,15 +157,6 @@ def encode_jpeg(pixels: UInt8[np.ndarray, "height width 3"], quality: int) -> by
     return buffer.getvalue()
 
 
-def decode_png(data: bytes, *, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Decode an RGB PNG in memory."""
-    damage = telling_damage(f"{where} cannot be read as PNG", "make the data set again")
-    with damage, open_image(io.BytesIO(data), formats=("PNG",)) as image:
-        if image.mode != "RGB":
-            raise ImageError(f"{where} has the colours {image.mode}, not RGB; make the data set again")
-        return np.array(image)
-
-
 def list_images(folder: Path) -> list[Path]:
     """List the image files of a folder in natural order (frame 2 before frame 10).
 
@@ -180,7 +169,7 @@ def list_images(folder: Path) -> list[Path]:
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
     for path in images:
         # without a frame that is a dead link, all later ones would move up
-        require_image(path)
+        require_file(path)
     if not images:
         raise InputError(f"{folder} holds no image (looked for {', '.join(sorted(IMAGE_SUFFIXES))}); check the path")
     return sorted(images, key=lambda path: natural_key(path.name))

@@ -148,7 +148,7 @@ def test_a_gap_among_the_pictures_of_a_trial_is_told(recording: Recording, tmp_p
     table = pq.read_table(path)
     pictures = pa.array([None, *table.column("image").to_pylist()[1:]], pa.binary())
     pq.write_table(table.set_column(table.column_names.index("image"), "image", pictures), path)
-    with pytest.raises(RecordingError, match="has gaps in the column 'image'"):
+    with pytest.raises(RecordingError, match=r"frame 0 of .* cannot be read"):
         list(stream_frames(path))
 
 

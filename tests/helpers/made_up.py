@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sliplens.codec import save_record, save_result
-from sliplens.files import Machine, Provenance
+from sliplens.files import Provenance
 from sliplens.recordings import TrialInfo
 from sliplens.recordings.dataset import write_dataset_table
 from sliplens.results.evaluation import Evaluation, LearningCurve, ScoredFrames, Training
@@ -30,7 +30,7 @@ def write_run(folder: Path, stage: str, config: dict[str, Any], result: object, 
         config=config,
         config_hash=stage.encode().hex(),
         versions={"sliplens": "0.1.0", "python": "3.12.1", "torch": "2.9.0", "numpy": "2.3.1"},
-        machine=Machine(system="Linux", processor="x86_64", cores=2, implementation="cpython"),
+        machine={"system": "Linux", "processor": "x86_64", "cores": 2, "implementation": "cpython"},
         finished=f"2026-11-21T04:{minute:02d}:00+00:00",
     )
     save_record(provenance, folder / "run.json")

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import pytest
 
-from sliplens.errors import RecordingError
+from sliplens.errors import InputError
 from sliplens.recordings.formats import images, lerobot, rosbag, tables, thesis, video
 from sliplens.recordings.options import ReadOptions
 
@@ -27,5 +27,5 @@ read_video = _by_keyword(video.read_video)
 
 def refused(read: Callable[..., object], path: Path, match: str, **options: object) -> None:
     """Check that a reader refuses a recording in a sentence."""
-    with pytest.raises(RecordingError, match=match):
+    with pytest.raises(InputError, match=match):
         read(path, **options)

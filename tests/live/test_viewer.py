@@ -15,7 +15,7 @@ from there import there
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.images import decode_png, write_png
+from sliplens.images import read_image, write_png
 from sliplens.live import viewer as viewer_process
 from sliplens.recordings import Dataset, Recording
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
@@ -69,7 +69,7 @@ def numbers(entities: dict[str, list[pa.RecordBatch]], entity: str) -> np.ndarra
 
 def pictures(entities: dict[str, list[pa.RecordBatch]], entity: str) -> np.ndarray:
     found = rows(entities, entity, "EncodedImage:blob")
-    return np.stack([decode_png(bytes(blob), where=entity) for (blob,) in found.values])
+    return np.stack([read_image(bytes(blob), where=entity) for (blob,) in found.values])
 
 
 @pytest.fixture(scope="module")

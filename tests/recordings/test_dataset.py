@@ -90,7 +90,7 @@ def test_a_truncated_trial_is_refused(tmp_path: Path, recording: Recording):
 @pytest.mark.parametrize(
     ("column", "value", "said"),
     [
-        ("contact_state", "flying", "the contact state 'flying', which is none"),
+        ("contact_state", "flying", "'flying' is not a valid ContactState"),
         ("safety_margin", "half", "string as 'safety_margin' where numbers belong"),
         ("image", 3, "int64 as 'image' where bytes belong"),
     ],
@@ -103,7 +103,7 @@ def test_a_stored_trial_with_labels_that_no_trial_has_is_refused(
     table = pq.read_table(path)
     place = table.column_names.index(column)
     pq.write_table(table.set_column(place, column, pa.array([value] * table.num_rows)), path)
-    with pytest.raises(RecordingError, match=rf"a\.parquet holds .*{said}.*; make the data set again"):
+    with pytest.raises(RecordingError, match=rf"a\.parquet .*{said}.*; make the data set again"):
         load_recording(path)
 
 

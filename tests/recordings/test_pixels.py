@@ -1,18 +1,14 @@
 """Images in a trial's file: nothing is lost, and damage is told."""
 
-from pathlib import Path
-
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from sliplens.errors import RecordingError
-from sliplens.recordings import Recording
-from sliplens.recordings.store import decode_pixels, encode_pixels, load_recording, save_recording
+from sliplens.recordings.store import decode_pixels, encode_pixels
 
 shapes = st.one_of(
     arrays.array_shapes(min_dims=2, max_dims=2), st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))
@@ -45,13 +41,3 @@ def test_an_image_of_another_size_is_refused_however_large_it_claims_to_be(size,
     data = encode_pixels(rng.integers(0, 256, (5, 7, 3), dtype=np.uint8))
     with pytest.raises(RecordingError, match="make the data set again"):
         decode_pixels(data, size=size, where="frame 3")
-
-
-def test_a_trial_with_another_codec_is_refused(tmp_path: Path, recording: Recording):
-    path = tmp_path / "a.parquet"
-    save_recording(recording, path)
-    table = pq.read_table(path)
-    metadata = {**(table.schema.metadata or {}), b"codec": b"jpeg"}
-    pq.write_table(table.replace_schema_metadata(metadata), path)
-    with pytest.raises(RecordingError, match=r"a\.parquet keeps its images as jpeg, rows\+zstd is needed"):
-        load_recording(path)

@@ -20,12 +20,11 @@ from jaxtyping import UInt8
 from sliplens.errors import ImageError, InputError, SourceError
 from sliplens.extras import Table, pick
 from sliplens.files import require_folder
-from sliplens.images import is_image, list_images, natural_key
+from sliplens.images import image_size, is_image, list_images, natural_key, read_image
 from sliplens.live.contract import LiveOptions, LiveSource, Pace, SourceKind
 from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import recognise
-from sliplens.recordings.formats.images import frame_size, read_frame
 from sliplens.recordings.formats.video import upright
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.source import open_source
@@ -243,7 +242,7 @@ class FolderSource(LiveSource):
         if not any(map(is_image, require_folder(self._folder, what="the folder").iterdir())):
             raise InputError(f"{self.name} holds no image yet; begin when the first has been saved there")
         *before, newest = list_images(self._folder)
-        self.size, self._taken = frame_size(newest), {path.name for path in before}
+        self.size, self._taken = image_size(newest), {path.name for path in before}
 
     def frames(self) -> Iterator[LiveFrame]:
         """Iterate over images in the natural order of their names; a damaged one is missing in the numbers."""
@@ -258,7 +257,7 @@ class FolderSource(LiveSource):
             for path in sorted(new, key=lambda path: natural_key(path.name)):
                 before = time.monotonic()
                 try:
-                    written_s, image = path.stat().st_mtime, read_frame(path, size=frame_size(path))
+                    written_s, image = path.stat().st_mtime, read_image(path)
                 except (ImageError, OSError):
                     broken_s = min(broken_s, before)
                     if path.exists() and before - broken_s < _WRITTEN_S:

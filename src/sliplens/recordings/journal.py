@@ -17,7 +17,7 @@ from filelock import FileLock, Timeout
 from sliplens.codec import from_builtins, one_line, to_builtins
 from sliplens.errors import RecordingError
 from sliplens.files import parse_json, require_file
-from sliplens.images import decode_png, encode_png
+from sliplens.images import encode_png, read_image
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
 from sliplens.recordings.store import ROW_GROUP, decode_pixels, encode_pixels, forces_path, save_forces, write_trial
@@ -108,7 +108,7 @@ def finish_journal(journal: Path, trial: Path) -> bool:
                 notes = ("No picture of the untouched sensor was taken: the first frame stands for it.",)
                 choice = ReferenceChoice(index=0, method="assumed")
             else:
-                reference, notes = decode_png(picture, where=f"the reference frame of {journal}"), ()
+                reference, notes = read_image(picture, where=f"the reference frame of {journal}"), ()
                 choice = ReferenceChoice(method="recorded apart from the frames")
             labelling = Labelling(source=header.source, forces=header.forces, notes=notes, reference=choice)
             samples_s, samples_n = (

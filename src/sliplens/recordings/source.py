@@ -1,8 +1,6 @@
 """Sources of frames: data sets, folders of images, videos, bags and whatever else a reader opens, or arrays."""
 
 import hashlib
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -12,14 +10,14 @@ from typing import TypeAlias, TypedDict, TypeVar, Unpack
 import numpy as np
 from jaxtyping import UInt8
 
+from sliplens.codec import ARRAY_DAMAGE
 from sliplens.errors import ImageError, InputError, RecordingError
 from sliplens.files import hash_file, hash_json, hash_tree
-from sliplens.images import Images, as_frames, is_image, list_images, read_image, require_rgb
+from sliplens.images import IMAGE_SUFFIXES, Images, as_frames, read_image, require_rgb
 from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
-from sliplens.recordings.formats import open_captures, recognise
-from sliplens.recordings.formats.images import frame_size, read_frame
+from sliplens.recordings.formats import open_captures
 from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
 from sliplens.recordings.options import LIMITS, Budget, ReadOptions, option_flags
@@ -235,40 +233,25 @@ def open_trials(
 def _read_captures(
     source: Path | Images, format: str | None, options: ReadOptions, *, whole: bool
 ) -> Sequence[Capture]:
-    own = set(options.given()) <= {"frame_rate"}  # options that frames in memory take
+    name, where, files = "frames", Capture.opened, None
     if isinstance(source, Path):
-        # unlike on import, the times of images may stay unknown
-        if format is None and source.suffix.lower() in _ARRAYS and source.is_file():
-            return [
-                replace(capture, trial=trial_name(source.stem), source=str(source))
-                for capture in _read_captures(
-                    as_frames(_load_array(source), what=f"frames of {source}"), None, options, whole=whole
-                )
-            ]
-        single = format is None and is_image(source)
-        if whole or not own or not (single or (format or recognise(source)) == "images"):
-            return open_captures(source, format=format, options=options)
-        paths = [source] if single else list_images(source)
-        name = trial_name(source.stem if single else source.resolve().name)
-        where, count, size = str(source), len(paths), frame_size(paths[0])
-        files = tuple(path.name for path in paths)
-
-        def read() -> Iterator[Frame]:
-            return (read_frame(path, size=size) for path in paths)
-    else:
-        source = as_frames(source)
-        if not len(source):
-            raise InputError("there is no frame; give one or more")
-        if not own:
-            flags = option_flags(name for name in options.given() if name != "frame_rate")
-            raise InputError(f"{Capture.opened} do not take {flags}; leave it out")
-        name, where, files, count, size = "frames", Capture.opened, None, len(source), source.shape[1:3]
-
-        def read() -> Iterator[Frame]:
-            return iter(source)
-
-    rate = options.frame_rate
-    time_s = np.full(count, np.nan) if rate is None else evenly_spaced(count, frame_rate=rate)
+        suffix = source.suffix.lower()
+        if whole or format is not None or suffix not in {*_ARRAYS, *IMAGE_SUFFIXES} or not source.is_file():
+            captures = open_captures(source, format=format, options=options)
+            # unlike on import, the times of images may stay unknown
+            if whole and any(capture.time_s is None for capture in captures):
+                cure = "give one of --times, --frame-rate, --name-unit"
+                raise RecordingError(f"the frames of {source} have no times; {cure}")
+            return captures
+        name, where, files = trial_name(source.stem), str(source), (source.name,)
+        source = _load_array(source) if suffix in _ARRAYS else read_image(source)
+    frames, rate = as_frames(source, what="frames" if files is None else f"frames of {where}"), options.frame_rate
+    if not len(frames):
+        raise InputError("there is no frame; give one or more")
+    if strange := [option for option in options.given() if option != "frame_rate"]:
+        raise InputError(f"{where} do not take {option_flags(strange)}; leave it out")
+    time_s = np.full(len(frames), np.nan) if rate is None else evenly_spaced(len(frames), frame_rate=rate)
+    read, size = frames.__iter__, frames.shape[1:3]
     return [Capture(trial=name, source=where, frame_time_s=time_s, frame_size=size, read_frames=read, files=files)]
 
 
@@ -286,16 +269,7 @@ def _load_array(path: Path) -> np.ndarray:
             if len(names) == 1:
                 return stored[names[0]]
             count = len(stored.files)
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        MemoryError,
-        SyntaxError,
-        TypeError,
-        zlib.error,
-        zipfile.BadZipFile,
-    ) as error:
+    except ARRAY_DAMAGE as error:
         raise RecordingError(f"{path} cannot be read as a NumPy array ({error}); save it again") from None
     raise RecordingError(f"{path} holds {number_of(count, 'array')}; name that of the frames 'frames'")
 
@@ -335,16 +309,14 @@ def _with_reference(trial: Capture, image: Path | str | Images | None, number: i
         return replace(trial, reference=None, reference_index=number)
     if image is None:
         return trial
-    pixels = read_image(Path(image)) if isinstance(image, str | Path) else _one_frame(image)
+    frames = as_frames(
+        read_image(Path(image)) if isinstance(image, str | Path) else image, what="levels of the reference"
+    )
+    if len(frames) != 1:
+        raise ImageError(f"the reference is {len(frames)} images; give one of the untouched sensor")
+    (pixels,) = frames
     if pixels.shape[:2] != trial.frame_size:
         height, width = trial.frame_size
         sizes = f"{pixels.shape[0]} x {pixels.shape[1]} pixels but the frames of {trial.name} are {height} x {width}"
         raise ImageError(f"the reference is {sizes}; record both with the same camera settings")
     return replace(trial, reference=pixels)
-
-
-def _one_frame(image: Images) -> Frame:
-    frames = as_frames(image, what="levels of the reference")
-    if len(frames) != 1:
-        raise ImageError(f"the reference is {len(frames)} images; give one of the untouched sensor")
-    return frames[0]

@@ -3,8 +3,9 @@
 import os
 import re
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from hashlib import sha256
@@ -22,7 +23,7 @@ from jaxtyping import Float, UInt8
 from sliplens.codec import from_builtins, open_parquet, parquet_errors, read_parquet, to_builtins
 from sliplens.errors import RecordingError
 from sliplens.files import hash_json, parse_json, whole_file
-from sliplens.images import MOST_PIXELS, decode_png, encode_png
+from sliplens.images import MOST_PIXELS, encode_png, read_image
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.trial import OPTIONAL_LABELS, SIGNALS, ContactState, GroundTruth, Labels, Recording, TrialFacts
@@ -32,7 +33,6 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 SCHEMA_VERSION = 2
-CODEC = "rows+zstd"  #: Coding of the images, named in the metadata of a trial.
 ROW_GROUP = 64  #: Frames that are written and read together.
 _AGAIN = "make the data set again"
 reading = partial(parquet_errors, cure=_AGAIN, error=RecordingError)
@@ -72,7 +72,7 @@ def decode_pixels(data: bytes | pa.Buffer, *, size: Sequence[int], where: str) -
     count = prod(size)
     try:
         raw = pa.decompress(data, decompressed_size=count, codec="zstd")
-    except (pa.ArrowInvalid, OSError, ValueError) as error:
+    except (pa.ArrowInvalid, OSError, ValueError, TypeError) as error:
         raise RecordingError(f"{where} cannot be read ({error}); {_AGAIN}") from None
     rows = np.frombuffer(raw, dtype=np.uint8)
     if rows.size != count:
@@ -118,17 +118,15 @@ _HEADER, _FIRST_REFERENCE = b"sliplens", b"first_reference"
 
 def read_header(path: Path) -> TrialHeader:
     """Read the facts of a trial and the provenance of its labels, without its frames."""
-    file, header = _open(path)
-    with file:
+    with _open(path) as (_, header, _):
         return header
 
 
 def read_first_reference(path: Path) -> Frame | None:
     """Read the image of the untouched sensor from before a correction named another; None where none did."""
-    file, _ = _open(path)
-    with file:
-        image = file.schema_arrow.metadata.get(_FIRST_REFERENCE)
-    return None if image is None else decode_png(image, where=f"the first reference frame of {path}")
+    with _open(path) as (_, _, metadata):
+        image = metadata.get(_FIRST_REFERENCE)
+        return None if image is None else read_image(image, where=f"the first reference frame of {path}", cure=_AGAIN)
 
 
 _KINDS = {
@@ -138,18 +136,16 @@ _KINDS = {
 """Kind of each column of a trial; `OPTIONAL_LABELS` may be missing."""
 
 
-def _open(path: Path) -> tuple[pq.ParquetFile, TrialHeader]:
+@contextmanager
+def _open(path: Path) -> Iterator[tuple[pq.ParquetFile, TrialHeader, Mapping[bytes, bytes]]]:
+    """Open a trial, its header and its metadata; whatever is damaged, also of what is read inside, is one sentence."""
     needed = {name: kind for name, kind in _KINDS.items() if name not in OPTIONAL_LABELS}
-    file = open_parquet(path, needed, cure=_AGAIN, error=RecordingError)
-    metadata: dict[bytes, bytes] = file.schema_arrow.metadata or {}
-    if missing := [key.decode() for key in (_HEADER, b"reference") if key not in metadata]:
-        raise RecordingError(f"{path} lacks {', '.join(missing)} in its metadata; {_AGAIN}")
-    if (codec := metadata.get(b"codec", b"png")) != CODEC.encode():
-        raise RecordingError(f"{path} keeps its images as {str(codec[:40])[2:-1]}, {CODEC} is needed; {_AGAIN}")
-    where = f"the header of {path}"
-    values = parse_json(metadata[_HEADER], where=where, cure=_AGAIN)
-    header = from_builtins(values, TrialHeader, where=where, command="sliplens import")
-    return file, replace(header, frames=file.metadata.num_rows)
+    with open_parquet(path, needed, cure=_AGAIN, error=RecordingError) as file, reading(path):
+        metadata: Mapping[bytes, bytes] = file.schema_arrow.metadata or {}
+        where = f"the header of {path}"
+        values = parse_json(metadata[_HEADER], where=where, cure=_AGAIN)
+        header = from_builtins(values, TrialHeader, where=where, command="sliplens import")
+        yield file, replace(header, frames=file.metadata.num_rows), metadata
 
 
 _TRUTH_SIGNALS = ("static_friction", "contact_radius_m", "stick_radius_m")
@@ -195,7 +191,7 @@ def write_trial(
     height, width, _ = reference.shape
     stored = {name: getattr(facts, name) for name in _FACTS} | {"frames": len(time_s), "height": height, "width": width}
     header = TrialHeader(**stored, labelling=labels.labelling, truth=truth_header)
-    metadata = {_HEADER: msgspec.json.encode(to_builtins(header)), b"codec": CODEC.encode()}
+    metadata = {_HEADER: msgspec.json.encode(to_builtins(header))}
     for key, image in ((b"reference", reference), (_FIRST_REFERENCE, first_reference)):
         if image is not None:
             metadata[key] = encode_png(image)
@@ -215,39 +211,35 @@ def write_trial(
 
 def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Recording:
     """Read a trial written by `save_recording`; without `pixels` every frame is the reference, without truth."""
-    file, header = _open(path)
-    with file:
-        present, metadata = file.schema_arrow.names, file.schema_arrow.metadata
-    exact = header.truth if truth and pixels else None
-    kinds = {name: kind for name, kind in _KINDS.items() if name in present and (pixels or name != "image")}
-    size, frames = (header.height, header.width, 3), header.frames
-    reference = decode_png(metadata[b"reference"], where=f"the reference frame of {path}")
-    if reference.shape != size:
-        raise RecordingError(f"{path} has a reference frame of another size than it says; {_AGAIN}")
-    if frames == 0:
-        raise RecordingError(f"trial {header.trial} has no frames; leave it out or record it again")
-    if pixels and frames * prod(size) > _MOST_BYTES:
-        raise RecordingError(f"{path} claims {frames:,} frames, more than memory holds; {_AGAIN}")
-    table = read_parquet(path, kinds | (_TRUTH_KINDS if exact else {}), cure=_AGAIN, error=RecordingError)
-    labels: dict[str, Any] = {
-        name: tuple(table.column(name).to_pylist())
-        if kind == "texts"
-        else table.column(name).to_numpy().astype(np.float64 if kind == "numbers" else np.bool_)
-        for name, kind in kinds.items()
-        if name != "image"
-    }
-    if strange := set(labels["contact_state"]) - set(ContactState):
-        raise RecordingError(f"{path} holds the contact state {min(strange)[:40]!r}, which is none; {_AGAIN}")
-    labels["contact_state"] = tuple(map(ContactState, labels["contact_state"]))
-    images = table.column("image") if pixels else None
-    return Recording(
-        **{name: getattr(header, name) for name in _FACTS},
-        **labels,
-        labelling=header.labelling,
-        reference=reference,
-        frames=np.broadcast_to(reference, (frames, *size)) if images is None else _decode(images, size, f"of {path}"),
-        truth=None if exact is None else _read_truth(table, exact, size[:2], path),
-    )
+    with _open(path) as (file, header, metadata):
+        exact = header.truth if truth and pixels else None
+        kinds = {name: kind for name, kind in _KINDS.items() if name in file.schema_arrow.names}
+        if not pixels:
+            del kinds["image"]
+        size, frames = (header.height, header.width, 3), header.frames
+        reference = read_image(metadata[b"reference"], where=f"the reference frame of {path}", cure=_AGAIN)
+        if pixels and frames * prod(size) > _MOST_BYTES:
+            raise RecordingError(f"{path} claims {frames:,} frames, more than memory holds; {_AGAIN}")
+        table = read_parquet(path, kinds | (_TRUTH_KINDS if exact else {}), cure=_AGAIN, error=RecordingError)
+        labels: dict[str, Any] = {}
+        for name, kind in kinds.items():
+            if kind == "texts":
+                labels[name] = tuple(table.column(name).to_pylist())
+            elif name != "image":
+                labels[name] = table.column(name).to_numpy().astype(np.float64 if kind == "numbers" else np.bool_)
+        labels["contact_state"] = tuple(map(ContactState, labels["contact_state"]))
+        if pixels:
+            images = _decode(table.column("image"), size, f"of {path}")
+        else:
+            images = np.broadcast_to(reference, (frames, *size))
+        return Recording(
+            **{name: getattr(header, name) for name in _FACTS},
+            **labels,
+            labelling=header.labelling,
+            reference=reference,
+            frames=images,
+            truth=None if exact is None else _read_truth(table, exact, size[:2], path),
+        )
 
 
 _MOST_BYTES = 2**35  # of the pixels of a trial that is read at once
@@ -255,20 +247,15 @@ _MOST_BYTES = 2**35  # of the pixels of a trial that is read at once
 
 def stream_frames(path: Path, places: Collection[int] | None = None) -> Iterator[Frame]:
     """Yield the frames of a stored trial, all or those of some places, with one row group in memory."""
-    file, header = _open(path)
     first = 0
-    with file:
+    with _open(path) as (file, header, _):
         for group in range(file.num_row_groups):
             rows = range(first, first + file.metadata.row_group(group).num_rows)
             inside = [place for place in rows if places is None or place in places]
-            if inside:
-                with reading(path):
-                    images = file.read_row_group(group, columns=["image"]).column("image")
-                if images.null_count:
-                    raise RecordingError(f"{path} has gaps in the column 'image'; {_AGAIN}")
-                for place in inside:
-                    where, size = f"frame {place} of {path}", (header.height, header.width, 3)
-                    yield decode_pixels(images[place - first].as_buffer(), size=size, where=where)
+            images = file.read_row_group(group, columns=["image"]).column("image") if inside else None
+            for place in inside:
+                where, size = f"frame {place} of {path}", (header.height, header.width, 3)
+                yield decode_pixels(images[place - first].as_buffer(), size=size, where=where)
             first = rows.stop
 
 
@@ -285,25 +272,22 @@ def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames 
 
 def hash_frames(path: Path) -> str:
     """Hash the images of a stored trial: its reference, its first and last frame, and the number of frames."""
-    file, header = _open(path)
-    with file, reading(path):
+    with _open(path) as (file, header, metadata):
         last = file.num_row_groups - 1
         ends = [file.read_row_group(group, columns=["image"]).column("image")[at] for group, at in ((0, 0), (last, -1))]
-        images = [file.schema_arrow.metadata[b"reference"], *(end.as_py() for end in ends)]
-    return hash_json([header.frames, *(sha256(image).hexdigest() for image in images)])
+        images = [metadata[b"reference"], *(end.as_py() for end in ends)]
+        return hash_json([header.frames, *(sha256(image).hexdigest() for image in images)])
 
 
 def _read_truth(table: pa.Table, header: TruthHeader, size: tuple[int, ...], path: Path) -> GroundTruth:
-    rest = len(header.marker_rest_px)
-    if (numbers := table.schema.field("marker_px").type.list_size) != 2 * rest:
-        raise RecordingError(f"{path} has {numbers} numbers a frame for {rest} markers, 2 each are needed; {_AGAIN}")
+    rest = np.array(header.marker_rest_px, dtype=np.float32).reshape(-1, 2)
     # a trial is read as one chunk or many, as Arrow likes
     flat = table.column("marker_px").combine_chunks().flatten()
     return GroundTruth(
         recipe=header.recipe,
         displacement=header.displacement,
-        marker_rest_px=np.array(header.marker_rest_px, dtype=np.float32).reshape(-1, 2),
-        marker_px=flat.to_numpy().astype(np.float32).reshape(table.num_rows, rest, 2),
+        marker_rest_px=rest,
+        marker_px=flat.to_numpy().astype(np.float32).reshape(table.num_rows, *rest.shape),
         contact_map=_decode(table.column("contact_map"), size, f"(contact map) of {path}"),
         **{name: table.column(name).to_numpy().astype(np.float64) for name in _TRUTH_SIGNALS},
     )

@@ -102,7 +102,7 @@ def write_report(
         study=bool(results.study),
         runs=results.runs,
         recipes=[json.dumps(run.config, indent=2, ensure_ascii=False) for run in runs],
-        facts={**runs[-1].versions, **vars(runs[-1].machine)},
+        facts={**runs[-1].versions, **runs[-1].machine},
     )
     # the figures first: a page that is there has all that it names
     figures = write_plates([block for block in blocks if isinstance(block, Plate)], page.parent / FOLDER)

@@ -7,6 +7,7 @@ from readers import read_image_folder, refused
 
 from sliplens.errors import ImageError
 from sliplens.images import write_png
+from sliplens.recordings.source import open_source
 
 
 @pytest.fixture
@@ -60,7 +61,7 @@ def test_names_hold_times_where_that_is_declared(tmp_path: Path, frames: np.ndar
 
 
 def test_times_must_be_given_in_one_way(folder: Path):
-    refused(read_image_folder, folder, "trial 7 have no times; give one of --times, --frame-rate,")
+    refused(lambda path: open_source(path, whole=True), folder, "trial 7 have no times; give one of --times, --fram")
     refused(read_image_folder, folder, "more than one source of times", frame_rate=30.0, name_unit="s")
     for rate in (0.0, -8.0, float("nan"), float("inf")):
         refused(read_image_folder, folder, f"a frame rate of {rate} frames/s cannot be", frame_rate=rate)

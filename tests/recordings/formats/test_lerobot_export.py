@@ -12,7 +12,7 @@ from data_sets import save_dataset
 from exportable import LENGTHS, make_trial
 from there import there
 
-from sliplens.images import decode_png
+from sliplens.images import read_image
 from sliplens.recordings import Dataset
 from sliplens.recordings.exporting import export_lerobot
 from sliplens.recordings.formats.lerobot_export import number_stats
@@ -105,7 +105,7 @@ def test_features_hold_the_labels_and_images_of_the_frames(data, exported):
     cells = rows["observation.images.tactile"].to_pylist()
     for index, frame in enumerate(first.read_frames()):
         assert cells[index]["path"] == f"frame-{index:06d}.png"
-        np.testing.assert_array_equal(decode_png(cells[index]["bytes"], where="a cell"), frame)
+        np.testing.assert_array_equal(read_image(cells[index]["bytes"], where="a cell"), frame)
 
 
 def test_statistics_are_those_of_the_finite_numbers(data, exported):

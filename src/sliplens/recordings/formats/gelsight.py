@@ -34,7 +34,7 @@ def read_gelsight(path: Path, options: ReadOptions) -> list[Capture]:
     else:
         clips = [path] if path.is_file() else sorted(path.glob("*.avi"))
     if not clips:
-        raise RecordingError(f"{path} holds no clip; name a clip, the folder of a grasp, or that of {LABELS_FILE}")
+        raise RecordingError(f"{path} holds no clip; name one, or its folder, or copy those that {LABELS_FILE} lists")
     rate = FRAME_RATE_HZ if options.frame_rate is None else options.frame_rate
     return [read_gelsight_clip(clip, frame_rate=rate) for clip in clips]
 
@@ -70,10 +70,7 @@ def read_gelsight_clip(path: Path, *, labels: Path | None = None, frame_rate: fl
 
 def list_gelsight_clips(folder: Path) -> list[Path]:
     """List the clips in the data set's `labels.csv` that exist."""
-    clips = [folder / name for name in _read_labels(folder / LABELS_FILE) if (folder / name).is_file()]
-    if not clips:
-        raise RecordingError(f"{folder} holds none of the clips that its {LABELS_FILE} lists; copy them beside it")
-    return clips
+    return [folder / name for name in _read_labels(folder / LABELS_FILE) if (folder / name).is_file()]
 
 
 def _read_labels(path: Path) -> dict[str, dict[str, str]]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from math import floor, prod
+from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,8 +19,8 @@ from jaxtyping import Float
 from sliplens.codec import open_parquet, parquet_errors, read_parquet
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import read_json
+from sliplens.images import read_image
 from sliplens.recordings.capture import Capture, Forces, Frame
-from sliplens.recordings.formats.images import decode_image
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.formats.video import first_frame_size, loss_note, open_video, upright
 from sliplens.recordings.options import ReadOptions
@@ -30,17 +31,6 @@ _FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
 _TACTILE = re.compile(r"tactile|touch|gel|digit|tactip|fingertip|skin", re.IGNORECASE)
 _FORCE = re.compile(r"force|wrench|(?<![a-z])f_?t(?![a-z])", re.IGNORECASE)
 _TORQUE = re.compile(r"torque|moment|(?<![a-z])[tm]_?[xyz](?![a-z])", re.IGNORECASE)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Episode:
-    """Place of an episode in the files."""
-
-    index: int
-    length: int  #: Frames.
-    data_file: Path
-    video_file: Path | None  #: None where the frames are in the data file.
-    video_start_s: float  #: Stamp of the first frame in the video.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +49,6 @@ class Feature:
         details = [each for each in (self.info, self.video_info) if isinstance(each, dict)]
         depth = any(each.get("is_depth_map") or each.get("video.is_depth_map") for each in details)
         return self.dtype in {"video", "image"} and not depth
-
-    @property
-    def may_be_force(self) -> bool:
-        """True for 3 or 6 floating-point numbers."""
-        return self.dtype.startswith("float") and self.shape in ((3,), (6,))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,38 +88,23 @@ def read_layout(folder: Path) -> Layout:
         raise RecordingError(f"{path} is not that of a LeRobot data set ({error}); {_COPY}") from None
 
 
-def read_episodes(layout: Layout, *, camera_key: str) -> list[Episode]:
-    """Find the episodes of a data set and the files with their frames from a camera, in their order."""
-    video_template = layout.video_path or "" if layout.features[camera_key].dtype == "video" else None
+def _read_episodes(layout: Layout, *, video: str) -> list[dict[str, int | float]]:
+    """Read the rows of the episodes, in their order; `video` begins the columns of their place in videos, if any."""
     names = ["episode_index", "length", "data/chunk_index", "data/file_index"]
-    if video_template is not None:
-        names += [f"videos/{camera_key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp")]
+    names += [f"{video}{name}" for name in ("chunk_index", "file_index", "from_timestamp")] if video else []
     columns = {name: "numbers" if name.endswith("timestamp") else "whole numbers" for name in names}
-    folder = layout.folder / "meta" / "episodes"
-    rows = []
+    folder, rows = layout.folder / "meta" / "episodes", []
     for path in sorted(folder.glob("*/*.parquet")):
-        table = read_parquet(path, columns, cure=_COPY, error=RecordingError)
-        rows += zip(*(table.column(name).to_pylist() for name in columns), strict=True)
+        rows += read_parquet(path, columns, cure=_COPY, error=RecordingError).to_pylist()
     if not rows:
         raise RecordingError(f"{folder} lists no episode; record one, or copy it again")
-    episodes = []
-    for index, length, chunk, file, *video in sorted(rows):
-        if episodes and episodes[-1].index == index:
-            raise RecordingError(f"{folder} lists episode {index} twice; {_COPY}")
-        video_file, start_s = None, 0.0
-        if video_template is not None:
-            video_chunk, video_number, start_s = video
-            places = {"video_key": camera_key, "chunk_index": video_chunk, "file_index": video_number}
-            video_file = layout.file(video_template, places)
-        if not 0 <= start_s <= _LATEST_S:
-            raise RecordingError(f"{folder} begins episode {index} at {start_s:g} s of a video; {_COPY}")
-        data_file = layout.file(layout.data_path, {"chunk_index": chunk, "file_index": file})
-        episodes.append(
-            Episode(
-                index=index, length=length, data_file=data_file, video_file=video_file, video_start_s=float(start_s)
-            )
-        )
-    return episodes
+    rows.sort(key=itemgetter("episode_index"))
+    for before, row in zip([{}, *rows], rows, strict=False):
+        if before.get("episode_index") == row["episode_index"]:
+            raise RecordingError(f"{folder} lists episode {row['episode_index']} twice; {_COPY}")
+        if not 0 <= (start_s := row.get(f"{video}from_timestamp", 0)) <= _LATEST_S:
+            raise RecordingError(f"{folder} begins episode {row['episode_index']} at {start_s:g} s of a video; {_COPY}")
+    return rows
 
 
 def video_frames(
@@ -174,7 +144,7 @@ def image_frames(path: Path, key: str, *, episode: int, frame_size: tuple[int, i
                 data = cell.get("bytes") if isinstance(cell, dict) else None
                 if not isinstance(data, bytes) or not data:
                     raise RecordingError(f"{where} is not in the file; embed the images, or {_COPY}")
-                pixels = decode_image(data, where=where)
+                pixels = read_image(data, where=where)
                 if frame_size is not None and pixels.shape[:2] != frame_size:
                     raise RecordingError(f"{where} is of another size than the first; leave the episode out")
                 yield pixels
@@ -192,30 +162,44 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
     kinds = {"episode_index": "whole numbers", "timestamp": "numbers", **({force: "values"} if force else {})}
     # episodes share files
     read_table = lru_cache(maxsize=1)(partial(read_parquet, columns=kinds, cure=_COPY, error=RecordingError))
-    read_header = cache(_read_video_header)
+
+    @cache
+    def read_header(path: Path) -> tuple[tuple[int, int], tuple[str, ...]]:
+        with open_video(path) as (_, stream):
+            return first_frame_size(path), loss_note(stream, name=path.name)
+
+    video = f"videos/{camera}/" if layout.features[camera].dtype == "video" else ""
     captures = []
-    for episode in read_episodes(layout, camera_key=camera):
-        path, loss, forces = episode.data_file, (), None
-        source = f"episode {episode.index} of {layout.folder}"
-        rows = read_table(path).filter(pc.field("episode_index") == episode.index)
-        if rows.num_rows != episode.length or not rows.num_rows:
-            count = f"{path} has {rows.num_rows} frames of episode {episode.index}, its metadata say {episode.length}"
+    for row in _read_episodes(layout, video=video):
+        episode, loss, forces = int(row["episode_index"]), (), None
+        places = {name: int(row[f"data/{name}"]) for name in ("chunk_index", "file_index")}
+        path, source = layout.file(layout.data_path, places), f"episode {episode} of {layout.folder}"
+        table = read_table(path).filter(pc.field("episode_index") == episode)
+        if table.num_rows != row["length"] or not table.num_rows:
+            count = f"{path} has {table.num_rows} frames of episode {episode}, its metadata say {row['length']}"
             raise RecordingError(f"{count}; leave the episode out, or {_COPY}")
-        time_s = rows.column("timestamp").to_numpy().astype(np.float64)
+        time_s = table.column("timestamp").to_numpy().astype(np.float64)
         if force is not None:
-            force_n = _read_vectors(rows, force, width=prod(layout.features[force].shape), path=path)[:, :3].copy()
+            column, width = table.column(force).combine_chunks(), prod(layout.features[force].shape)
+            numbers = column.flatten() if hasattr(column, "flatten") else column
+            if len(numbers) != len(table) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
+                holds = f"{force} of {path} does not hold {width} numbers a frame, as meta/info.json says"
+                raise RecordingError(f"{holds}; {_COPY}")
+            force_n = numbers.to_numpy().astype(np.float64).reshape(-1, width)[:, :3].copy()
             forces = Forces(time_s=time_s, force_n=force_n, source=f"{force} of {source}")
-        if episode.video_file is None:
-            read_frames = partial(image_frames, path, camera, episode=episode.index)
+        if video:
+            places = {name: int(row[f"{video}{name}"]) for name in ("chunk_index", "file_index")}
+            file = layout.file(layout.video_path or "", {"video_key": camera, **places})
+            size, loss = read_header(file)
+            stamps_s, tolerance_s = row[f"{video}from_timestamp"] + time_s, 0.5 / layout.fps
+            read_frames = partial(video_frames, file, stamps_s, tolerance_s=tolerance_s, frame_size=size)
+        else:
+            read_frames = partial(image_frames, path, camera, episode=episode)
             size = next(read_frames()).shape[:2]
             read_frames = partial(read_frames, frame_size=size)
-        else:
-            size, loss = read_header(episode.video_file)
-            stamps_s, tolerance_s = episode.video_start_s + time_s, 0.5 / layout.fps
-            read_frames = partial(video_frames, episode.video_file, stamps_s, tolerance_s=tolerance_s, frame_size=size)
         captures.append(
             Capture(
-                trial=trial_name(f"{layout.folder.resolve().name}-{episode.index:06d}"),
+                trial=trial_name(f"{layout.folder.resolve().name}-{episode:06d}"),
                 source=f"{camera} of {source}",
                 frame_time_s=time_s,
                 frame_size=size,
@@ -227,47 +211,35 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
     return captures
 
 
-def _read_vectors(rows: pa.Table, key: str, *, width: int, path: Path) -> Float[np.ndarray, "frames numbers"]:
-    column = rows.column(key).combine_chunks()
-    numbers = column.flatten() if hasattr(column, "flatten") else column
-    if len(numbers) != len(rows) * width or numbers.null_count or not pa.types.is_floating(numbers.type):
-        raise RecordingError(f"{key} of {path} does not hold {width} numbers a frame, as meta/info.json says; {_COPY}")
-    return numbers.to_numpy().astype(np.float64).reshape(-1, width)
-
-
-def _read_video_header(path: Path) -> tuple[tuple[int, int], tuple[str, ...]]:
-    with open_video(path) as (_, video):
-        return first_frame_size(path), loss_note(video, name=path.name)
+def _choose(layout: Layout, fitting: Sequence[str], chosen: Sequence[str], *, name: str | None, kind: str) -> str:
+    """Return the only feature that was chosen; `name` is that of the option, where one is given."""
+    if len(chosen) == 1:
+        return chosen[0]
+    wanted = f"{len(chosen) or 'no'} {kind}s" if name is None else f"no {kind} {name}"
+    some = ", ".join(fitting) or "none"
+    raise RecordingError(f"{layout.folder} has {wanted} among {some}; name one with --{kind}-key")
 
 
 def _choose_camera(layout: Layout, name: str | None) -> str:
     cameras = [key for key, feature in layout.features.items() if feature.is_camera]
     chosen = [key for key in cameras if key == name] if name else [key for key in cameras if _TACTILE.search(key)]
-    chosen = chosen or (cameras if name is None else [])
-    if len(chosen) != 1:
-        wanted = f"{len(chosen) or 'no'} tactile cameras" if name is None else f"no camera {name}"
-        raise RecordingError(f"{layout.folder} has {wanted} among {_list_keys(cameras)}; name one with --camera-key")
-    return chosen[0]
+    return _choose(layout, cameras, chosen or (cameras if name is None else []), name=name, kind="camera")
 
 
 def _choose_force(layout: Layout, name: str | None) -> str | None:
-    fitting = [key for key, feature in layout.features.items() if feature.may_be_force]
+    fitting = [
+        key for key, each in layout.features.items() if each.dtype.startswith("float") and each.shape in ((3,), (6,))
+    ]
     # what was commanded is not what was felt
     forces = [key for key in fitting if _FORCE.search(key) and not key.startswith("action")]
     forces = forces if name is None else [key for key in fitting if key == name]
-    if len(forces) > 1 or (name and not forces):
-        wanted = f"{len(forces)} forces" if name is None else f"no feature {name} of 3 or 6 floating-point numbers"
-        raise RecordingError(f"{layout.folder} has {wanted} among {_list_keys(fitting)}; name one with --force-key")
-    if not forces:
+    if not forces and name is None:
         return None
+    force = _choose(layout, fitting, forces, name=name, kind="force")
     # names of the numbers are a list, or lists by group
-    names = layout.features[forces[0]].names
+    names = layout.features[force].names
     groups = names.values() if isinstance(names, dict) else [names]
     first = [str(name) for group in groups if isinstance(group, list) for name in group][:3]
     if any(_TORQUE.search(name) for name in first):
-        raise RecordingError(f"{forces[0]} of {layout.folder} begins with {', '.join(first)}; forces must come first")
-    return forces[0]
-
-
-def _list_keys(keys: Sequence[str]) -> str:
-    return ", ".join(keys) or "none"
+        raise RecordingError(f"{force} of {layout.folder} begins with {', '.join(first)}; forces must come first")
+    return force

@@ -96,18 +96,6 @@ class _Bag:
         data = bytes(self._types.serialize_cdr(self.make(kind, **fields), kind))
         self.writer.add_message(self._channels[topic], log_time=stamp_ns, data=data, publish_time=stamp_ns)
 
-    def write_image(self, topic: str, stamp_ns: int, png: bytes) -> None:
-        """Write an image."""
-        self.write(topic, stamp_ns, format="png", data=np.frombuffer(png, dtype=np.uint8))
-
-    def write_wrench(self, stamp_ns: int, force_n: Sequence[float]) -> None:
-        """Write a force without a torque."""
-        force, torque = (
-            self.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", vector, strict=True)))
-            for vector in (force_n, (0.0, 0.0, 0.0))
-        )
-        self.write(WRENCH, stamp_ns, wrench=self.make("geometry_msgs/msg/Wrench", force=force, torque=torque))
-
 
 def _write_trial(bag: _Bag, capture: Capture) -> None:
     """Write the messages of a trial in the order of time."""
@@ -123,17 +111,24 @@ def _write_trial(bag: _Bag, capture: Capture) -> None:
     rows = {name: getattr(labels, name).tolist() for name in (*LABEL_SIGNALS, "safety_margin_sigma", "valid")}
     rows |= {"time_s": capture.frame_time_s.tolist(), "invalid_reason": labels.reason or ()}
     rows["contact_state"] = [str(state) for state in labels.contact_state]
-    (first_ns,) = _stamps_ns([first_s], offset_s)
-    bag.write_image(REFERENCE, first_ns, encode_png(capture.reference))
+
+    def write_image(topic: str, stamp_ns: int, png: bytes) -> None:
+        bag.write(topic, stamp_ns, format="png", data=np.frombuffer(png, dtype=np.uint8))
+
+    def vector(x: float, y: float, z: float) -> object:
+        return bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    write_image(REFERENCE, *_stamps_ns([first_s], offset_s), encode_png(capture.reference))
     wrenches = zip(_stamps_ns(forces.time_s, offset_s), forces.force_n.tolist(), strict=True) if forces else ()
     pngs = (png for _, batch in encode_batches(capture.read_frames()) for png in batch)
     frames = zip(_stamps_ns(capture.frame_time_s, offset_s), enumerate(pngs), strict=True)
     for stamp_ns, content in merge(wrenches, frames, key=itemgetter(0)):
         if isinstance(content, list):
-            bag.write_wrench(stamp_ns, content)
+            force, torque = vector(*content), vector(0.0, 0.0, 0.0)
+            bag.write(WRENCH, stamp_ns, wrench=bag.make("geometry_msgs/msg/Wrench", force=force, torque=torque))
             continue
         index, png = content
-        bag.write_image(IMAGE, stamp_ns, png)
+        write_image(IMAGE, stamp_ns, png)
         bag.write(LABELS, stamp_ns, **{name: values[index] for name, values in rows.items()})
         bag.write(MARGIN, stamp_ns, data=rows["safety_margin"][index])
         report_progress(index + 1, len(capture))

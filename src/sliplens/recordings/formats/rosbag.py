@@ -3,7 +3,7 @@
 import io
 import os
 from array import array
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache, partial
 from importlib import import_module
@@ -18,9 +18,8 @@ import numpy as np
 from sliplens.errors import RecordingError, SliplensError
 from sliplens.extras import require_packages
 from sliplens.files import require_file
-from sliplens.images import upright_size
+from sliplens.images import image_size, read_image
 from sliplens.recordings.capture import Capture, Forces, Frame
-from sliplens.recordings.formats.images import decode_image, open_encoded
 from sliplens.recordings.formats.mcap import IMAGE, TOPICS, WRENCH, trial_types
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.options import ReadOptions
@@ -35,11 +34,10 @@ _STORAGE = (".mcap", ".db3")
 _CLOCKS = ("header", "bag")  # of the stamp in a message, and of its arrival at the bag
 
 
-def image_size(message: Any, *, where: str) -> tuple[int, int]:
+def _message_size(message: Any, *, where: str) -> tuple[int, int]:
     """Return height and width of an image, in pixels, without decoding it."""
     if message.__msgtype__ == COMPRESSED:
-        with open_encoded(message.data, where=f"{where}, of format {message.format[:40]!r},") as image:
-            return upright_size(image)
+        return image_size(message.data, where=f"{where}, of format {message.format[:40]!r},")
     channels = _CHANNELS.get(message.encoding)
     if channels is None:
         raise RecordingError(f"{where} has encoding {message.encoding[:40]!r}; record it as rgb8, bgr8, mono8 or PNG")
@@ -49,20 +47,6 @@ def image_size(message: Any, *, where: str) -> tuple[int, int]:
         claims = f"claims {height} rows of {step} bytes for {width} pixels of {message.encoding}"
         raise RecordingError(f"{where} {claims} but holds {len(message.data)} bytes; mend it or record it again")
     return height, width
-
-
-def image_pixels(message: Any, *, where: str) -> Frame:
-    """Decode an image as RGB; grey is repeated in all three channels."""
-    if message.__msgtype__ == COMPRESSED:
-        return decode_image(message.data, where=where)
-    height, width = image_size(message, where=where)
-    channels = _CHANNELS[message.encoding]
-    # rows may be padded: step counts the padding too
-    rows = message.data[: height * message.step].reshape(height, message.step)[:, : width * channels]
-    pixels = rows.reshape(height, width, channels)
-    if message.encoding == "mono8":
-        return np.repeat(pixels, 3, axis=2)
-    return np.array(pixels[..., ::-1] if message.encoding == "bgr8" else pixels, order="C")
 
 
 MOST_BYTES = 256 * 2**20
@@ -89,7 +73,12 @@ def bounded_reader() -> "type[Reader]":
     class Mcap(mcap.McapReader):
         def _open(self) -> None:
             super()._open()
-            _require_room(self.chunks)
+            # chunks that cover one moment are all expanded at once; what begins then counts before what ends
+            times = [
+                (chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size) for chunk in self.chunks
+            ]
+            steps = [(begin, 0, size) for begin, _, size in times] + [(max(span), 1, -size) for *span, size in times]
+            _require_below(max(accumulate(size for *_, size in sorted(steps)), default=0), MOST_BYTES)
 
     class Sqlite(sqlite.Sqlite3Reader):
         def _open(self) -> None:
@@ -133,20 +122,6 @@ def _load_copy(name: str) -> Any:
     return module
 
 
-def _require_room(chunks: Iterable[Any]) -> None:
-    """Refuse chunks that cover one moment and are too large together: rosbags expands all of these at once."""
-    # at the same moment what begins counts before what ends
-    begins = [(chunk.message_start_time, 0, chunk.uncompressed_size) for chunk in chunks]
-    ends = [(max(chunk.message_start_time, chunk.message_end_time), 1, -chunk.uncompressed_size) for chunk in chunks]
-    _require_below(max(accumulate(size for _, _, size in sorted(begins + ends)), default=0), MOST_BYTES)
-
-
-def bag_topics(path: Path) -> dict[str, str]:
-    """List the topics of a bag with the types of their messages."""
-    with open_bag(path) as bag:
-        return {connection.topic: connection.msgtype for connection in bag.connections}
-
-
 def bag_messages(path: Path, topics: Mapping[str, str]) -> Iterator[tuple[str, int, Any]]:
     """Iterate over topic, time of arrival in nanoseconds and content of messages, in the order of recording."""
     with open_bag(path) as bag:
@@ -170,7 +145,12 @@ def open_bag(path: Path) -> Iterator["Reader"]:
         raise RecordingError(f"{path} has no metadata.yaml; write it with `ros2 bag reindex`, or name {inside}")
     for file in files:
         require_file(file)
-        _require_whole_pages(file)
+        # https://www.sqlite.org/fileformat.html: 16 bytes of magic, then the page size, where 1 stands for 65536
+        with file.open("rb") as stream:
+            head = stream.read(18)
+        page = int.from_bytes(head[16:18], "big")
+        if head.startswith(b"SQLite format 3\0") and file.stat().st_size % (65536 if page == 1 else page or 1):
+            raise RecordingError(f"{file} is cut off; copy it again")  # sqlite would read zeros there
     try:
         with bounded_reader()(path) as bag:
             yield bag
@@ -184,16 +164,6 @@ def open_bag(path: Path) -> Iterator["Reader"]:
         raise RecordingError(f"{path} is not a readable ROS 2 bag ({text}); try `mcap recover`") from None
 
 
-def _require_whole_pages(file: Path) -> None:
-    """Refuse a database that is cut off within a page, for sqlite would read zeros there."""
-    with file.open("rb") as stream:
-        head = stream.read(18)
-    # https://www.sqlite.org/fileformat.html: 16 bytes of magic, then the page size, where 1 stands for 65536
-    page = int.from_bytes(head[16:18], "big")
-    if head.startswith(b"SQLite format 3\0") and file.stat().st_size % (65536 if page == 1 else page or 1):
-        raise RecordingError(f"{file} is cut off; copy it again")
-
-
 def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     """Read a bag as one trial.
 
@@ -202,7 +172,9 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     that never meet, both take the times at which the bag received them, and `notes` say so.
     Times are seconds since the first frame or force: since the epoch, double precision would round them to 0.2 us.
     """
-    topics, notes, size = bag_topics(path), [], None
+    notes, size = [], None
+    with open_bag(path) as bag:
+        topics = {connection.topic: connection.msgtype for connection in bag.connections}
     images = _choose(topics, options.image_topic, what="image", path=path)
     wrenches = _choose(topics, options.wrench_topic, what="wrench", path=path)
     if images is None:
@@ -214,7 +186,7 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     for name, bag_ns, message in bag_messages(path, {name: topics[name] for name in chosen}):
         if name == images:
             where = f"frame {len(stamps_ns[name]['bag'])} of {images} in {path}"
-            before, size = size, image_size(message, where=where)
+            before, size = size, _message_size(message, where=where)
             if before not in {None, size}:
                 raise RecordingError(f"{where} is of another size than those before it; cut the bag there")
         else:
@@ -248,7 +220,16 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
 
 def _read_frames(path: Path, images: str, kind: str) -> Iterator[Frame]:
     for index, (_, _, message) in enumerate(bag_messages(path, {images: kind})):
-        yield image_pixels(message, where=f"frame {index} of {images} in {path}")
+        where = f"frame {index} of {images} in {path}"
+        if kind == COMPRESSED:
+            yield read_image(message.data, where=where)
+            continue
+        height, width = _message_size(message, where=where)
+        channels = _CHANNELS[message.encoding]
+        # rows may be padded: step counts the padding too
+        rows = message.data[: height * message.step].reshape(height, message.step)[:, : width * channels]
+        pixels = rows.reshape(height, width, channels)[..., :: -1 if message.encoding == "bgr8" else 1]
+        yield np.repeat(pixels, 3, axis=2) if channels == 1 else np.array(pixels, order="C")
 
 
 def _choose(topics: Mapping[str, str], name: str | None, *, what: str, path: Path) -> str | None:

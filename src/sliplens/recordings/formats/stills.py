@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from sliplens.errors import RecordingError
+from sliplens.images import read_image
 from sliplens.recordings.capture import Capture, Forces
-from sliplens.recordings.formats.images import common_size, guess_name_column, read_frame
+from sliplens.recordings.formats.images import common_size, guess_name_column
 from sliplens.recordings.formats.tables import (
-    TextTable,
     choose_force_columns,
     open_text_table,
     read_numbers,
@@ -64,7 +64,14 @@ def read_stills(path: Path, options: ReadOptions) -> Capture:
     numbers, lines, notes = read_numbers(replace(table, rows=iter(rows)), names)
     force_n, (axes, unit) = scale_forces(numbers, lines, names, options, path=states)
     root = options.image_root or states.parent
-    images = _find_images(table, name_column, rows, root=root)
+    place, lines_of = table.header.index(name_column), dict[Path, int]()
+    for line, cells in rows:
+        image = find_image(cells[place], f"{states}, line {line}", folder=states.parent, root=root)
+        if image in lines_of:
+            again = f"{states}, line {line} names {cells[place]!r} again, as line {lines_of[image]}"
+            raise RecordingError(f"{again}; drop one")
+        lines_of[image] = line
+    images = tuple(lines_of)
     size = common_size(images)
     time_s = np.arange(float(len(images)))
     normal_n, tangential_n = force_n[:, 2], np.hypot(force_n[:, 0], force_n[:, 1])
@@ -73,15 +80,13 @@ def read_stills(path: Path, options: ReadOptions) -> Capture:
         raise RecordingError(f"{where}: the normal force is {normal_n.min():.4g} N; give it positive where it presses")
     untouched = np.flatnonzero(np.abs(force_n).max(axis=1) < _LEAST_FORCE_N)
     labels = labels_of_margins(np.full(len(images), np.nan))
-    states_of = [
-        ContactState.NO_CONTACT if index in untouched else ContactState.UNKNOWN for index in range(len(images))
-    ]
+    unknown = (ContactState.NO_CONTACT if at in untouched else ContactState.UNKNOWN for at in range(len(images)))
     return Capture(
         trial=trial_name(states.resolve().parent.name),
         source=str(states),
         frame_time_s=time_s,
         frame_size=size,
-        read_frames=partial(map, partial(read_frame, size=size), images),
+        read_frames=partial(map, partial(read_image, size=size), images),
         forces=Forces(time_s=time_s, force_n=force_n, source=str(states)),
         notes=(
             f"{states.name}: forces are those of {', '.join(map(repr, names))} as {axes} ({how}), {unit}.",
@@ -92,21 +97,8 @@ def read_stills(path: Path, options: ReadOptions) -> Capture:
             labels,
             normal_force_n=normal_n,
             tangential_force_n=tangential_n,
-            contact_state=tuple(states_of),
+            contact_state=tuple(unknown),
         ),
         reference_index=int(untouched[0]) if len(untouched) else None,
         files=tuple(image.name for image in images),
     )
-
-
-def _find_images(table: TextTable, column: str, rows: list[tuple[int, list[str]]], *, root: Path) -> tuple[Path, ...]:
-    """Find the image of each row; the same one twice is an error."""
-    at, lines = table.header.index(column), {}
-    for line, cells in rows:
-        image = find_image(cells[at], f"{table.path}, line {line}", folder=table.path.parent, root=root)
-        if image in lines:
-            raise RecordingError(
-                f"{table.path}, line {line} names {cells[at]!r} again, as line {lines[image]}; drop one"
-            )
-        lines[image] = line
-    return tuple(lines)

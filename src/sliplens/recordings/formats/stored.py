@@ -13,7 +13,7 @@ from sliplens.images import encode_png
 from sliplens.recordings.capture import Capture, Forces, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames
-from sliplens.recordings.trial import Labels, Recording, TrialFacts
+from sliplens.recordings.trial import Labels, TrialFacts
 
 _BATCH = 16  # frames that are encoded side by side
 
@@ -26,31 +26,27 @@ def read_stored(folder: Path) -> list[Capture]:
 
 def read_stored_trial(data: Dataset, info: TrialInfo, *, samples: bool = True) -> Capture:
     """Read one trial of a data set as `read_stored` does, with or without the samples of its forces."""
-    path = trial_path(data.folder, info.trial)
+    path, forces = trial_path(data.folder, info.trial), None
     stored = load_recording(path, pixels=False)
+    pull, press = stored.tangential_force_n, stored.normal_force_n
+    measured = np.isfinite(pull) & np.isfinite(press)
+    if samples and info.forces_sha256:
+        forces = load_forces(forces_path(data.folder, info.trial))
+    elif samples and measured.any():
+        force_n = np.stack([pull, np.zeros_like(pull), press], axis=-1)[measured]
+        forces = Forces(time_s=stored.time_s[measured], force_n=force_n, source=f"the frames of {info.trial}")
     return Capture(
         **{field.name: getattr(info, field.name) for field in fields(TrialFacts)},
         source=f"{info.trial} of {data.folder}",
         frame_time_s=stored.time_s,
         frame_size=(info.height, info.width),
         read_frames=partial(stream_frames, path),
-        forces=_read_forces(data, info, stored) if samples else None,
+        forces=forces,
         labels=stored,
         reference=stored.reference,
         split=info.split,
         simulated=data.simulated,
     )
-
-
-def _read_forces(data: Dataset, info: TrialInfo, stored: Recording) -> Forces | None:
-    if info.forces_sha256:
-        return load_forces(forces_path(data.folder, info.trial))
-    pull, press = stored.tangential_force_n, stored.normal_force_n
-    measured = np.isfinite(pull) & np.isfinite(press)
-    if not measured.any():
-        return None
-    samples = np.stack([pull, np.zeros_like(pull), press], axis=-1)[measured]
-    return Forces(time_s=stored.time_s[measured], force_n=samples, source=f"the frames of {info.trial}")
 
 
 def encode_batches(frames: Iterator[Frame]) -> Iterator[tuple[list[Frame], list[bytes]]]:

@@ -7,9 +7,9 @@ from pathlib import Path, PureWindowsPath
 import numpy as np
 
 from sliplens.errors import RecordingError
-from sliplens.images import natural_key
+from sliplens.images import natural_key, read_image
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.formats.images import common_size, read_frame
+from sliplens.recordings.formats.images import common_size
 from sliplens.recordings.formats.tables import evenly_spaced, text_lines, trial_name
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import labels_of_margins, require_possible
@@ -65,10 +65,10 @@ def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
                 source=f"{name} of {frames_list}",
                 frame_time_s=evenly_spaced(len(paths), frame_rate=rate),
                 frame_size=size,
-                read_frames=partial(map, partial(read_frame, size=size), paths),
+                read_frames=partial(map, partial(read_image, size=size), paths),
                 notes=(note, times, *moved),
                 labels=labels_of_margins(np.array([rows[image] for image in paths])),
-                reference=read_frame(reference, size=size),
+                reference=read_image(reference, size=size),
             )
         )
     return captures

@@ -33,7 +33,14 @@ _WAKES = 1.015  # a camera that adapts its exposure when it is started grows bri
 
 def small_copies(frames: Iterable[Frame]) -> Float32[np.ndarray, "frames rows columns 3"]:
     """Reduce frames to the means of blocks, enough to tell scenes apart and small enough to keep."""
-    copies = [_block_means(frame) for frame in islice(frames, _HORIZON)]
+    copies = []
+    for frame in islice(frames, _HORIZON):
+        rows, columns = (min(most, size) for most, size in zip(_BLOCKS, frame.shape[:2], strict=True))
+        height, width = frame.shape[0] // rows, frame.shape[1] // columns
+        whole = frame[: rows * height, : columns * width]
+        # rows first, which lie in one piece: several times faster than both at once
+        lines = whole.reshape(rows, height, -1).sum(axis=1, dtype=np.uint32)
+        copies.append((lines.reshape(rows, columns, width, 3).sum(axis=2) / (height * width)).astype(np.float32))
     return np.stack(copies) if copies else np.empty((0, *_BLOCKS, 3), dtype=np.float32)
 
 
@@ -64,15 +71,6 @@ def least_contact(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
     padded = np.pad(colour, ((0, 0), (2, 2), (2, 2), (0, 0)), mode="edge")
     smooth = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(1, 2)).mean(axis=(-2, -1))
     return int(np.argmin(np.abs(colour - smooth).mean(axis=(1, 2, 3))))
-
-
-def _block_means(frame: Frame) -> Float32[np.ndarray, "rows columns 3"]:
-    rows, columns = (min(most, size) for most, size in zip(_BLOCKS, frame.shape[:2], strict=True))
-    height, width = frame.shape[0] // rows, frame.shape[1] // columns
-    whole = frame[: rows * height, : columns * width]
-    # rows first, which lie in one piece: several times faster than both at once
-    sums = whole.reshape(rows, height, -1).sum(axis=1, dtype=np.uint32).reshape(rows, columns, width, 3).sum(axis=2)
-    return (sums / (height * width)).astype(np.float32)
 
 
 # FFmpeg also plays text files and play lists, and would follow these to other files and hosts
