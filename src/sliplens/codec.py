@@ -191,14 +191,10 @@ class Columns(_Described):
 
     def groups(self: _Columns, *names: str) -> dict[tuple[str, ...], _Columns]:
         """Group rows by the values of some text columns, in the order in which these first appear."""
-        codes = np.zeros(len(self), dtype=np.int64)
-        for name in names:
-            values, place = np.unique(getattr(self, name), return_inverse=True)
-            codes = codes * len(values) + place
-        order = np.argsort(codes, kind="stable")
-        pieces = np.split(order, np.flatnonzero(np.diff(codes[order])) + 1) if len(order) else []
-        pieces.sort(key=lambda rows: rows[0])
-        return {tuple(str(getattr(self, name)[rows[0]]) for name in names): self.where(rows) for rows in pieces}
+        rows: dict[tuple[str, ...], list[int]] = {}
+        for row, key in enumerate(zip(*(map(str, getattr(self, name)) for name in names), strict=True)):
+            rows.setdefault(key, []).append(row)
+        return {key: self.where(np.array(places)) for key, places in rows.items()}
 
     @classmethod
     def joined(cls: type[_Columns], pieces: Sequence[_Columns]) -> _Columns:
@@ -232,11 +228,11 @@ def from_builtins(values: object, kind: type[Record], *, where: Path | str, comm
     >>> from sliplens.codec import from_builtins
     >>> @dataclass(frozen=True)
     ... class Grip:
-    ...     normal_force_n: float
-    >>> from_builtins({"normal_force_n": "much"}, Grip, where="a.json", command="sliplens grip")
+    ...     force_n: float
+    >>> from_builtins({"force_n": "much"}, Grip, where="a.json", command="sliplens grip")
     Traceback (most recent call last):
         ...
-    sliplens.errors.InputError: a.json is not what was written (Expected `float`, got `str` - at `$.normal_force_n`); ...
+    sliplens.errors.InputError: a.json is not what was written (Expected `float`, got `str` - at `$.force_n`); ...
     """
     try:
         return msgspec.convert(values, kind, dec_hook=_decode, str_keys=True)

@@ -83,7 +83,8 @@ def _orientation(image: Image.Image) -> int:
 
 
 def _upright_size(image: Image.Image) -> tuple[int, int]:
-    return image.size if _orientation(image) >= 5 else image.size[::-1]
+    width, height = image.size
+    return (width, height) if _orientation(image) >= 5 else (height, width)
 
 
 def image_size(source: Path | Buffer, *, where: str = "") -> tuple[int, int]:

@@ -58,7 +58,7 @@ def recording(small_dataset: Dataset) -> Recording:
 def journal_of(folder: Path, recording: Recording, frames: list[LiveFrame]) -> tuple[Journal, list[int]]:
     """Write frames as a recording that was cut off has them; gives the size of the file after each."""
     lock, _ = begin_recording(folder, simulated=False)
-    header = JournalHeader(facts=FACTS, source="a camera", simulated=False, size=(48, 48))
+    header = JournalHeader(facts=FACTS, source="a camera", size=(48, 48))
     journal, ends = Journal(folder, header, reference=recording.reference), []
     for frame in frames:
         journal.append(frame.image, time_s=frame.time_s, safety_margin=frame.safety_margin, forces=frame.forces)
@@ -128,7 +128,7 @@ from sliplens.recordings.dataset import begin_recording
 from sliplens.recordings.journal import Journal, JournalHeader
 from sliplens.recordings.trial import TrialFacts
 lock, _ = begin_recording(Path(sys.argv[1]), simulated=False)
-header = JournalHeader(facts=TrialFacts(trial="a"), source="", simulated=False, size=(48, 48))
+header = JournalHeader(facts=TrialFacts(trial="a"), source="", size=(48, 48))
 journal = Journal(Path(sys.argv[1]), header, reference=None)
 for number in range(10**6):
     journal.append(np.full((48, 48, 3), number % 256, dtype=np.uint8), time_s=float(number))

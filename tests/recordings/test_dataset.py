@@ -15,7 +15,8 @@ from sliplens.recordings import Recording, load_dataset
 from sliplens.recordings.store import (
     ROW_GROUP,
     decode_pixels,
-    encode_frames,
+    encode_pixels,
+    in_turn,
     load_recording,
     read_frames,
     save_recording,
@@ -72,7 +73,7 @@ def test_no_more_than_a_few_frames_are_held_while_a_long_trial_is_encoded():
             yield frame
             most = max(most, sum(one() is not None for one in made))
 
-    images = [image for chunk in encode_frames(frames()) for image in chunk]
+    images = in_turn(encode_pixels, frames())
     decoded = [decode_pixels(image, size=(8, 8, 3), where="frame") for image in images]
     np.testing.assert_array_equal([one[0, 0, 0] for one in decoded], np.arange(100 * workers) % 256)
     # two a worker that wait or are worked on, one a worker that it has just done, and the newest

@@ -66,7 +66,7 @@ class Recorder:
         self.folder = Path(folder)
         self._facts = facts or TrialFacts(trial="live")
         require_trial_name(self._facts.trial)
-        self._source, self._simulated, self._reference = source, simulated, reference
+        self._source, self._reference = source, reference
         self._lock, taken = begin_recording(self.folder, simulated=simulated)
         self._taken = set(taken)
         self._journal: Journal | None = None
@@ -145,7 +145,6 @@ class Recorder:
         header = JournalHeader(
             facts=facts,
             source=self._source,
-            simulated=self._simulated,
             size=frame.size,
             forces=None if frame.forces is None else frame.forces.source,
         )

@@ -2,9 +2,9 @@
 
 import shlex
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
 from filelock import FileLock
@@ -13,7 +13,7 @@ from sliplens.codec import Result, from_builtins, save_record
 from sliplens.errors import RecordingError
 from sliplens.files import hash_file, hash_json, read_json, require_folder, whole_file
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
-from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, finish_journal, journals_of, lock_journals
+from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, finish_journal, lock_journals
 from sliplens.recordings.labelling import Labelling
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
 from sliplens.recordings.store import SCHEMA_VERSION, StoredFacts, forces_path, load_recording, read_header
@@ -40,16 +40,12 @@ class LeftOut:
     why: str  #: Error and its cure.
 
 
-_UNITS = {"time_s": "s", "normal_force_n": "N", "tangential_force_n": "N"}
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Table:
     """Contents of `dataset.json`."""
 
     schema_version: int = SCHEMA_VERSION
     simulated: bool = False
-    units: Mapping[str, str] = field(default_factory=_UNITS.copy)
     trials: tuple[TrialInfo, ...]
     left_out: tuple[LeftOut, ...] = ()
 
@@ -183,7 +179,7 @@ def finish_recording(folder: Path, lock: FileLock | None = None) -> None:
     try:
         table = _read_table(folder)
         trials = {info.trial: info for info in table.trials}
-        for journal in journals_of(folder):
+        for journal in sorted((folder / JOURNAL_FOLDER).glob("*.arrow")):
             path = trial_path(folder, journal.stem)
             if finish_journal(journal, path):
                 trials[journal.stem] = trial_info(path, split=_RECORDED_SPLIT)

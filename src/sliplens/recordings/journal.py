@@ -6,7 +6,7 @@ Each frame is passed to the system before the next is taken: a process that is k
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 
 import msgspec
@@ -20,7 +20,7 @@ from sliplens.files import parse_json, require_file
 from sliplens.images import encode_png, read_image
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.labelling import Labelling, ReferenceChoice
-from sliplens.recordings.store import ROW_GROUP, decode_pixels, encode_pixels, forces_path, save_forces, write_trial
+from sliplens.recordings.store import decode_pixels, encode_pixels, forces_path, save_forces, write_trial
 from sliplens.recordings.trial import TrialFacts, labels_of_margins
 
 JOURNAL_FOLDER = "recording"  #: Folder of a data set with the journals of recordings that run or were cut off.
@@ -39,7 +39,6 @@ class JournalHeader:
 
     facts: TrialFacts
     source: str  #: Camera, stream or file.
-    simulated: bool
     size: tuple[int, int]  #: Height and width of the frames, in pixels.
     forces: str | None = None  #: Source of the forces; None where there is none.
 
@@ -82,11 +81,6 @@ def lock_journals(data: Path) -> FileLock:
     return lock
 
 
-def journals_of(data: Path) -> list[Path]:
-    """List the journals of a data set that are no trials yet."""
-    return sorted((data / JOURNAL_FOLDER).glob("*.arrow"))
-
-
 def finish_journal(journal: Path, trial: Path) -> bool:
     """Make a trial, and the file of its force samples, of a journal; False where it holds no complete frame."""
     require_file(journal, missing="move it away")
@@ -122,7 +116,7 @@ def finish_journal(journal: Path, trial: Path) -> bool:
                 save_forces(forces, forces_path(trial.parent.parent, trial.stem))
             write_trial(
                 trial,
-                iter(lambda: list(islice(images, ROW_GROUP)), []),
+                images,
                 facts=header.facts,
                 time_s=numbers.column("time_s").to_numpy(),
                 labels=replace(labels_of_margins(numbers.column("safety_margin").to_numpy()), labelling=labelling),

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from hashlib import sha256
-from itertools import islice
+from itertools import accumulate, islice, pairwise
 from math import prod
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -45,12 +45,6 @@ def encode_pixels(pixels: Pixels) -> bytes:
     rows[1:] -= pixels[:-1]
     # a copy of the right size: bytes that shrink in place leave holes, and memory would grow with every frame
     return pa.compress(rows, codec="zstd").to_pybytes()
-
-
-def encode_frames(frames: Iterable[Pixels]) -> Iterator[list[bytes]]:
-    """Encode frames in threads while the next are made; yields them in chunks of a row group."""
-    images = in_turn(encode_pixels, frames)
-    yield from iter(lambda: list(islice(images, ROW_GROUP)), [])
 
 
 def in_turn(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
@@ -156,7 +150,7 @@ def save_recording(recording: Recording, path: Path) -> None:
     """Write a trial as one Parquet file with lossless images; complete or not at all."""
     write_trial(
         path,
-        encode_frames(recording.frames),
+        in_turn(encode_pixels, recording.frames),
         facts=recording,
         time_s=recording.time_s,
         labels=recording,
@@ -167,7 +161,7 @@ def save_recording(recording: Recording, path: Path) -> None:
 
 def write_trial(
     path: Path,
-    images: Iterable[list[bytes]],
+    images: Iterable[bytes],
     *,
     facts: TrialFacts,
     time_s: Float[np.ndarray, " frames"],
@@ -186,8 +180,7 @@ def write_trial(
         truth_header = TruthHeader(recipe=truth.recipe, displacement=truth.displacement, marker_rest_px=rest)
         columns |= {name: getattr(truth, name) for name in _TRUTH_SIGNALS}
         columns["marker_px"] = pa.FixedSizeListArray.from_arrays(truth.marker_px.ravel(), list_size=2 * len(rest))
-        maps = [encoded for chunk in encode_frames(truth.contact_map) for encoded in chunk]
-        columns["contact_map"] = pa.array(maps, type=pa.binary())
+        columns["contact_map"] = pa.array(list(in_turn(encode_pixels, truth.contact_map)), type=pa.binary())
     height, width, _ = reference.shape
     stored = {name: getattr(facts, name) for name in _FACTS} | {"frames": len(time_s), "height": height, "width": width}
     header = TrialHeader(**stored, labelling=labels.labelling, truth=truth_header)
@@ -197,16 +190,15 @@ def write_trial(
             metadata[key] = encode_png(image)
     table = pa.table({"frame": np.arange(len(time_s)), **columns})
     schema = pa.schema([*table.schema, pa.field("image", pa.binary())], metadata)
-    written = 0
+    images = iter(images)
     with (
         whole_file(path) as part,
         # the images, nearly all of the file, neither compress further nor repeat
         pq.ParquetWriter(part, schema, compression="none", use_dictionary=False) as writer,
     ):
-        for chunk in images:
-            rows = table.slice(written, len(chunk)).append_column("image", pa.array(chunk, pa.binary()))
-            writer.write_table(rows.combine_chunks())
-            written += len(chunk)
+        for first in range(0, len(table), ROW_GROUP):
+            chunk = pa.array(islice(images, ROW_GROUP), pa.binary())
+            writer.write_table(table.slice(first, ROW_GROUP).append_column("image", chunk).combine_chunks())
 
 
 def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Recording:
@@ -247,16 +239,15 @@ _MOST_BYTES = 2**35  # of the pixels of a trial that is read at once
 
 def stream_frames(path: Path, places: Collection[int] | None = None) -> Iterator[Frame]:
     """Yield the frames of a stored trial, all or those of some places, with one row group in memory."""
-    first = 0
     with _open(path) as (file, header, _):
-        for group in range(file.num_row_groups):
-            rows = range(first, first + file.metadata.row_group(group).num_rows)
-            inside = [place for place in rows if places is None or place in places]
-            images = file.read_row_group(group, columns=["image"]).column("image") if inside else None
+        sizes = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
+        for group, (first, stop) in enumerate(pairwise(accumulate(sizes, initial=0))):
+            if not (inside := [place for place in range(first, stop) if places is None or place in places]):
+                continue
+            images = file.read_row_group(group, columns=["image"]).column("image")
             for place in inside:
                 where, size = f"frame {place} of {path}", (header.height, header.width, 3)
                 yield decode_pixels(images[place - first].as_buffer(), size=size, where=where)
-            first = rows.stop
 
 
 def read_frames(path: Path, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:

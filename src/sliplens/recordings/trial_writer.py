@@ -24,7 +24,6 @@ from sliplens.recordings.labels import Reason, choose_reference, describe_repeat
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.store import (
-    ROW_GROUP,
     decode_pixels,
     encode_pixels,
     forces_path,
@@ -177,7 +176,7 @@ def import_trial(
             save_forces(capture.forces, forces_file)
         write_trial(
             path,
-            footage.chunks(),
+            footage.images(),
             facts=capture,
             time_s=capture.frame_time_s,
             labels=replace(labels, labelling=labelling),
@@ -221,10 +220,9 @@ class _Footage:
             where = f"frame {place} of {self.capture.source}"
             yield decode_pixels(self._image(place), size=(*self.capture.frame_size, 3), where=where)
 
-    def chunks(self) -> Iterator[list[bytes]]:
-        """Yield the encoded frames in chunks of a row group."""
-        for first in range(0, len(self.capture), ROW_GROUP):
-            yield [self._image(place) for place in range(first, min(first + ROW_GROUP, len(self.capture)))]
+    def images(self) -> Iterator[bytes]:
+        """Yield the encoded frames."""
+        return map(self._image, range(len(self.capture)))
 
 
 def _choose_reference(

@@ -115,16 +115,16 @@ def _write_trial(bag: _Bag, capture: Capture) -> None:
     def write_image(topic: str, stamp_ns: int, png: bytes) -> None:
         bag.write(topic, stamp_ns, format="png", data=np.frombuffer(png, dtype=np.uint8))
 
-    def vector(x: float, y: float, z: float) -> object:
-        return bag.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+    def vector(xyz: Sequence[float]) -> object:
+        return bag.make("geometry_msgs/msg/Vector3", **dict(zip("xyz", xyz, strict=True)))
 
-    write_image(REFERENCE, *_stamps_ns([first_s], offset_s), encode_png(capture.reference))
+    write_image(REFERENCE, _stamps_ns([first_s], offset_s)[0], encode_png(capture.reference))
     wrenches = zip(_stamps_ns(forces.time_s, offset_s), forces.force_n.tolist(), strict=True) if forces else ()
     pngs = (png for _, batch in encode_batches(capture.read_frames()) for png in batch)
     frames = zip(_stamps_ns(capture.frame_time_s, offset_s), enumerate(pngs), strict=True)
     for stamp_ns, content in merge(wrenches, frames, key=itemgetter(0)):
         if isinstance(content, list):
-            force, torque = vector(*content), vector(0.0, 0.0, 0.0)
+            force, torque = vector(content), vector((0.0, 0.0, 0.0))
             bag.write(WRENCH, stamp_ns, wrench=bag.make("geometry_msgs/msg/Wrench", force=force, torque=torque))
             continue
         index, png = content
