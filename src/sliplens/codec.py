@@ -293,7 +293,16 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
         absent = NoneType in get_args(declared[name]) and content.get(name, ...) is None
         values[name] = None if absent else _load_columns(folder / f"{name}.parquet", table, cure)
     path = folder / ARRAYS_FILE
-    stored = _load_arrays(path, cure) if arrays else {}
+    stored = {}
+    if arrays:
+        room = max(_MOST_REPEATED, MOST_TIMES * require_file(path, missing=cure))
+        try:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+                if (expanded := sum(info.file_size for info in archive.zip.infolist())) > room:
+                    raise InputError(f"{path} claims arrays of {expanded:,} bytes; {cure}")
+                stored = dict(archive)
+        except ARRAY_DAMAGE as error:
+            raise InputError(f"{path} cannot be read as arrays ({one_line(error)}); {cure}") from None
     with jaxtyped("context"):  # "frames" of one array are as many as "frames" of another
         for name, hint in arrays.items():
             mapping = _inner(hint) is not hint
@@ -470,17 +479,6 @@ ARRAY_DAMAGE = (
     tokenize.TokenError,
 )  # fmt: skip
 """Errors of NumPy on a damaged array or archive."""
-
-
-def _load_arrays(path: Path, cure: str) -> dict[str, np.ndarray]:
-    room = max(_MOST_REPEATED, MOST_TIMES * require_file(path, missing=cure))
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            if (expanded := sum(info.file_size for info in archive.zip.infolist())) > room:
-                raise InputError(f"{path} claims arrays of {expanded:,} bytes; {cure}")
-            return dict(archive)
-    except ARRAY_DAMAGE as error:
-        raise InputError(f"{path} cannot be read as arrays ({one_line(error)}); {cure}") from None
 
 
 TABLE_SUFFIXES = (".parquet", ".csv", ".json")  #: Endings of the tables that can be written.

@@ -224,13 +224,25 @@ def load_recording(path: Path, *, truth: bool = True, pixels: bool = True) -> Re
             images = _decode(table.column("image"), size, f"of {path}")
         else:
             images = np.broadcast_to(reference, (frames, *size))
+        if exact is not None:
+            rest = np.array(exact.marker_rest_px, dtype=np.float32).reshape(-1, 2)
+            # a trial is read as one chunk or many, as Arrow likes
+            places = table.column("marker_px").combine_chunks().flatten().to_numpy().astype(np.float32)
+            exact = GroundTruth(
+                recipe=exact.recipe,
+                displacement=exact.displacement,
+                marker_rest_px=rest,
+                marker_px=places.reshape(frames, *rest.shape),
+                contact_map=_decode(table.column("contact_map"), size[:2], f"(contact map) of {path}"),
+                **{name: table.column(name).to_numpy().astype(np.float64) for name in _TRUTH_SIGNALS},
+            )
         return Recording(
             **{name: getattr(header, name) for name in _FACTS},
             **labels,
             labelling=header.labelling,
             reference=reference,
             frames=images,
-            truth=None if exact is None else _read_truth(table, exact, size[:2], path),
+            truth=exact,
         )
 
 
@@ -268,20 +280,6 @@ def hash_frames(path: Path) -> str:
         ends = [file.read_row_group(group, columns=["image"]).column("image")[at] for group, at in ((0, 0), (last, -1))]
         images = [metadata[b"reference"], *(end.as_py() for end in ends)]
         return hash_json([header.frames, *(sha256(image).hexdigest() for image in images)])
-
-
-def _read_truth(table: pa.Table, header: TruthHeader, size: tuple[int, ...], path: Path) -> GroundTruth:
-    rest = np.array(header.marker_rest_px, dtype=np.float32).reshape(-1, 2)
-    # a trial is read as one chunk or many, as Arrow likes
-    flat = table.column("marker_px").combine_chunks().flatten()
-    return GroundTruth(
-        recipe=header.recipe,
-        displacement=header.displacement,
-        marker_rest_px=rest,
-        marker_px=flat.to_numpy().astype(np.float32).reshape(table.num_rows, *rest.shape),
-        contact_map=_decode(table.column("contact_map"), size, f"(contact map) of {path}"),
-        **{name: table.column(name).to_numpy().astype(np.float64) for name in _TRUTH_SIGNALS},
-    )
 
 
 def _decode(images: pa.ChunkedArray, size: tuple[int, ...], where: str) -> UInt8[np.ndarray, "frames ..."]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from jaxtyping import Bool
 from threadpoolctl import threadpool_limits
 
 from sliplens.codec import RESULT_FILE, load_record, save_record
@@ -154,7 +153,15 @@ def import_trial(
                     basis = replace(basis, doubts=(*basis.doubts, doubt))
             elif settings.mu is not None and not labels.labelled.any():
                 labels = label_by_friction(labels, settings.mu)
-            reference, choice = _choose_reference(footage, settings=settings, untouched=untouched)
+            index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
+            if capture.reference is not None and index is None:
+                method = "came with the recording" if untouched is None else "recorded apart from the frames"
+                reference, choice = capture.reference, capture.reference_choice or ReferenceChoice(method=method)
+            else:
+                of_forces = np.zeros(len(capture), dtype=np.bool_) if untouched is None else untouched
+                choice = choose_reference(footage.read, of_forces, index=index)
+                choice = choice if untouched is not None else replace(choice, contact_energy=None)
+                (reference,) = footage.read([choice.index or 0])
         except RecordingError as error:
             raise RecordingError(f"{capture.source}: {error}") from None
         first = None
@@ -223,21 +230,3 @@ class _Footage:
     def images(self) -> Iterator[bytes]:
         """Yield the encoded frames."""
         return map(self._image, range(len(self.capture)))
-
-
-def _choose_reference(
-    footage: _Footage, *, settings: LabelSettings, untouched: Bool[np.ndarray, " frames"] | None
-) -> tuple[Frame, ReferenceChoice]:
-    """Return the image of the untouched sensor: the one named, the recorded one, or one of the untouched frames."""
-    capture = footage.capture
-    index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
-    if capture.reference is not None and index is None:
-        method = "came with the recording" if untouched is None else "recorded apart from the frames"
-        return capture.reference, capture.reference_choice or ReferenceChoice(method=method)
-    of_forces = np.zeros(len(capture), dtype=np.bool_) if untouched is None else untouched
-    choice = choose_reference(footage.read, of_forces, index=index)
-    if untouched is None:
-        choice = replace(choice, contact_energy=None)
-    assert choice.index is not None
-    (image,) = footage.read([choice.index])
-    return image, choice

@@ -27,22 +27,22 @@ _LEAST_FORCE_N = 1e-9  #: Forces below it are none: the sensor is untouched.
 
 
 def find_states(path: Path) -> Path | None:
-    """Find the table of stills that a path is, or the only one in a folder: a column of files, forces beside it."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    tables = [file for file in files if file.suffix.lower() in _SUFFIXES and file.is_file() and _lists_stills(file)]
+    """Find the table of stills that a path is, or the only one in a folder: a column of files, forces beside it.
+
+    Its first row names an image that exists; a number of a frame is no file.
+    """
+    tables = []
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        with suppress(RecordingError, OSError):
+            if file.suffix.lower() in _SUFFIXES and file.is_file():
+                table = open_text_table(file)
+                column, row = guess_name_column(table.header), next(table.rows, None)
+                if column is not None and row is not None:
+                    choose_force_columns(table, ReadOptions())
+                    listed = row[1][table.header.index(column)]
+                    find_image(listed, str(file), folder=file.parent, root=file.parent)
+                    tables.append(file)
     return tables[0] if len(tables) == 1 else None
-
-
-def _lists_stills(path: Path) -> bool:
-    """Return True for a table whose first row names an image that exists; a number of a frame is no file."""
-    with suppress(RecordingError, OSError):
-        table = open_text_table(path)
-        column, row = guess_name_column(table.header), next(table.rows, None)
-        if column is not None and row is not None:
-            choose_force_columns(table, ReadOptions())
-            find_image(row[1][table.header.index(column)], str(path), folder=path.parent, root=path.parent)
-            return True
-    return False
 
 
 def read_stills(path: Path, options: ReadOptions) -> Capture:
