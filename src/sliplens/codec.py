@@ -414,7 +414,7 @@ def read_parquet(
 _LARGEST = 1e12  # no stage measures more of anything, infinity among them; seconds since 1970 are 2e9
 
 
-def _array_hints(kind: type) -> dict[str, Any]:
+def _array_hints(kind: type) -> dict[str, object]:
     """Return the declarations of the fields of arrays, `X` or `Mapping[str, X]`."""
 
     def is_array(hint: object) -> bool:

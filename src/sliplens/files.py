@@ -31,7 +31,7 @@ MANIFEST_FILE = "manifest.json"  #: Facts of a network; its folder is one that h
 def remove(path: Path) -> None:
     """Remove a file, or a folder with all in it, if it exists; a folder disappears at once even if killed meanwhile."""
     aside = path.with_name(f".{path.name}.removed")
-    _drop(aside)
+    shutil.rmtree(aside, ignore_errors=True)
     if path.is_dir():
         path.rename(aside)
         shutil.rmtree(aside)
@@ -329,7 +329,7 @@ def output_folder(
         if replaced.exists():  # the process that replaced it was killed, before or after the new one took its place
             remove(replaced) if target.exists() else replaced.rename(target)
         if _is_complete(target, config_hash, overwrite=overwrite):
-            _drop(partial)
+            shutil.rmtree(partial, ignore_errors=True)
             yield Output(folder=target, complete=True)
             return
         recipe_file = partial / ".recipe"
@@ -341,10 +341,10 @@ def output_folder(
             yield Output(folder=partial, complete=False)
         except BaseException:
             if not resumable or not any(path.is_file() and path != recipe_file for path in partial.rglob("*")):
-                _drop(partial)
+                shutil.rmtree(partial, ignore_errors=True)
             raise
         if not recipe_file.exists():
-            _drop(partial)
+            shutil.rmtree(partial, ignore_errors=True)
             raise InputError(f"{partial} was removed while {target} was being made; give the command again")
         now, used = datetime.now(UTC).isoformat(timespec="seconds"), versions()
         provenance = Provenance(
@@ -355,7 +355,7 @@ def output_folder(
         if target.exists():
             target.rename(replaced)
         partial.rename(target)  # one of the two is complete at any moment
-        _drop(replaced)
+        shutil.rmtree(replaced, ignore_errors=True)
 
 
 def _is_complete(target: Path, config_hash: str, *, overwrite: bool) -> bool:
@@ -370,7 +370,3 @@ def _is_complete(target: Path, config_hash: str, *, overwrite: bool) -> bool:
     if not (isinstance(provenance, dict) and provenance.get("config_hash") == config_hash):
         raise InputError(f"{target} holds a result of other settings; choose another folder or pass --overwrite")
     return True
-
-
-def _drop(folder: Path) -> None:
-    shutil.rmtree(folder, ignore_errors=True)

@@ -243,9 +243,13 @@ def _read_captures(
                 cure = "give one of --times, --frame-rate, --name-unit"
                 raise RecordingError(f"the frames of {source} have no times; {cure}")
             return captures
-        name, where, files = trial_name(source.stem), str(source), (source.name,)
+        name, where = trial_name(source.stem), str(source)
+        files = None if suffix in _ARRAYS else (source.name,)
         source = _load_array(source) if suffix in _ARRAYS else read_image(source)
-    frames, rate = as_frames(source, what="frames" if files is None else f"frames of {where}"), options.frame_rate
+    frames, rate = (
+        as_frames(source, what="frames" if where == Capture.opened else f"frames of {where}"),
+        options.frame_rate,
+    )
     if not len(frames):
         raise InputError("there is no frame; give one or more")
     if strange := [option for option in options.given() if option != "frame_rate"]:

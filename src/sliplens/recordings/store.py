@@ -61,7 +61,7 @@ def in_turn(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Ite
             yield waiting.popleft().result()
 
 
-def decode_pixels(data: bytes | pa.Buffer, *, size: Sequence[int], where: str) -> Pixels:
+def decode_pixels(data: bytes | pa.Buffer | None, *, size: Sequence[int], where: str) -> Pixels:
     """Decode the pixels of an image of known size (height, width, and channels if any)."""
     count = prod(size)
     try:

@@ -79,7 +79,16 @@ def write_lerobot(data: Dataset, trials: Sequence[TrialInfo], folder: Path) -> N
     meta = folder / "meta"
     (meta / "episodes" / "chunk-000").mkdir(parents=True)
     pq.write_table(pa.Table.from_pylist(rows), meta / "episodes" / "chunk-000" / "file-000.parquet")
-    _write_tasks(meta / "tasks.parquet", list(tasks))
+    # a data frame of pandas, whose index is the text of the task
+    table = pa.table(
+        {"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(list(tasks), pa.string())}
+    )
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+        for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    ]
+    index = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
+    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(index)}), meta / "tasks.parquet")
     write_json(meta / "stats.json", total)
     ranges = {split: f"{splits.index(split)}:{splits.index(split) + splits.count(split)}" for split in splits}
     totals = {"total_episodes": len(rows), "total_frames": first, "total_tasks": len(tasks)}
@@ -106,18 +115,19 @@ def _features(trials: Sequence[TrialInfo]) -> Features:
     for info in trials:
         if (info.height, info.width) != (first.height, first.width):
             raise RecordingError(f"trial {info.trial} has other frames, and a LeRobot data set has one size; {_APART}")
-    features: Features = {
-        CAMERA: {"dtype": "image", "shape": [first.height, first.width, 3], "names": ["height", "width", "channels"]},
-        TIME: {"dtype": "float64", "shape": [1], "names": ["time_s"]},
-        FORCE: {"dtype": "float64", "shape": [3], "names": ["tangential_n", "across_n", "normal_n"]},
-        **{key: {"dtype": "float64", "shape": [1], "names": [name]} for name, key in NUMBERS.items()},
-        VALID: {"dtype": "bool", "shape": [1], "names": ["valid"]},
-        STATE: {"dtype": "int64", "shape": [1], "names": ["contact_state"], "info": {"values": _STATES}},
-        REASON: {"dtype": "int64", "shape": [1], "names": ["invalid_reason"]},
-        "timestamp": {"dtype": "float32", "shape": [1], "names": None},
-    }
-    counts = ("frame_index", "episode_index", "index", "task_index")
-    return features | {name: {"dtype": "int64", "shape": [1], "names": None} for name in counts}
+    rows = [
+        (TIME, "float64", ["time_s"]),
+        (FORCE, "float64", ["tangential_n", "across_n", "normal_n"]),
+        *((key, "float64", [name]) for name, key in NUMBERS.items()),
+        *((VALID, "bool", ["valid"]), (STATE, "int64", ["contact_state"]), (REASON, "int64", ["invalid_reason"])),
+        ("timestamp", "float32", None),
+        *((name, "int64", None) for name in ("frame_index", "episode_index", "index", "task_index")),
+    ]
+    camera = {"dtype": "image", "shape": [first.height, first.width, 3], "names": ["height", "width", "channels"]}
+    features: Features = {CAMERA: camera}
+    features |= {name: {"dtype": kind, "shape": [len(names or "1")], "names": names} for name, kind, names in rows}
+    features[STATE]["info"] = {"values": _STATES}
+    return features
 
 
 def _frame_columns(capture: Capture, *, fps: int | float, reasons: dict[str, int]) -> dict[str, np.ndarray]:
@@ -189,17 +199,6 @@ def number_stats(values: Shaped[np.ndarray, "frames *numbers"]) -> Stats:
         **dict(zip(_QUANTILES, np.quantile(exact, list(_QUANTILES.values()), axis=0), strict=True)),
     }
     return {**{name: value.tolist() for name, value in stats.items()}, "count": [len(finite)]}
-
-
-def _write_tasks(path: Path, tasks: Sequence[str]) -> None:
-    """Write the tasks as a data frame of pandas, whose index is their text."""
-    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
-    columns = [
-        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
-        for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
-    ]
-    index = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.2.0"}
-    pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(index)}), path)
 
 
 def _data_schema(features: Features) -> pa.Schema:
