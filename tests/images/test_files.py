@@ -28,26 +28,25 @@ def test_png_in_memory_gives_back_its_pixels(rng: np.random.Generator):
     np.testing.assert_array_equal(read_image(encode_png(pixels), where="a"), pixels)
 
 
-def test_an_image_of_another_size_is_refused(tmp_path: Path):
-    path = save(tmp_path / "a.png", np.zeros((5, 7, 3), np.uint8))
-    with pytest.raises(ImageError, match=r"a\.png is 5 x 7 pixels, 4 x 4 are needed"):
-        read_image(path, size=(4, 4))
-
-
 @pytest.mark.parametrize(
-    ("channels", "message"),
-    [((2,), "colours LA, not RGB; convert it"), ((4,), "colours RGBA, not RGB; drop the alpha")],
+    ("name", "pixels", "message"),
+    [
+        ("a.png", np.zeros((5, 7, 2), np.uint8), r"a\.png has the colours LA, not RGB; convert"),
+        ("a.png", np.zeros((5, 7, 4), np.uint8), r"a\.png has the colours RGBA, not RGB; drop the alpha"),
+        ("a.png", np.zeros((5, 7, 3), np.uint8), r"a\.png is 5 x 7 pixels, 4 x 4 are needed"),
+        ("a.tiff", np.full((5, 7), 40_000, np.uint16), r"a\.tiff has 16 bits a channel; divide its levels by 256"),
+    ],
 )
-def test_images_of_other_colours_are_refused(tmp_path: Path, channels: tuple[int, ...], message: str):
-    path = save(tmp_path / "a.png", np.zeros((5, 7, *channels), np.uint8))
+def test_images_of_other_colours_or_sizes_are_refused(
+    tmp_path: Path, name: str, pixels: np.ndarray, message: str
+):
     with pytest.raises(ImageError, match=message):
-        read_image(path)
+        read_image(save(tmp_path / name, pixels), size=(4, 4))
 
 
-def test_a_16_bit_tiff_is_refused(tmp_path: Path):
-    path = save(tmp_path / "a.tiff", np.full((5, 7), 40_000, np.uint16))
-    with pytest.raises(ImageError, match=r"a\.tiff has 16 bits a channel; divide its levels by 256"):
-        read_image(path)
+def test_a_grey_image_is_repeated_in_all_channels(tmp_path: Path, rng: np.random.Generator):
+    grey = rng.integers(0, 256, (5, 7), dtype=np.uint8)
+    np.testing.assert_array_equal(read_image(save(tmp_path / "a.png", grey)), np.stack([grey] * 3, axis=-1))
 
 
 def test_what_is_no_whole_image_is_refused(tmp_path: Path, rng: np.random.Generator):

@@ -4,14 +4,14 @@ import shlex
 import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 from filelock import FileLock
 
-from sliplens.codec import Result, from_builtins, save_record
+from sliplens.codec import Result, from_builtins
 from sliplens.errors import RecordingError
-from sliplens.files import hash_file, hash_json, read_json, require_folder, whole_file
+from sliplens.files import hash_file, hash_json, read_json, require_folder, whole_file, write_json
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
 from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, finish_journal, lock_journals
 from sliplens.recordings.labelling import Labelling
@@ -38,16 +38,6 @@ class LeftOut:
     trial: str  #: Name that its trial would have.
     source: str  #: File or folder.
     why: str  #: Error and its cure.
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Table:
-    """Contents of `dataset.json`."""
-
-    schema_version: int = SCHEMA_VERSION
-    simulated: bool = False
-    trials: tuple[TrialInfo, ...]
-    left_out: tuple[LeftOut, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,15 +107,15 @@ def load_dataset(folder: Dataset | Path | str) -> Dataset:
     if isinstance(folder, Dataset):
         return folder
     folder = require_folder(Path(folder), what="the data set")
-    table, unfinished = _read_table(folder), ""
+    data, unfinished = _read(folder), ""
     if (folder / JOURNAL_FOLDER).is_dir():
         cure = f"stop it, or finish it with `{shlex.join(['sliplens', 'recover', str(folder)])}`"
         unfinished = f"{folder} holds a recording that still runs or was cut off; {cure}"
-    if not table.trials:
+    if not data.trials:
         raise RecordingError(unfinished or f"{folder} lists no trials; make or import a data set first")
     if unfinished:
         add_note(unfinished)
-    return Dataset(folder=folder, trials=table.trials, simulated=table.simulated, left_out=table.left_out)
+    return data
 
 
 def recover_dataset(folder: Path | str, *, on_progress: OnProgress | None = None) -> Dataset:
@@ -144,13 +134,13 @@ def recover_dataset(folder: Path | str, *, on_progress: OnProgress | None = None
         return load_dataset(folder)
 
 
-def _read_table(folder: Path) -> _Table:
+def _read(folder: Path) -> Dataset:
     path = folder / DATASET_FILE
     missing = f"make a data set of recordings with `sliplens import {folder} -o DATA`, and name that"
     values = read_json(path, missing=missing)
     if not isinstance(values, dict) or values.get("schema_version") != SCHEMA_VERSION:
         raise RecordingError(f"{path} is not a sliplens data set of schema {SCHEMA_VERSION}; make it again")
-    return from_builtins(values, _Table, where=path, command="sliplens import")
+    return from_builtins({**values, "folder": str(folder)}, Dataset, where=path, command="sliplens import")
 
 
 def begin_recording(folder: Path, *, simulated: bool) -> tuple[FileLock, tuple[str, ...]]:
@@ -163,13 +153,13 @@ def begin_recording(folder: Path, *, simulated: bool) -> tuple[FileLock, tuple[s
     if exists and (folder / JOURNAL_FOLDER).is_dir():
         finish_recording(folder)
         exists = (folder / DATASET_FILE).is_file()  # removed where nothing had been recorded
-    table = _read_table(folder) if exists else _Table(trials=(), simulated=simulated)
+    table = _read(folder) if exists else Dataset(folder=folder, trials=(), simulated=simulated)
     if table.simulated != simulated:
         kinds = ("simulated", "real") if table.simulated else ("real", "simulated")
         raise RecordingError(f"{folder} holds {kinds[0]} trials, these are {kinds[1]}; choose another folder")
     lock = lock_journals(folder)
     # also without a trial: whoever opens the folder sees a data set, and recovers it if it was cut off
-    save_record(table, folder / DATASET_FILE)
+    write_dataset_table(folder, table.trials, simulated=simulated, left_out=table.left_out)
     return lock, tuple(info.trial for info in table.trials)
 
 
@@ -177,13 +167,13 @@ def finish_recording(folder: Path, lock: FileLock | None = None) -> None:
     """Make trials of the journals of a data set; a data set without a trial is removed."""
     lock = lock or lock_journals(folder)
     try:
-        table = _read_table(folder)
+        table = _read(folder)
         trials = {info.trial: info for info in table.trials}
         for journal in sorted((folder / JOURNAL_FOLDER).glob("*.arrow")):
             path = trial_path(folder, journal.stem)
             if finish_journal(journal, path):
                 trials[journal.stem] = trial_info(path, split=_RECORDED_SPLIT)
-        save_record(replace(table, trials=tuple(trials.values())), folder / DATASET_FILE)
+        write_dataset_table(folder, [*trials.values()], simulated=table.simulated, left_out=table.left_out)
         shutil.rmtree(folder / JOURNAL_FOLDER)
     finally:
         lock.release()
@@ -238,5 +228,5 @@ def write_dataset_table(
     folder: Path, trials: Sequence[TrialInfo], *, simulated: bool = False, left_out: Sequence[LeftOut] = ()
 ) -> None:
     """Write `dataset.json`, the last file of a data set."""
-    table = _Table(trials=tuple(trials), simulated=simulated, left_out=tuple(left_out))
-    save_record(table, folder / DATASET_FILE)
+    table = {"schema_version": SCHEMA_VERSION, "simulated": simulated, "trials": [*trials], "left_out": [*left_out]}
+    write_json(folder / DATASET_FILE, table)

@@ -2,9 +2,8 @@
 
 import os
 import re
-from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -51,14 +50,14 @@ def in_turn(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Ite
     """Apply a function in threads while the next items are made; yields the results in the order of the items."""
     cores = os.environ.get("OMP_NUM_THREADS", "")  # of this process, where several work
     workers = int(cores) if cores.isdigit() and int(cores) else os.cpu_count() or 1
-    waiting: deque[Future[_Result]] = deque()
+    items = iter(items)
+    waiting: Iterator[_Result] = iter(())
     with ThreadPoolExecutor(workers) as pool:
-        for item in items:
-            waiting.append(pool.submit(function, item))
-            if len(waiting) == 2 * workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
+        while batch := list(islice(items, workers)):
+            ahead = pool.map(function, batch)
+            yield from waiting
+            waiting = ahead
+        yield from waiting
 
 
 def decode_pixels(data: bytes | pa.Buffer | None, *, size: Sequence[int], where: str) -> Pixels:

@@ -1,7 +1,6 @@
 """Data sets written here in the layout of LeRobot v3.0 come back as they were; others are refused."""
 
 import contextlib
-import io
 import json
 from collections.abc import Callable
 from fractions import Fraction
@@ -13,10 +12,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
 from readers import read_lerobot, refused
 
 from sliplens.errors import InputError, RecordingError
+from sliplens.images import encode_png
 
 FPS = 30
 HEIGHT, WIDTH = 48, 64
@@ -41,12 +40,6 @@ def write_video(path: Path, frames: np.ndarray, *, codec: str, pix_fmt: str, opt
             frame.pts, frame.time_base = index, Fraction(1, FPS)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
-
-
-def png(pixels: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
-    return buffer.getvalue()
 
 
 def write_info(folder: Path, edit: Edit | None = None) -> None:
@@ -105,7 +98,7 @@ def write_dataset(
             "observation.state": pa.array(wrenches[own][:, :2].tolist()),
         }
         if images:
-            columns[CAMERA] = [{"bytes": png(pixels), "path": "frame.png"} for pixels in frames[own]]
+            columns[CAMERA] = [{"bytes": encode_png(pixels), "path": "frame.png"} for pixels in frames[own]]
         else:
             for key, shown in ((CAMERA, frames), (SCENE, 255 - frames)):
                 write_video(folder / "videos" / key / f"{place}.mp4", shown[own], **coding)
@@ -185,8 +178,8 @@ def test_a_damaged_image_in_parquet_is_refused(tmp_path, frames, wrenches):
     refusals = {
         b"": "is not in the file; embed the images",
         cells[3]["bytes"][:900]: "cannot be read as an image",
-        png(frames[0][:-1]): "is of another size than the first",
-        png(np.zeros((HEIGHT, WIDTH, 4), np.uint8)): "has the colours RGBA",
+        encode_png(frames[0][:-1]): "is of another size than the first",
+        encode_png(np.zeros((HEIGHT, WIDTH, 4), np.uint8)): "has the colours RGBA",
     }
     for data, message in refusals.items():
         cells[3]["bytes"] = data

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,10 +13,12 @@ from jaxtyping import Int64, Shaped
 
 from sliplens.errors import RecordingError
 from sliplens.files import write_json
+from sliplens.images import encode_png
 from sliplens.progress import report_each, report_progress
-from sliplens.recordings.capture import Capture
+from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import Dataset, TrialInfo
-from sliplens.recordings.formats.stored import encode_batches, fill_labels, read_stored_trial
+from sliplens.recordings.formats.stored import fill_labels, read_stored_trial
+from sliplens.recordings.store import in_turn
 from sliplens.recordings.trial import ContactState
 
 CAMERA, TIME, FORCE = "observation.images.tactile", "observation.time_s", "observation.force"
@@ -27,6 +30,7 @@ NUMBERS = {
 VALID, STATE, REASON = "observation.valid", "observation.contact_state", "observation.invalid_reason"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _CHUNK_FILES = 1000
+_BATCH = 16  # frames that are written together
 _APART = "export them apart"
 _STATES = [str(state) for state in ContactState]
 _IMAGE = pa.struct({"bytes": pa.binary(), "path": pa.string()})
@@ -151,6 +155,11 @@ def _write_episode(
     path: Path, schema: pa.Schema, columns: Mapping[str, np.ndarray], capture: Capture
 ) -> Int64[np.ndarray, "3 256"]:
     """Write the frames of a trial as one data file; return how often each channel has each level."""
+
+    def encode(frame: Frame) -> tuple[bytes, Int64[np.ndarray, "3 256"]]:
+        levels = [np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)]
+        return encode_png(frame), np.array(levels)
+
     path.parent.mkdir(parents=True, exist_ok=True)
     arrays = {}
     for name, values in columns.items():
@@ -158,9 +167,10 @@ def _write_episode(
         arrays[name] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]) if values.ndim == 2 else flat
     counts, done = np.zeros((3, 256), dtype=np.int64), 0
     with pq.ParquetWriter(path, schema, compression="snappy", use_dictionary=False) as writer:
-        for frames, pngs in encode_batches(capture.read_frames()):
-            for frame in frames:
-                counts += [np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)]
+        images = in_turn(encode, capture.read_frames())
+        while batch := list(islice(images, _BATCH)):
+            pngs = [png for png, _ in batch]
+            counts += sum(levels for _, levels in batch)
             names = pa.array([f"frame-{done + index:06d}.png" for index in range(len(pngs))])
             batch = {name: array.slice(done, len(pngs)) for name, array in arrays.items()}
             batch[CAMERA] = pa.StructArray.from_arrays([pa.array(pngs, pa.binary()), names], ["bytes", "path"])

@@ -17,7 +17,8 @@ from sliplens.images import encode_png
 from sliplens.progress import report_each, report_progress
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import Dataset, TrialInfo
-from sliplens.recordings.formats.stored import encode_batches, fill_labels, read_stored_trial
+from sliplens.recordings.formats.stored import fill_labels, read_stored_trial
+from sliplens.recordings.store import in_turn
 from sliplens.recordings.trial import LABEL_SIGNALS
 
 if TYPE_CHECKING:
@@ -120,7 +121,7 @@ def _write_trial(bag: _Bag, capture: Capture) -> None:
 
     write_image(REFERENCE, _stamps_ns([first_s], offset_s)[0], encode_png(capture.reference))
     wrenches = zip(_stamps_ns(forces.time_s, offset_s), forces.force_n.tolist(), strict=True) if forces else ()
-    pngs = (png for _, batch in encode_batches(capture.read_frames()) for png in batch)
+    pngs = in_turn(encode_png, capture.read_frames())
     frames = zip(_stamps_ns(capture.frame_time_s, offset_s), enumerate(pngs), strict=True)
     for stamp_ns, content in merge(wrenches, frames, key=itemgetter(0)):
         if isinstance(content, list):

@@ -1,21 +1,15 @@
 """Data sets of sliplens as recordings."""
 
-from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from sliplens.images import encode_png
-from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, trial_path
 from sliplens.recordings.store import forces_path, load_forces, load_recording, stream_frames
 from sliplens.recordings.trial import Labels, TrialFacts
-
-_BATCH = 16  # frames that are encoded side by side
 
 
 def read_stored(folder: Path) -> list[Capture]:
@@ -47,13 +41,6 @@ def read_stored_trial(data: Dataset, info: TrialInfo, *, samples: bool = True) -
         split=info.split,
         simulated=data.simulated,
     )
-
-
-def encode_batches(frames: Iterator[Frame]) -> Iterator[tuple[list[Frame], list[bytes]]]:
-    """Iterate over batches of frames and their PNG images; the images of a batch are encoded in threads."""
-    with ThreadPoolExecutor() as pool:
-        while batch := list(islice(frames, _BATCH)):
-            yield batch, list(pool.map(encode_png, batch))
 
 
 def fill_labels(labels: Labels) -> Labels:
