@@ -47,7 +47,8 @@ def export_lerobot(
     from sliplens.recordings.formats.lerobot_export import write_lerobot  # noqa: PLC0415 (PyAV comes with it)
 
     with reporting(on_progress):
-        return _export(write_lerobot, data, Path(out), trials=trials, overwrite=overwrite)
+        run_file = "meta/sliplens/run.json"
+        return _export(write_lerobot, data, Path(out), trials=trials, overwrite=overwrite, run_file=run_file)
 
 
 def export_mcap(
@@ -75,7 +76,7 @@ def export_mcap(
     from sliplens.recordings.formats.mcap import write_mcap  # noqa: PLC0415 (ROS messages come with it)
 
     with reporting(on_progress):
-        return _export(write_mcap, data, Path(out), trials=trials, overwrite=overwrite)
+        return _export(write_mcap, data, Path(out), trials=trials, overwrite=overwrite, run_file="run.json")
 
 
 def _export(
@@ -85,12 +86,15 @@ def _export(
     *,
     trials: Sequence[str] | None,
     overwrite: bool,
+    run_file: str,
 ) -> Export:
     data = load_dataset(data)
     chosen = tuple(data.find(trial) for trial in dict.fromkeys(trials)) if trials else data.trials
     names, frames = tuple(info.trial for info in chosen), sum(info.frames for info in chosen)
     config = {"format": write.__name__, "data_hash": data.hash, "trials": list(names)}
-    with output_folder(folder, stage="export", config=config, overwrite=overwrite, resumable=False) as output:
+    with output_folder(
+        folder, stage="export", config=config, overwrite=overwrite, run_file=run_file, resumable=False
+    ) as output:
         if not output.complete:
             with open_stage("Writing frames"):
                 write(data, chosen, output.folder)
