@@ -310,7 +310,8 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
             for key in keys:
                 if key not in stored:
                     raise InputError(f"{path} lacks {key!r}; {cure}")
-                _require_array(stored[key], _inner(hint), name=key, path=path, cure=cure)
+                fits = isinstance(stored[key], _kind(_inner(hint)))
+                _require_array(stored[key], _inner(hint), fits=fits, name=key, path=path, cure=cure)
             values[name] = {key[len(name) + 1 :]: stored[key] for key in keys} if mapping else stored[name]
     try:
         return kind(**values)
@@ -417,12 +418,11 @@ _LARGEST = 1e12  # no stage measures more of anything, infinity among them; seco
 def _array_hints(kind: type) -> dict[str, object]:
     """Return the declarations of the fields of arrays, `X` or `Mapping[str, X]`."""
 
-    def is_array(hint: object) -> bool:
-        kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    def is_array(kind: object) -> bool:
         return isinstance(kind, type) and (issubclass(kind, AbstractArray) or kind is np.ndarray)
 
     hints = get_type_hints(kind, include_extras=True)
-    return {name: hint for name, hint in hints.items() if is_array(_inner(hint))}
+    return {name: hint for name, hint in hints.items() if is_array(_kind(_inner(hint)))}
 
 
 def _inner(hint: Any) -> Any:
@@ -430,15 +430,19 @@ def _inner(hint: Any) -> Any:
     return get_args(hint)[1] if get_origin(hint) in {dict, Mapping} else hint
 
 
+def _kind(hint: Any) -> Any:
+    """Return the type of an array without its bounds."""
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
+
+
 def _words_of(hint: Any) -> str:
-    kind = get_args(hint)[0] if get_origin(hint) is Annotated else hint
-    return getattr(kind, "__name__", str(kind)).replace("ndarray, ", "")
+    return getattr(_kind(hint), "__name__", str(hint)).replace("ndarray, ", "")
 
 
-def _require_array(values: np.ndarray, hint: Any, *, name: str, path: Path, cure: str) -> None:
-    """Check type, shape (in the caller's context of sizes) and bounds of an array against its declaration."""
-    kind, *facts = get_args(hint) if get_origin(hint) is Annotated else [hint]
-    if not isinstance(values, kind):
+def _require_array(values: np.ndarray, hint: Any, *, fits: bool, name: str, path: Path, cure: str) -> None:
+    """Check type and shape, which the caller compares in its own context of sizes, and bounds of an array."""
+    facts = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+    if not fits:
         actual = f"{values.dtype} of shape {values.shape}"
         raise InputError(f"{path} holds {actual} as {name!r} where {_words_of(hint)} belongs; {cure}")
     bounds = next((fact for fact in facts if isinstance(fact, msgspec.Meta)), None)
@@ -467,7 +471,7 @@ def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
         value = np.array(column.to_pylist(), dtype=str) if columns[name] == "texts" else column.to_numpy()
         # a context of its own: "rows" of one table need not be as many as "rows" of another
         with jaxtyped("context"):
-            _require_array(value, hint, name=name, path=path, cure=cure)
+            _require_array(value, hint, fits=isinstance(value, _kind(hint)), name=name, path=path, cure=cure)
         if value.dtype.kind == "f" and (np.abs(value) > _LARGEST).any():
             raise InputError(f"{path} holds {value[np.nanargmax(np.abs(value))]:g} as {name!r}; {cure}")
         values[name] = value
