@@ -278,7 +278,7 @@ def load_result(folder: Path, kind: type[Record], *, command: str) -> Record:
     if not isinstance(content, dict):
         raise InputError(f"{path} holds no JSON object; {cure}")
     declared = get_type_hints(kind, include_extras=True)
-    arrays = _array_hints(kind)
+    arrays = {name: hint for name, hint in declared.items() if _is_array(hint)}
     kinds = {name: get_args(hint) or (hint,) for name, hint in declared.items()}  # of `X` or `X | None`
     tables = {
         name: each[0] for name, each in kinds.items() if isinstance(each[0], type) and issubclass(each[0], Columns)
@@ -415,14 +415,10 @@ def read_parquet(
 _LARGEST = 1e12  # no stage measures more of anything, infinity among them; seconds since 1970 are 2e9
 
 
-def _array_hints(kind: type) -> dict[str, object]:
-    """Return the declarations of the fields of arrays, `X` or `Mapping[str, X]`."""
-
-    def is_array(kind: object) -> bool:
-        return isinstance(kind, type) and (issubclass(kind, AbstractArray) or kind is np.ndarray)
-
-    hints = get_type_hints(kind, include_extras=True)
-    return {name: hint for name, hint in hints.items() if is_array(_kind(_inner(hint)))}
+def _is_array(hint: Any) -> bool:
+    """Return True for the declaration of arrays, `X` or `Mapping[str, X]`."""
+    kind = _kind(_inner(hint))
+    return isinstance(kind, type) and (issubclass(kind, AbstractArray) or kind is np.ndarray)
 
 
 def _inner(hint: Any) -> Any:
@@ -457,7 +453,7 @@ def _require_array(values: np.ndarray, hint: Any, *, fits: bool, name: str, path
 
 
 def _load_columns(path: Path, kind: type[_Columns], cure: str) -> _Columns:
-    hints = _array_hints(kind)
+    hints = {name: hint for name, hint in get_type_hints(kind, include_extras=True).items() if _is_array(hint)}
     words = {name: _words_of(hint) for name, hint in hints.items()}
     columns = {
         name: "true and false" if "Bool" in text else "whole numbers" if "Int" in text else "numbers"
