@@ -12,14 +12,13 @@ from jaxtyping import Float
 from sliplens.errors import InputError
 from sliplens.files import hash_json
 
-LOWEST, HIGHEST = 0.05, 2.0
-"""Range of an unknown coefficient of friction: ice on steel to clean rubber on glass."""
 GRASP_SPREAD = 0.06
 """Standard deviation of an object's friction from grasp to grasp, as a share of it; measured on simulated days."""
 MOST_FRICTION = 20.0
 """Largest coefficient: with more, something sticks, or the number is wrong."""
 LEARNT = "learnt from slips"
 """Note of friction learnt from slips."""
+_LOWEST, _HIGHEST = 0.05, 2.0  # unknown friction: ice on steel to clean rubber on glass
 _REACH = 4.0  # standard deviations to either side that a distribution of friction covers
 _NODES = 400  # values over two decades, in steps of 1 %: finer than any slip shows
 _NEGLIGIBLE = 1e-6
@@ -136,7 +135,7 @@ class Friction:
 
         Exact friction stays; a slip far outside the possible values leaves the nearest of them.
         """
-        if not (math.isfinite(ratio) and ratio > 0 and math.isfinite(sigma) and sigma > 0):
+        if not (0 < ratio < math.inf and 0 < sigma < math.inf):
             raise InputError(
                 f"a slip needs a positive ratio F_t / F_n and a positive sigma, got {ratio:g} and {sigma:g}"
             )
@@ -168,8 +167,7 @@ class Friction:
     @property
     def mean(self) -> float:
         """Expected coefficient of friction."""
-        values, weights = self.nodes
-        return float(values @ weights)
+        return float(np.dot(*self.nodes))
 
     @property
     def sigma(self) -> float:
@@ -277,19 +275,15 @@ def as_friction(friction: FrictionLike) -> Friction:
     if isinstance(friction, Friction):
         return friction
     about = isinstance(friction, str) and "+-" in friction
-    parts = friction if isinstance(friction, tuple) else (friction,)
-    if isinstance(friction, str):
-        parts = friction.split("+-" if about else "..")
+    parts = friction if isinstance(friction, tuple) else str(friction).split("+-" if about else "..")
+    makers = {1: Friction, 2: Friction.about if about else Friction.between}
     try:
         numbers = [float(part) for part in parts]
-    except (TypeError, ValueError):
-        numbers = []
-    if len(numbers) not in {1, 2}:
+        make = makers[len(numbers)]
+    except (TypeError, ValueError, KeyError):
         cure = "give a number such as 0.62, a range such as 0.5..0.8, or mean and spread such as 0.58+-0.05"
-        raise InputError(f"{friction!r} is no friction; {cure}")
-    if len(numbers) == 1:
-        return Friction(numbers[0])
-    return Friction.about(*numbers) if about else Friction.between(*numbers)
+        raise InputError(f"{friction!r} is no friction; {cure}") from None
+    return make(*numbers)
 
 
 def _likely(values: Float[np.ndarray, " values"], weights: Float[np.ndarray, " values"], *, note: str) -> Friction:
@@ -301,7 +295,7 @@ def _likely(values: Float[np.ndarray, " values"], weights: Float[np.ndarray, " v
 
 def _unknown(near: Float[np.ndarray, " values"] | None = None, *, spread: float = GRASP_SPREAD) -> Friction:
     """Return unknown friction, evenly in the logarithm, over a range that covers some values and their spread."""
-    low, high = LOWEST, HIGHEST
+    low, high = _LOWEST, _HIGHEST
     if near is not None and len(near) and np.all((near > 0) & np.isfinite(near)):
         low = min(low, float(near.min()) * math.exp(-_REACH * spread))
         high = min(MOST_FRICTION, max(high, float(near.max()) * math.exp(_REACH * spread)))

@@ -107,8 +107,7 @@ def _draft_row(labels: Recording) -> dict[str, str]:
     labelling, row = labels.labelling, {"valid_frames": str(labels.labelled.sum()), "frames": str(len(labels))}
     if labelling is None:
         return row
-    if labelling.corrections is not None:
-        row |= {name: _cell(getattr(labelling.corrections, name)) for name in _SETTINGS}
+    row |= {name: _cell(getattr(labelling.corrections, name, None)) for name in _SETTINGS}
     current: dict[str, object] = {"reference_frame": labelling.reference.index}
     if (basis := labelling.basis) is not None:
         touching = [state not in (ContactState.NO_CONTACT, ContactState.UNKNOWN) for state in labels.contact_state]

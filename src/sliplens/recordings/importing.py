@@ -103,8 +103,7 @@ def import_recordings(
     require_executor(on)
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]
     reading, labelling = reading or ReadOptions(), labelling or LabelSettings()
-    if forces is not None:
-        reading = replace(reading, forces=Path(forces))
+    reading = reading if forces is None else replace(reading, forces=Path(forces))
     last = options.get("validation_trials"), options.get("test_trials")
     if splits is not None and last != (None, None):
         raise InputError("splits come from a file or from numbers of trials, not from both; leave one out")
@@ -115,10 +114,10 @@ def import_recordings(
         with open_stage("Opening the recordings"):
             lost = work.open_all()
         names = {info.trial for info in old}
-        if existing := [job.capture.trial for job in work.jobs.values() if job.capture.trial in names]:
+        jobs = {item: job for item, job in work.jobs.items() if job.capture.trial not in names}
+        if existing := [job.capture.trial for item, job in work.jobs.items() if item not in jobs]:
             count = number_of(len(existing), "trial")
             add_note(f"already in {out}, and left as it is: {count}, such as {existing[0]}")
-        jobs = {item: job for item, job in work.jobs.items() if job.capture.trial not in names}
         if before is not None and not jobs:
             report_dataset(before, existed=True)
             return replace(before, left_out=tuple(lost))
@@ -272,11 +271,11 @@ class _ImportWork(TrialWork):
             return str(value.resolve()), sum(each.st_size for each in stats), changed
 
         settings = {name: value for name, value in vars(self).items() if name not in {"rows", "reading", "jobs"}}
-        rows = [{name: describe(value) for name, value in vars(row).items()} for row in self.rows]
-        return settings | {
-            "rows": rows,
-            "reading": {name: describe(value) for name, value in vars(self.reading).items()},
-        }
+        rows, (reading,) = (
+            [{name: describe(value) for name, value in vars(record).items()} for record in records]
+            for records in (self.rows, [self.reading])
+        )
+        return settings | {"rows": rows, "reading": reading}
 
 
 def _link_trials(source: Path, folder: Path) -> None:
@@ -317,13 +316,11 @@ def _deal(
     if plan is not None:
         trials = [*old, *captures]
         return assign_splits(trials, plan) if isinstance(plan, Mapping) else deal_splits(trials, by=plan)
-    splits = [capture.split or "train" for capture in captures]
+    splits, (validation, test) = [capture.split or "train" for capture in captures], (number or 0 for number in last)
+    if validation < 0 or test < 0:
+        raise InputError(f"numbers of trials are not negative, got {validation} and {test}; give 0 or more")
+    if (training := len(captures) - validation - test) < 0:
+        raise InputError(f"{validation} to validate and {test} to test are more than {len(captures)}; give fewer")
     if last != (None, None):
-        validation, test = (number or 0 for number in last)
-        if validation < 0 or test < 0:
-            raise InputError(f"numbers of trials are not negative, got {validation} and {test}; give 0 or more")
-        training = len(captures) - validation - test
-        if training < 0:
-            raise InputError(f"{validation} to validate and {test} to test are more than {len(captures)}; give fewer")
         splits = ["train"] * training + ["validation"] * validation + ["test"] * test
     return SplitResult(splits=(*(info.split for info in old), *splits), notes=())

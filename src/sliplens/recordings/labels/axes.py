@@ -134,8 +134,7 @@ def infer_axes(
         never = f"{forces.source} never departs from its noise: no touch to infer the axes from"
         raise RecordingError(f"{never}; give --normal-axis, --normal-sign and --tare, or leave the trial out")
     still = forces.force_n[forces.time_s < until]
-    tare, tare_sigma, tare_found = np.zeros(3), np.zeros(3), Found.ASSUMED
-    notes = []
+    tare, tare_sigma, tare_found, notes = np.zeros(3), np.zeros(3), Found.ASSUMED, []
     if tare_n is not None:
         tare, tare_found = np.array(tare_n, dtype=np.float64), Found.DECLARED
     elif len(still) < _FEW_STILL:
@@ -150,18 +149,20 @@ def infer_axes(
         end = touch + _PRESS_SHARE * (forces.time_s[-1] - touch)
         press = np.mean(forces.force_n[(forces.time_s >= touch) & (forces.time_s <= end)], axis=0) - tare
     rise = _measure_rise(forces, tare, tare_sigma, noise=noise, touch_s=touch, drift_n_s=drift)
-    main = press if rise is None or rise.bends else rise.direction
+    main = press if rise.bends else rise.direction
     axis = AXES[int(np.argmax(np.abs(main)))] if normal is None else normal
     first, second = np.sort(np.abs(press))[[-1, -2]]
-    if normal is None and main is press and second > _DOUBTFUL * first:
+    if normal is None and rise.bends and second > _DOUBTFUL * first:
         notes.append(
             f"the normal axis is doubtful: {axis} departs by {first:.2f} N, another by {second:.2f} N; declare it"
         )
     # ForceAxes refuses an unknown axis
-    inferred_sign = 1 if axis not in AXES or main[AXES.index(axis)] >= 0 else -1
-    tilt_deg = 0.0 if rise is None or axis not in AXES else _tilt_deg(rise, axis, sign or inferred_sign)
-    turned = rise is not None and not rise.bends and normal is None and sign in (None, inferred_sign) and tilt_deg > 0
-    if rise is not None and tilt_deg > (_SHEAR_FLAG_DEG if rise.bends else _TILT_FLAG_DEG):
+    index = AXES.index(axis) if axis in AXES else 0
+    inferred_sign = 1 if main[index] >= 0 else -1
+    tilt_deg = float(np.rad2deg(np.arccos(np.clip((sign or inferred_sign) * rise.direction[index], -1, 1))))
+    tilt_deg *= tilt_deg > max(_LEAST_TILT_DEG, _TILT_SIGMAS * np.rad2deg(rise.sigma))
+    turned = not rise.bends and normal is None and sign in (None, inferred_sign) and tilt_deg > 0
+    if tilt_deg > (_SHEAR_FLAG_DEG if rise.bends else _TILT_FLAG_DEG):
         cure = (
             f"so the axes were turned by that; if the press was oblique, give --normal-axis {axis}"
             if turned
@@ -181,8 +182,8 @@ def infer_axes(
     return ForceAxes(
         normal=axis,
         sign=inferred_sign if sign is None else sign,
-        direction=_vector(rise.direction) if turned and rise is not None else None,
-        direction_sigma=rise.sigma if turned and rise is not None else 0.0,
+        direction=_vector(rise.direction) if turned else None,
+        direction_sigma=rise.sigma if turned else 0.0,
         tare_n=_vector(tare),
         noise_n=_vector(noise),
         tare_sigma_n=_vector(tare_sigma),
@@ -197,28 +198,22 @@ def infer_axes(
 
 
 class _Rise(NamedTuple):
-    """Direction of the force while the load of a press rises, and its standard uncertainty in radians."""
+    """Direction of the force while the load of a press rises, and its standard uncertainty; by default unknown."""
 
-    direction: Axes
-    sigma: float
-    bends: bool  # on the way or soon after, because something shears
-
-
-def _tilt_deg(rise: _Rise, axis: str, sign: int) -> float:
-    """Return the angle of a press to an axis; 0 where it is not significant."""
-    angle = float(np.rad2deg(np.arccos(np.clip(sign * rise.direction[AXES.index(axis)], -1, 1))))
-    return angle if angle > max(_LEAST_TILT_DEG, _TILT_SIGMAS * np.rad2deg(rise.sigma)) else 0.0
+    direction: Axes = np.zeros(3)
+    sigma: float = np.inf  # in radians
+    bends: bool = True  # on the way or soon after, because something shears
 
 
 def _measure_rise(
     forces: Forces, tare_n: Axes, tare_sigma_n: Axes, *, noise: Axes, touch_s: float, drift_n_s: Axes
-) -> _Rise | None:
-    """Measure the direction of the force from the touch to the hold; None where axes or samples are missing."""
+) -> _Rise:
+    """Measure the direction of the force from the touch to the hold, unless axes or samples are missing."""
     time = forces.time_s
     contact = np.flatnonzero(time >= touch_s)
     # two columns give no direction: the tangential force may be a length
     if len(contact) < _FEW_STILL or not np.ptp(forces.force_n, axis=0).all():
-        return None
+        return _Rise()
     force = forces.force_n - tare_n - drift_n_s * (time - (time[0] + touch_s) / 2)[:, None]
     load = np.linalg.norm(mean_force(time, force, time, window_s=_WINDOW_S), axis=1)
     early = load[contact][time[contact] <= touch_s + _PRESS_SHARE * (time[-1] - touch_s)]
@@ -227,12 +222,10 @@ def _measure_rise(
     top = contact[np.argmax(load[contact] >= high)]
     rising = np.arange(contact[0], top)
     rising = rising[load[rising] > low]
-    if len(rising) < _FEW_RISING:
-        return None
     # as long again, once it is pressed
-    holding = np.flatnonzero((time > time[top]) & (time <= 2 * time[top] - time[rising[0]]))
-    if len(holding) < _FEW_RISING:
-        return None
+    holding = np.flatnonzero((time > time[top]) & (time <= 2 * time[top] - time[rising[:1]].max(initial=-np.inf)))
+    if min(len(rising), len(holding)) < _FEW_RISING:
+        return _Rise()
 
     def direction(part: Int[np.ndarray, " part"]) -> tuple[Axes, float]:
         weight = float(np.sum(load[part] ** 2))

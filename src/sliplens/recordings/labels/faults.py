@@ -20,6 +20,7 @@ from sliplens.recordings.labels.axes import (
     typical_step,
 )
 from sliplens.recordings.labels.lag import estimate_lag, force_changes
+from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import MOST_FORCE_N
 
 Times: TypeAlias = Float[np.ndarray, " times"]
@@ -141,14 +142,13 @@ def screen_trial(
     image_motion: Times,
     forces: Forces,
     *,
-    lag: Lag | None,
-    bad_frames: Sequence[tuple[int, int]] = (),
-    slip_s: float | None = None,
+    settings: LabelSettings,
     rng: np.random.Generator,
 ) -> tuple[Screened, Lag]:
-    """Screen the forces of a trial by its image, and estimate the lag if None; a jump at `slip_s` is no fault."""
+    """Screen the forces of a trial by its image, and estimate the lag if not set; a jump at a set slip is no fault."""
+    lag, slip_s = None if settings.lag_ms is None else Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0), settings.slip_s
     bad_time_s = frame_time_s - (0.0 if lag is None else lag.lag_s)
-    bad_s = [(float(bad_time_s[first]), float(bad_time_s[last])) for first, last in bad_frames]
+    bad_s = [(float(bad_time_s[first]), float(bad_time_s[last])) for first, last in settings.bad_frames]
     screened = screen_forces(forces, image_moves=lambda _t, _n: True, bad_s=bad_s)
     continuous, jumps = _remove_jumps(screened.forces)
     if lag is None:
@@ -227,12 +227,10 @@ def _noise(force_n: Samples) -> Axis:
     sigma = np.zeros(3)
     for axis, values in enumerate(force_n.T):
         changes = np.abs(np.diff(values))
-        changes = changes[changes > 0]
         # coarse or repeated values change seldom: the median of all changes would be 0, and neighbours are alike
-        if len(changes):
+        if len(changes := changes[changes > 0]):
             run = min(len(values) / len(changes), _FIT_SAMPLES[1])
-            coarse = np.median(changes) if run > _COARSE else 0.0
-            sigma[axis] = max(float(noise_sigma(values)), coarse) * np.sqrt(run)
+            sigma[axis] = max(float(noise_sigma(values)), np.median(changes) * (run > _COARSE)) * np.sqrt(run)
     return sigma
 
 
@@ -296,21 +294,9 @@ class _Part(NamedTuple):
     last_n: Axis
 
 
-class _Tolerance(NamedTuple):
-    """Difference of equal forces of a trial, and median rate at which the force changes."""
-
-    near_n: Axis
-    rate_n_s: float
-
-    def equal(self, difference_n: Axis, more_n: float = 0.0) -> bool:
-        """Return True where a difference of two forces is no more than that of equal ones."""
-        return bool(np.all(np.abs(difference_n) <= self.near_n + more_n))
-
-
-def _tolerance(forces: Forces) -> _Tolerance:
-    near = 6 * _noise(forces.force_n) + 0.5 * _JUMP_SHARE * _load(forces.force_n)
-    rates = np.linalg.norm(np.diff(forces.force_n, axis=0), axis=1) / np.diff(forces.time_s)
-    return _Tolerance(near, float(np.median(rates)))
+def _near(forces: Forces) -> Axis:
+    """Return the largest difference of equal forces of a trial."""
+    return 6 * _noise(forces.force_n) + 0.5 * _JUMP_SHARE * _load(forces.force_n)
 
 
 def _cut(forces: Forces, spans: Sequence[tuple[int, int]]) -> list[_Part]:
@@ -334,46 +320,44 @@ def _find_steps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[Codes,
     breaks, _ = _classify_jumps(forces, image_moves=image_moves)
     if not breaks:
         return codes, shift
-    tolerance = _tolerance(forces)
+    returns = _make_return_test(forces)
     last, *parts = _cut(forces, list(pairwise([0, *breaks, len(forces.time_s)])))
     faulty: list[_Part] = []
     for part in parts:
-        if faulty and _returns(last, faulty, part, tolerance):
+        if faulty and returns(last, faulty, part):
             last, faulty = part, []
         else:
             codes[part.start : part.end] = _STEP
             faulty.append(part)
-    moved, sigma = np.zeros(3), _noise(forces.force_n)
+    moved, sigma, near = np.zeros(3), _noise(forces.force_n), _near(forces)
     for before, part in pairwise([last, *faulty]):
         jump = part.first_n - before.last_n
-        if np.any((np.abs(jump) > 6 * sigma) & (np.abs(jump + 2 * before.last_n) < tolerance.near_n)):
+        if np.any((np.abs(jump) > 6 * sigma) & (np.abs(jump + 2 * before.last_n) < near)):
             break  # a change of sign is no step, and the samples after it cannot be moved back
         moved += jump
         shift[part.start : part.end] = moved
     return codes, shift
 
 
-def _returns(last: _Part, faulty: Sequence[_Part], part: _Part, tolerance: _Tolerance) -> bool:
-    """Return True where the force after some faulty parts continues from its value before them."""
-    jumps = (after.first_n - before.last_n for before, after in pairwise([last, *faulty, part]))
-    if tolerance.equal(sum(jumps, np.zeros(3))):
-        return True
-    gap_s = part.start_s - last.end_s
-    if gap_s <= _BRIEF_S and tolerance.equal(part.first_n - last.last_n, 3 * tolerance.rate_n_s * gap_s):
-        return True
-    if len(faulty) > 1:
-        return False
-    # one change of scale, signs among them, or of axes, that explains both jumps
-    (wrong,) = faulty
-    inside, outside = np.stack((wrong.first_n, wrong.last_n)), np.stack((last.last_n, part.first_n))
-    scale = np.sum(inside * outside, axis=0) / np.maximum(np.sum(outside**2, axis=0), 1e-12)
-    if all(tolerance.equal(row) for row in (inside - scale * outside) / np.maximum(1, np.abs(scale))):
-        return True
-    return any(
-        tolerance.equal(wrong.first_n - last.last_n[list(order)])
-        and tolerance.equal(wrong.last_n - part.first_n[list(order)])
-        for order in permutations(range(3))
-    )
+def _make_return_test(forces: Forces) -> Callable[[_Part, Sequence[_Part], _Part], bool]:
+    """Make the test whether the force after some faulty parts continues from its value before them."""
+    near = _near(forces)
+    rate_n_s = float(np.median(np.linalg.norm(np.diff(forces.force_n, axis=0), axis=1) / np.diff(forces.time_s)))
+
+    def returns(last: _Part, faulty: Sequence[_Part], part: _Part) -> bool:
+        jumps = (after.first_n - before.last_n for before, after in pairwise([last, *faulty, part]))
+        gap_s = part.start_s - last.end_s
+        more = 3 * rate_n_s * gap_s if gap_s <= _BRIEF_S else -np.inf
+        if np.all(np.abs(sum(jumps, np.zeros(3))) <= near) or np.all(np.abs(part.first_n - last.last_n) <= near + more):
+            return True
+        # one change of scale, signs among them, or of axes, that explains both jumps
+        inside, outside = np.stack((faulty[0].first_n, faulty[0].last_n)), np.stack((last.last_n, part.first_n))
+        scale = np.sum(inside * outside, axis=0) / np.maximum(np.sum(outside**2, axis=0), 1e-12)
+        changed = [outside[:, order] for order in permutations(range(3))]
+        rests = [(inside - scale * outside) / np.maximum(1, np.abs(scale)), *(inside - each for each in changed)]
+        return len(faulty) == 1 and any(np.all(np.abs(rest) <= near) for rest in rests)
+
+    return returns
 
 
 def _classify_jumps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[list[int], list[float]]:
@@ -387,14 +371,10 @@ def _classify_jumps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[li
     except RecordingError:
         return resting, []  # nothing is ever loaded
     time, force = forces.time_s, forces.force_n - axes.tare_n
-    groups: list[list[int]] = []
-    for at, _ in jumps:
-        if groups and time[at] - time[groups[-1][-1]] <= _RELEASE_S:
-            groups[-1].append(at)
-        else:
-            groups.append([at])
+    at = np.array([at for at, _ in jumps])
+    groups = [group.tolist() for group in np.split(at, np.flatnonzero(np.diff(time[at]) > _RELEASE_S) + 1)]
     starts, ends = [0, *(group[-1] for group in groups)], [*(group[0] for group in groups), len(time)]
-    parts, tolerance = _cut(forces, list(zip(starts, ends, strict=True))), _tolerance(forces)
+    parts, returns = _cut(forces, list(zip(starts, ends, strict=True))), _make_return_test(forces)
     normal = axes.sign * turn_matrix(axes)[axes.normal_index]
     slips_s: list[float] = []
     harmless: set[int] = set()
@@ -402,12 +382,9 @@ def _classify_jumps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[li
     for place, group in enumerate(groups):
         if not any(at in resting for at in group):
             continue
-        unloads, slips = _measure_fall(forces, force, group, normal, tolerance)
+        unloads, slips = _measure_fall(forces, force, group, normal)
         pairs = [(before, place) for before in faulty] + [(place, later) for later in range(place + 1, len(groups))]
-        if not unloads or any(
-            _returns(parts[leaves], parts[leaves + 1 : comes + 1], parts[comes + 1], tolerance)
-            for leaves, comes in pairs
-        ):
+        if not unloads or any(returns(parts[a], parts[a + 1 : b + 1], parts[b + 1]) for a, b in pairs):
             faulty.append(place)
             continue
         harmless |= set(group)
@@ -416,11 +393,9 @@ def _classify_jumps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[li
     return [at for at in resting if at not in harmless], slips_s
 
 
-def _measure_fall(
-    forces: Forces, force_n: Samples, group: list[int], normal: Axis, tolerance: _Tolerance
-) -> tuple[bool, bool]:
+def _measure_fall(forces: Forces, force_n: Samples, group: list[int], normal: Axis) -> tuple[bool, bool]:
     """Compare the force over a group of jumps with a slip or release; whether it unloads, and whether only the pull."""
-    count, near = _fit_count(forces), float(np.linalg.norm(tolerance.near_n))
+    count, near = _fit_count(forces), float(np.linalg.norm(_near(forces)))
     start, end = max(1, group[0] - count), min(len(force_n) - 1, group[-1] + count)
     before = np.median(force_n[max(0, start - count) : start], axis=0)
     after = np.median(force_n[end : end + count], axis=0)

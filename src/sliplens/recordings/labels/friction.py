@@ -199,6 +199,10 @@ def estimate_friction(
     sets the friction, the slips are found as well. If the friction contradicts the forces, because the ratio exceeds it
     or slips elsewhere by more than 3 sigma, the difference counts as an error, and the notes give the numbers.
     """
+    if not np.ptp(forces.tangential_n, axis=0).any():
+        # a sensor that measures it has noise, a simulated pull changes
+        never = f"{forces.recorded.source} has no tangential force (both axes but {forces.axes.normal} never change)"
+        raise RecordingError(f"{never}, and a margin needs it; name the columns of all axes with --force-columns")
     spans = find_contacts(forces, contact_threshold_n=contact_threshold_n)
     means = [_mean_ratio(forces, window_s=window_s, contact_threshold_n=contact_threshold_n) for window_s in _WINDOWS_S]
     rough: list[float] = []
@@ -210,7 +214,7 @@ def estimate_friction(
         # a slip at which the image rests is less likely
         visible = [time_s for time_s in times if (_image_sigmas(image, time_s) or 0) >= _IMAGE_SIGMAS]
         rough += (visible or times)[:1]
-    slips = []
+    slips: list[_Slip] = []
     for time_s in sorted(rough if slip_s is None else [*rough, slip_s]):
         reach_s = 0.0 if time_s == slip_s else _REACH_S
         limits = {"contact_threshold_n": contact_threshold_n, "reach_s": reach_s, "draws": draws}
@@ -222,31 +226,32 @@ def estimate_friction(
             slips.append(_Slip(time_s))  # the friction is known without it
     # the window that shows most surely how far the ratio reaches
     mean = max(means, key=lambda mean: float(mean.least.max()))
-    highest = int(np.argmax(mean.least))
+    first = slips[0] if slips else None
     if mu is not None:
-        estimate = FrictionEstimate(mu=mu, low=mu, high=mu)
-    elif not slips:
-        never = f"the trial never slips (F_t / F_n reaches {mean.ratio[highest]:.2f} without breaking off)"
+        low, high, found, method = mu, mu, Found.DECLARED, "given by hand"
+    elif first is None or first.mu is None:
+        never = f"the trial never slips (F_t / F_n reaches {mean.ratio[mean.least.argmax()]:.2f} without breaking off)"
         raise RecordingError(f"{never}, so its friction is unknown; give it with --mu, or in a manifest")
     else:
-        first, method = slips[0], "F_t / F_n at the slip set by hand"
-        assert first.mu is not None  # a slip without a friction was refused above
-        if first.low <= 0:
-            interval = f"{first.mu:.2g} with a 68 % interval from {first.low:.2g} to {first.high:.2g}, which is none"
+        mu, low, high = first.mu, first.low, first.high
+        found, method = Found.INFERRED, "F_t / F_n at the slip set by hand"
+        if low <= 0:
+            interval = f"{mu:.2g} with a 68 % interval from {low:.2g} to {high:.2g}, which is none"
             raise RecordingError(f"the slip at {first.time_s:.2f} s gives a friction of {interval}; give it with --mu")
         if first.time_s != slip_s:
             visible = (_image_sigmas(image, first.time_s) or 0) >= _IMAGE_SIGMAS
             method = "break of F_t / F_n" + (", seen in the image" if visible else "")
-        estimate = FrictionEstimate(mu=first.mu, low=first.low, high=first.high, found=Found.INFERRED, method=method)
-    if slips:
-        first, *later = slips
-        estimate = replace(
-            estimate,
-            onset_s=first.time_s,
-            onset_sigma_s=first.sigma_s,
-            image_sigmas=_image_sigmas(image, first.time_s),
-            later_onsets_s=tuple(slip.time_s for slip in later),
-        )
+    estimate = FrictionEstimate(
+        mu=mu,
+        low=low,
+        high=high,
+        found=found,
+        method=method,
+        onset_s=first and first.time_s,
+        onset_sigma_s=first and first.sigma_s,
+        image_sigmas=first and _image_sigmas(image, first.time_s),
+        later_onsets_s=tuple(slip.time_s for slip in slips[1:]),
+    )
     notes, error = _find_contradictions(estimate, slips, mean, slip_s=slip_s, friction_change=friction_change)
     if not notes:
         return estimate

@@ -136,10 +136,7 @@ def estimate_lag(
 
 def _find_release(forces: Forces, *, sudden_s: float) -> tuple[float, float] | None:
     """Return the times at which the load is pressed and begins to fall; None where it holds or falls suddenly."""
-    # the tare alone is needed: neither axis nor sign matters to a length
-    force = forces.force_n - infer_axes(forces, normal="x", sign=1).tare_n
-    time = forces.time_s
-    load = np.linalg.norm(mean_force(time, force, time, window_s=_LOAD_WINDOW_S), axis=1)
+    time, (load, _) = forces.time_s, _measure_load(forces)
     hold = float(np.median(load[load >= load.max() / 2]))
     light, heavy = (time[load >= share * hold] for share in _PART)
     fall_s = float(light[-1] - heavy[-1])
@@ -199,13 +196,18 @@ def doubt_agreement(
 
 def _find_loads(forces: Forces) -> list[tuple[float, float]]:
     """Find the stretches, in seconds, in which the force departs from that of the untouched sensor."""
-    axes, time = infer_axes(forces, normal="x", sign=1), forces.time_s
-    if axes.still_until_s is None:
-        return []
-    load = np.linalg.norm(mean_force(time, forces.force_n - axes.tare_n, time, window_s=_LOAD_WINDOW_S), axis=1)
-    loaded = (load > _LOADED_SHARE * float(np.quantile(load, 0.95))) & (time >= axes.still_until_s)
+    time, (load, still_until_s) = forces.time_s, _measure_load(forces)
+    loaded = (load > _LOADED_SHARE * float(np.quantile(load, 0.95))) & (time >= still_until_s)
     spans = find_spans(time, loaded, apart_s=_APART_S)
     return [(float(time[start]), float(time[end - 1])) for start, end in spans]
+
+
+def _measure_load(forces: Forces) -> tuple[Float[np.ndarray, " samples"], float]:
+    """Return the length of the force without its tare, and the time until which nothing touches the sensor."""
+    # neither axis nor sign matters to a length
+    axes, time = infer_axes(forces, normal="x", sign=1), forces.time_s
+    load = np.linalg.norm(mean_force(time, forces.force_n - axes.tare_n, time, window_s=_LOAD_WINDOW_S), axis=1)
+    return load, np.inf if axes.still_until_s is None else axes.still_until_s
 
 
 def _agreement(change_n: Intervals, motion: Intervals) -> float:

@@ -1,7 +1,7 @@
 """Labels of frames: forces, safety margin with uncertainty, contact state and validity."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple, TypeAlias, TypeVar
 
@@ -105,8 +105,10 @@ class FoundLabels(Labels):
     basis: LabelBasis
 
 
-def contact_threshold(forces: ContactForces, *, window_s: float) -> float:
-    """Return the least normal force of a contact: well above the noise, and a small share of the largest force."""
+def contact_threshold(forces: ContactForces, settings: LabelSettings, *, window_s: float) -> float:
+    """Return the least normal force of a contact: as set, or well above the noise, and a share of the largest force."""
+    if settings.contact_threshold is not None:
+        return settings.contact_threshold
     smooth = mean_force(forces.time_s, forces.normal_n, forces.time_s, window_s=window_s)
     return float(max(_CONTACT_SIGMAS * forces.noise_of_means_n(window_s)[0], _CONTACT_SHARE * smooth.max(), 1e-9))
 
@@ -119,7 +121,6 @@ def label_frames(
     lag: Lag | None = None,
     settings: LabelSettings = LabelSettings(),  # noqa: B008 (frozen)
     screened: Screened | None = None,
-    doubts: tuple[str, ...] = (),
 ) -> FoundLabels:
     """Label frames, each at its own time.
 
@@ -133,11 +134,8 @@ def label_frames(
         cause = "it is not estimated" if lag is None else lag.doubt
         raise RecordingError(f"the lag cannot be applied: {cause}; give the lag by hand or leave it out")
     window, gap = typical_step(frame_time_s), GAP_STEPS * typical_step(forces.time_s)
-    threshold = settings.contact_threshold
-    if threshold is None:
-        threshold = contact_threshold(forces, window_s=window)
+    threshold = contact_threshold(forces, settings, window_s=window)
     onset = np.inf if friction.onset_s is None else friction.onset_s
-
     limits = {"window_s": window, "gap_s": gap, "until_s": onset, "force_range_n": settings.force_range}
     forces_at = partial(interpolate_forces, forces, **limits)
     shift = lag.lag_s if lag is not None and apply_lag else 0.0
@@ -214,7 +212,6 @@ def label_frames(
             gap_s=gap,
             force_range_n=settings.force_range,
             faults=() if screened is None else screened.faults,
-            doubts=doubts,
         ),
     )
 
@@ -239,26 +236,41 @@ def _first_of(words: Sequence[_Word], *flags: Bool[np.ndarray, " frames"]) -> tu
 
 
 def label_trial(
-    frame_time_s: Frames,
-    image_motion: Frames,
-    forces: Forces,
-    *,
-    settings: LabelSettings,
-    rng: np.random.Generator,
-    lag: Lag | None = None,
+    frame_time_s: Frames, image_motion: Frames, forces: Forces, *, settings: LabelSettings, rng: np.random.Generator
 ) -> FoundLabels:
     """Label the frames of a trial: axes, lag, friction and margins, in that order.
 
-    The lag is estimated even if it is not applied, to compare the image with falls of the force, unless it is an
-    argument or set in `settings`.
+    The lag is estimated unless it is set, even if it is not applied, to compare the image with falls of the force.
     """
-    if lag is None and settings.lag_ms is not None:
-        lag = Lag(lag_s=settings.lag_ms / 1e3, sigma_s=0.0)
     require_inside(settings, frames=len(frame_time_s), time_s=forces.time_s)
-    bad, slip_s = settings.bad_frames, settings.slip_s
-    screened, lag = screen_trial(frame_time_s, image_motion, forces, lag=lag, bad_frames=bad, slip_s=slip_s, rng=rng)
+    screened, lag = screen_trial(frame_time_s, image_motion, forces, settings=settings, rng=rng)
     try:
-        return _label_screened(frame_time_s, image_motion, screened, lag=lag, settings=settings, rng=rng)
+        axes = infer_axes(
+            screened.forces,
+            normal=settings.normal_axis,
+            sign=settings.normal_sign,
+            tare_n=settings.tare,
+            touch_s=settings.contact_s,
+            drift_n_s=settings.drift_rate,
+            moved_s=screened.moved_s,
+        )
+        contact = apply_axes(screened.forces, axes)
+        friction = estimate_friction(
+            contact,
+            contact_threshold_n=contact_threshold(contact, settings, window_s=typical_step(frame_time_s)),
+            rng=rng,
+            image=ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion),
+            slip_s=settings.slip_s,
+            mu=settings.mu,
+            friction_change=settings.friction_change,
+        )
+        labels = label_frames(frame_time_s, contact, friction=friction, lag=lag, settings=settings, screened=screened)
+        doubts = (
+            *screened.doubts,
+            *_find_doubts(contact, labels.basis, frame_time_s=frame_time_s, recorded_s=forces.time_s),
+            *doubt_agreement(frame_time_s, image_motion, screened.forces, lag),
+        )
+        return replace(labels, basis=replace(labels.basis, doubts=doubts))
     except RecordingError as error:
         if not screened.faults:
             raise
@@ -282,64 +294,13 @@ def require_inside(settings: LabelSettings, *, frames: int, time_s: Frames) -> N
         raise RecordingError(f"the slip is set to {settings.slip_s:.2f} s, before the contact; set the contact first")
 
 
-def _label_screened(
-    frame_time_s: Frames,
-    image_motion: Frames,
-    screened: Screened,
-    *,
-    lag: Lag,
-    settings: LabelSettings,
-    rng: np.random.Generator,
-) -> FoundLabels:
-    forces = screened.forces
-    axes = infer_axes(
-        forces,
-        normal=settings.normal_axis,
-        sign=settings.normal_sign,
-        tare_n=settings.tare,
-        touch_s=settings.contact_s,
-        drift_n_s=settings.drift_rate,
-        moved_s=screened.moved_s,
-    )
-    contact = apply_axes(forces, axes)
-    if not np.ptp(contact.tangential_n, axis=0).any():
-        # a sensor that measures it has noise, a simulated pull changes
-        never = f"{forces.source} has no tangential force (both axes but {axes.normal} never change)"
-        raise RecordingError(f"{never}, and a margin needs it; name the columns of all axes with --force-columns")
-    threshold = settings.contact_threshold
-    if threshold is None:
-        threshold = contact_threshold(contact, window_s=typical_step(frame_time_s))
-    friction = estimate_friction(
-        contact,
-        contact_threshold_n=threshold,
-        rng=rng,
-        image=ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion),
-        slip_s=settings.slip_s,
-        mu=settings.mu,
-        friction_change=settings.friction_change,
-    )
-    if friction.onset_s is not None:
-        begin = forces.time_s[0] if axes.still_until_s is None else axes.still_until_s
-        pull = (screened.recorded.time_s > begin) & (screened.recorded.time_s < friction.onset_s)
-        lost = np.isin(screened.recorded.time_s[pull], forces.time_s, invert=True)
-        if lost.sum() > _MOST_LOST * len(lost):
-            raise RecordingError("most samples between touch and slip are faulty; give the friction with --mu")
-    spans = {"frames_s": float(np.ptp(frame_time_s)), "forces_s": float(np.ptp(screened.recorded.time_s))}
-    doubts = (
-        *screened.doubts,
-        *_find_doubts(contact, friction, threshold, **spans, lag=lag),
-        *doubt_agreement(frame_time_s, image_motion, forces, lag),
-    )
-    return label_frames(
-        frame_time_s, contact, friction=friction, lag=lag, settings=settings, screened=screened, doubts=doubts
-    )
-
-
-def _find_doubts(
-    forces: ContactForces, friction: FrictionEstimate, threshold_n: float, *, frames_s: float, forces_s: float, lag: Lag
-) -> tuple[str, ...]:
+def _find_doubts(forces: ContactForces, basis: LabelBasis, *, frame_time_s: Frames, recorded_s: Frames) -> list[str]:
     """Describe an implausible friction, a contact that pulls more than it presses, and clocks of different lengths."""
-    doubts = []
+    friction, lag, doubts = basis.friction, basis.lag, []
+    begin = recorded_s[0] if basis.axes.still_until_s is None else basis.axes.still_until_s
+    pull = recorded_s[(recorded_s > begin) & (recorded_s < (begin if friction.onset_s is None else friction.onset_s))]
+    if np.isin(pull, forces.time_s, invert=True).sum() > _MOST_LOST * len(pull):
+        raise RecordingError("most samples between touch and slip are faulty; give the friction with --mu")
     low, high = _PLAUSIBLE_FRICTION
     usual = f"that of a fingertip lies between {low:g} and {high:g}"
     if not low <= friction.mu <= high:
@@ -350,13 +311,14 @@ def _find_doubts(
     elif friction.mu > _USUAL_FRICTION:
         seldom = f"that of a fingertip seldom exceeds {_USUAL_FRICTION:g}: check --normal-axis and --mu"
         doubts.append(f"the friction is {friction.mu:.3g}, and {seldom}")
-    pulls, presses = (np.mean(side > threshold_n) for side in (-forces.normal_n, forces.normal_n))
+    pulls, presses = (np.mean(side > basis.contact_threshold_n) for side in (-forces.normal_n, forces.normal_n))
     if pulls > presses:
         samples = f"{100 * pulls:.0f} % of the samples, positive in {100 * presses:.0f} %"
         doubts.append(f"the normal force is negative in {samples}; give its sign with --normal-sign")
-    fits = not lag.doubt and lag.correlation is not None and abs(lag.lag_s) <= _NEAR_LAG_S
+    fits = lag is not None and not lag.doubt and lag.correlation is not None and abs(lag.lag_s) <= _NEAR_LAG_S
+    frames_s, forces_s = float(np.ptp(frame_time_s)), float(np.ptp(recorded_s))
     if not fits and min(frames_s, forces_s) < _LIKE_SPANS * max(frames_s, forces_s):
         lengths = f"the frames last {frames_s:.2f} s and the forces {forces_s:.2f} s"
         cure = "if a clock runs wrong, give --frame-rate or --time-unit on import"
         doubts.append(f"{lengths}, the image does not move with the force; {cure}")
-    return tuple(doubts)
+    return doubts
