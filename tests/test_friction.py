@@ -1,8 +1,11 @@
 """What is known of friction, and what slips teach."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy import stats
+from there import there
 
 from sliplens.errors import InputError
 from sliplens.friction import Friction, SlipLearner, as_friction
@@ -26,15 +29,10 @@ def test_a_slip_teaches_as_gaussians_multiply():
     assert after.sigma == pytest.approx(precision**-0.5, abs=1e-4)
 
 
-def test_slips_in_any_order_teach_alike():
+def test_slips_in_any_order_teach_alike_and_exact_friction_stays():
     prior = Friction.between(0.2, 1.2)
-    one, other = (prior.update(*first).update(*second) for first, second in (((0.5, 0.1), (0.6, 0.05)),) * 2)
-    reverse = prior.update(0.6, 0.05).update(0.5, 0.1)
-    assert one.mean == pytest.approx(reverse.mean)
-    assert other.sigma == pytest.approx(reverse.sigma)
-
-
-def test_what_is_known_exactly_stays():
+    one, reverse = prior.update(0.5, 0.1).update(0.6, 0.05), prior.update(0.6, 0.05).update(0.5, 0.1)
+    assert (one.mean, one.sigma) == pytest.approx((reverse.mean, reverse.sigma))
     assert Friction(0.62).update(0.3, 0.05).mean == 0.62
 
 
@@ -54,10 +52,7 @@ def test_many_slips_leave_the_spread_of_one_grasp(rng: np.random.Generator):
     one = Friction.from_slips([0.6], sigma=0.01, grasp_spread=0.06)
     # twice the spread of a grasp: that of the slip and that of the next one
     assert one.sigma == pytest.approx(0.6 * 0.06 * np.sqrt(2), rel=0.05)
-
-
-def test_no_slip_leaves_everything_possible():
-    assert Friction.from_slips([]).sigma > 0.3
+    assert Friction.from_slips([]).sigma > 0.3  # everything is possible
 
 
 @pytest.mark.parametrize(
@@ -75,17 +70,19 @@ def test_what_is_no_friction_is_refused(told: object):
         as_friction(told)  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize("slip", [(0.0, 0.1), (0.5, 0.0), (float("nan"), 0.1)])
-def test_what_is_no_slip_is_refused(slip: tuple[float, float]):
-    with pytest.raises(InputError, match="a slip needs a positive ratio"):
-        Friction.between(0.2, 1.0).update(*slip)
-
-
-def test_weights_must_fit():
-    with pytest.raises(InputError, match="2 values of friction need as many weights"):
-        Friction(np.array([0.5, 0.6]), np.array([1.0, -1.0]))
-    with pytest.raises(InputError, match="share of the friction"):
-        Friction(0.5).next_grasp(1.5)
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: Friction.between(0.2, 1.0).update(0.0, 0.1), "a slip needs a positive ratio"),
+        (lambda: Friction.between(0.2, 1.0).update(0.5, 0.0), "a slip needs a positive ratio"),
+        (lambda: Friction.between(0.2, 1.0).update(float("nan"), 0.1), "a slip needs a positive ratio"),
+        (lambda: Friction(np.array([0.5, 0.6]), np.array([1.0, -1.0])), "2 values of friction need as many weights"),
+        (lambda: Friction(0.5).next_grasp(1.5), "share of the friction"),
+    ],
+)
+def test_impossible_slips_weights_and_spreads_are_refused(call: Callable[[], object], words: str):
+    with pytest.raises(InputError, match=words):
+        call()
 
 
 def rising(learner: SlipLearner, *, until: float, sigma: float = 0.03) -> float:
@@ -103,18 +100,13 @@ def slip_at(learner: SlipLearner, ratio: float, *, sigma: float = 0.03) -> None:
     learner.update(0.2, slipping_s=None, touches=False)
 
 
-def known(learner: SlipLearner) -> Friction:
-    assert learner.friction is not None
-    return learner.friction
-
-
 def test_a_slip_teaches_what_was_read_as_it_began():
     prior, learner = Friction.between(0.2, 1.0), SlipLearner(Friction.between(0.2, 1.0))
     end_s = rising(learner, until=0.5)
     for late in range(3):  # the same slip, told again and again
         learner.update(end_s + 0.05 * late, slipping_s=0.1 + 0.05 * late)
     began = 0.6 * (end_s - 0.1)
-    assert known(learner).mean == pytest.approx(prior.update(began, 0.03).mean, abs=0.011)  # a frame before
+    assert there(learner.friction).mean == pytest.approx(prior.update(began, 0.03).mean, abs=0.011)  # a frame before
 
 
 def test_ten_slips_of_one_contact_teach_as_the_first():
@@ -123,26 +115,26 @@ def test_ten_slips_of_one_contact_teach_as_the_first():
     end_s = rising(learner, until=0.5, sigma=0.05)
     for number in range(10):
         learner.update(end_s + number, slipping_s=number + 0.05)
-        assert known(learner).sigma == pytest.approx(0.05, rel=0.02)
+        assert there(learner.friction).sigma == pytest.approx(0.05, rel=0.02)
         learner.update(end_s + number + 0.5, slipping_s=None)
     assert learner.slips == 1
     learner.release()
-    before = known(learner)
+    before = there(learner.friction)
     learner.note(0.5, sigma=0.05, time_s=21.0)
     learner.update(21.2, slipping_s=0.1)
-    assert known(learner).sigma < before.sigma  # another contact teaches again
+    assert there(learner.friction).sigma < before.sigma  # another contact teaches again
     assert learner.slips == 2
 
 
 def test_the_next_grasp_of_a_slip_that_was_learnt_is_less_sure():
     learner = SlipLearner(Friction.between(0.2, 1.0), same_object=True)
     learner.update(rising(learner, until=0.5), slipping_s=0.05)
-    held = known(learner).sigma
+    held = there(learner.friction).sigma
     learner.update(5.0, slipping_s=None, touches=False)
-    let_go = known(learner).sigma
-    assert let_go == pytest.approx(np.hypot(held, 0.06 * known(learner).mean), rel=0.05)
+    let_go = there(learner.friction).sigma
+    assert let_go == pytest.approx(np.hypot(held, 0.06 * there(learner.friction).mean), rel=0.05)
     learner.update(6.0, slipping_s=None, touches=False)  # still nothing touches
-    assert known(learner).sigma == let_go
+    assert there(learner.friction).sigma == let_go
     assert learner.learnt is learner.friction
 
 
@@ -165,25 +157,25 @@ def test_where_nothing_was_told_a_slip_teaches_the_grasps_that_follow():
     learner.update(0.1, slipping_s=0.05)
     assert learner.friction is None  # not this one
     learner.release()
-    once = known(learner)
+    once = there(learner.friction)
     assert once.mean == pytest.approx(0.5, rel=0.03)
     for _ in range(3):
         slip_at(learner, 0.5)
     # the steady state of Kalman's filter: steps of 6 % of 0.5, each seen by a slip that is as wrong
     step, seen = (0.06 * 0.5) ** 2, 0.03**2
     steady = step / 2 + np.sqrt(step**2 / 4 + step * seen)
-    assert known(learner).sigma == pytest.approx(np.sqrt(steady), rel=0.1)
-    assert known(learner).sigma < once.sigma
+    assert there(learner.friction).sigma == pytest.approx(np.sqrt(steady), rel=0.1)
+    assert there(learner.friction).sigma < once.sigma
     assert learner.slips == 4
 
 
 def test_friction_is_told_again_as_it_was_learnt():
     learner = SlipLearner(same_object=True)
     slip_at(learner, 0.58)
-    again = as_friction(known(learner).text)
+    again = as_friction(there(learner.friction).text)
     # three and two digits are written
-    assert again.mean == pytest.approx(known(learner).mean, rel=0.005)
-    assert again.sigma == pytest.approx(known(learner).sigma, rel=0.05)
+    assert again.mean == pytest.approx(there(learner.friction).mean, rel=0.005)
+    assert again.sigma == pytest.approx(there(learner.friction).sigma, rel=0.05)
     assert as_friction(Friction(0.62).text).sigma == 0
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.manifest import find_rows, pair_recordings, read_rows
+from sliplens.recordings.manifest import ManifestRow, find_rows, pair_recordings, read_rows
 from sliplens.recordings.options import ReadOptions
 
 
@@ -67,18 +67,12 @@ def test_a_manifest_says_all_of_a_trial(tmp_path: Path):
         encoding="utf-8",
     )
     one, two = read_rows(path)
-    assert (one.trial, one.video, one.forces) == ("one", tmp_path / "a.mp4", tmp_path / "a.csv")
-    assert (one.sensor, one.day, one.object, one.condition, one.mu) == (
-        str(tmp_path / "tip.toml"),
-        2,
-        "cup",
-        "wet",
-        0.7,
-    )
-    assert one.reference == 12
-    assert (two.trial, two.forces, two.sensor, two.day, two.reference) == (
-        "b", None, "digit", None, tmp_path / "still.png"
+    profile = str(tmp_path / "tip.toml")
+    assert one == ManifestRow(
+        trial="one", video=tmp_path / "a.mp4", forces=tmp_path / "a.csv", sensor=profile, day=2, object="cup",
+        condition="wet", mu=0.7, reference=12,
     )  # fmt: skip
+    assert two == ManifestRow(trial="b", video=tmp_path / "b.mp4", sensor="digit", reference=tmp_path / "still.png")
     assert find_rows(path) == (one, two)
 
 

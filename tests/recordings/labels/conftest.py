@@ -1,12 +1,13 @@
 """A trial made by hand, of which everything is known."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import ForceAxes, Found
+from sliplens.recordings.labels import ForceAxes, Found, FoundLabels, LabelSettings, label_trial
 from sliplens.recordings.labels.axes import ContactForces, apply_axes
 
 FORCE_HZ, FRAME_HZ = 500, 30
@@ -47,9 +48,21 @@ class Trial:
     ) -> Forces:
         """As recorded: the normal force is in the column where `order` has its 0."""
         force = (self.contact_n * np.array([sign, 1, 1]))[:, list(order)] + np.array(tare_n)
-        if rng is not None:
-            force = force + rng.normal(0, noise_n, force.shape)
-        return Forces(time_s=self.time_s, force_n=force, source="sensor")
+        return self.record(force if rng is None else force + rng.normal(0, noise_n, force.shape))
+
+    def record(self, force_n: np.ndarray) -> Forces:
+        """Other forces at the same times."""
+        return Forces(time_s=self.time_s, force_n=force_n, source="sensor")
+
+    @property
+    def truth(self) -> np.ndarray:
+        """Safety margin of the frames, up to the slip."""
+        return 1 - ratio(self.frame_time_s) / STATIC
+
+    def label(self, forces: Forces, **settings: Any) -> FoundLabels:
+        """Label the frames."""
+        rng = np.random.default_rng(2)
+        return label_trial(self.frame_time_s, self.motion, forces, settings=LabelSettings(**settings), rng=rng)
 
     def contact(self, *, noise_n: float = 0.0, rng: np.random.Generator | None = None) -> ContactForces:
         """In the axes of the contact, with the right axes and no tare."""

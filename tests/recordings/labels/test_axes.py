@@ -1,11 +1,12 @@
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sliplens.errors import RecordingError
-from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import Found, infer_axes
+from sliplens.recordings.labels import Found, LabelSettings, infer_axes
 from sliplens.recordings.labels.axes import apply_axes, magnitude
 
 from .conftest import NORMAL_N, SLIP_S, TOUCH_S, Trial
@@ -38,28 +39,22 @@ def test_noise_with_a_memory_makes_the_tare_less_certain(trial: Trial, rng: np.r
     white = rng.normal(0, 0.02, (len(trial.time_s) + 24, 3))
     # means over 25 samples, as of a sensor that filters: the same spread sample by sample, a 25th as many of them
     slow = np.lib.stride_tricks.sliding_window_view(white, 25, axis=0).mean(axis=-1) * 5
-    quick, filtered = (
-        infer_axes(Forces(time_s=trial.time_s, force_n=trial.contact_n + noise, source="sensor"))
-        for noise in (white[:-24], slow)
-    )
+    quick, filtered = (infer_axes(trial.record(trial.contact_n + noise)) for noise in (white[:-24], slow))
     assert np.all(filtered.tare_sigma_n > 1.5 * np.array(quick.tare_sigma_n))
 
 
 def test_a_recording_that_begins_in_the_press_has_no_still_samples(trial: Trial, rng: np.random.Generator):
-    whole = trial.forces(noise_n=0.02, rng=rng)
-    kept = whole.time_s > TOUCH_S + 0.02
-    axes = infer_axes(Forces(time_s=whole.time_s[kept], force_n=whole.force_n[kept], source="sensor"))
+    later = trial.time_s > TOUCH_S + 0.02
+    begins = replace(trial, time_s=trial.time_s[later], contact_n=trial.contact_n[later])
+    axes = infer_axes(begins.forces(noise_n=0.02, rng=rng))
     assert axes.tare_found is Found.ASSUMED
     assert "no still samples before contact" in axes.notes[0]
     np.testing.assert_array_equal(axes.tare_n, 0)
 
 
 def turned(degrees: float, *, about: tuple[float, float, float]) -> np.ndarray:
-    """Rotation about an axis (Rodrigues)."""
-    x, y, z = np.array(about) / np.linalg.norm(about)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.deg2rad(degrees)
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    """Rotation about an axis."""
+    return Rotation.from_rotvec(degrees * np.array(about) / np.linalg.norm(about), degrees=True).as_matrix()
 
 
 @pytest.mark.parametrize("degrees", [2, 5, 20, 50])
@@ -69,7 +64,7 @@ def test_a_tilted_sensor_gives_the_forces_of_a_straight_one(
     trial: Trial, rng: np.random.Generator, degrees: float, about: tuple[float, float, float], sign: int
 ):
     straight = trial.forces(noise_n=0.02, rng=rng, sign=sign)
-    tilted = Forces(time_s=trial.time_s, force_n=straight.force_n @ turned(degrees, about=about).T + TARE, source="s")
+    tilted = trial.record(straight.force_n @ turned(degrees, about=about).T + TARE)
     axes = infer_axes(tilted)
     contact = apply_axes(tilted, axes)
     # the direction is known to 0.02 N / (1.5 N sqrt(60)), those of 250 samples of a press that weigh as much as a full
@@ -87,7 +82,7 @@ def test_a_tilted_sensor_gives_the_forces_of_a_straight_one(
 
 def test_a_tilt_off_a_declared_axis_is_flagged_and_not_turned(trial: Trial):
     tilted = trial.contact_n @ turned(20, about=(0, 1, 0)).T
-    axes = infer_axes(Forces(time_s=trial.time_s, force_n=tilted, source="sensor"), normal="x", sign=1)
+    axes = infer_axes(trial.record(tilted), LabelSettings(normal_axis="x", normal_sign=1))
     assert axes.direction is None
     assert "points 20 degrees off the axis x that was declared" in axes.notes[0]
 
@@ -97,24 +92,24 @@ def test_a_press_that_is_pulled_from_the_touch_on_is_no_tilt(trial: Trial, rng: 
     normal = trial.contact_n[:, 0]
     pull = 0.5 * np.clip((trial.time_s - TOUCH_S - pull_s) / 2.0, 0, 1) * normal
     force = np.stack((normal, pull, 0 * pull), axis=1) + rng.normal(0, 0.02, (len(normal), 3))
-    axes = infer_axes(Forces(time_s=trial.time_s, force_n=force, source="sensor"))
+    axes = infer_axes(trial.record(force))
     assert (axes.normal, axes.direction) == ("x", None)
 
 
 def test_moved_samples_give_no_drift(trial: Trial, rng: np.random.Generator):
     force = trial.contact_n * (trial.time_s < 5)[:, None] + rng.normal(0, 0.02, (len(trial.time_s), 3))
     force[trial.time_s > 4.0] += 0.2
-    forces = Forces(time_s=trial.time_s, force_n=force, source="sensor")
+    forces = trial.record(force)
     # 0.2 N in the 5 s from the middle of the untouched samples to the end
     np.testing.assert_allclose(infer_axes(forces).drift_n_s, 0.2 / 5.3, rtol=0.15)
     np.testing.assert_array_equal(infer_axes(forces, moved_s=4.0).drift_n_s, 0)
 
 
 def test_a_sensor_that_is_never_touched_is_refused(trial: Trial, rng: np.random.Generator):
-    forces = Forces(time_s=trial.time_s, force_n=rng.normal(0.5, 0.02, (len(trial.time_s), 3)), source="sensor")
+    forces = trial.record(rng.normal(0.5, 0.02, (len(trial.time_s), 3)))
     with pytest.raises(RecordingError, match=r"sensor never departs from its noise.*; give --normal-axis"):
         infer_axes(forces)
-    assert infer_axes(forces, normal="z", sign=1).still_until_s is None
+    assert infer_axes(forces, LabelSettings(normal_axis="z", normal_sign=1)).still_until_s is None
 
 
 @pytest.mark.parametrize("force_n", [0.1, NORMAL_N])

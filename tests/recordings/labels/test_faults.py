@@ -8,10 +8,10 @@ import pytest
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import FoundLabels, LabelSettings, Reason, infer_axes, label_trial
+from sliplens.recordings.labels import Reason, infer_axes
 from sliplens.recordings.labels.faults import screen_forces
 
-from .conftest import PULL_S, SLIP_S, STATIC, Trial, ratio
+from .conftest import PULL_S, SLIP_S, STATIC, Trial
 
 TARE = (0.7, -0.4, 0.2)
 NOISE_N = 0.02
@@ -19,7 +19,7 @@ AT_S = 3.0
 Spoil = Callable[[np.ndarray, np.ndarray], None]
 
 
-def spoilt(trial: Trial, spoil: Spoil, *, every: int = 1) -> Forces:
+def spoilt(trial: Trial, spoil: Spoil = lambda _time, _force: None, *, every: int = 1) -> Forces:
     """Forces through noise and an offset, changed in place between samples."""
     forces = trial.forces(noise_n=NOISE_N, rng=np.random.default_rng(5), tare_n=TARE)
     time, force = forces.time_s[::every], forces.force_n[::every].copy()
@@ -27,33 +27,19 @@ def spoilt(trial: Trial, spoil: Spoil, *, every: int = 1) -> Forces:
     return replace(forces, time_s=time, force_n=force)
 
 
-def label(trial: Trial, forces: Forces) -> FoundLabels:
-    return label_trial(trial.frame_time_s, trial.motion, forces, settings=LabelSettings(), rng=np.random.default_rng(2))
-
-
-def span(time: np.ndarray, length_s: float) -> np.ndarray:
-    return (time >= AT_S - 1e-9) & (time < AT_S + length_s - 1e-9)
-
-
-def add(length_s: float, size_n: float, axis: int) -> Spoil:
-    def spoil(time: np.ndarray, force: np.ndarray) -> None:
-        force[span(time, length_s), axis] += size_n
-
-    return spoil
-
-
 def put(length_s: float, change: Callable[[np.ndarray], object]) -> Spoil:
     def spoil(time: np.ndarray, force: np.ndarray) -> None:
-        force[span(time, length_s)] = change(force[span(time, length_s)])
+        span = (time >= AT_S - 1e-9) & (time < AT_S + length_s - 1e-9)
+        force[span] = change(force[span])
 
     return spoil
 
 
 SPANS = {
-    "a sample of 70 N": (add(0.002, 70, 0), 0.002, Reason.SPIKE),
-    "a small spike": (add(0.004, -0.5, 1), 0.004, Reason.SPIKE),
-    "100 ms of 70 N pull": (add(0.1, -70, 0), 0.1, Reason.STEP),
-    "a soft pull": (add(0.2, 0.4, 2), 0.2, Reason.STEP),
+    "a sample of 70 N": (put(0.002, lambda part: np.add(part, (70, 0, 0))), 0.002, Reason.SPIKE),
+    "a small spike": (put(0.004, lambda part: np.subtract(part, (0, 0.5, 0))), 0.004, Reason.SPIKE),
+    "100 ms of 70 N pull": (put(0.1, lambda part: np.subtract(part, (70, 0, 0))), 0.1, Reason.STEP),
+    "a soft pull": (put(0.2, lambda part: np.add(part, (0, 0, 0.4))), 0.2, Reason.STEP),
     "no numbers": (put(0.3, lambda part: np.nan * part), 0.3, Reason.DROP_OUT),
     "no force": (put(0.002, lambda part: 1e56 + 0 * part), 0.002, Reason.DROP_OUT),
     "zeros": (put(0.3, lambda part: 0 * part), 0.3, Reason.DROP_OUT),
@@ -80,10 +66,9 @@ def test_a_fault_is_marked_from_its_first_sample_to_its_last(trial: Trial, fault
 @pytest.mark.parametrize("every", [1, 5])
 def test_labels_are_those_of_the_sound_samples(trial: Trial, fault: str, every: int):
     spoil, length_s, _ = SPANS[fault]
-    labels = label(trial, spoilt(trial, spoil, every=every))
-    time, truth = trial.frame_time_s, 1 - ratio(trial.frame_time_s) / STATIC
+    labels, time = trial.label(spoilt(trial, spoil, every=every)), trial.frame_time_s
     assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.03)
-    error = np.abs(labels.safety_margin - truth)[labels.valid]
+    error = np.abs(labels.safety_margin - trial.truth)[labels.valid]
     assert np.all(error < 4 * labels.safety_margin_sigma[labels.valid] + 0.01)
     # frames at the fault say so, the others of the pull keep their labels
     inside = (time > AT_S) & (time < AT_S + length_s)
@@ -100,7 +85,7 @@ def test_a_slip_in_a_sample_is_no_step_for_the_image_sees_it(trial: Trial):
     frames = np.stack([np.interp(trial.frame_time_s, trial.time_s, column) for column in sudden.T], axis=1)
     motion = 0.7 + np.append(0, 3 * np.linalg.norm(np.diff(frames, axis=0), axis=1))
     slipped = replace(trial, contact_n=sudden, motion=motion)
-    labels = label(slipped, spoilt(slipped, lambda _time, _force: None))
+    labels = slipped.label(spoilt(slipped))
     assert labels.basis.faults == ()
     assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.02)
 
@@ -113,7 +98,7 @@ def test_a_fall_of_the_pull_at_constant_normal_force_is_a_slip(trial: Trial, axe
         pull = np.linalg.norm(slipped.contact_n[:, 1:], axis=1)
         slipped = replace(slipped, contact_n=np.stack((slipped.contact_n[:, 0], pull, 0 * pull), axis=1))
     rests = replace(slipped, motion=np.where(np.abs(trial.frame_time_s - SLIP_S) < 0.1, 0.7, trial.motion))
-    labels = label(rests, spoilt(rests, lambda _time, _force: None, every=every))
+    labels = rests.label(spoilt(rests, every=every))
     assert labels.basis.faults == ()
     # of 100 samples a second the slip lies anywhere in a hundredth
     assert labels.basis.slip_s == pytest.approx(SLIP_S, abs=0.012)
@@ -136,7 +121,7 @@ def test_a_fall_of_both_forces_is_a_release(trial: Trial, every: int, length_s: 
     begin_s = SLIP_S + 0.4 if slips else 4.0
     left = np.clip(1 - (trial.time_s - begin_s) / length_s, 0, 1)
     left = left if shape == "even" else left**2 * (3 - 2 * left)
-    forces = spoilt(replace(trial, contact_n=trial.contact_n * left[:, None]), lambda _time, _force: None, every=every)
+    forces = spoilt(replace(trial, contact_n=trial.contact_n * left[:, None]), every=every)
     # no image is asked
     screened = screen_forces(forces)
     assert screened.faults == ()
@@ -154,7 +139,7 @@ def test_a_fall_that_returns_is_a_fault(trial: Trial, what: str, share: float):
     if what == "pull":
         scale[:, 0] = 1
     faulty = replace(trial, contact_n=trial.contact_n * scale)
-    faults = screen_forces(spoilt(faulty, lambda _time, _force: None)).faults
+    faults = screen_forces(spoilt(faulty)).faults
     assert {fault.kind for fault in faults} == {Reason.STEP}
     assert faults[0].start_s == pytest.approx(AT_S, abs=0.006)
     assert faults[-1].end_s == pytest.approx(AT_S + 0.2, abs=0.008)
@@ -165,18 +150,17 @@ def test_a_step_that_may_be_a_slip_names_the_option_that_says_so(trial: Trial):
     jumped = sudden_slip(trial)
     jumped[trial.time_s >= SLIP_S, 0] += 0.4
     rests = replace(trial, contact_n=jumped, motion=np.where(trial.frame_time_s > SLIP_S - 0.1, 0.74, trial.motion))
-    forces = spoilt(rests, lambda _time, _force: None)
+    forces = spoilt(rests)
     with pytest.raises(RecordingError, match=r"if the contact slips at 4\.50 s, give --slip-s 4\.50") as refusal:
-        label(rests, forces)
+        rests.label(forces)
     slip_s = float(str(refusal.value).rsplit("--slip-s ", 1)[1].rstrip(")"))
-    settings = LabelSettings(slip_s=slip_s)
-    labels = label_trial(rests.frame_time_s, rests.motion, forces, settings=settings, rng=np.random.default_rng(2))
+    labels = rests.label(forces, slip_s=slip_s)
     assert labels.basis.faults == ()
     assert labels.basis.friction.mu == pytest.approx(STATIC, rel=0.03)
 
 
 def test_after_a_step_nothing_is_valid_and_what_is_before_stays(trial: Trial):
-    labels = label(trial, spoilt(trial, add(99, 3.0, 1)))
+    labels = trial.label(spoilt(trial, put(99, lambda part: np.add(part, (0, 3, 0)))))
     time = trial.frame_time_s
     assert not labels.valid[time > AT_S].any()
     assert labels.valid[(time > PULL_S) & (time < AT_S - 0.05)].all()
@@ -193,7 +177,7 @@ def test_clipped_tops_are_not_taken_for_forces(trial: Trial):
     # pressed to 1.2 N of 1.5 after four fifths of half a second
     assert screened.faults[0].start_s == pytest.approx(1.0, abs=0.03)
     with pytest.raises(RecordingError, match=r"\(left out were: clipped force "):
-        label(trial, spoilt(trial, clip))
+        trial.label(spoilt(trial, clip))
 
 
 def test_coarse_and_repeated_readings_are_no_fault(trial: Trial):
@@ -211,12 +195,11 @@ def test_a_drift_counts_as_an_error_of_its_size(trial: Trial):
     def drift(time: np.ndarray, force: np.ndarray) -> None:
         force[:, 1] += 0.12 * time
 
-    labels = label(trial, spoilt(trial, drift))
+    labels = trial.label(spoilt(trial, drift))
     assert labels.basis.axes.drift_n_s[1] == pytest.approx(0.12, rel=0.3)
     assert labels.basis.axes.drift_n_s[::2] == (0, 0)
     assert any("drifts by" in flag for flag in labels.basis.flags)
-    truth = 1 - ratio(trial.frame_time_s) / STATIC
-    error = np.abs(labels.safety_margin - truth)[labels.valid]
+    error = np.abs(labels.safety_margin - trial.truth)[labels.valid]
     assert np.all(error < 3 * labels.safety_margin_sigma[labels.valid])
     assert error.max() > 0.1
 
@@ -224,29 +207,23 @@ def test_a_drift_counts_as_an_error_of_its_size(trial: Trial):
 def test_a_friction_that_no_fingertip_has_is_refused_or_flagged(trial: Trial):
     strong = replace(trial, contact_n=trial.contact_n * np.array([1, 20, 20]))
     forces = strong.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
-    given = {"normal_axis": "x", "normal_sign": 1}
-
-    def friction(mu: float | None) -> FoundLabels:
-        settings = LabelSettings(mu=mu, **given)
-        return label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=np.random.default_rng(2))
-
     with pytest.raises(RecordingError, match=r"comes out as 12.., and that of a fingertip lies between 0.05 and 4"):
-        friction(None)
-    assert any(flag.startswith("a friction of 9 was given") for flag in friction(9.0).basis.flags)
+        trial.label(forces, normal_axis="x", normal_sign=1)
+    flags = trial.label(forces, normal_axis="x", normal_sign=1, mu=9.0).basis.flags
+    assert any(flag.startswith("a friction of 9 was given") for flag in flags)
 
 
 def test_a_normal_force_that_mostly_pulls_is_flagged(trial: Trial):
     forces = trial.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE, sign=-1)
     forces.force_n[trial.time_s > 5.4, 0] += 3.0
-    settings = LabelSettings(normal_axis="x", normal_sign=1, mu=STATIC)
-    labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=np.random.default_rng(2))
+    labels = trial.label(forces, normal_axis="x", normal_sign=1, mu=STATIC)
     assert any("the normal force is negative in" in flag for flag in labels.basis.flags)
 
 
 @pytest.mark.parametrize("speed", [0.5, 4])
 def test_frames_by_a_clock_of_another_speed_than_the_forces_are_flagged(trial: Trial, speed: float):
     forces = trial.forces(noise_n=NOISE_N, rng=np.random.default_rng(0), tare_n=TARE)
-    labels = label(replace(trial, frame_time_s=trial.frame_time_s / speed), forces)
+    labels = replace(trial, frame_time_s=trial.frame_time_s / speed).label(forces)
     (flag,) = [flag for flag in labels.basis.flags if flag.startswith("the frames last")]
     assert f"the frames last {np.ptp(trial.frame_time_s) / speed:.2f} s and the forces 5.50 s" in flag
     assert "--frame-rate" in flag

@@ -143,16 +143,11 @@ def test_an_image_that_moves_as_the_force_changes_is_in_no_doubt(trial: Trial, n
 @pytest.mark.parametrize("case", ["image rests", "image repeats", "forces rest", "forces of another trial"])
 def test_a_contact_in_which_one_moves_and_the_other_does_not_is_told_with_the_correlation(trial: Trial, case: str):
     motion, forces = frames_of(trial), trial.forces(noise_n=0.02, rng=np.random.default_rng(2))
-    if case == "image rests":
-        motion = frames_of(trial, until_s=0.0)
-    elif case == "image repeats":
-        motion = np.zeros(len(motion))
-    elif case == "forces rest":
-        force = np.random.default_rng(2).normal(0, 0.02, forces.force_n.shape)
-        forces = replace(forces, force_n=force)
-    else:  # which press and slip at other moments
-        forces = replace(forces, force_n=forces.force_n[::-1].copy())
-    (doubt,) = doubts(trial.frame_time_s, motion, forces)
+    noise = np.random.default_rng(2).normal(0, 0.02, forces.force_n.shape)
+    motion = {"image rests": frames_of(trial, until_s=0.0), "image repeats": 0 * motion}.get(case, motion)
+    # another trial presses and slips at other moments
+    others = {"forces rest": noise, "forces of another trial": forces.force_n[::-1].copy()}
+    (doubt,) = doubts(trial.frame_time_s, motion, replace(forces, force_n=others.get(case, forces.force_n)))
     assert re.search(r"do not move together from .* \(correlation -?0\.[012]\d, 0\.3 is needed\)", doubt)
 
 

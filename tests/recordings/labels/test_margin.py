@@ -14,7 +14,6 @@ from sliplens.recordings.labels import (
     apply_axes,
     estimate_friction,
     label_frames,
-    label_trial,
 )
 
 from .conftest import NORMAL_N, PULL_S, SLIP_S, STATIC, TOUCH_S, Trial, ratio
@@ -29,8 +28,7 @@ def reasons(labels: FoundLabels) -> set[Reason]:
 
 
 def test_the_margin_is_one_less_the_used_friction(trial: Trial):
-    labels = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION)
-    truth = 1 - ratio(trial.frame_time_s) / STATIC
+    labels, truth = label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION), trial.truth
     # windows lie evenly about their frames, so that only those over a kink of the pull err: by its slope times an
     # eighth of the window of 33 ms
     np.testing.assert_allclose(labels.safety_margin[labels.valid], truth[labels.valid], atol=0.0015)
@@ -77,11 +75,8 @@ def test_after_gross_slip_the_margin_is_0_until_the_contact_is_loaded_anew(trial
 def test_no_valid_label_follows_a_friction_that_contradicts_the_forces(
     trial: Trial, rng: np.random.Generator, mu: float, slip_s: float | None
 ):
-    settings, forces = LabelSettings(mu=mu, slip_s=slip_s), trial.forces(noise_n=0.02, rng=rng)
-    labels = label_trial(trial.frame_time_s, trial.motion, forces, settings=settings, rng=rng)
-    truth = 1 - ratio(trial.frame_time_s) / STATIC
-    truth[trial.frame_time_s >= SLIP_S] = 0
-    error = np.abs(labels.safety_margin - truth)
+    labels = trial.label(trial.forces(noise_n=0.02, rng=rng), mu=mu, slip_s=slip_s)
+    error = np.abs(labels.safety_margin - np.where(trial.frame_time_s < SLIP_S, trial.truth, 0))
     assert np.all((error <= 3 * labels.safety_margin_sigma)[labels.valid])
     assert labels.basis.flags
     assert Reason.CONTRADICTED in reasons(labels)
@@ -122,15 +117,12 @@ def test_frames_without_samples_have_no_label(trial: Trial):
 
 
 def test_forces_outside_the_range_have_no_label(trial: Trial):
-    labels = label_frames(
-        trial.frame_time_s, trial.contact(), friction=FRICTION, settings=LabelSettings(force_range=NORMAL_N - 0.1)
+    some, everything = (
+        label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, settings=LabelSettings(force_range=limit))
+        for limit in (NORMAL_N - 0.1, NORMAL_N + 0.1)
     )
-    assert Reason.OUT_OF_RANGE in reasons(labels)
-    assert np.nanmax(labels.normal_force_n[labels.valid]) < NORMAL_N - 0.1
-    everything = label_frames(
-        trial.frame_time_s, trial.contact(), friction=FRICTION, settings=LabelSettings(force_range=NORMAL_N + 0.1)
-    )
-    assert Reason.OUT_OF_RANGE not in reasons(everything)
+    assert Reason.OUT_OF_RANGE in reasons(some) - reasons(everything)
+    assert np.nanmax(some.normal_force_n[some.valid]) < NORMAL_N - 0.1
 
 
 def test_a_lag_is_applied_only_when_asked(trial: Trial):
@@ -177,8 +169,7 @@ def test_friction_moves_the_margin_by_its_share(trial: Trial):
 
 
 def test_the_band_of_the_margin_covers(trial: Trial):
-    truth = 1 - ratio(trial.frame_time_s) / STATIC
-    shares = []
+    truth, shares = trial.truth, []
     for number in range(20):
         rng = np.random.default_rng(number)
         contact = trial.contact(noise_n=0.03, rng=rng)

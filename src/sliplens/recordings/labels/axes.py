@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import AXES, ForceAxes, Found, Vector
+from sliplens.recordings.options import LabelSettings
 
 _WINDOW_S = 0.03  # time over which the force is averaged to find the touch: a press takes longer, a spike is shorter
 _FIRST_S, _GUARD_S = 0.1, 0.15  # untouched time at the start, and time before the touch that is left out of the tare
@@ -109,26 +110,18 @@ def _integral(time_s: Samples, values: Columns, at_s: Times) -> Float[np.ndarray
     return sums[before] + (at_s - time_s[before])[:, None] * (values[before] + here) / 2
 
 
-def infer_axes(
-    forces: Forces,
-    *,
-    normal: str | None = None,
-    sign: int | None = None,
-    tare_n: Vector | None = None,
-    touch_s: float | None = None,
-    drift_n_s: float | None = None,
-    moved_s: float = np.inf,
-) -> ForceAxes:
-    """Infer the axes, sign and tare of a force sensor that are not declared.
+def infer_axes(forces: Forces, settings: LabelSettings | None = None, *, moved_s: float = np.inf) -> ForceAxes:
+    """Infer the axes, sign and tare of a force sensor that are not declared in the settings.
 
     The tare is the mean of the samples before the touch, spikes left out. The normal axis departs furthest from it in
     the press, positively by its sign. While nothing shears, the force of a press keeps its direction: where that is no
     axis, the sensor is tilted, and its normal is that direction, unless an axis was declared. Where nothing is ever
-    pressed, axis and sign cannot be inferred, which is a `RecordingError`. `drift_n_s` is the standard deviation of the
-    rate at which the zero may drift, if known; samples from `moved_s` on were moved, and show no drift.
+    pressed, axis and sign cannot be inferred, which is a `RecordingError`. Samples from `moved_s` on show no drift.
     """
+    settings = settings or LabelSettings()
+    normal, sign, tare_n = settings.normal_axis, settings.normal_sign, settings.tare
     noise = np.asarray(noise_sigma(forces.force_n))
-    touch = _find_touch(forces, tare_n=tare_n) if touch_s is None else touch_s
+    touch = _find_touch(forces, tare_n=tare_n) if settings.contact_s is None else settings.contact_s
     until = touch - min(_GUARD_S, max(0.0, touch - float(forces.time_s[0])) / 2) if np.isfinite(touch) else touch
     if np.isinf(touch) and (normal is None or sign is None):
         never = f"{forces.source} never departs from its noise: no touch to infer the axes from"
@@ -171,8 +164,8 @@ def infer_axes(
             else "that was declared; leave out --normal-axis and --normal-sign if the sensor is tilted"
         )
         notes.append(f"the force of the press points {tilt_deg:.0f} degrees off the axis {axis} {cure}")
-    if drift_n_s is not None:
-        drift_sigma = np.full(3, drift_n_s)
+    if settings.drift_rate is not None:
+        drift_sigma = np.full(3, settings.drift_rate)
     elif np.any(drift_sigma * np.ptp(forces.time_s) > _UNCERTAIN_LOAD * np.linalg.norm(press)):
         most = f"the zero may drift by {_signed(drift_sigma * np.ptp(forces.time_s))} N (x, y, z) over the trial unseen"
         notes.append(f"{most}: let go before the recording ends, wait before the touch, or give --drift-rate")

@@ -1,6 +1,7 @@
 """Lag between camera and force sensor, by cross-correlation: the image moves when the force changes."""
 
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -11,16 +12,12 @@ from sliplens.images import Soft
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import Lag
 from sliplens.recordings.labels.axes import find_spans, infer_axes, mean_force, typical_step
+from sliplens.recordings.options import LabelSettings
 
 
 def measure_motion(softened: Iterable[Soft]) -> Float[np.ndarray, " frames"]:
     """Return the mean absolute difference of softened frames from their predecessors, in grey levels; 0 first."""
-    motion: list[float] = []
-    previous = None
-    for soft in softened:
-        motion.append(0.0 if previous is None else float(np.mean(np.abs(soft - previous))))
-        previous = soft
-    return np.array(motion, dtype=np.float64)
+    return np.array([0.0, *(np.mean(np.abs(soft - before)) for before, soft in pairwise(softened))], dtype=np.float64)
 
 
 # Lossless repeats change nothing, and repeats of lossy video up to an eighth of what the frames beside them do; noise
@@ -205,7 +202,7 @@ def _find_loads(forces: Forces) -> list[tuple[float, float]]:
 def _measure_load(forces: Forces) -> tuple[Float[np.ndarray, " samples"], float]:
     """Return the length of the force without its tare, and the time until which nothing touches the sensor."""
     # neither axis nor sign matters to a length
-    axes, time = infer_axes(forces, normal="x", sign=1), forces.time_s
+    axes, time = infer_axes(forces, LabelSettings(normal_axis="x", normal_sign=1)), forces.time_s
     load = np.linalg.norm(mean_force(time, forces.force_n - axes.tare_n, time, window_s=_LOAD_WINDOW_S), axis=1)
     return load, np.inf if axes.still_until_s is None else axes.still_until_s
 

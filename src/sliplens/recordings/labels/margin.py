@@ -245,16 +245,7 @@ def label_trial(
     require_inside(settings, frames=len(frame_time_s), time_s=forces.time_s)
     screened, lag = screen_trial(frame_time_s, image_motion, forces, settings=settings, rng=rng)
     try:
-        axes = infer_axes(
-            screened.forces,
-            normal=settings.normal_axis,
-            sign=settings.normal_sign,
-            tare_n=settings.tare,
-            touch_s=settings.contact_s,
-            drift_n_s=settings.drift_rate,
-            moved_s=screened.moved_s,
-        )
-        contact = apply_axes(screened.forces, axes)
+        contact = apply_axes(screened.forces, infer_axes(screened.forces, settings, moved_s=screened.moved_s))
         friction = estimate_friction(
             contact,
             contact_threshold_n=contact_threshold(contact, settings, window_s=typical_step(frame_time_s)),
