@@ -22,7 +22,6 @@ LABELLING = Labelling(
             tare_found=Found.ASSUMED,
         ),
         friction=FrictionEstimate(mu=0.3, low=0.2, high=0.4),
-        friction_change=0.0,
         slip_s=None,
         lag=Lag(lag_s=0.1, sigma_s=1 / 3),
         lag_applied=False,

@@ -71,7 +71,6 @@ def make_labelling(
     basis = LabelBasis(
         axes=AXES,
         friction=FRICTION,
-        friction_change=0.0,
         slip_s=1.97,
         lag=LAG,
         lag_applied=False,

@@ -75,7 +75,6 @@ class FrictionEstimate:
     onset_s: float | None = None  #: First gross slip, on the force sensor's clock; None where no slip is known.
     found: Found = Found.DECLARED
     method: str = "given by hand"  #: Method of the estimate, in words.
-    onset_sigma_s: float | None = None  #: Standard uncertainty of the onset; None where it is unknown.
     image_sigmas: float | None = None
     """Motion of the image at the onset beyond that before it, in standard deviations; None where not measured."""
     later_onsets_s: tuple[float, ...] = ()  #: Gross slips of later contacts, at most one each.
@@ -164,7 +163,6 @@ class LabelBasis:
 
     axes: ForceAxes
     friction: FrictionEstimate
-    friction_change: float  #: Relative standard deviation of the change of friction from touch to slip.
     slip_s: float | None  #: First gross slip, on the force sensor's clock; None if there is none.
     lag: Lag | None  #: None where it was neither estimated nor set.
     lag_applied: bool

@@ -34,7 +34,6 @@ class Break(NamedTuple):
     time_s: float
     level: float  # at the break
     levels: Float[np.ndarray, " draws"]  # at the breaks of the bootstrap's draws
-    times_s: Float[np.ndarray, " draws"]
 
 
 def fit_break(
@@ -64,8 +63,7 @@ def fit_break(
     # the parameters of a fit explain a part of the noise
     residuals = (residuals - residuals.mean()) * np.sqrt(len(values) / max(1, len(values) - _PARAMETERS))
     drawn = fitted[:, None] + residuals[_blocks(residuals, draws=draws, rng=rng)]
-    chosen, levels = _best(bases, triangles, drawn)
-    return Break(float(moments[index]), float(level), levels, moments[chosen])
+    return Break(float(moments[index]), float(level), _best(bases, triangles, drawn)[1])
 
 
 def _bracket_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.random.Generator, draws: int) -> Break:
@@ -83,7 +81,7 @@ def _bracket_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.
     noise = np.std(values[before] - line(time_s[before]), ddof=2)
     times = rng.uniform(last_s, next_s, draws)
     middle = float(last_s + next_s) / 2
-    return Break(middle, float(line(middle)), line(times) + rng.normal(0, noise, draws), times)
+    return Break(middle, float(line(middle)), line(times) + rng.normal(0, noise, draws))
 
 
 def _best(
@@ -152,7 +150,6 @@ class _Slip(NamedTuple):
     mu: float | None = None
     low: float = np.nan
     high: float = np.nan
-    sigma_s: float | None = None
 
 
 class _MeanRatio(NamedTuple):
@@ -248,7 +245,6 @@ def estimate_friction(
         found=found,
         method=method,
         onset_s=first and first.time_s,
-        onset_sigma_s=first and first.sigma_s,
         image_sigmas=first and _image_sigmas(image, first.time_s),
         later_onsets_s=tuple(slip.time_s for slip in slips[1:]),
     )
@@ -341,10 +337,7 @@ def _fit_slip(
     (normal,), (tangential,) = forces.tare_sigma_n(np.array([fit.time_s]))
     tare = np.hypot(tangential, fit.level * normal)
     low, high = np.quantile(fit.levels + rng.normal(0, float(tare) / normal_n, draws), _BAND)
-    early, late = np.quantile(fit.times_s, _BAND)
-    return _Slip(
-        fit.time_s, fit.level, float(min(low, fit.level)), float(max(high, fit.level)), float(late - early) / 2
-    )
+    return _Slip(fit.time_s, fit.level, float(min(low, fit.level)), float(max(high, fit.level)))
 
 
 def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: float) -> _MeanRatio:

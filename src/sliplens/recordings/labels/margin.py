@@ -203,7 +203,6 @@ def label_frames(
         basis=LabelBasis(
             axes=forces.axes,
             friction=friction,
-            friction_change=settings.friction_change,
             slip_s=slip_s,
             lag=lag,
             lag_applied=apply_lag,
