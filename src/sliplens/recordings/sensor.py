@@ -19,6 +19,7 @@ from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.options import LabelSettings
 
 _MOST_STRETCH = 0.02  # of width against height: markers stay round, and distances mean the same along both
+_FLIPPED_AXES = {"none": (), "horizontal": 1, "vertical": 0, "both": (0, 1)}
 _SHIPPED = Path(str(files("sliplens"))) / "sensors"
 SENSORS_FOLDER = "sensors"
 """Folder in a data set with the profiles that its frames went through."""
@@ -98,11 +99,7 @@ class SensorProfile:
             frame = frame[..., [self.colours.index(channel) for channel in "rgb"]]
         x0, y0, x1, y1 = self._box(size)
         frame = np.rot90(frame[y0:y1, x0:x1], k=-self.rotate_deg // 90)
-        if self.flip in {"horizontal", "both"}:
-            frame = frame[:, ::-1]
-        if self.flip in {"vertical", "both"}:
-            frame = frame[::-1]
-        frame = np.ascontiguousarray(frame)
+        frame = np.ascontiguousarray(np.flip(frame, _FLIPPED_AXES[self.flip]))
         if frame.shape[:2] == (height, width):
             return frame
         # a triangle as wide as the step between new pixels: the noise of neighbours averages out instead of aliasing
