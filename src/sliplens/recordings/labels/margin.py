@@ -14,6 +14,7 @@ from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import Found, FrictionEstimate, LabelBasis, Lag, Reason, describe_faults
 from sliplens.recordings.labels.axes import (
     ContactForces,
+    Samples,
     apply_axes,
     half_window,
     infer_axes,
@@ -284,7 +285,7 @@ def require_inside(settings: LabelSettings, *, frames: int, time_s: Frames) -> N
         raise RecordingError(f"the slip is set to {settings.slip_s:.2f} s, before the contact; set the contact first")
 
 
-def _find_doubts(forces: ContactForces, basis: LabelBasis, *, frame_time_s: Frames, recorded_s: Frames) -> list[str]:
+def _find_doubts(forces: ContactForces, basis: LabelBasis, *, frame_time_s: Frames, recorded_s: Samples) -> list[str]:
     """Describe an implausible friction, a contact that pulls more than it presses, and clocks of different lengths."""
     friction, lag, doubts = basis.friction, basis.lag, []
     begin = recorded_s[0] if basis.axes.still_until_s is None else basis.axes.still_until_s
