@@ -225,13 +225,13 @@ def estimate_friction(
     mean = max(means, key=lambda mean: float(mean.least.max()))
     first = slips[0] if slips else None
     if mu is not None:
-        low, high, found, method = mu, mu, Found.DECLARED, "given by hand"
+        low, high, origin, method = mu, mu, Found.DECLARED, "given by hand"
     elif first is None or first.mu is None:
         never = f"the trial never slips (F_t / F_n reaches {mean.ratio[mean.least.argmax()]:.2f} without breaking off)"
         raise RecordingError(f"{never}, so its friction is unknown; give it with --mu, or in a manifest")
     else:
         mu, low, high = first.mu, first.low, first.high
-        found, method = Found.INFERRED, "F_t / F_n at the slip set by hand"
+        origin, method = Found.INFERRED, "F_t / F_n at the slip set by hand"
         if low <= 0:
             interval = f"{mu:.2g} with a 68 % interval from {low:.2g} to {high:.2g}, which is none"
             raise RecordingError(f"the slip at {first.time_s:.2f} s gives a friction of {interval}; give it with --mu")
@@ -242,7 +242,7 @@ def estimate_friction(
         mu=mu,
         low=low,
         high=high,
-        found=found,
+        found=origin,
         method=method,
         onset_s=first and first.time_s,
         image_sigmas=first and _image_sigmas(image, first.time_s),
