@@ -24,15 +24,16 @@ from sliplens.codec import save_record
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.plots.style import UNKNOWN, input_name, inputs_in_order, method_name, tell_ends
 from sliplens.recordings import Dataset
-from sliplens.report.comparisons import AS_RUN, DELETION, compare_errors
 from sliplens.report.results import Results, load_results
 from sliplens.report.verdict import (
+    AS_RUN,
+    DELETION,
     ClaimRow,
     MethodRow,
     Outcome,
     ShiftPoint,
     ThesisRecord,
-    all_of,
+    compare_errors,
     judge_gap,
     judge_methods,
 )
@@ -109,18 +110,16 @@ def judge_claims(sample: Results, held_out: Results, *, rng: np.random.Generator
     rows = [*_predictions(held_out, rng), *_deletion(sample, "", rng)]
     if sample is not held_out:
         rows += _deletion(held_out, ", test trials", rng)
-    for name in inputs_in_order(sample.study.deletion):
+    for name in inputs_in_order(sample.deletion):
         rows += [*_regions(sample, name, rng), *_looks(sample, name)]
-    for name in inputs_in_order(held_out.study.truth):
+    for name in inputs_in_order(held_out.truth):
         rows += _reasoning(held_out, name, rng)
     return tuple(rows)
 
 
 def method_rows(held_out: Results) -> tuple[MethodRow, ...]:
     """Rows of every method under the neutral judge."""
-    return tuple(
-        row for name in inputs_in_order(held_out.study.truth) for row in judge_methods(held_out.study.truth[name])
-    )
+    return tuple(row for name in inputs_in_order(held_out.truth) for row in judge_methods(held_out.truth[name]))
 
 
 def _row(
@@ -148,6 +147,14 @@ def _row(
         outcome=judged,
         why=why,
     )
+
+
+def all_of(outcomes: Iterable[Outcome]) -> Outcome:
+    """Join parts that must all hold: one that does not is enough."""
+    distinct = set(outcomes)
+    if "does not hold" in distinct:
+        return "does not hold"
+    return "holds" if distinct == {"holds"} else "undecided"
 
 
 # Table 1 and Fig. 7
@@ -224,7 +231,7 @@ def _scores(curve: DeletionCurve, *, at: float | None) -> Float[np.ndarray, " fr
 
 
 def _deletion(results: Results, where: str, rng: np.random.Generator) -> Iterator[ClaimRow]:
-    curves = {name: scores.curves for name, scores in results.study.deletion.items()}
+    curves = {name: scores.curves for name, scores in results.deletion.items()}
     for name, of_input in curves.items():
         means = {method: float(of_input[method].scores.mean()) for method in (*THREE, CHANCE)}
         ours = ", ".join(f"{method_name(method)} {means[method]:.3f}" for method in THREE)
@@ -284,7 +291,7 @@ def _shared(first: DeletionCurve, second: DeletionCurve) -> tuple[np.ndarray, np
 
 
 def _regions(results: Results, name: str, rng: np.random.Generator) -> Iterator[ClaimRow]:
-    explained, curves = results.study.explanations[name], results.study.deletion[name].curves
+    explained, curves = results.explanations[name], results.deletion[name].curves
     places = {frame.id: row for row, frame in enumerate(explained.frames)}
     left, share = {}, {}
     for method in THREE:
@@ -311,7 +318,7 @@ def _regions(results: Results, name: str, rng: np.random.Generator) -> Iterator[
 
 
 def _looks(results: Results, name: str) -> Iterator[ClaimRow]:
-    quality = results.study.map_quality[name]
+    quality = results.map_quality[name]
     resolution = {method: quality.methods[method].resolution for method in THREE}
     text = ", ".join(f"{method_name(method)} {value or 0:.2f}" for method, value in resolution.items())
     gaps = {(gap.first, gap.second): gap.gap for gap in quality.comparisons}
@@ -330,7 +337,7 @@ def _looks(results: Results, name: str) -> Iterator[ClaimRow]:
         why=f"Depth of the valley between markers, 1 where told apart: {text}; without an interval. Holds where only "
         "Poly-CAM's is over 0.2.",
     )
-    seconds = {method: results.study.explanations[name].methods[method].seconds_per_frame for method in THREE}
+    seconds = {method: results.explanations[name].methods[method].seconds_per_frame for method in THREE}
     yield ClaimRow(
         source="Appendix C",
         claim="Grad-CAM is fastest, Poly-CAM slowest",
@@ -351,7 +358,7 @@ def _negative(gap: Difference) -> Difference:
 
 
 def _reasoning(results: Results, name: str, rng: np.random.Generator) -> Iterator[ClaimRow]:
-    truth, explained = results.study.truth[name], results.study.explanations[name]
+    truth, explained = results.truth[name], results.explanations[name]
     figure = {"difference": "Fig. 11", "raw": "Fig. 12"}[name]
     shares, half = _strongest(truth.effects)
     clusters = _clusters(truth.effects)
@@ -368,8 +375,7 @@ def _reasoning(results: Results, name: str, rng: np.random.Generator) -> Iterato
             f"Correlation with the effects of moved markers {_estimate(judged.neutral)}. Ours: less the best control's."
         )
         yield _row("Conclusion", title, name, "yes", lead and lead.gap, why=why)
-    mass = truth.methods[POLY_CAM].mass["edges"] or 0.0
-    why = f"Share of Poly-CAM's relevance on edges ({100 * mass:.0f} %) less their share of the image."
+    why = "Share of Poly-CAM's relevance on edges less their share of the image."
     yield _row(
         figure, "Poly-CAM highlights the edges of markers", name, "by eye", truth.methods[POLY_CAM].edges, why=why
     )
@@ -440,7 +446,7 @@ def main() -> None:
         out = options.work / f"study-{name}"
         sl.run_study(data, list(NETWORKS.values()), config, out=out, on=options.on, on_progress=Terminal())
     sample, held_out = (load_results(options.work / f"study-{name}") for name in STUDIES)
-    choice, tested = sample.study.choice, held_out.study.choice
+    choice, tested = sample.choice, held_out.choice
     assert choice is not None
     assert tested is not None
     shift, frames = measure_shift(data)

@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import sliplens as sl
-from sliplens.report.comparisons import DELETION
+from sliplens.report.verdict import DELETION
 
 # %%
 # Data

@@ -12,21 +12,14 @@ from sliplens.demo import find_real_frames, run_demo
 from sliplens.files import read_json
 from sliplens.report.page import Written
 
-SMALL = {"dry_trials": 3, "wet_trials": 1, "frames_per_trial": 24, "days": 2, "test_days": 1}
+SMALL = {"preset": "thesis", "dry_trials": 3, "wet_trials": 1, "frames_per_trial": 24, "days": 2, "test_days": 1}
 
 
 @pytest.fixture(autouse=True)
 def _small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SLIPLENS_REFERENCE", str(tmp_path / "nothing"))
     monkeypatch.setattr(sliplens.demo, "SHOWN_DATA", SMALL)
-    monkeypatch.setattr(sliplens.demo, "TRAINING_DATA", SMALL | {"dry_trials": 8})
     monkeypatch.setattr(sliplens.demo, "STRIP_METHOD", "grad-cam")
-    monkeypatch.setattr(sliplens.demo, "SHORTEST_TRAINING", 0.01)
-
-
-def train_two(out: Path, *, on_page=None) -> Path:
-    """Networks of 32 px, so that explaining them takes seconds."""
-    return run_demo(out, train_minutes=0.02, image_size=32, on_page=on_page)
 
 
 @pytest.fixture
@@ -38,9 +31,9 @@ def test_the_demo_runs_every_stage_and_its_page_grows(
     tmp_path: Path, pages: list[str], monkeypatch: pytest.MonkeyPatch
 ):
     out = tmp_path / "demo"
-    page = train_two(out, on_page=lambda page: pages.append(page.read_text(encoding="utf-8")))
+    page = run_demo(out, on_page=lambda page: pages.append(page.read_text(encoding="utf-8")))
     stages = {read_json(path)["stage"] for path in out.glob("*/run.json")}
-    assert stages >= {"simulate", "train", "strip", "evaluate"}
+    assert stages >= {"simulate", "strip", "evaluate"}
     assert page == out / "report.html"
     assert pages[-1] == page.read_text(encoding="utf-8")
     # while something is missing the page says so and loads itself anew, and ends complete
@@ -53,11 +46,11 @@ def test_the_demo_runs_every_stage_and_its_page_grows(
     # the same again makes nothing anew; drawing its three pages again would take as long as all the rest
     written = {path: path.stat().st_mtime_ns for path in out.glob("*/run.json")}
     monkeypatch.setattr(sliplens.demo, "write_report", lambda *_, **__: Written(page=page, figures=()))
-    assert train_two(out) == page
+    assert run_demo(out) == page
     assert {path: path.stat().st_mtime_ns for path in out.glob("*/run.json")} == written
 
 
-def test_a_demo_of_other_settings_is_refused_with_a_cure_that_exists(
+def test_a_folder_that_is_no_demo_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     def stop(*arguments: object, **options: object) -> None:
@@ -66,9 +59,10 @@ def test_a_demo_of_other_settings_is_refused_with_a_cure_that_exists(
     monkeypatch.setattr(sliplens.demo, "simulate", stop)
     assert run("demo", tmp_path / "demo") == 130
     assert run("demo", tmp_path / "demo") == 130  # the same goes on
+    (tmp_path / "demo").mkdir(exist_ok=True)
+    (tmp_path / "demo" / "thesis.tex").touch()
     capsys.readouterr()
-    sentence = refused(capsys, "demo", tmp_path / "demo", "--seed", 1)
-    assert "holds a demo of other settings; choose another folder or delete it" in sentence
+    assert "is no demo; choose another folder" in refused(capsys, "demo", tmp_path / "demo")
 
 
 def test_real_frames_are_found_where_the_environment_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -38,7 +38,6 @@ MISTAKES = {
     "study DATA -o OUT --on cloud": "no executor named 'cloud'",
     "report EMPTY": "EMPTY",
     "demo EMPTY/..": "is no demo; choose another folder",
-    "demo OUT --train-minutes 0": "must be above 0",
     "demo OUT --real-frames NOTHING": "folder of real frames",
     f"simulate {SMALL}": "nothing to do; name a folder to make, or a picture with --preview",
     "simulate OUT --days 1": "days is 1, at least 2 is needed",

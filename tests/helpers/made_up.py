@@ -1,19 +1,19 @@
 """A made-up workspace: the files that the stages write, with plausible numbers and nothing measured."""
 
 import json
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sliplens.codec import save_record, save_result
+from sliplens.faithfulness.scoring import score_deletion
 from sliplens.files import Provenance
 from sliplens.recordings import TrialInfo
 from sliplens.recordings.dataset import write_dataset_table
 from sliplens.results.evaluation import Evaluation, LearningCurve, ScoredFrames, Training
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
-from sliplens.results.faithfulness import DeletionScores, DeletionTable, MethodScore
 from sliplens.training.evaluation import lead_times, regression_scores, risk_coverage
 
 METHODS = ("grad-cam", "integrated-gradients", "poly-cam")
@@ -231,58 +231,31 @@ def explained(
 
 
 def write_score(workspace: Path, name: str, *, size: int, rng: np.random.Generator) -> Path:
-    last = 0.25 if name == "difference" else 0.45
-    removed = np.arange(1, size + 1) * size
-    curves = {}
+    frames = tuple(
+        ExplainedFrame(
+            id=f"f{number:03d}",
+            trial=f"f{number:03d}",
+            condition="dry",
+            safety_margin=None,
+            prediction=0.0,
+            reference_prediction=1.0,
+        )
+        for number in range(12)
+    )
+    last, removed = 0.25 if name == "difference" else 0.45, np.arange(1, size + 1) / size
+    answers = {}
     for method, fall in FALL.items():
-        curves[method] = []
-        for frame in range(12):
+        answers[method] = np.zeros((len(frames), size + 1))
+        for row in answers[method]:
             rate = fall * rng.uniform(0.7, 1.3) * (1 if name == "difference" else 2)
-            fallen = (1 - np.exp(-removed / size**2 / rate)) / (1 - np.exp(-1 / rate))
+            fallen = (1 - np.exp(-removed / rate)) / (1 - np.exp(-1 / rate))
             score = np.clip(1 - (1 - last) * fallen + 0.01 * rng.normal(size=size) * (fallen < 1), 0, 1)
-            curves[method].append((f"f{frame:03d}", removed, 1 - np.sqrt(score), score))
-    return write_run(
-        workspace / f"score-{name}",
-        "score",
-        {"input": name, "fill": "grey"},
-        DeletionScores(
-            input=name,
-            source="simulated",
-            fill="grey",
-            steps=size,
-            pixels_per_step=size,
-            methods={method: method_score([score for *_, score in rows]) for method, rows in curves.items()},
-            alarms=("on 3 frames the filled image is answered like the frame itself",) if name == "raw" else (),
-            table=deletion_table(curves),
-        ),
-        minute=20,
-    )
-
-
-def deletion_table(curves: dict[str, list[tuple[str, np.ndarray, np.ndarray, np.ndarray]]]) -> DeletionTable:
-    """Of each method the frames, with the pixels removed, answers and scores of their steps."""
-    return DeletionTable.joined(
-        [
-            DeletionTable(
-                method=np.repeat(method, len(removed)),
-                frame_id=np.repeat(frame, len(removed)),
-                day=np.ones(len(removed), dtype=np.int64),
-                trial=np.repeat(frame.rpartition("-")[0] or frame, len(removed)),
-                step=np.arange(len(removed)),
-                pixels_removed=np.asarray(removed, dtype=np.int64),
-                prediction=answers,
-                score=scores,
-            )
-            for method, rows in curves.items()
-            for frame, removed, answers, scores in rows
-        ]
-    )
-
-
-def method_score(scores: list[np.ndarray]) -> MethodScore:
-    auc = np.array([score.mean() for score in scores])
-    last = float(np.mean([score[-1] for score in scores]))
-    return MethodScore(mean=float(auc.mean()), sd=float(auc.std()), last_step_mean=last, frames=len(auc))
+            row[1:] = 1 - np.sqrt(score)
+    pictures = np.zeros((len(frames), size, size, 3), dtype=np.uint8)
+    scores = score_deletion(explained(name, frames, {}, pictures, {}), answers, fill="grey")
+    alarms = ("on 3 frames the filled image is answered like the frame itself",) if name == "raw" else ()
+    config = {"input": name, "fill": "grey"}
+    return write_run(workspace / f"score-{name}", "score", config, replace(scores, alarms=alarms), minute=20)
 
 
 def write_workspace(workspace: Path, *, size: int = 24, trials: int = 6, seed: int = 20261121) -> Path:

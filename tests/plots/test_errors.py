@@ -35,7 +35,7 @@ def legend(ax: Axes) -> list[str]:
 
 
 def draw(name: str, results: Results, ax: Axes) -> Axes:
-    evaluations, scored = results.evaluations, results.scores["difference", "simulated"]
+    evaluations, scored = results.evaluations, results.deletion["difference"]
     return {
         "bins": lambda: plot_bins({key: one.conditions["dry"].bins for key, one in evaluations.items()}, ax=ax),
         "predictions": lambda: plot_predictions(evaluations["raw"].predictions, colour=ORANGE, ax=ax),
@@ -81,7 +81,7 @@ def test_bars_have_the_height_of_their_bins(results, ax):
 def test_faithfulness_curve_is_the_mean_over_frames(results, ax):
     draw("faithfulness", results, ax)
 
-    curve = results.scores["difference", "simulated"].curves["grad-cam"]
+    curve = results.deletion["difference"].curves["grad-cam"]
     np.testing.assert_allclose(ax.lines[0].get_ydata(), curve.scores.mean(axis=0))
     assert np.asarray(ax.lines[0].get_xdata())[-1] == pytest.approx(100)
     assert len(ax.collections) == 4

@@ -24,7 +24,7 @@ def results(tmp_path_factory):
 @pytest.fixture
 def explanation(results) -> Explanation:
     """Two frames, the second with one pixel that raises the prediction and one that lowers it."""
-    some = results.explanations["raw", "simulated"].take([0, 1])
+    some = results.explanations["raw"].take([0, 1])
     relevance = np.zeros(some.relevance["grad-cam"].shape, dtype=np.float32)
     relevance[1, 2, 3], relevance[1, 6, 6] = 0.4, -0.4
     frames = tuple(replace(frame, prediction=0.2, reference_prediction=1.0) for frame in some.frames)
@@ -36,7 +36,7 @@ def test_records_of_a_workspace_have_a_figure_each(results):
     for record, label in (
         (results.evaluations["raw"], "True Γ (%)"),
         (results.trainings["raw"], "Epoch (passes over the training frames)"),
-        (results.scores["raw", "simulated"], "Pixels removed (%)"),
+        (results.deletion["raw"], "Pixels removed (%)"),
         (results.evaluations["raw"].predictions, "Time (s)"),
     ):
         figure = sl.plot(record)

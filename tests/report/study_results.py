@@ -1,25 +1,17 @@
 """A made-up study: the files that its stages write, with numbers that tests choose and nothing measured."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from made_up import deletion_table, explained, method_score, picture_and_maps, write_evaluation, write_run
+from made_up import explained, picture_and_maps, write_evaluation, write_run
 
-from sliplens.faithfulness.controls import lead_over_controls
-from sliplens.intervals import Difference, paired_difference
-from sliplens.results.explanation import ExplainedFrame, MethodNotes
-from sliplens.results.faithfulness import (
-    DeletionScores,
-    Faithfulness,
-    Lead,
-    MethodGap,
-    RemovalGap,
-    RemovalScore,
-    RemovalTable,
-)
+from sliplens.faithfulness.scoring import SettingCurves, score_curves, score_deletion
+from sliplens.intervals import Difference
+from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
+from sliplens.results.faithfulness import Lead, MethodGap
 from sliplens.results.study import (
     Choice,
     ChosenFrame,
@@ -30,12 +22,9 @@ from sliplens.results.study import (
     MarkerEffects,
     MarkerTable,
     MetaTest,
-    MethodTime,
     NeutralScores,
-    Randomisation,
-    RandomisedMethod,
+    Setting,
     States,
-    Timing,
     Truth,
 )
 
@@ -113,8 +102,8 @@ def write_study(workspace: Path, made: Made | None = None, *, seed: int = 7) -> 
     write_states(workspace, made)
     for name in made.inputs:
         write_evaluation(workspace, name, trials=6, rng=rng)
-        maps = write_maps(workspace, name, made, rng=rng)
-        write_thesis_scores(workspace, name, made, maps, rng=rng)
+        write_maps(workspace, name, made, rng=rng)
+        write_thesis_scores(workspace, name, made, rng=rng)
         write_faithfulness(workspace, name, made, rng=rng)
         write_others(workspace, name, made)
         write_truth(workspace, name, made, rng=rng)
@@ -141,12 +130,8 @@ def write_choice(workspace: Path, made: Made) -> Path:
             qualified=made.trials - (not made.sound),
             qualified_alone=dict.fromkeys(made.inputs, made.trials),
             mean_error={name: 0.07 if name == "difference" else 0.13 for name in made.inputs},
-            summary=f"{made.trials - 1} of 60 dry test trials lie within 3 %, so the nearest other was taken too.",
             source="simulated",
             condition="dry",
-            inputs=made.inputs,
-            levels=LEVELS,
-            scored_levels=SCORED,
             trials=trials,
             frames=tuple(frames_of(made)),
         ),
@@ -174,11 +159,8 @@ def write_states(workspace: Path, made: Made) -> Path:
     return write_run(workspace / "states", "states", {}, States(untracked=(), table=MarkerTable.joined(tables)))
 
 
-def write_maps(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    rows = frames_of(made)
-    drawn = [picture_and_maps(row.safety_margin, name, size=made.size, rng=rng) for row in rows]
-    stacked = {method: np.stack([maps[method] for _, maps in drawn]).astype(np.float32) for method in METHODS}
-    frames = tuple(
+def frames_explained(rows: Sequence[ChosenFrame]) -> tuple[ExplainedFrame, ...]:
+    return tuple(
         ExplainedFrame(
             id=row.id,
             trial=row.trial,
@@ -189,46 +171,33 @@ def write_maps(workspace: Path, name: str, made: Made, *, rng: np.random.Generat
         )
         for row in rows
     )
+
+
+def without_maps(name: str, rows: Sequence[ChosenFrame], size: int) -> Explanation:
+    return explained(name, frames_explained(rows), {}, np.zeros((len(rows), size, size, 3), np.uint8), {})
+
+
+def write_maps(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> None:
+    rows = frames_of(made)
+    drawn = [picture_and_maps(row.safety_margin, name, size=made.size, rng=rng) for row in rows]
+    stacked = {method: np.stack([maps[method] for _, maps in drawn]).astype(np.float32) for method in METHODS}
     notes: dict[str, MethodNotes] = dict.fromkeys(METHODS, MethodNotes(seconds_per_frame=0.1, warnings=()))
     pictures = np.stack([picture for picture, _ in drawn])
-    found = explained(name, frames, notes, pictures, stacked)
+    found = explained(name, frames_explained(rows), notes, pictures, stacked)
     write_run(workspace / f"explain-{name}", "explain", {"input": name}, found)
-    return stacked
 
 
-def thesis_curve(gain: float, size: int, *, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Answers that fall by up to 0.5, the earlier the more the method gains; and the score D of each."""
-    share = np.arange(1, size + 1) / size
-    change = rng.uniform(0.4, 0.6) * share ** np.exp(-8 * gain) + 0.005 * rng.random(size)
-    return 0.6 - change, (1 - change) ** 2
-
-
-def write_thesis_scores(
-    workspace: Path, name: str, made: Made, maps: Mapping[str, np.ndarray], *, rng: np.random.Generator
-) -> Path:
-    size = made.size
-    removed = size * np.arange(1, size + 1)
-    curves = {
-        method: [
-            (row.id, removed, *thesis_curve(gain_of(made, name, method), size, rng=rng)) for row in frames_of(made)
-        ]
-        for method in [*maps, "random"]
+def write_thesis_scores(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> Path:
+    """Predictions that fall by up to 0.5, the earlier the more the method gains."""
+    rows, share = frames_of(made), np.arange(made.size + 1) / made.size
+    falls = {method: share ** np.exp(-8 * gain_of(made, name, method)) for method in [*METHODS, "random"]}
+    answers = {
+        method: 0.6 - rng.uniform(0.4, 0.6, (len(rows), 1)) * fall - 0.005 * rng.random((len(rows), len(share)))
+        for method, fall in falls.items()
     }
-    return write_run(
-        workspace / f"score-{name}",
-        "score",
-        {"fill": "grey"},
-        DeletionScores(
-            input=name,
-            source="simulated",
-            fill="grey",
-            steps=size,
-            pixels_per_step=size,
-            methods={method: method_score([score for *_, score in rows]) for method, rows in curves.items()},
-            alarms=("the fill decides in 2 of 18 frames",),
-            table=deletion_table(curves),
-        ),
-    )
+    scores = score_deletion(without_maps(name, rows, made.size), answers, fill="grey")
+    scores = replace(scores, alarms=("the fill decides in 2 of 18 frames",))
+    return write_run(workspace / f"score-{name}", "score", {"fill": "grey"}, scores)
 
 
 def gain_of(made: Made, name: str, method: str) -> float:
@@ -241,78 +210,25 @@ def write_faithfulness(workspace: Path, name: str, made: Made, *, rng: np.random
     areas = np.linspace(0, 1, made.areas)
     bump = 6 * areas * (1 - areas)
     bump /= np.trapezoid(bump, areas)
-    rows = scored_frames(made)
-    trials = np.array([row.trial for row in rows])
-    scores, comparisons, tables = [], [], []
-    chance = 0.4 * areas
+    rows, chance, curves = scored_frames(made), 0.4 * areas, {}
     for fill, unit in FILLS:
-        gains, resampled = {}, {"clusters": [trials], "rng": rng}
+        of_setting = {}
         for method in [*made.methods, *CONTROLS]:
             of_trial = rng.normal(0, made.spread, made.trials)
-            gains[method] = np.array([gain_of(made, name, method) + of_trial[int(row.trial[1:])] for row in rows])
-        for method, own in gains.items():
-            most = chance + own[:, None] / 2 * bump
-            least = chance - own[:, None] / 2 * bump
-            tables.append(
-                RemovalTable(
-                    fill=np.repeat(fill, most.size),
-                    unit=np.repeat(unit, most.size),
-                    method=np.repeat(method, most.size),
-                    frame_id=np.repeat([row.id for row in rows], len(areas)),
-                    day=np.ones(most.size, dtype=np.int64),
-                    trial=np.repeat(trials, len(areas)),
-                    safety_margin=np.repeat([row.safety_margin for row in rows], len(areas)),
-                    area=np.tile(areas, len(rows)),
-                    most_first=most.ravel(),
-                    least_first=least.ravel(),
-                    random=np.tile(chance, len(rows)),
-                )
-            )
-            scores.append(
-                RemovalScore(
-                    fill=fill,
-                    unit=unit,
-                    method=method,
-                    control=method in CONTROLS,
-                    srg=paired_difference(own, 0 * own, clusters=[trials], rng=rng),
-                    lead_over_controls=None
-                    if method in CONTROLS
-                    else lead_over_controls(own, {one: gains[one] for one in CONTROLS}, **resampled),
-                )
-            )
-        pairs = combinations(made.methods, 2)
-        comparisons += [
-            RemovalGap(
-                fill=fill,
-                unit=unit,
-                first=first,
-                second=second,
-                gap=paired_difference(gains[first], gains[second], clusters=[trials], rng=rng),
-            )
-            for first, second in pairs
-        ]
-    return write_run(
-        workspace / f"faithfulness-{name}",
-        "faithfulness",
-        {},
-        Faithfulness(
-            input=name,
-            source="simulated",
-            frames=len(rows),
-            trials=made.trials,
-            random_orders=20,
-            scores=tuple(scores),
-            comparisons=tuple(comparisons),
-            alarms=("grad-cam does not beat a random order: its symmetric gain is -0.050",),
-            table=RemovalTable.joined(tables),
-        ),
-    )
+            gains = np.array([gain_of(made, name, method) + of_trial[int(row.trial[1:])] for row in rows])
+            half = gains[:, None] / 2 * bump
+            of_setting[method] = np.stack([chance + half, chance - half, chance + 0 * half])
+        answers = {"whole": np.full(len(rows), 0.5), "blank": np.full(len(rows), np.nan)}
+        curves[Setting(fill=fill, unit=unit)] = SettingCurves(areas=areas, curves=of_setting, **answers)
+    scores = score_curves(without_maps(name, rows, made.size), curves, random_orders=20, seed=0)
+    scores = replace(scores, alarms=("grad-cam does not beat a random order: its symmetric gain is -0.050",))
+    return write_run(workspace / f"faithfulness-{name}", "faithfulness", {}, scores)
 
 
 def write_others(workspace: Path, name: str, made: Made) -> None:
     layers = (1, 4, 8, 16)
     randomised = {
-        method: RandomisedMethod(
+        method: MapMeasures(
             layers=layers,
             similarity=tuple(
                 0.9 / (1 + index * (0.1 if method == "grad-cam" else 1.0)) for index in range(len(layers))
@@ -324,7 +240,7 @@ def write_others(workspace: Path, name: str, made: Made) -> None:
         workspace / f"randomisation-{name}",
         "randomisation",
         {},
-        Randomisation(input=name, source="simulated", frames=6, methods=randomised, alarms=()),
+        MapQuality(input=name, source="simulated", frames=6, methods=randomised),
     )
     rougher = [
         MethodGap(first=first, second=second, gap=interval(gap, made.trials, half=0.001))
@@ -333,16 +249,9 @@ def write_others(workspace: Path, name: str, made: Made) -> None:
     ]
     write_quality(workspace, name, made.looks, rougher if made.rougher_told else [])
     seconds = {"grad-cam": 0.02, "integrated-gradients": 0.4, "poly-cam": 3.0}
-    timed = {
-        method: MethodTime(seconds=one, seconds_without_forward=one - 0.01, low=one * 0.9, high=one * 1.1, frames=3)
-        for method, one in seconds.items()
-    }
-    write_run(
-        workspace / f"timing-{name}",
-        "timing",
-        {},
-        Timing(input=name, source="simulated", device="cpu", threads=2, frames=3, forward_seconds=0.01, methods=timed),
-    )
+    timed = {method: MapMeasures(seconds=value) for method, value in seconds.items()}
+    timing = MapQuality(input=name, source="simulated", frames=3, methods=timed)
+    write_run(workspace / f"timing-{name}", "timing", {}, timing)
 
 
 def write_quality(
@@ -352,7 +261,10 @@ def write_quality(
         input=name,
         source="simulated",
         frames=42,
-        methods={method: MapMeasures(**values) for method, values in looks.items()},
+        methods={
+            method: MapMeasures(resolution=values["resolution"], total_variation=values["total_variation"])
+            for method, values in looks.items()
+        },
         comparisons=tuple(rougher),
     )
     return write_run(workspace / f"map-quality-{name}", "map-quality", {}, quality)
@@ -361,8 +273,7 @@ def write_quality(
 def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Generator) -> Path:
     rows, size = scored_frames(made), made.size
     x, y = (size * axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2))
-    tables, maps = [], {"shapley": [], "network": [], "margin": []}
-    grid_y, grid_x = np.mgrid[:size, :size]
+    tables = []
     for row in rows:
         network = np.full(len(x), (1 - made.top_share) / (len(x) - 2))
         network[[14, 20]] = made.top_share / 2
@@ -386,12 +297,8 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                 state=np.ones(len(x), dtype=np.int64),
             )
         )
-        for key, effects in (("shapley", network), ("network", network), ("margin", -margin)):
-            spots = np.exp(-((grid_x - x[:, None, None]) ** 2 + (grid_y - y[:, None, None]) ** 2) / (0.002 * size**2))
-            maps[key].append((effects[:, None, None] * (spots > 0.4)).sum(axis=0).astype(np.float32))
     known = {"edges": 0.1, "oracle": 1.0, "degraded-oracle": 0.8}
     spearman = {**made.spearman, **known}
-    mass: dict[str, float | None] = {"markers": 0.5, "slip_annulus": 0.4, "edges": made.edge_mass}
     held = {
         "oracle": 0.3,
         "degraded": 0.2,
@@ -406,10 +313,8 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
             input=name,
             source="simulated",
             frames=len(rows),
-            areas={"markers": 0.18, "slip_annulus": 0.2, "edges": 0.07},
             methods={
                 method: Localisation(
-                    mass=mass,
                     neutral=interval(value, made.trials),
                     stick=interval(value, made.trials),
                     shapley=interval(value, made.trials),
@@ -430,10 +335,7 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
             neutral_reliability=0.9,
             pairs=400,
             reliability=interval(0.9, made.trials),
-            sums={"shapley": 1.0, "network": -1.2},
-            shapley_against_margin=interval(0.5, made.trials),
             meta=(MetaTest(fill="true", **held),),
-            summary="Each marker was put back where it rested.",
             effects=MarkerEffects.joined(tables),
             neutral=NeutralScores(
                 frame_id=np.tile([row.id for row in rows], len(spearman)),
@@ -442,9 +344,6 @@ def write_truth(workspace: Path, name: str, made: Made, *, rng: np.random.Genera
                 method=np.repeat(list(spearman), len(rows)),
                 correlation=np.repeat(list(spearman.values()), len(rows)),
             ),
-            shapley_maps=np.stack(maps["shapley"]),
-            network_maps=np.stack(maps["network"]),
-            margin_maps=np.stack(maps["margin"]),
         ),
     )
 

@@ -80,7 +80,7 @@ def test_page_needs_nothing_but_itself(text, reader, complete):
 def test_links_of_the_contents_lead_to_sections(reader):
     targets = {attributes.get("id") for _, attributes in reader.tags}
     links = [attributes["href"] for tag, attributes in reader.tags if tag == "a"]
-    assert links == ["#opening", "#verdict", "#real", "#accuracy", "#deletion", "#maps", "#recipe"]
+    assert links == ["#opening", "#verdict", "#real", "#accuracy", "#faithfulness", "#maps", "#recipe"]
     assert all(link[1:] in targets for link in links)
 
 
@@ -97,7 +97,7 @@ def test_tables_hold_the_numbers_of_the_results(reader, complete):
         for score in evaluation.conditions.values():
             assert score.r2 is not None
             assert {f"{score.mse:.4f}", f"{score.r2:.3f}", f"{100 * score.mae:.1f}"} <= set(reader.cells)
-    for scored in results.scores.values():
+    for scored in results.deletion.values():
         for score in scored.methods.values():
             assert f"{score.mean:.3f} ± {score.sd:.3f}" in reader.cells
 
@@ -111,7 +111,7 @@ def test_the_thesis_stands_beside_and_is_marked(text, reader):
 def test_warnings_and_alarms_are_shown(text):
     assert "On 3 frames the filled image is answered like the frame itself." in text
     assert "Integrated Gradients: completeness gap 1.8 % on 2 frames." in text
-    assert "<li>Deletion: alarms, raw images: 1.</li>" in text
+    assert "<li>Faithfulness: alarms, raw images: 1.</li>" in text
 
 
 def test_same_results_make_the_same_page(text, complete, tmp_path):
@@ -124,7 +124,7 @@ def test_what_was_not_asked_for_is_not_missed(build, workspace):
     text = build()
 
     assert "not run yet" not in text
-    assert "<h2>Deletion" not in text
+    assert "<h2>How far" not in text
 
 
 def test_hostile_names_are_escaped(build, workspace):
@@ -184,7 +184,7 @@ def test_page_is_not_written_where_a_result_is_malformed(workspace, tmp_path):
 )
 def test_frames_fall_from_stick_to_slip_and_without_labels_stand_in_order(complete, labels, chosen):
     results = load_results(complete[0])
-    explained = results.explanations["raw", "simulated"]
+    explained = results.explanations["raw"]
     frames = [replace(explained.frames[0], id=str(at), safety_margin=label) for at, label in enumerate(labels)]
     frames.append(replace(explained.frames[0], id="wet", condition="wet", safety_margin=0.5))
     many = explained.take([0] * len(frames))

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 
 import sliplens as sl
 from sliplens.codec import Result
-from sliplens.report import load_results
-from sliplens.report.plates import Plate, bright_pictures, plate_truth, write_plates
+from sliplens.report import Results, load_results
+from sliplens.report.plates import Plate, bright_pictures, write_plates
 from sliplens.report.tables import table_scores
 from sliplens.results.evaluation import Evaluation, Training
 from sliplens.results.explanation import Strip, StripReadings
-from sliplens.results.study import RECORDS, Study, UntrainedMaps
+from sliplens.results.study import RECORDS, UntrainedMaps
 
 from .study_results import METHODS, SPEARMAN, Made, write_choice, write_faithfulness
 
@@ -46,7 +46,7 @@ def test_every_record_has_a_short_repr_a_table_and_a_figure(results, pristine_wo
     records = [*public_records(results), *public_records(workspace), data, data.load(data.trials[0]), untouched, strip]
     kinds = {type(record) for record in records}
 
-    assert {*RECORDS.values(), Training, Evaluation, Strip, Study} <= kinds
+    assert {*RECORDS.values(), Training, Evaluation, Strip, Results} <= kinds
     for record in {type(record): record for record in reversed(records)}.values():
         assert len(repr(record).splitlines()) <= 10, record
         assert max(map(len, repr(record).splitlines())) <= 280
@@ -62,7 +62,7 @@ def make_plate(rows: list[tuple] | None = None) -> Plate:
 
 
 def test_differences_are_brightened_by_one_factor_and_raw_frames_never(results):
-    raw, difference = (results.explanations[name, "simulated"] for name in ("raw", "difference"))
+    raw, difference = (results.explanations[name] for name in ("raw", "difference"))
     [_, untouched], title = bright_pictures(raw, [0, 3])
     np.testing.assert_array_equal(untouched, raw.pictures[3])
     assert title == "Input"
@@ -75,17 +75,8 @@ def test_differences_are_brightened_by_one_factor_and_raw_frames_never(results):
     assert bright_pictures(replace(difference, input="signed"), [0])[1] == "Input"
 
 
-def test_the_truth_stands_beside_the_maps_that_match_it_best(results):
-    study, truth = results.study, results.study.truth["raw"]
-    turned = {"grad-cam": truth.methods["poly-cam"], "poly-cam": truth.methods["grad-cam"]}
-    study = replace(study, truth={"raw": replace(truth, methods=truth.methods | turned)})
-    plate = plate_truth(replace(results, study=study), "raw")
-    assert plate is not None
-    assert "maps of Grad-CAM, Integrated Gradients and Poly-CAM" in plate.alt
-
-
 def test_the_truth_alone_is_a_figure(results):
-    (ax,) = sl.plot(results.study.truth["raw"]).axes
+    (ax,) = sl.plot(results.truth["raw"]).axes
     row = [label.get_text() for label in ax.get_yticklabels()].index("Poly-CAM")
     assert np.asarray(ax.lines[2 * row + 1].get_xdata()).item() == SPEARMAN["poly-cam"]
     assert ax.yaxis_inverted()  # the thesis's methods on top
@@ -108,7 +99,7 @@ def test_the_thesis_stands_beside_its_own_poly_cam(tmp_path, rng, more, beside):
     made = Made(inputs=("raw",), methods=(*METHODS, *more))
     write_choice(tmp_path, made)
     write_faithfulness(tmp_path, "raw", made, rng=rng)
-    table = table_scores("raw", load_results(tmp_path).study.faithfulness["raw"], None)
+    table = table_scores("raw", load_results(tmp_path).faithfulness["raw"], None)
     scores = {row[0].text: row[2].text for row in table.rows}
     assert scores[beside] == "0.512 ± 0.203"
     assert list(scores.values()).count("0.512 ± 0.203") == 1

@@ -9,7 +9,7 @@ from sliplens.explainers.explain import explain_frames
 from sliplens.explainers.frames import frames_at
 from sliplens.models import Network, load
 from sliplens.recordings import Dataset
-from sliplens.results.study import Choice, MarkerPlaces
+from sliplens.results.study import Choice, MarkerPlaces, StudyConfig
 from sliplens.study.choice import Material, choose_frames, gather, study_explainers
 
 METHODS = ("grad-cam", "integrated-gradients")
@@ -22,7 +22,7 @@ def network(difference_run: Path) -> Network:
 
 @pytest.fixture(scope="session")
 def choice(network: Network, fine_dataset: Dataset) -> Choice:
-    return choose_frames({"difference": network}, fine_dataset, trials=2, tolerance=1.0)
+    return choose_frames({"difference": network}, fine_dataset, StudyConfig(trials=2, tolerance=1.0))
 
 
 @pytest.fixture(scope="session")

@@ -11,6 +11,7 @@ from sliplens.faithfulness.scoring import (
     influences,
     ranking_alarms,
 )
+from sliplens.progress import reporting
 from sliplens.results.faithfulness import Faithfulness, RemovalCurve
 from sliplens.results.study import Setting
 from sliplens.study.choice import Material
@@ -97,11 +98,12 @@ def test_an_interrupted_run_goes_on_after_the_last_trial(material: Material, tmp
             raise KeyboardInterrupt
 
     removal = removal_of(material, PIXELS, MARKERS)
-    with pytest.raises(KeyboardInterrupt):
-        removal.make(tmp_path, on_progress=interrupt)
+    with pytest.raises(KeyboardInterrupt), reporting(interrupt):
+        removal.make(tmp_path)
     assert len(list(tmp_path.glob("trial=*/*/result.json"))) == 1
     before = len(calls)
-    again = removal.make(tmp_path, on_progress=lambda done, total: calls.append((done, total)))
+    with reporting(lambda done, total: calls.append((done, total))):
+        again = removal.make(tmp_path)
     assert all(done >= 3 for done, _ in calls[before:])
     assert calls[-1] == (12, 12)
     assert again.scores == scored.scores

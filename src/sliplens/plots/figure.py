@@ -41,7 +41,7 @@ from sliplens.recordings.sensor import profile_text
 from sliplens.recordings.source import Frames
 from sliplens.results.explanation import CLOSE, Explanation
 from sliplens.results.faithfulness import Faithfulness, is_control
-from sliplens.results.study import Randomisation, Study, Truth, UntrainedMaps
+from sliplens.results.study import MapQuality, Study, Truth, UntrainedMaps
 
 
 def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Figure:
@@ -146,7 +146,10 @@ def _truth(truth: Truth, ax: Axes, _: int | None) -> None:
     ax.set_title(input_name(truth.input))
 
 
-def _randomisation(record: Randomisation, ax: Axes, _: int | None) -> None:
+def _quality(record: MapQuality, ax: Axes, index: int | None) -> None:
+    if not all(method.similarity for method in record.methods.values()):
+        _rows(record, ax, index)
+        return
     for name in methods_in_order(record.methods):
         method = record.methods[name]
         values = np.array(method.similarity, dtype=float)
@@ -242,7 +245,7 @@ DRAWERS: dict[str, Callable[[Any, Axes, int | None], object]] = {
     "Network": _network,
     "Explanation": _explanation,
     "UntrainedMaps": _untrained,
-    "Randomisation": _randomisation,
+    "MapQuality": _quality,
     "DeletionScores": lambda result, ax, _: plot_faithfulness(result.curves, ax=ax).set_title(input_name(result.input)),
     "Faithfulness": _faithfulness,
     "Study": _study,

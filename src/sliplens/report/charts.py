@@ -1,23 +1,20 @@
-"""Plates that are charts: errors, learning, deletion and removal curves, and a grip."""
+"""Plates that are charts: errors, deletion curves, and a grip."""
 
 from collections.abc import Mapping
-from textwrap import fill as wrap
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
+from scipy.stats import binomtest
 
 from sliplens.grip.records import Grip
 from sliplens.plots import errors, style
 from sliplens.plots.margins import plot_grip
 from sliplens.progress import number_of
-from sliplens.report.comparisons import settings
 from sliplens.report.plates import Plate, rows_of
 from sliplens.report.results import Results
 from sliplens.report.verdict import ThesisRecord
-from sliplens.results.faithfulness import DeletionScores, Faithfulness, is_control
+from sliplens.results.faithfulness import DeletionScores
 
 _FEW = 4  # charts in a row
 
@@ -131,31 +128,6 @@ def plate_predictions(results: Results) -> Plate:
     )
 
 
-def plate_learning(results: Results) -> Plate:
-    """Draw the learning curves of all inputs."""
-    trainings = {name: results.trainings[name] for name in style.inputs_in_order(results.trainings)}
-    text = "; ".join(
-        f"{style.input_name(name)}: best validation MSE {style.decimals(training.best_validation_mse, 4)} "
-        f"after {style.decimals(training.epochs, 1)} epochs (stopped by {training.stopped_by})"
-        for name, training in trainings.items()
-    )
-    figure, axes = _make_charts(1, each=(5.6, 3.2))
-    with style.drawing_style():
-        errors.plot_learning_curves(trainings, ax=axes[0])
-    return Plate(
-        name="learning",
-        figure=figure,
-        alt=f"Training and validation error by epoch. {text}",
-        caption=f"Learning curves. {text}.",
-        columns=("input", "epoch", "train_mse", "validation_mse"),
-        rows=[
-            (name, *values)
-            for name, training in trainings.items()
-            for values in rows_of(training.curve.epoch, training.curve.train_mse, training.curve.validation_mse)
-        ],
-    )
-
-
 def plate_deletion(scores: Mapping[str, DeletionScores]) -> Plate:
     """Draw the mean deletion score while pixels go, a chart an input, all of one source (thesis, Fig. 9)."""
     figure, axes = _make_charts(len(scores), each=(4.6, 3.5))
@@ -168,63 +140,17 @@ def plate_deletion(scores: Mapping[str, DeletionScores]) -> Plate:
                 low, high = np.quantile(curve.scores, [0.25, 0.75], axis=0)
                 values = rows_of(curve.pixels_removed, curve.scores.mean(axis=0), low, high)
                 rows += [(name, method, *row) for row in values]
-    source = " or ".join(sorted({style.source_name(score.source) for score in scores.values()}))
-    fill = " or ".join(sorted({score.fill for score in scores.values()}))
-    real = "-real" if all(score.source == "real" for score in scores.values()) else ""
+    source, fill = (
+        " or ".join(sorted({getattr(score, key) for score in scores.values()})) for key in ("source", "fill")
+    )
     return Plate(
-        name=f"fig-09-faithfulness{real}",
+        name="fig-09-faithfulness",
         figure=figure,
         alt=f"Deletion score D against pixels removed: {style.listed([style.input_name(name) for name in scores])}",
-        caption=f"Deletion score D of the thesis on {source} while pixels become {fill}, most salient first; the line "
-        "is the mean over frames, the band holds the middle half of them. A curve that falls early names pixels the "
-        "network relies on; at the right end every pixel is filled, and no map has a part in it.",
+        caption=f"Deletion score D of the thesis on {style.source_name(source)} while pixels become {fill}, most "
+        "salient first; the line is the mean over frames, the band holds the middle half of them. A curve that falls "
+        "early names pixels the network relies on; at the right end every pixel is filled.",
         columns=("input", "method", "pixels_removed", "mean", "quartile_low", "quartile_high"),
-        rows=rows,
-    )
-
-
-def plate_removal_curves(faithful: Faithfulness) -> Plate | None:
-    """Draw change against area, most and least influential first and at random, by method and fill; None without."""
-    curves = {key: curve for key, curve in faithful.curves.items() if not is_control(key[2])}
-    methods, fills = style.methods_in_order({method for _, _, method in curves}), settings(faithful)
-    if not curves:
-        return None
-    means = np.array([[curve.most_first.mean(axis=0), curve.least_first.mean(axis=0)] for curve in curves.values()])
-    with style.drawing_style():
-        figure = Figure(figsize=(1.75 * len(fills) + 0.9, 1.55 * len(methods) + 0.9), layout="constrained")
-        axes = figure.subplots(len(methods), len(fills), squeeze=False, sharex=True, sharey=True)
-        for line, method in zip(axes, methods, strict=True):
-            for ax, setting in zip(line, fills, strict=True):
-                if (*setting, method) in curves:
-                    errors.plot_removal(curves[*setting, method], colour=style.method_colour(method), ax=ax)
-                    ax.tick_params(labelsize=7.5)
-                else:
-                    ax.set_axis_off()
-            line[0].set_ylabel(wrap(style.method_name(method), 20), fontsize=8.5)
-        for ax, setting in zip(axes[0], fills, strict=True):
-            ax.set_title(style.fill_name(*setting).capitalize().replace(" (", "\n("), fontsize=8.5)
-        # below zero where more speaks for the prediction than before
-        ends = 1.15 * min(means.min(), 0.0), 1.15 * max(means.max(), 1e-3)
-        axes[0, 0].set(ylim=ends, xlim=(0, 100), xticks=[0, 50, 100])
-        kinds: dict[str, Any] = {"most supporting first": "-", "least supporting first": "--", "random orders": ":"}
-        handles = [Line2D([], [], color=style.BLACK, linestyle=line, label=label) for label, line in kinds.items()]
-        figure.legend(handles=handles, loc="outside upper left", ncols=3)
-        figure.supxlabel("Removed (% of the image)", fontsize=9)
-        figure.supylabel("Evidence lost (margin units)", fontsize=9)
-    rows = []
-    for key, curve in faithful.curves.items():
-        lines = (line.mean(axis=0) for line in (curve.most_first, curve.least_first, curve.random))
-        rows += [(*key, *values) for values in rows_of(curve.areas, *lines)]
-    return Plate(
-        name=f"sound-curves-{faithful.input}",
-        figure=figure,
-        alt=f"Evidence lost against the area removed, {style.input_name(faithful.input).lower()}, for "
-        f"{style.listed([style.method_name(method) for method in methods])}",
-        caption=f"{style.input_name(faithful.input)}: how much of the prediction's change from the baseline is "
-        f"lost while parts go, most supporting first, least supporting first, and in {faithful.random_orders} random "
-        f"orders; the band holds the middle half of {number_of(faithful.frames, 'frame')}. The area between the first "
-        "two is the symmetric gain.",
-        columns=("fill", "unit", "method", "area", "most_first", "least_first", "random"),
         rows=rows,
     )
 
@@ -236,7 +162,9 @@ def plate_trace(grip: Grip) -> Plate:
         plot_grip(grip.trace.to_arrow(), axes=axes)
     columns = ("time_s", "force_n", "least_force_n", "true_margin", "margin", "low", "high", "slip_m")
     first, setup = grip.episodes.where(np.arange(1)), grip.setup
+    count, fell = len(grip.episodes), int(grip.episodes.dropped.sum())
     fate = "fell" if first.dropped[0] else "was held"
+    low, high = (style.percent(end) for end in binomtest(fell, count).proportion_ci(method="wilson"))
     excess = style.percent(float(first.force_excess[0]))
     source = "those of drawn frames" if setup.rendered else "looked up in the network's measured errors"
     friction = "" if setup.friction is None else f" Predictions used the coefficient of friction {setup.friction}."
@@ -247,7 +175,9 @@ def plate_trace(grip: Grip) -> Plate:
         caption=f"A {setup.object}, {setup.condition}, held by the controller {setup.controller}: it {fate}, with a "
         f"mean force of {float(first.mean_force_n[0]):.2f} N, {excess} over the least that holds. Predictions were "
         f"{source}, with a latency of {1e3 * setup.latency_s:.0f} ms and the actuator's lag. The predicted "
-        f"margin is the mean of both fingers, the true one that of the finger with less.{friction}",
+        f"margin is the mean of both fingers, the true one that of the finger with less.{friction} Of "
+        f"{number_of(count, 'episode')} {fell} fell ({low} to {high}, 95 % interval), with a median force of "
+        f"{style.percent(float(np.median(grip.episodes.force_excess)))} over the least that holds.",
         columns=columns,
         rows=rows_of(*(getattr(grip.trace, column) for column in columns)),
     )

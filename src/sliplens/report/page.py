@@ -17,15 +17,15 @@ from markupsafe import Markup, escape
 from sliplens.codec import Result
 from sliplens.errors import InputError
 from sliplens.plots.style import written_whole
-from sliplens.report.comparisons import CITATION
-from sliplens.report.opening import build_opening, without_weak
 from sliplens.report.plates import FOLDER, Plate, write_plates
 from sliplens.report.results import load_results
-from sliplens.report.sections import Notes, build_sections
-from sliplens.report.verdict import cautions, judge_results, judge_study
+from sliplens.report.sections import Notes, build_opening, build_sections
+from sliplens.report.tables import table_accuracy, table_claims
+from sliplens.report.verdict import CITATION, cautions, judge_results, judge_study, without_weak
 from sliplens.results.study import Study
 
 PAGE = "report.html"
+VERDICT = "Networks compared with one another and on real touch, with 95 % intervals over days and trials."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,8 +69,7 @@ def write_report(
     if page.is_dir():
         raise InputError(f"{page} is a folder; name the HTML file to write, such as {page / PAGE}")
     results = load_results(folder)
-    # one stream, seeded: the same results give the same intervals
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # seeded: the same results give the same intervals
     results, weak = without_weak(results)
     sections = build_sections(results)
     rows = judge_study(results)
@@ -88,18 +87,21 @@ def write_report(
         alarms += [f"{section.short_title}: {'; '.join(counts)}."] if counts else []
     text = render_page(
         "report.html.j2",
-        name=results.workspace.resolve().name,
+        name=results.folder.resolve().name,
         finished=runs[-1].finished[:16].replace("T", " at "),
         thesis=CITATION,
         waiting_for=waiting_for,
         answer=opening.answer,
         opening=opening.blocks,
         next_step=opening.next_step,
-        verdict=judge_results(results, rng=rng),
+        verdict=[
+            *([table_accuracy(results)] if results.evaluations else []),
+            *([table_claims(VERDICT, claims)] if (claims := judge_results(results, rng=rng)) else []),
+        ],
         cautions=[*weak, *cautions(results)],
         alarms=alarms,
         sections=sections,
-        study=bool(results.study),
+        study=results.begun,
         runs=results.runs,
         recipes=[json.dumps(run.config, indent=2, ensure_ascii=False) for run in runs],
         facts={**runs[-1].versions, **runs[-1].machine},

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from sliplens.plots.contact_sheet import TIMES, brighten, brightening
@@ -18,10 +17,8 @@ from sliplens.plots.saliency import (
     FrameU8,
     PictureRow,
     draw_pictures,
-    full_colour,
     full_points,
     overlay_points,
-    overlay_relevance,
 )
 from sliplens.plots.style import (
     Picture,
@@ -42,7 +39,6 @@ from sliplens.results.faithfulness import is_control
 
 FOLDER = "figures"
 """Beside the page."""
-_TRUTH_FRAMES = _TRUTH_METHODS = 3
 _MOST_FRAMES = 6
 _THESIS_NUMBERS = {"difference": 15, "raw": 16}
 
@@ -186,69 +182,10 @@ def plate_states(results: Results, explained: Explanation) -> Plate:
     )
 
 
-def plate_truth(results: Results, name: str) -> Plate | None:
-    """Draw frames, effects of each marker on prediction and margin, and the maps nearest to these; None without."""
-    truth, explained = results.study.truth.get(name), explained_of(results, name)
-    if truth is None or explained is None:
-        return None
-    places = {frame.id: index for index, frame in enumerate(explained.frames)}
-    rows = spread_frames(explained, [places[key] for key in truth.frame_ids if key in places], _TRUTH_FRAMES)
-    if not rows:
-        return None
-    likeness = {
-        method: record.neutral.estimate
-        for method, record in truth.methods.items()
-        if method in explained.relevance and not is_control(method) and record.neutral is not None
-    }
-    methods = sorted(methods_in_order(likeness), key=lambda method: -likeness[method])[:_TRUTH_METHODS]
-    pictures, title = bright_pictures(explained, rows)
-    lines = []
-    for row, picture in zip(rows, pictures, strict=True):
-        frame = explained.frames[row]
-        at = truth.frame_ids.index(frame.id)
-        effects = [maps[at] for maps in (truth.shapley_maps, truth.network_maps, truth.margin_maps)]
-        lines.append(
-            PictureRow(
-                name=f"Γ {percent(frame.safety_margin)}\n{reading_words(frame.prediction, frame.withheld)}",
-                pictures=[
-                    picture,
-                    *(_painted(picture, values, percentile=100.0) for values in effects),
-                    *(_painted(picture, explained.relevance[method][row]) for method in methods),
-                ],
-                words=["", *(f"up to {100 * np.abs(values).max():.1f} points" for values in effects)],
-            )
-        )
-    columns = ("frame_id", "marker", "x_px", "y_px", "shapley", "shapley_error", "stick", "network", "margin", "state")
-    titles = [method_name(method) for method in methods]
-    heads = [title, "Shapley values", "Put back alone:\nprediction", "Put back alone:\nmargin", *titles]
-    return Plate(
-        name=f"truth-{name}",
-        figure=draw_pictures(lines, heads=heads),
-        alt=f"{input_name(name)}: Shapley value and single effect of each marker in the prediction, and its effect on "
-        f"the best estimate of the margin, beside the maps of {listed(titles or ['no method'])}",
-        caption=f"{input_name(name)}: what each marker does to the network's prediction, in whatever company of "
-        "markers (Shapley value) and alone, and to the best estimate of the margin, in percentage points (value less "
-        "value with that marker put back where it rested), beside the maps that the neutral judge ranks first. Orange "
-        "lowers, blue raises; full colour at the largest effect of each picture.",
-        columns=columns,
-        rows=rows_of(*(getattr(truth.effects, column) for column in columns)),
-        pixels=True,
-    )
-
-
-def _painted(picture: FrameU8, values: Float[np.ndarray, "rows columns"], *, percentile: float = 99.5) -> FrameU8:
-    return overlay_relevance(picture, values / full_colour(values, percentile=percentile))
-
-
-def explained_of(results: Results, name: str) -> Explanation | None:
-    """Find the explained frames of the study's source."""
-    return results.explanations.get((name, results.study.source))
-
-
 def frames_by_margin(results: Results, explained: Explanation) -> list[int]:
     """Numbers of the frames to show: those of the study's choice, else a few of one condition; the margin falls."""
     places = {frame.id: index for index, frame in enumerate(explained.frames)}
-    choice = results.study.choice
+    choice = results.choice
     chosen = [frame for frame in choice.frames if frame.shown and frame.id in places] if choice else []
     if chosen:
         chosen = [frame for frame in chosen if frame.trial == chosen[0].trial]

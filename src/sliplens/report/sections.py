@@ -1,17 +1,18 @@
 """Sections of the page: a table, of which those are drawn whose results are there."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 from sliplens.plots.style import fill_name, input_name, inputs_in_order, listed, method_name, name_methods
 from sliplens.progress import number_of
 from sliplens.report import charts, plates, tables
-from sliplens.report.comparisons import write_sample
 from sliplens.report.results import Results
-from sliplens.report.verdict import load_thesis
-from sliplens.results.explanation import BASELINES
+from sliplens.report.verdict import MethodRow, answer_trust, load_thesis, why_no_verdict
+from sliplens.results.explanation import BASELINES, Explanation
 from sliplens.results.study import TESTS
+
+OF_PACKAGE = "These are results on the simulated networks of the thesis that come with sliplens, not on this workspace."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,6 +33,41 @@ Blocks = Iterator[Block | None]
 
 
 @dataclass(frozen=True, kw_only=True)
+class Opening:
+    """First page: the answer, what shows it, and what to do next."""
+
+    answer: str
+    blocks: tuple[Block, ...]
+    next_step: str
+
+
+def build_opening(results: Results, rows: Sequence[MethodRow]) -> Opening:
+    """Build the first page from the study of a workspace, or from that of the package where it holds none."""
+    strip = results.strip
+    answer, reasons = "Not known: no explanation was scored yet.", []
+    if rows:
+        reasons = [why_no_verdict(results, name) for name in dict.fromkeys(row.input for row in rows)]
+        answer = answer_trust(rows, reasons)
+    elif strip is not None and not results.begun:
+        rows = load_thesis().methods
+        answer = f"{answer_trust(rows)} {OF_PACKAGE}"
+    blocks = [
+        plates.plate_strip(strip) if strip else None,
+        plates.plate_moved(strip, strip.moved) if strip and strip.moved else None,
+        charts.plate_shift(load_thesis()) if strip and strip.source == "simulated" else None,
+        tables.table_methods(rows) if rows else None,
+    ]
+    best = next((row.method for row in rows if row.status == "ahead"), None)
+    if not results.begun:
+        step = "judge the maps of your own network on your recordings: `sliplens study DATA --network RUN --quick`."
+    elif best:
+        step = f"look at your own frames with the method that is ahead: `sliplens explain RUN DATA --method {best}`."
+    else:
+        step = "train on more trials until five of them are predicted within 5 points, and run the study again."
+    return Opening(answer=answer, blocks=tuple(block for block in blocks if block is not None), next_step=step)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Section:
     """A part of the page; without any block it is left out."""
 
@@ -42,28 +78,24 @@ class Section:
     build: Callable[[Results], Blocks]
     step: str = ""
     """Step of a study that makes its results; the page names it where it was not run. Empty where no study has it."""
-    of_sample: bool = False
-    """True where its scores are of the study's sample: the page says how sound that is."""
     blocks: tuple[Block, ...] = ()
     """In the order they are read, once it is built."""
 
 
 def build_sections(results: Results) -> tuple[Section, ...]:
     """Build the sections whose results are there, in the order they are read; the last says what was not run."""
-    built, absent, study = [], [], results.study
-    baseline = next((BASELINES[each.baseline] for each in results.explanations.values()), BASELINES["untouched"])
+    built, absent = [], []
+    explained = (results.explanations | results.real).values()
+    baseline = next((BASELINES[each.baseline] for each in explained), BASELINES["untouched"])
     for section in SECTIONS:
         blocks = tuple(block for block in section.build(results) if block is not None)
-        if blocks:
-            sample = f" {write_sample(study.choice)}" if study.choice is not None and section.of_sample else ""
-            intro = f"{section.intro}{sample}".replace("{baseline}", baseline)
-            built.append(replace(section, intro=intro, blocks=blocks))
-        elif study and section.step and not (section.step == "truth" and study.source == "real"):
-            left_out = study.config is not None and section.step in set(TESTS) - set(study.config.tests)
+        if blocks or section is RECIPE:
+            built.append(replace(section, intro=section.intro.replace("{baseline}", baseline), blocks=blocks))
+        elif results.begun and section.step and not (section.step == "truth" and results.source == "real"):
+            left_out = results.config is not None and section.step in set(TESTS) - set(results.config.tests)
             absent += [] if left_out else [section.short_title]
-    blocks = tuple(block for block in RECIPE.build(results) if block is not None)
     missing = f" {', '.join(absent)}: not run yet; `sliplens study` makes it." if absent else ""
-    return *built, replace(RECIPE, intro=f"{RECIPE.intro}{missing}", blocks=blocks)
+    return *built[:-1], replace(built[-1], intro=f"{built[-1].intro}{missing}")
 
 
 def _names(names: Iterable[str]) -> list[str]:
@@ -78,81 +110,52 @@ def _notes(title: str, sentences: Iterable[str], *, tone: Literal["plain", "caut
     return Notes(title=title, sentences=tuple(texts), tone=tone) if texts else None
 
 
-def _alarms(name: str, sentences: Iterable[str]) -> Notes | None:
-    return _notes(f"Alarms, {input_name(name).lower()}", sentences)
+def _alarms(name: str, *sentences: Iterable[str]) -> Notes | None:
+    return _notes(f"Alarms, {input_name(name).lower()}", (text for each in sentences for text in each))
 
 
 def _accuracy(results: Results) -> Blocks:
     if results.evaluations:
-        yield tables.table_accuracy(results)
         yield charts.plate_bins(results)
         yield charts.plate_predictions(results)
 
 
 def _faithfulness(results: Results) -> Blocks:
-    for name in _names(results.study.faithfulness):
-        faithful = results.study.faithfulness[name]
-        yield tables.table_scores(name, faithful, results.scores.get((name, results.study.source)))
-        yield _alarms(name, faithful.alarms)
-        yield charts.plate_removal_curves(faithful)
+    for name in _names({*results.faithfulness, *results.deletion}):
+        records = results.faithfulness.get(name), results.deletion.get(name)
+        yield tables.table_scores(name, *records)
+        yield _alarms(name, *(record.alarms for record in records if record is not None))
+    if deletion := results.deletion:
+        yield charts.plate_deletion({name: deletion[name] for name in _names(deletion)})
 
 
-def _deletion(results: Results) -> Blocks:
-    study = results.study
-    for source in ("simulated", "real"):
-        scores = {
-            name: results.scores[name, source] for name in _names(results.inputs) if (name, source) in results.scores
-        }
-        if scores:
-            yield charts.plate_deletion(scores)
-        for name, scored in scores.items():
-            # beside the removal scores stands D already
-            yield None if name in study.faithfulness else tables.table_scores(name, None, scored)
-            yield _alarms(name, scored.alarms)
-
-
-def _randomisation(results: Results) -> Blocks:
-    if records := results.study.randomisation:
-        yield tables.table_randomisation(records)
-        yield from (_alarms(name, records[name].alarms) for name in _names(records))
-
-
-def _maps(results: Results, source: str) -> Blocks:
-    for name in _names(name for name, origin in results.explanations if origin == source):
-        explained = results.explanations[name, source]
+def _maps(results: Results, explanations: Mapping[str, Explanation]) -> Blocks:
+    for name in _names(explanations):
+        explained = explanations[name]
         yield plates.plate_states(results, explained)
         warnings = {method_name(method): notes.warnings for method, notes in explained.methods.items()}
         yield _alarms(name, (f"{method}: {text}" for method, texts in warnings.items() for text in texts))
 
 
 def _study_maps(results: Results) -> Blocks:
-    study = results.study
-    if study.states is not None:
-        yield _notes("Markers that could not be followed", study.states.untracked)
-    yield from _maps(results, study.source)
-    yield tables.table_looks(study.map_quality) if study.map_quality else None
-
-
-def _real_maps(results: Results) -> Blocks:
-    if results.study.source != "real":
-        yield from _maps(results, "real")
-
-
-def _timing(results: Results) -> Blocks:
-    if results.study.timing:
-        yield tables.table_times(results.study.timing)
+    if results.states is not None:
+        yield _notes("Markers that could not be followed", results.states.untracked)
+    yield from _maps(results, results.explanations)
+    if results.map_quality or results.randomisation or results.timing:
+        yield tables.table_properties(results)
+    for name in _names(results.randomisation):
+        yield _alarms(name, results.randomisation[name].alarms)
 
 
 def _choice(results: Results) -> Blocks:
-    if (choice := results.study.choice) is not None:
-        sentences = [choice.summary, write_sample(choice), *results.study.left_out.values()]
+    if (choice := results.choice) is not None:
+        sentences = [choice.summary, *results.left_out.values()]
         yield _notes(f"{number_of(len(choice.trials), 'trial')} of {choice.condition} objects", sentences, tone="plain")
 
 
 def _truth(results: Results) -> Blocks:
-    for name in _names(results.study.truth):
-        truth = results.study.truth[name]
-        yield plates.plate_truth(results, name)
+    for name in _names(results.truth):
+        truth = results.truth[name]
         yield tables.table_localisation(truth)
         unfit = [fill_name(test.fill) for test in truth.meta if not test.holds]
         if unfit:
@@ -164,26 +167,30 @@ def _truth(results: Results) -> Blocks:
 def _grip(results: Results) -> Blocks:
     if results.grip is not None:
         yield charts.plate_trace(results.grip)
-        yield tables.table_episodes(results.grip)
 
 
 def _claims(results: Results) -> Blocks:
-    if results.study or results.strip is not None:
-        yield tables.table_claims(load_thesis())
+    if results.begun or results.strip is not None:
+        thesis = load_thesis()
+        caption = "Claims of the thesis, its numbers, and ours with 95 % intervals over days and trials."
+        yield tables.table_claims(f"{caption} {thesis.sample}", thesis.claims)
 
 
-def _learning(results: Results) -> Blocks:
-    if results.trainings:
-        yield charts.plate_learning(results)
-
-
+RECIPE = Section(
+    id="recipe",
+    title="How these results were made",
+    short_title="Recipe",
+    intro="Every stage is in a folder of its own; `sliplens report` draws this page from the folders alone, and "
+    "`sliplens study` with the same options goes on where it stopped.",
+    build=lambda _: iter(()),
+)
 SECTIONS: tuple[Section, ...] = (
     Section(
         id="real",
         title="Real touch",
         short_title="Real touch",
         intro="Frames of a real sensor, shown to each network.",
-        build=_real_maps,
+        build=lambda results: _maps(results, results.real),
     ),
     Section(
         id="accuracy",
@@ -210,30 +217,11 @@ SECTIONS: tuple[Section, ...] = (
         short_title="Faithfulness",
         intro="Parts of a frame are removed: the most supporting first, the least supporting first, and at random. "
         "With a faithful map the prediction returns to that of {baseline} at once in the first case, and not "
-        "in the second. Controls are maps that use nothing the network learned.",
+        "in the second. Controls are maps that use nothing the network learned. The thesis's score beside it: D = "
+        "(1 \N{MINUS SIGN} |change of Γ|)² while pixels go, the most salient first, 1 where nothing changed; with "
+        "every pixel gone no map has a part in it.",
         build=_faithfulness,
         step="faithfulness",
-        of_sample=True,
-    ),
-    Section(
-        id="deletion",
-        title="The thesis's score, step by step",
-        short_title="Deletion",
-        intro="D = (1 \N{MINUS SIGN} |change of Γ|)² while pixels go, the most salient first: 1 where nothing changed, "
-        "towards 0 if the network did rely on them. Removing pixels in random order is the control that each method "
-        "has to beat. With every pixel gone no map has a part in it.",
-        build=_deletion,
-        step="score",
-        of_sample=True,
-    ),
-    Section(
-        id="randomisation",
-        title="Does the explanation notice that the network forgot everything?",
-        short_title="New weights",
-        intro="The weights are drawn anew, layer by layer from the output. A map of what was learned has to change.",
-        build=_randomisation,
-        step="randomisation",
-        of_sample=True,
     ),
     Section(
         id="maps",
@@ -243,15 +231,6 @@ SECTIONS: tuple[Section, ...] = (
         "rather than that of {baseline}. The thesis judged the maps by eye; a study measures the same.",
         build=_study_maps,
         step="explain",
-        of_sample=True,
-    ),
-    Section(
-        id="timing",
-        title="What an explanation costs",
-        short_title="Cost",
-        intro="Seconds a frame; a study measures them with warm-up, and waiting for the device to finish.",
-        build=_timing,
-        step="timing",
     ),
     Section(
         id="choice",
@@ -265,14 +244,11 @@ SECTIONS: tuple[Section, ...] = (
         id="truth",
         title="What the network should have looked at",
         short_title="Truth",
-        intro="The simulator draws each frame again with groups of markers moved to where they lie at another margin "
-        "of the same trial: a map should predict, signs included, how that changes the prediction. No map is made to. "
-        "Beside this neutral judge: Shapley values, the mean effect of putting a marker back to the stick frame, or to "
-        "rest, in the company of all others. Integrated Gradients is close to those by construction. The best "
-        "estimate of the margin is linear in the markers' displacements and shows where the network should look.",
+        intro="Beside the neutral judge, whose effects no map is made to predict: Shapley values, the mean effect of "
+        "putting a marker back in the company of all others, to which Integrated Gradients is close by construction. "
+        "The best estimate of the margin is linear in the displacements and shows where the network should look.",
         build=_truth,
         step="truth",
-        of_sample=True,
     ),
     Section(
         id="claims",
@@ -282,13 +258,6 @@ SECTIONS: tuple[Section, ...] = (
         "sensor: not of this workspace. A claim holds or does not hold beyond the interval; otherwise it is open.",
         build=_claims,
     ),
+    RECIPE,
 )
 """Sections in the order they are read."""
-RECIPE = Section(
-    id="recipe",
-    title="How these results were made",
-    short_title="Recipe",
-    intro="Every stage is in a folder of its own; `sliplens report` draws this page from the folders alone, and "
-    "`sliplens study` with the same options goes on where it stopped.",
-    build=_learning,
-)

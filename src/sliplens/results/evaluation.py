@@ -32,8 +32,8 @@ _ROUNDED = 1 + 1e-6
 AT_MOST_ONE = Meta(le=_ROUNDED)
 SHARE = Meta(ge=0, le=_ROUNDED)
 CORRELATION = Meta(ge=-_ROUNDED, le=_ROUNDED)
-EXCESS = PLACE = Meta(ge=-1)
-"""Of a ratio less one, and of a number in a list, -1 for none."""
+EXCESS = Meta(ge=-1)
+"""Of a ratio less one."""
 PIXEL = Meta(ge=-1e5, le=1e5)
 """No picture is as wide."""
 

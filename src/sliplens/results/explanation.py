@@ -83,16 +83,6 @@ class Explanation(OfOutput):
     baseline: BaselineName = "untouched"
     """Kind of the baseline; trials whose stick frame was not found are compared with the untouched sensor."""
 
-    def __post_init__(self) -> None:
-        """Check that the arrays are of the frames."""
-        if not self.frames:
-            raise ValueError("names no frame")
-        if not len(self.images) == len(self.references) == len(self.frames):
-            raise ValueError(f"holds {len(self.images)} images of {len(self.frames)} frames")
-        absent = [name for name in self.methods if name not in self.relevance]
-        if absent:
-            raise ValueError(f"holds no relevance of {', '.join(absent)}")
-
     def influence(self, method: str) -> Float64[np.ndarray, "frames size size"]:
         """Return the relevance along the change of the prediction, which ranks pixels.
 

@@ -1,9 +1,9 @@
 """Scores of explanations: by deletion as the thesis does, and by removal against controls."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, TypeVar
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64, Int, Int64, Shaped
@@ -14,7 +14,6 @@ from sliplens.intervals import Difference
 from sliplens.progress import number_of
 from sliplens.results.evaluation import AMOUNT, ANSWER, MARGIN, SHARE, UNIT, OfNetwork, OfOutput
 
-_Rows = TypeVar("_Rows", "DeletionTable", "RemovalTable")
 Key = tuple[str, str, str]
 """Fill, unit and method."""
 CHANCE = "random"
@@ -95,18 +94,13 @@ class DeletionScores(Deletion, OfNetwork):
 
     table: DeletionTable
 
-    def __post_init__(self) -> None:
-        """Check that every score has its curves."""
-        _require_curves(self.methods, self.curves)
-
     @cached_property
     def curves(self) -> dict[str, DeletionCurve]:
         """Curves by method, frames sorted by their ids."""
         curves = {}
-        for (method,), group in self.table.groups("method").items():
-            ids, clusters, rows = _sort_by_frame(group, group.step, f"lacks steps of some frames under {method!r}")
-            pixels, scores, predictions = (
-                values.reshape(len(ids), -1) for values in (rows.pixels_removed, rows.score, rows.prediction)
+        for (method,), rows in self.table.groups("method").items():
+            ids, clusters, (pixels, scores, predictions) = _by_frame(
+                rows, rows.step, (rows.pixels_removed, rows.score, rows.prediction)
             )
             curves[method] = DeletionCurve(
                 frame_ids=ids, clusters=clusters, pixels_removed=pixels[0], scores=scores, predictions=predictions
@@ -221,21 +215,15 @@ class Faithfulness(OfOutput):
     """Deletion score of the thesis; None if it was not computed."""
     deletion_table: DeletionTable | None = None
 
-    def __post_init__(self) -> None:
-        """Check that every score has its curves."""
-        _require_curves([score.key for score in self.scores], self.curves)
-
     @cached_property
     def curves(self) -> dict[Key, RemovalCurve]:
         """Curves by fill, unit and method, frames sorted by their ids."""
         curves = {}
-        for (fill, unit, method), group in self.table.groups("fill", "unit", "method").items():
-            complaint = f"lacks areas of some frames under {fill} / {unit} / {method}"
-            ids, clusters, rows = _sort_by_frame(group, group.area, complaint)
-            areas, most, least, random = (
-                values.reshape(len(ids), -1) for values in (rows.area, rows.most_first, rows.least_first, rows.random)
+        for key, rows in self.table.groups("fill", "unit", "method").items():
+            ids, clusters, (areas, most, least, random) = _by_frame(
+                rows, rows.area, (rows.area, rows.most_first, rows.least_first, rows.random)
             )
-            curves[fill, unit, method] = RemovalCurve(
+            curves[key] = RemovalCurve(
                 frame_ids=ids, clusters=clusters, areas=areas[0], most_first=most, least_first=least, random=random
             )
         return curves
@@ -267,21 +255,11 @@ class Faithfulness(OfOutput):
         return f"symmetric relevance gain of {best.method} {best.srg} {self.unit_words}{over}; {counts}"
 
 
-def _sort_by_frame(
-    rows: _Rows, step: np.ndarray, complaint: str
-) -> tuple[tuple[str, ...], Shaped[np.ndarray, "2 frames"], _Rows]:
-    """Frames, their days and trials, and the rows sorted by frame and step, each pair of which must be there once."""
-    ids, frame_at = np.unique(rows.frame_id, return_inverse=True)
-    steps, step_at = np.unique(step, return_inverse=True)
-    cells = frame_at * len(steps) + step_at
-    if not np.array_equal(np.sort(cells), np.arange(len(ids) * len(steps))):
-        raise ValueError(complaint)
-    rows = rows.where(np.argsort(cells))
-    clusters = np.stack([values.reshape(len(ids), -1)[:, 0].astype(str) for values in (rows.day, rows.trial)])
-    return tuple(ids.tolist()), clusters, rows
-
-
-def _require_curves(names: Iterable[str | Key], curves: Mapping[Any, object]) -> None:
-    for name in names:
-        if name not in curves:
-            raise ValueError(f"lacks the curves of {name if isinstance(name, str) else ' / '.join(name)}")
+def _by_frame(
+    rows: DeletionTable | RemovalTable, step: np.ndarray, values: Sequence[np.ndarray]
+) -> tuple[tuple[str, ...], Shaped[np.ndarray, "2 frames"], list[np.ndarray]]:
+    """Frames in the order of their ids, their days and trials, and values by frame and step."""
+    order = np.lexsort((step, rows.frame_id))
+    ids = np.unique(rows.frame_id)
+    day, trial, *columns = (column[order].reshape(len(ids), -1) for column in (rows.day, rows.trial, *values))
+    return tuple(ids.tolist()), np.stack([day[:, 0].astype(str), trial[:, 0].astype(str)]), columns

@@ -1,6 +1,5 @@
 """Stages of a study: what was chosen, what the camera saw, and how the explanations were tested."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,15 +11,10 @@ from jaxtyping import Float32, Float64, Int64, Shaped
 
 from sliplens.codec import UNKNOWN, Columns, Result, table_rows
 from sliplens.intervals import Difference
+from sliplens.progress import number_of
 from sliplens.results.evaluation import AMOUNT, ANSWER, CORRELATION, MARGIN, PIXEL, Evaluation, OfNetwork
-from sliplens.results.explanation import BASELINES, BaselineName, Explanation, Strip
+from sliplens.results.explanation import BASELINES, Explanation, Strip
 from sliplens.results.faithfulness import DeletionScores, Faithfulness, Lead, MethodGap
-
-REGIONS = ("markers", "slip_annulus", "edges")
-"""Areas in which a map may lie."""
-MAP_MEASURES = ("resolution", "total_variation")
-"""Measures of how a map looks."""
-
 
 CLOSE_TO_LABELS = 0.05
 """Largest error of a trial that is taken where too few qualify, in margin units; five such are needed for a verdict."""
@@ -72,14 +66,9 @@ class Choice(Result):
     """Trials that would qualify with one network alone, by input."""
     mean_error: dict[str, float]
     """Mean error of the answers on the scored frames, in margin units, by input."""
-    summary: str
-    """Description of the choice in a sentence or two."""
     source: str
     split: str = "test"
     condition: str
-    inputs: tuple[str, ...]
-    levels: tuple[float, ...]
-    scored_levels: tuple[float, ...]
     trials: tuple[ChosenTrial, ...]
     frames: tuple[ChosenFrame, ...]
 
@@ -87,6 +76,19 @@ class Choice(Result):
     def sound(self) -> bool:
         """True where every trial that was taken qualifies; otherwise errors are explained too."""
         return all(trial.qualified for trial in self.trials)
+
+    @property
+    def summary(self) -> str:
+        """How the trials were chosen, and how wrong the explained predictions are, in a few sentences."""
+        worst = 100 * max(trial.worst for trial in self.trials)
+        errors = " and ".join(f"{100 * error:.0f} points ({name} images)" for name, error in self.mean_error.items())
+        return (
+            f"{number_of(self.considered, f'{self.condition} {self.split} trial')} have a frame near every level; of "
+            f"{self.qualified} every network predicts all such frames within {100 * self.tolerance:g} points. "
+            f"{len(self.trials)} of {self.trials_wanted} wanted were taken: {self.close} are predicted within "
+            f"{100 * max(self.tolerance, CLOSE_TO_LABELS):g} points, the worst prediction is off by {worst:.0f}. "
+            f"Predictions on the frames to score are off by {errors} on average."
+        )
 
     @property
     def close(self) -> int:
@@ -145,75 +147,33 @@ class UntrainedMaps(OfNetwork):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RandomisedMethod:
-    """Change of a method's maps as layers get new weights; None where the maps cannot be compared."""
-
-    layers: tuple[int, ...]
-    similarity: tuple[float | None, ...]
-
-    def __post_init__(self) -> None:
-        """Hold the layers against the similarities."""
-        if len(self.layers) != len(self.similarity):
-            raise ValueError(f"has {len(self.layers)} layers but {len(self.similarity)} similarities")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Randomisation(OfNetwork):
-    """Change of explanations as the network's weights are drawn anew."""
-
-    frames: int
-    methods: dict[str, RandomisedMethod]
-    alarms: tuple[str, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
 class MapMeasures:
-    """Looks of a method's maps, as means over frames; None where undefined."""
+    """Properties of a method's maps beside their scores, as means over frames; None where undefined or not measured."""
 
-    resolution: float | None
-    total_variation: float | None
+    resolution: float | None = None
+    total_variation: float | None = None
+    layers: tuple[int, ...] = ()
+    similarity: tuple[float | None, ...] = ()
+    """Of the maps with those of the network with new weights in so many layers."""
+    seconds: Annotated[float, AMOUNT] | None = None
+    """Median time to explain one frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapQuality(OfNetwork):
-    """Looks of maps, by method."""
+    """Looks of maps, their dependence on the weights, or their cost, by method."""
 
     frames: int
     methods: dict[str, MapMeasures]
-    comparisons: tuple[MethodGap, ...]
+    comparisons: tuple[MethodGap, ...] = ()
     """Of the total variation."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class MethodTime:
-    """Seconds a frame: median over frames with the forward pass and without it, and the range."""
-
-    seconds: Annotated[float, AMOUNT]
-    seconds_without_forward: float
-    low: Annotated[float, AMOUNT]
-    high: Annotated[float, AMOUNT]
-    frames: int
-    """Frames that were timed."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Timing(OfNetwork):
-    """Cost of explanations on one machine."""
-
-    device: str
-    threads: int
-    frames: int
-    """Frames of the sample."""
-    forward_seconds: float
-    methods: dict[str, MethodTime]
+    alarms: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Localisation:
-    """Where a method's relevance lies, and how far it agrees with what markers do to the prediction and the margin."""
+    """How far a method's maps agree with what markers do to the prediction and the margin."""
 
-    mass: dict[str, float | None]
-    """Share of the relevance by `REGIONS`."""
     neutral: Difference | None
     """Mean correlation (Pearson, signed) of the map's sums over groups of markers with the change of the prediction as
     the group is moved to another margin of the trial: the main judge. The fields beside it are other truths."""
@@ -291,8 +251,6 @@ class Truth(OfNetwork):
     """Comparison of explanations with the effects of markers, known in simulation."""
 
     frames: int
-    areas: dict[str, float | None]
-    """Share of the image that each of `REGIONS` covers, None where no frame has it."""
     methods: dict[str, Localisation]
     neutral_reliability: float | None
     """Expected correlation of `Localisation.neutral` by map and frame with that by as many other groups (split half,
@@ -302,33 +260,18 @@ class Truth(OfNetwork):
     reliability: Difference | None
     """Expected correlation of the Shapley values with a second estimate, by their standard errors; its root is the most
     that a map can reach."""
-    sums: dict[str, float | None]
-    """Multiple of the prediction's change from the untouched sensor to which `shapley` and `network` add up."""
-    shapley_against_margin: Difference | None
-    """Rank correlation of the Shapley values with the effects on the best reading of the margin."""
     meta: tuple[MetaTest, ...]
-    summary: str
     effects: MarkerEffects
     neutral: NeutralScores
-    shapley_maps: Annotated[Float32[np.ndarray, "frames size size"], ANSWER]
-    network_maps: Annotated[Float32[np.ndarray, "frames size size"], ANSWER]
-    margin_maps: Annotated[Float32[np.ndarray, "frames size size"], ANSWER]
-    """`effects` painted on the markers, a map a frame."""
 
-    def __post_init__(self) -> None:
-        """Hold the maps against the frames."""
-        count = len(self.frame_ids)
-        for maps in (self.shapley_maps, self.network_maps, self.margin_maps):
-            if len(maps) != count or not np.isfinite(maps).all():
-                raise ValueError(f"holds maps of shape {maps.shape} where {count} finite ones belong")
-
-    @cached_property
-    def frame_ids(self) -> tuple[str, ...]:
-        """Frames of the maps."""
-        return tuple(dict.fromkeys(self.effects.frame_id.tolist()))
-
-
-_Test = Faithfulness | Randomisation | MapQuality | Timing | Truth
+    @property
+    def summary(self) -> str:
+        """How many frames and scenes were drawn, and how sure the truths are."""
+        sure = {"neutral scores": self.neutral_reliability}
+        sure |= {"Shapley values": self.reliability and self.reliability.estimate}
+        words = [f"{name} {value:.2f}" for name, value in sure.items() if value is not None]
+        drawn = f"{number_of(self.frames, 'frame')}, {self.pairs} pairs of scenes each"
+        return f"{drawn}; expected correlation with a second measurement: {', '.join(words) or 'unknown'}"
 
 
 RECORDS: dict[str, type] = {
@@ -339,10 +282,10 @@ RECORDS: dict[str, type] = {
     "score": DeletionScores,
     "control": UntrainedMaps,
     "faithfulness": Faithfulness,
-    "randomisation": Randomisation,
+    "randomisation": MapQuality,
     "map-quality": MapQuality,
     "truth": Truth,
-    "timing": Timing,
+    "timing": MapQuality,
 }
 """Record of each step of a study."""
 TABLES = {
@@ -352,8 +295,8 @@ TABLES = {
     "faithfulness": "faithfulness",
     "randomisation": "randomisation",
     "map-quality": "map_quality",
-    "timing": "timing",
     "truth": "truth",
+    "timing": "timing",
 }
 """Field of `Study` with the records of each step, one a network."""
 CONFIG_FILE = "study.json"
@@ -433,14 +376,6 @@ class StudyConfig:
     """If True, six trials, three methods and the judge that decides: about five minutes on two cores."""
 
 
-def say_left_out(dropped: int, chosen: int, name: str, baseline: BaselineName) -> str:
-    """Say how many of the frames to score are left out of the scores of an input."""
-    return (
-        f"{dropped} of {chosen} frames to score are left out with the {name} network: it predicts nearly the margin "
-        f"of {BASELINES[baseline]} there, so that there is nothing to explain and the direction is chance"
-    )
-
-
 @dataclass(frozen=True, kw_only=True)
 class Study(Result):
     """A study, stage by stage; tables are by input, and empty where a stage was not run."""
@@ -455,23 +390,23 @@ class Study(Result):
     explanations: dict[str, Explanation] = field(default_factory=dict)
     deletion: dict[str, DeletionScores] = field(default_factory=dict)
     faithfulness: dict[str, Faithfulness] = field(default_factory=dict)
-    randomisation: dict[str, Randomisation] = field(default_factory=dict)
+    randomisation: dict[str, MapQuality] = field(default_factory=dict)
     map_quality: dict[str, MapQuality] = field(default_factory=dict)
-    timing: dict[str, Timing] = field(default_factory=dict)
     truth: dict[str, Truth] = field(default_factory=dict)
+    timing: dict[str, MapQuality] = field(default_factory=dict)
 
     @property
     def summary(self) -> str:
         """Gain of the best method with each network, in a sentence."""
         scores = [f"{name} images: {record.summary}" for name, record in self.faithfulness.items()]
         for name, truth in self.truth.items():
-            rows = {method: truth.methods.get(method) for method in (self.config or StudyConfig()).methods}
             judged = {
-                method: row.neutral for method, row in rows.items() if row is not None and row.neutral is not None
+                method: row.neutral for method, row in truth.methods.items() if row.neutral and row.lead_over_controls
             }
-            best = max(judged, key=lambda method: judged[method].estimate, default=None)
-            if best is not None:
-                scores.append(f"{name} images: correlation of {best} with the effects of markers {judged[best]}")
+            best = max(judged, key=lambda method: judged[method].estimate, default="")
+            scores += (
+                [f"{name} images: correlation of {best} with the effects of markers {judged[best]}"] if best else []
+            )
         return "; ".join(scores) or "no method was scored"
 
     def to_arrow(self) -> pa.Table:
@@ -482,40 +417,34 @@ class Study(Result):
         )
 
     @property
-    def inputs(self) -> set[str]:
-        """Inputs that some stage tells of; both where none does."""
-        records = {name for table in self._tests for name in table} | set(self.choice.inputs if self.choice else ())
-        return records or {"difference", "raw"}
-
-    @property
     def source(self) -> str:
         """Where the study's frames come from: "simulated" or "real"."""
         if self.choice is not None:
             return self.choice.source
-        return next((test.source for table in self._tests for test in table.values()), "simulated")
+        return next((test.source for test in self._tests), "simulated")
 
     @property
     def left_out(self) -> dict[str, str]:
         """How many frames to score no score counts, and why, in words by input; nothing where all count."""
         if self.choice is None:
             return {}
-        chosen = sum(frame.scored for frame in self.choice.frames)
-        tested = {**self.faithfulness, **self.truth}
-        return {
-            name: say_left_out(
-                chosen - record.frames,
-                chosen,
-                name,
-                self.explanations[name].baseline if name in self.explanations else "untouched",
-            )
-            for name, record in tested.items()
-            if record.frames < chosen
-        }
-
-    def __bool__(self) -> bool:
-        """True where any step of a study was run."""
-        return any(self._tests) or self.choice is not None or self.states is not None
+        chosen, sentences = sum(frame.scored for frame in self.choice.frames), {}
+        for name, record in {**self.faithfulness, **self.truth}.items():
+            if record.frames < chosen:
+                baseline = self.explanations[name].baseline if name in self.explanations else "untouched"
+                sentences[name] = (
+                    f"{chosen - record.frames} of {chosen} frames to score are left out with the {name} network: it "
+                    f"predicts nearly the margin of {BASELINES[baseline]} there, so that there is nothing to explain "
+                    "and the direction is chance"
+                )
+        return sentences
 
     @property
-    def _tests(self) -> tuple[Mapping[str, _Test], ...]:
-        return self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth
+    def begun(self) -> bool:
+        """True where any step of a study was run."""
+        return bool(self._tests) or self.choice is not None or self.states is not None
+
+    @property
+    def _tests(self) -> list[OfNetwork]:
+        tables = self.faithfulness, self.randomisation, self.map_quality, self.timing, self.truth
+        return [record for table in tables for record in table.values()]

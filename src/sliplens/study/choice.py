@@ -21,7 +21,6 @@ from sliplens.faithfulness.removal import Units
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.markers import track_markers
 from sliplens.models import Network
-from sliplens.plots.style import input_name, listed
 from sliplens.progress import number_of, report_each
 from sliplens.recordings import Dataset, TrialInfo
 from sliplens.results.explanation import CLOSE, Explanation
@@ -35,6 +34,7 @@ from sliplens.results.study import (
     MarkerPlaces,
     MarkerTable,
     States,
+    StudyConfig,
 )
 
 SCORED_LEVELS = (0.4, 0.2, 0.0)
@@ -49,15 +49,7 @@ def sample_trials(data: Dataset, *, split: str, condition: str) -> tuple[TrialIn
     return data.select(split="test" if split == "train" and not has_split else split, condition=condition)
 
 
-def choose_frames(
-    networks: Mapping[str, Network],
-    data: Dataset,
-    *,
-    split: str = "train",
-    condition: str = "dry",
-    trials: int = 14,
-    tolerance: float = 0.03,
-) -> Choice:
+def choose_frames(networks: Mapping[str, Network], data: Dataset, config: StudyConfig) -> Choice:
     """Choose trials in which every network predicts the frames along the margin within a tolerance, in margin units.
 
     Where more trials qualify than are wanted, the first in the data set's order are taken; where fewer do, those within
@@ -67,13 +59,12 @@ def choose_frames(
 
     Polak, section 4: 14 training trials predicted within 3 %, 84 frames to look at, 42 to score.
     """
-    if not networks:
-        raise InputError("a study needs a network; name one at least")
+    trials, tolerance, condition = config.trials, config.tolerance, config.condition
     if trials < 1:
         raise InputError(f"a study of {trials} trials is impossible; ask for 1 or more")
     if not 0 <= tolerance <= 1:
         raise InputError(f"the tolerance is {tolerance:g}; give a share of the margin between 0 and 1")
-    infos = sample_trials(data, split=split, condition=condition)
+    infos = sample_trials(data, split=config.split, condition=condition)
     candidates = [
         candidate
         for info in report_each(infos)
@@ -91,7 +82,7 @@ def choose_frames(
     taken = ranked[: min(trials, max(close, FEWEST_UNITS))]
     best = min((candidate.trial for candidate in taken), key=lambda trial: trial.worst).trial
     scored = [level in SCORED_LEVELS for level in LEVELS]
-    choice = Choice(
+    return Choice(
         trials_wanted=trials,
         tolerance=tolerance,
         considered=len(candidates),
@@ -100,17 +91,12 @@ def choose_frames(
             name: sum(candidate.trial.worst_error[name] <= tolerance for candidate in candidates) for name in networks
         },
         mean_error={name: float(np.mean([candidate.errors[name][scored] for candidate in taken])) for name in networks},
-        summary="",
         source=data.source,
         split=infos[0].split,
         condition=condition,
-        inputs=tuple(networks),
-        levels=LEVELS,
-        scored_levels=SCORED_LEVELS,
         trials=tuple(candidate.trial for candidate in taken),
         frames=tuple(replace(frame, shown=frame.trial == best) for candidate in taken for frame in candidate.frames),
     )
-    return replace(choice, summary=_summarise(choice, len(infos)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,28 +141,6 @@ def _measure_trial(
     )
     trial = ChosenTrial(trial=info.trial, qualified=max(worst.values()) <= tolerance, worst_error=worst)
     return _Candidate(trial=trial, frames=frames, errors=errors)
-
-
-def _summarise(choice: Choice, trials: int) -> str:
-    networks, taken, wanted = len(choice.inputs), choice.trials, choice.trials_wanted
-    who = "the network predicts" if networks == 1 else f"{'both' if networks == 2 else 'all'} networks predict"
-    summary = (
-        f"Of {number_of(trials, f'{choice.condition} {choice.split} trial')} {choice.considered} have a frame near "
-        f"every level, and in {choice.qualified} of those {who} every such frame within "
-        f"{100 * choice.tolerance:g} points."
-    )
-    others = [trial for trial in taken if not trial.qualified]
-    if others:
-        summary += (
-            f" {wanted} were wanted, so the {len(others)} next best were taken too: {choice.close} of the {len(taken)} "
-            f"are within {100 * CLOSE_TO_LABELS:g} points, and the worst prediction is off by "
-            f"{100 * max(trial.worst for trial in others):.0f}."
-        )
-    elif choice.qualified > wanted:
-        summary += f" The first {wanted} were taken."
-    errors = [f"{100 * error:.0f} points ({input_name(name).lower()})" for name, error in choice.mean_error.items()]
-    summary += f" The predictions on the frames to score are off by {listed(errors)} on average."
-    return summary + (f" There were no more: {len(taken)} instead of {wanted}." if len(taken) < wanted else "")
 
 
 def show_states(choice: Choice, data: Dataset) -> States:

@@ -1,7 +1,7 @@
 """Public call that explains frames, its folder, and the strip of one trial."""
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack, cast
@@ -9,7 +9,6 @@ from typing import Literal, TypedDict, Unpack, cast
 import numpy as np
 from torch import nn
 
-from sliplens.codec import save_result
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import (
@@ -18,7 +17,6 @@ from sliplens.explainers.explain import (
     choose_explainers,
     explain_frames,
     explain_rows,
-    input_pictures,
     join_maps,
     with_markers,
 )
@@ -36,18 +34,16 @@ from sliplens.explainers.frames import (
 )
 from sliplens.explainers.occlusion import markers_in_recording
 from sliplens.explainers.table import EXPLAINERS, RECOMMENDED_METHOD
-from sliplens.files import output_folder, remove
-from sliplens.images import Images, as_frames, read_image, write_png
+from sliplens.images import Images, as_frames, read_image
 from sliplens.models import Network
 from sliplens.models.wrapping import Preprocess, open_run
-from sliplens.plots.saliency import draw_explanation, overlay_points
+from sliplens.plots.saliency import draw_explanation
 from sliplens.progress import (
     OnProgress,
     add_note,
     ignore,
     number_of,
     open_stage,
-    report_file,
     reporting,
 )
 from sliplens.recordings import Dataset, Recording, load_dataset
@@ -57,7 +53,7 @@ from sliplens.results.explanation import BASELINES, Explanation, Strip, StripRea
 from sliplens.runner import Part, part
 from sliplens.study.choice import study_explainers, without_markers
 from sliplens.study.neutral import prove_map
-from sliplens.study.stages import MakeRecord, Stage
+from sliplens.study.stages import MakeRecord, Stage, keep_record
 
 
 class Running(TypedDict, total=False):
@@ -173,31 +169,27 @@ def explain(
         recipe |= {"method": tuple(explainers), "budget": budget, "baseline": chosen.baseline}
         maps = "a map" if len(explainers) == 1 else number_of(len(explainers), "map")
         what = f"{maps} of {frames if len(chosen.ids) == 1 else f'each of {frames}'}, panel.png"
+
+        def make(parts: Path) -> Explanation:
+            work = Explaining(
+                trained=network,
+                chosen=replace(chosen, find_markers=None),
+                explainers=explainers,
+                warnings=warnings,
+            )
+            with open_stage(title):
+                on, retry_failed = running.get("on", "serial"), running.get("retry_failed", False)
+                explanation = work.make(parts, on=on, retry_failed=retry_failed)
+                notes = explanation.methods
+                # inside the stage: warnings that differ in numbers alone are then shown once
+                for warning in dict.fromkeys(text for each in notes.values() for text in each.warnings):
+                    methods = [name for name, each in notes.items() if warning in each.warnings]
+                    add_note(f"{', '.join(methods)}: {warning}")
+            draw_explanation(explanation, parts.parent)
+            return explanation
+
         overwrite = running.get("overwrite", False)
-        with output_folder(Path(out), stage="explain", config=recipe, overwrite=overwrite) as output:
-            if not output.complete:
-                work = Explaining(
-                    trained=network,
-                    chosen=replace(chosen, find_markers=None),
-                    explainers=explainers,
-                    warnings=warnings,
-                )
-                with open_stage(title):
-                    explanation = work.make(
-                        output.folder / "parts",
-                        on=running.get("on", "serial"),
-                        retry_failed=running.get("retry_failed", False),
-                        on_record=_draw_first(output.folder, network, chosen),
-                    )
-                    notes = explanation.methods
-                    # inside the stage: warnings that differ in numbers alone are then shown once
-                    for warning in dict.fromkeys(text for each in notes.values() for text in each.warnings):
-                        methods = [name for name, each in notes.items() if warning in each.warnings]
-                        add_note(f"{', '.join(methods)}: {warning}")
-                draw_explanation(explanation, output.folder)
-                save_result(explanation, output.folder)
-                remove(output.folder / "parts")  # not before: if drawing or saving fails, the next call continues
-        report_file(Path(out), what, kept=output.complete)
+        keep_record(Path(out), make, stage="explain", config=recipe, what=what, overwrite=overwrite)
     return load_explanation(Path(out))
 
 
@@ -252,24 +244,6 @@ def _open_baseline(baseline: Baseline | Path | str | None, profile: SensorProfil
     return baseline if profile is None else profile.apply(baseline)
 
 
-def _draw_first(folder: Path, network: Network, chosen: ChosenFrames) -> Callable[[tuple[str, int], MethodMaps], None]:
-    """Return a function that draws the first map as soon as it exists, on a scale of its own."""
-    drawn = []
-
-    def draw(item: tuple[str, int], maps: MethodMaps) -> None:
-        if drawn:
-            return
-        method, batch = item
-        row = chosen.batches[batch][0]
-        path = folder / "overlays" / method / f"{chosen.ids[row]}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_png(path, overlay_points(input_pictures(network, chosen)[row : row + 1], maps.relevance[:1])[0])
-        drawn.append(path)
-        report_file(path, "a first picture; the folder takes its name when all are there")
-
-    return draw
-
-
 @dataclass(frozen=True, kw_only=True)
 class Explaining(Stage[Explanation]):
     """Maps of chosen frames; a part is a method and the number of a batch of frames."""
@@ -298,17 +272,14 @@ class Explaining(Stage[Explanation]):
         """Yield all batches with the first method, then with the next."""
         chosen = self.chosen
         for method in self.explainers:
-            # the folder of the parts is one of these options alone (`files.output_folder`)
-            recipe = {"weights_sha256": self.trained.manifest.weights_sha256, "method": method}
             for batch, rows in enumerate(chosen.batches):
-                content = hashlib.sha256(chosen.images[rows].numpy().tobytes())
-                content.update(chosen.references[rows].numpy().tobytes())
+                # the folder of the parts is one of these frames and options alone (`files.output_folder`)
                 yield part(
                     (method, batch),
                     trial=chosen.trial[rows[0]],
                     name=f"{method} of {chosen.ids[rows[0]]}",
-                    recipe=recipe,
-                    content=content.hexdigest(),
+                    recipe=method,
+                    content="",
                     first=rows[0],
                     frames=len(rows),
                 )

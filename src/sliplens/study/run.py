@@ -2,7 +2,7 @@
 
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,14 +12,14 @@ from typing import Any, TypeAlias
 import torch
 from torch import nn
 
-from sliplens.codec import load_result, save_record, save_result
+from sliplens.codec import load_result, save_record
 from sliplens.errors import InputError
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.explain import with_markers
 from sliplens.explainers.frames import frames_at
 from sliplens.explainers.table import RECOMMENDED_METHOD
 from sliplens.faithfulness.scoring import influences
-from sliplens.files import DEFAULT_NETWORK, hash_json, output_folder, remove, scratch_folder
+from sliplens.files import DEFAULT_NETWORK, hash_json, scratch_folder
 from sliplens.intervals import FEWEST_UNITS
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
@@ -29,7 +29,6 @@ from sliplens.progress import (
     current_listener,
     number_of,
     open_stage,
-    report_file,
     reporting,
 )
 from sliplens.recordings import Dataset, load_dataset
@@ -42,15 +41,13 @@ from sliplens.results.study import (
     SETTINGS,
     TABLES,
     TESTS,
-    Choice,
     Setting,
     Study,
     StudyConfig,
-    say_left_out,
 )
 from sliplens.runner import MakePart, Work, require_executor
 from sliplens.simulation.intervention import rebuild_trial
-from sliplens.study.checks import Randomising, Untrained, measure_maps, time_explainers
+from sliplens.study.checks import Untrained, measure_maps, randomise_weights, time_explainers
 from sliplens.study.choice import (
     LEVELS,
     SCORED_LEVELS,
@@ -66,7 +63,7 @@ from sliplens.study.choice import (
 )
 from sliplens.study.explaining import Explaining, make_strip
 from sliplens.study.scoring import Influence, PixelDeletion, Removal
-from sliplens.study.stages import Stage
+from sliplens.study.stages import Stage, keep_record
 from sliplens.study.truth import TRUE_FILL, JudgingByTruth, true_curves
 from sliplens.training.evaluation import evaluate
 
@@ -143,6 +140,9 @@ def run_study(
             data=data,
             networks=load_networks(networks, device=device),
             config=config,
+            on=on,
+            retry_failed=retry_failed,
+            overwrite=overwrite,
         )
         if not (records.folder / CONFIG_FILE).exists():
             minutes = estimate_minutes(records)
@@ -153,18 +153,20 @@ def run_study(
             )
             for name, run in records.networks.items()
         }
+        of_networks = [replace(records, network=name) for name in records.networks]
         steps = _required_steps(config.tests)
         for step in (step for step in steps if step.shared):
-            _run_step(step, records, overwrite=overwrite)
+            _run_step(step, records)
         save_record(config, records.folder / CONFIG_FILE)
-        records = replace(records, redrawn="truth" in config.tests and _can_redraw(records))
-        steps = [step for step in steps if not step.shared and (step.name != "truth" or records.redrawn)]
-        for name in records.networks:
-            of_network = replace(records, network=name)
-            for step in steps:
-                _run_step(step, of_network, on=on, retry_failed=retry_failed, overwrite=overwrite)
+        if records.not_redrawn:
+            if data.simulated and "truth" in config.tests:
+                add_note(f"the truth is left out, since {records.not_redrawn}")
+            steps = [step for step in steps if step.name != "truth"]
+        for of_network in of_networks:
+            for step in (step for step in steps if not step.shared):
+                _run_step(step, of_network)
         tables = {
-            TABLES[step.name]: {name: replace(records, network=name)[step.name] for name in records.networks}
+            TABLES[step.name]: {each.network: each[step.name] for each in of_networks}
             for step in steps
             if step.name in TABLES
         }
@@ -176,6 +178,8 @@ def run_study(
             evaluations=evaluations,
             **tables,
         )
+        for sentence in (records["choice"].summary, *study.left_out.values()):
+            add_note(sentence)
         weakref.finalize(study, stack.pop_all().close)
         return study
 
@@ -190,6 +194,8 @@ def load_networks(networks: NetworkLike | Sequence[NetworkLike], *, device: str 
                 f"two networks read the input {run.encoding.name}, and a study takes one network an input; study them "
                 "one by one"
             )
+    if not by_input:
+        raise InputError("a study needs a network; name one at least")
     return dict(sorted(by_input.items()))
 
 
@@ -201,8 +207,9 @@ class Records:
     data: Dataset
     networks: Mapping[str, Network]
     config: StudyConfig
-    redrawn: bool = False
-    """True where frames can be drawn anew with markers put back."""
+    on: str = "serial"
+    retry_failed: bool = False
+    overwrite: bool = False
     network: str = ""
 
     def path(self, step: "Step") -> Path:
@@ -219,16 +226,22 @@ class Records:
         return self.networks[self.network]
 
     @cached_property
-    def frames_without_markers(self) -> list[str]:
-        """Chosen frames whose markers are unknown."""
-        markers = self["states"].markers
-        return [frame.id for frame in self["choice"].frames if frame.id not in markers]
-
-    @cached_property
     def explainers(self) -> dict[str, Explainer]:
         """Explainers by name; tiles stand for markers where the markers of some frame are unknown."""
-        explainers = study_explainers(self.config.methods, budget=self.config.budget)
-        return without_markers(explainers) if self.frames_without_markers else explainers
+        explainers, markers = study_explainers(self.config.methods, budget=self.config.budget), self["states"].markers
+        everywhere = all(frame.id in markers for frame in self["choice"].frames)
+        return explainers if everywhere else without_markers(explainers)
+
+    @cached_property
+    def not_redrawn(self) -> str:
+        """Reason why the chosen frames cannot be drawn anew with markers put back; empty where they can."""
+        if not self.data.simulated:
+            return "the data were recorded"
+        try:
+            rebuild_trial(self.data.folder, self.data.load(self.data.find(self["choice"].frames[0].trial)))
+        except InputError as error:
+            return str(error)
+        return ""
 
     @cached_property
     def material(self) -> Material:
@@ -264,71 +277,37 @@ def _require_trials(data: Dataset, config: StudyConfig) -> None:
         add_note(f"fewer than {FEWEST_UNITS} trials decide nothing: the page shows maps and no verdict; raise --trials")
 
 
-_EXPLAINED_AS_PASSES = {"grad-cam": 8, "integrated-gradients": 250, "poly-cam": 500, "occlusion": 200, "shapley": 300}
-"""Forward passes that a map takes about as long as, by the beginning of the method's name."""
+_PASSES_OF_MAP = {"grad-cam": 8, "integrated-gradients": 250, "poly-cam": 500, "occlusion": 200, "shapley": 300}
+"""Forward passes that a map takes about as long as, by the beginning of the method's name; 100 for others."""
 
 
 def estimate_minutes(records: Records) -> float:
-    """Estimate the minutes that the steps take on one core, from a few forward passes on this machine.
-
-    The estimate is rough: half or twice of it is usual.
-    """
-    config, total = records.config, 0.0
+    """Estimate the minutes that the steps take on one core, from a few forward passes; half or twice of it is usual."""
+    config, seconds = records.config, 0.0
     trials = min(config.trials, len(sample_trials(records.data, split=config.split, condition=config.condition)))
-    scored, methods = len(SCORED_LEVELS) * trials, len(config.methods)
     for run in records.networks.values():
-        size = run.manifest.image_size
+        size, methods = run.manifest.image_size, len(config.methods)
         images = torch.zeros(32, run.encoding.colours, size, size, device=run.device)
         run.predict(images)
         started = time.perf_counter()
         run.predict(images)
         pass_s = (time.perf_counter() - started) / len(images)
-        explained = sum(
-            next((passes for start, passes in _EXPLAINED_AS_PASSES.items() if name.startswith(start)), 100)
+        maps = sum(
+            next((passes for start, passes in _PASSES_OF_MAP.items() if name.startswith(start)), 100)
             for name in config.methods
         )
-        passes = len(LEVELS) * trials * explained
-        passes += scored * explained / 2 if {"faithfulness", "truth"} & set(config.tests) else 0
-        passes += scored * (methods + 1) * (config.steps or size) if "score" in config.tests else 0
-        if "faithfulness" in config.tests:
-            passes += scored * len(config.settings) * (4 * methods + 10 + config.random_orders) * 7
-        passes += scored * 3000 if "truth" in config.tests and records.data.simulated else 0
-        total += passes * pass_s / 60
-    return total
-
-
-def _can_redraw(records: Records) -> bool:
-    """Return True where the chosen frames can be drawn anew with markers put back; a recording never can."""
-    if not records.data.simulated:
-        return False
-    info = records.data.find(records["choice"].frames[0].trial)
-    try:
-        rebuild_trial(records.data.folder, records.data.load(info))
-    except InputError as error:
-        add_note(f"the truth is left out, since {error}")
-        return False
-    return True
+        of_frame = {
+            "control": maps / 2,
+            "score": (methods + 1) * (config.steps or size),
+            "faithfulness": len(config.settings) * (4 * methods + 10 + config.random_orders) * 7,
+            "truth": 3000 if records.data.simulated else 0,
+        }
+        scored = sum(of_frame.get(step.name, 0) for step in _required_steps(config.tests))
+        seconds += trials * (len(LEVELS) * maps + len(SCORED_LEVELS) * scored) * pass_s
+    return seconds / 60
 
 
 # the steps, in their order
-
-
-def _choose(records: Records) -> Choice:
-    config = records.config
-    return choose_frames(
-        records.networks,
-        records.data,
-        split=config.split,
-        condition=config.condition,
-        trials=config.trials,
-        tolerance=config.tolerance,
-    )
-
-
-def _note_markers(records: Records) -> Iterator[str]:
-    missing = records.frames_without_markers
-    if missing and list(records.explainers) != list(study_explainers(records.config.methods)):
-        yield f"the markers of {number_of(len(missing), 'frame')} are not known, so that tiles are asked instead"
 
 
 def _show_trial(records: Records) -> Strip:
@@ -355,17 +334,9 @@ def _explain(records: Records) -> Explaining:
     return Explaining(trained=run, chosen=replace(frames, find_markers=None), explainers=explainers)
 
 
-def _note_left_out(records: Records) -> Iterator[str]:
-    scored = [frame for frame in records["choice"].frames if frame.scored]
-    if records.config.tests and (dropped := len(scored) - len(worth_scoring(scored, records["explain"]))):
-        yield say_left_out(dropped, len(scored), records.network, records["explain"].baseline)
-
-
 def _delete(records: Records) -> PixelDeletion:
-    config = records.config
-    return PixelDeletion(
-        trained=records.run, explained=records.material.explained, steps=config.steps, seed=config.seed
-    )
+    steps, seed = records.config.steps, records.config.seed
+    return PixelDeletion(trained=records.run, explained=records.material.explained, steps=steps, seed=seed)
 
 
 def _remove(records: Records) -> Removal:
@@ -382,7 +353,7 @@ def _remove(records: Records) -> Removal:
         maps=records.influence,
         settings=config.settings,
         random_orders=config.random_orders,
-        further={Setting(fill=TRUE_FILL, unit="marker"): put_back} if records.redrawn else {},
+        further={Setting(fill=TRUE_FILL, unit="marker"): put_back} if not records.not_redrawn else {},
         seed=config.seed,
     )
 
@@ -417,33 +388,24 @@ class Step:
     """Makes the record, or a `Stage` whose parts workers share."""
     needs: tuple[str, ...] = ("explain",)
     """Steps whose records it takes."""
-    options: tuple[str, ...] = ()
-    """Fields of `StudyConfig`, or `redrawn`, that its record depends on, beside methods, budget, baseline and seed."""
-    notes: Callable[[Records], Iterator[str]] = lambda _: iter(())
-    """Sentences that the user should know once it is made."""
     shared: bool = False
     """True where one record is of all networks."""
 
     def config(self, records: Records) -> object:
         """Return all that the record depends on: a folder with another configuration is not reused."""
-        names = self.options if self.shared else ("methods", "budget", "baseline", "seed", *self.options)
-        values = vars(records.config) | {"redrawn": records.redrawn}
-        config = {name: values[name] for name in names} | {"data_hash": records.data.hash}
         weights = {name: run.manifest.weights_sha256 for name, run in records.networks.items()}
+        config = vars(records.config) | {"tests": (), "data_hash": records.data.hash, "weights_sha256": weights}
         if self.shared:
-            return config | {"weights_sha256": weights}
+            return config
         return config | {"weights_sha256": weights[records.network], "choice": hash_json(records["choice"])}
 
 
-_SAMPLE = ("split", "condition", "trials", "tolerance")
 STUDY = (
     Step(
         name="choice",
         title="Choosing trials",
-        make=_choose,
+        make=lambda records: choose_frames(records.networks, records.data, records.config),
         needs=(),
-        options=_SAMPLE,
-        notes=lambda records: iter((records["choice"].summary,)),
         shared=True,
     ),
     Step(
@@ -451,8 +413,6 @@ STUDY = (
         title="Following markers",
         make=lambda records: show_states(records["choice"], records.data),
         needs=("choice",),
-        options=_SAMPLE,
-        notes=_note_markers,
         shared=True,
     ),
     Step(
@@ -460,56 +420,30 @@ STUDY = (
         title="Explaining a trial from stick to slip",
         make=_show_trial,
         needs=("choice",),
-        options=(*_SAMPLE, "methods", "baseline", "seed"),
         shared=True,
     ),
-    Step(
-        name="explain",
-        title=Explaining.title,
-        make=_explain,
-        needs=("choice", "states"),
-        notes=_note_left_out,
-    ),
-    Step(name="score", title=PixelDeletion.title, make=_delete, options=("steps",)),
+    Step(name="explain", title=Explaining.title, make=_explain, needs=("choice", "states")),
+    Step(name="score", title=PixelDeletion.title, make=_delete),
     Step(
         name="control",
         title=Untrained.title,
         make=lambda records: Untrained(material=records.material, seed=records.config.seed),
     ),
-    Step(
-        name="faithfulness",
-        title=Removal.title,
-        make=_remove,
-        needs=("explain", "control"),
-        options=("random_orders", "settings", "redrawn"),
-    ),
+    Step(name="faithfulness", title=Removal.title, make=_remove, needs=("explain", "control")),
     Step(
         name="randomisation",
-        title=Randomising.title,
-        make=lambda records: Randomising(material=records.material, seed=records.config.seed),
+        title="Drawing weights anew, layer by layer",
+        make=lambda records: randomise_weights(records.material, seed=records.config.seed),
     ),
     Step(
         name="map-quality",
         title="Measuring how maps look",
         make=lambda records: measure_maps(records.material, seed=records.config.seed),
     ),
-    Step(
-        name="truth",
-        title=JudgingByTruth.title,
-        make=judge_by_truth,
-        needs=("explain", "control"),
-    ),
+    Step(name="truth", title=JudgingByTruth.title, make=judge_by_truth, needs=("explain", "control")),
     Step(name="timing", title="Timing the methods", make=lambda records: time_explainers(records.material)),
 )
 """Steps of a study in their order."""
-
-
-ALARMS = {
-    "score": "Consequence: the deletion score does not rank these methods",
-    "faithfulness": "Consequence: believe no map under a fill where it has an alarm",
-    "randomisation": "Consequence: such a map shows the image, not what was learned",
-}
-"""Consequence of the alarms of a step."""
 
 
 def _find_step(name: str) -> Step:
@@ -543,24 +477,20 @@ class _StepWork(Work):
         return _find_step(self.name).make(self.records).begin()
 
 
-def _run_step(
-    step: Step, records: Records, *, on: str = "serial", retry_failed: bool = False, overwrite: bool = False
-) -> None:
+def _run_step(step: Step, records: Records) -> None:
     """Keep the record of a step, unless its folder is complete."""
     folder = records.path(step)
     title = step.title if step.shared else f"{step.title} ({records.network})"
-    with output_folder(folder, stage=step.name, config=step.config(records), overwrite=overwrite) as output:
-        if not output.complete:
-            with open_stage(title):
-                record = step.make(records)
-                if isinstance(record, Stage):
-                    work = _StepWork(step.name, records)
-                    record = record.make(output.folder / "parts", work=work, on=on, retry_failed=retry_failed)
-            save_result(record, output.folder)
-            remove(output.folder / "parts")  # not before: what fails above goes on from them
-            if alarms := getattr(record, "alarms", ()):
-                # the page has them beside their table; here their consequence is enough
-                add_note(f"{folder.name}: {number_of(len(alarms), 'alarm')}, such as: {alarms[0]}. {ALARMS[step.name]}")
-    report_file(folder, title[0].lower() + title[1:], kept=output.complete)
-    for sentence in step.notes(records):
-        add_note(sentence)
+
+    def make(parts: Path) -> Any:
+        with open_stage(title):
+            record = step.make(records)
+            if isinstance(record, Stage):
+                work = _StepWork(step.name, records)
+                record = record.make(parts, work=work, on=records.on, retry_failed=records.retry_failed)
+        if alarms := getattr(record, "alarms", ()):
+            add_note(f"{folder.name}: {number_of(len(alarms), 'alarm')}, such as: {alarms[0]}")
+        return record
+
+    what = title[0].lower() + title[1:]
+    keep_record(folder, make, stage=step.name, config=step.config(records), what=what, overwrite=records.overwrite)

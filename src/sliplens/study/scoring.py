@@ -8,10 +8,10 @@ from typing import Literal, TypeAlias, Unpack
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float, UInt8
 from torch import nn
 
-from sliplens.codec import load_result, save_result
+from sliplens.codec import load_result
 from sliplens.errors import InputError, SaliencyError
 from sliplens.explainers.explain import network_inputs, network_references
 from sliplens.explainers.occlusion import tile_regions
@@ -29,17 +29,16 @@ from sliplens.faithfulness.scoring import (
     score_curves,
     score_deletion,
 )
-from sliplens.files import output_folder, remove
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
-from sliplens.progress import open_stage, report_each, report_file, reporting
+from sliplens.progress import open_stage, report_each, reporting
 from sliplens.results.explanation import Explanation, load_explanation
 from sliplens.results.faithfulness import Deletion, DeletionScores, Faithfulness, RemovalCurve
 from sliplens.results.study import SETTINGS, Setting
 from sliplens.runner import Part
 from sliplens.study.choice import trial_seed
 from sliplens.study.explaining import Running
-from sliplens.study.stages import MakeRecord, Stage, join_trials, trial_parts
+from sliplens.study.stages import MakeRecord, Stage, TrialArrays, join_trials, keep_record, trial_parts
 
 STEPS = 28
 """An eighth of the thesis's 224: the mean over the steps differs from that over all of them by less than a step."""
@@ -139,8 +138,8 @@ def score(
     if steps:
         stages.append(PixelDeletion(trained=network, explained=explanation, steps=steps, seed=seed))
 
-    def compute(folder: Path | None = None, *, on: str = "serial", retry_failed: bool = False) -> Faithfulness:
-        results = []
+    def make(folder: Path | None) -> Faithfulness:
+        results, on, retry_failed = [], running.get("on", "serial"), running.get("retry_failed", False)
         for stage in stages:
             with open_stage(stage.title):
                 parts = folder and folder / type(stage).__name__
@@ -153,7 +152,7 @@ def score(
 
     with reporting(running.get("on_progress")):
         if out is None:
-            return compute()
+            return make(None)
         hashes = hashlib.sha256()
         for values in explanation.relevance.values():
             hashes.update(values.tobytes())
@@ -161,12 +160,8 @@ def score(
         config |= {"input": explanation.input, "source": explanation.source, "seed": seed, "steps": steps}
         config |= {"fill": fill, "unit": unit, "random_orders": random_orders}
         overwrite = running.get("overwrite", False)
-        with output_folder(Path(out), stage="faithfulness", config=config, overwrite=overwrite) as output:
-            if not output.complete:
-                retry_failed, on = running.get("retry_failed", False), running.get("on", "serial")
-                save_result(compute(output.folder / "parts", on=on, retry_failed=retry_failed), output.folder)
-                remove(output.folder / "parts")
-        report_file(Path(out), "curves and scores", kept=output.complete)
+        what = "curves and scores"
+        keep_record(Path(out), make, stage="faithfulness", config=config, what=what, overwrite=overwrite)
     return load_result(Path(out), Faithfulness, command="sliplens score")
 
 
@@ -289,17 +284,10 @@ class Removal(Stage[Faithfulness]):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TrialAnswers:
-    """Predictions of the frames of a trial, whole and while pixels are removed, by the order of removal."""
-
-    answers: dict[str, Float64[np.ndarray, "frames answers"]]
-
-
-@dataclass(frozen=True, kw_only=True)
 class PixelDeletion(Stage[DeletionScores]):
     """Deletion of the most salient pixels by every method and in a random order; a part is a trial."""
 
-    record = TrialAnswers
+    record = TrialArrays
     title = "Deleting pixels, as the thesis did"
 
     trained: Network
@@ -319,17 +307,17 @@ class PixelDeletion(Stage[DeletionScores]):
         removed = deletion_steps((self.explained.image_size, self.explained.image_size), steps=self.steps)
         predict = prepare_passes(self.trained, inputs, len(orders) * len(inputs) * len(removed))
 
-        def delete(item: tuple[str]) -> TrialAnswers:
+        def delete(item: tuple[str]) -> TrialArrays:
             rows = self.explained.trials[item[-1]]
             answers = {
                 name: delete_pixels(predict, inputs[rows], orders[name][rows], fill=self.fill, steps=self.steps)
                 for name in report_each(list(orders), sizes=[len(rows)] * len(orders))
             }
-            return TrialAnswers(answers=answers)
+            return TrialArrays(arrays=answers)
 
         return delete
 
-    def join(self, records: Sequence[TrialAnswers]) -> DeletionScores:
+    def join(self, records: Sequence[TrialArrays]) -> DeletionScores:
         """Score all curves."""
-        answers = join_trials(self.explained, [record.answers for record in records])
+        answers = join_trials(self.explained, [record.arrays for record in records])
         return score_deletion(self.explained, answers, fill=self.fill)

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeAlias, TypeVar
 
@@ -9,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from sliplens.codec import load_result, save_result
+from sliplens.files import output_folder, remove
 from sliplens.models import Network
-from sliplens.progress import OnProgress, report_each, reporting
+from sliplens.progress import report_each, report_file
 from sliplens.results.explanation import Explanation
 from sliplens.runner import MakePart, Part, Work, part, run_parts
 
@@ -65,31 +67,37 @@ class Stage(Work, Generic[Result]):
         work: Work | None = None,
         on: str = "serial",
         retry_failed: bool = False,
-        on_record: Callable[[Any, Any], None] | None = None,
-        on_progress: OnProgress | None = None,
     ) -> Result:
         """Make the result, in memory or of the records in a folder, of which those that exist are not made again.
 
-        `work` opens this stage in other processes; the stage itself does if None. `on_record` is called with the item
-        of each part and its record as soon as it exists.
+        `work` opens this stage in other processes; the stage itself does if None.
         """
         every = list(self.parts())
         if folder is None:
             make_record = self.prepare()
-            with reporting(on_progress):
-                sizes = [each.frames for each in every]
-                return self.join([make_record(each.item) for each in report_each(every, sizes=sizes)])
+            sizes = [each.frames for each in every]
+            return self.join([make_record(each.item) for each in report_each(every, sizes=sizes)])
+        run_parts(work or self, every, folder, title=self.title, on=on, retry_failed=retry_failed)
+        command = "the interrupted command"
+        return self.join([load_result(folder / each.path, self.record, command=command) for each in every])
 
-        def read(each: Part) -> Any:
-            return load_result(folder / each.path, self.record, command="the interrupted command")
 
-        def show(each: Part) -> None:
-            if on_record is not None:
-                on_record(each.item, read(each))
+@dataclass(frozen=True, kw_only=True)
+class TrialArrays:
+    """Arrays of the frames of a trial by method, such as maps or predictions."""
 
-        with reporting(on_progress):
-            run_parts(work or self, every, folder, title=self.title, on=on, retry_failed=retry_failed, on_part=show)
-        return self.join([read(each) for each in every])
+    arrays: dict[str, Float[np.ndarray, "frames ..."]]
+
+
+def keep_record(
+    folder: Path, make: Callable[[Path], Any], *, stage: str, config: object, what: str, overwrite: bool = False
+) -> None:
+    """Keep a record in a folder, complete or absent; `make` takes the folder of parts that the next call continues."""
+    with output_folder(folder, stage=stage, config=config, overwrite=overwrite) as output:
+        if not output.complete:
+            save_result(make(output.folder / "parts"), output.folder)
+            remove(output.folder / "parts")  # not before: what fails above goes on from them
+    report_file(folder, what, kept=output.complete)
 
 
 def mean_of_known(values: Float[np.ndarray, " values"]) -> float | None:

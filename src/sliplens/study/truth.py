@@ -1,7 +1,7 @@
 """Explanations compared with the effects of markers on the prediction, which only a simulator knows."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float, Float64, Int, Int64, Shaped, UInt8
 from scipy.stats import spearmanr
 from torch import Tensor
 
-from sliplens.errors import InputError
 from sliplens.explainers.attribution import change_of
 from sliplens.explainers.explain import network_inputs, network_references
 from sliplens.explainers.occlusion import marker_regions
@@ -33,13 +32,11 @@ from sliplens.faithfulness.removal import (
 from sliplens.faithfulness.scoring import prepare_passes, require_same_network
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.models import Network
-from sliplens.plots.style import tell_ends
 from sliplens.progress import ignore, reporting
-from sliplens.recordings import Dataset
-from sliplens.recordings.trial import SLIPS
-from sliplens.results.explanation import Explanation
+from sliplens.recordings import Dataset, Recording
+from sliplens.results.explanation import ExplainedFrame, Explanation
 from sliplens.results.faithfulness import CHANCE, RemovalCurve, is_control
-from sliplens.results.study import REGIONS, Localisation, MarkerEffects, MetaTest, NeutralScores, Truth
+from sliplens.results.study import Localisation, MarkerEffects, MetaTest, NeutralScores, Truth
 from sliplens.runner import Part, part
 from sliplens.simulation.intervention import (
     FilmedTrial,
@@ -56,51 +53,35 @@ from sliplens.study.neutral import (
     neutral_frame,
     split_half_reliability,
 )
-from sliplens.study.stages import MakeRecord, Stage, mean_of_known
+from sliplens.study.stages import MakeRecord, Stage
 
 _RIM_PX = 1.5
 """How far a marker's edge reaches on either side of its outline, in pixels of the network's input."""
-_ROUNDING = 1
-"""Grey levels by which an input may differ where another machine resized it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StagedFrame:
-    """A frame of a study with all that drew it."""
+    """A frame of a study with all that drew it, and where the network sees its markers, in pixels of its input."""
 
-    id: str
-    day: int
-    trial: str
+    explained: ExplainedFrame
     number: int
     """In its trial."""
     safety_margin: float
-    baseline_frame: int | None
-    """Frame of the trial that is the baseline of the explanation; None if that is the untouched sensor."""
     neutral_frame: int
     """Frame to whose places groups of markers are moved."""
     scene: FilmedTrial
-    reference: UInt8[np.ndarray, "height width 3"]
-    contact_map: UInt8[np.ndarray, "height width"]
+    reference: UInt8[np.ndarray, "rows columns 3"]
     markers: Int[np.ndarray, " markers"]
     """Numbers of the markers that lie wholly in the image: those cut by its border stay as they are."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Places:
-    """Where the network sees what moves, in pixels of its input."""
-
     units: Units
-    """For each pixel which of the frame's `markers` covers it, where it is or where the baseline has it, its rim
-    included: its place among them, or their number where there is none."""
-    markers: Bool[np.ndarray, "size size"]
+    """For each pixel which of the `markers` covers it, where it is or where the baseline has it, its rim included: its
+    place among them, or their number where there is none."""
     edges: Bool[np.ndarray, "size size"]
-    """All markers in the image, those at its border too: their areas, and their rims alone."""
+    """Rims of all markers in the image, those at its border too."""
     regions: Int[np.ndarray, "size size"]
     """Marker near to each pixel, or their number where there is none: all regions are of about one size."""
-    slip_annulus: Bool[np.ndarray, "size size"]
-    """Where the skin slips over the object."""
     now_px: Float[np.ndarray, "markers 2"]
-    """Where the frame's `markers` are, as x, y."""
+    """Where the `markers` are, as x, y."""
     state: Int[np.ndarray, " markers"]
     """State of each of them: slips (1), sticks (2), or lies outside of the contact (0)."""
 
@@ -112,40 +93,49 @@ class Places:
 def stage_frames(trained: Network, explained: Explanation, data: Dataset) -> tuple[StagedFrame, ...]:
     """Make frames of a study ready to be drawn anew."""
     require_same_network(trained, explained)
-    if not data.simulated or explained.source != "simulated":
-        raise InputError(f"{data.folder} was recorded: what each marker does is known of simulated frames alone")
-    infos = {info.trial: info for info in data.trials}
     staged: dict[int, StagedFrame] = {}
-    for trial, some in explained.trials.items():
-        if trial not in infos:
-            raise InputError(f"{data.folder} has no trial {trial}; name the data set whose frames were explained")
-        recording = data.load(infos[trial])
+    for trial, rows in explained.trials.items():
+        recording = data.load(data.find(trial))
         scene = rebuild_trial(data.folder, recording)
-        for row in some:
-            name = explained.frames[row].id
-            digits = name.removeprefix(f"{trial}-f")
-            if digits == name or not digits.isdecimal() or int(digits) >= len(recording.frames):
-                raise InputError(f"{name} does not name a frame of trial {trial}; explain frames of a data set")
-            number = int(digits)
-            frame, image_size = recording.frames[number : number + 1], trained.manifest.image_size
-            image = trained.encoding.compare_small(frame, recording.reference, image_size=image_size)[0].numpy()
-            if np.abs(image.astype(np.int16) - explained.images[row].astype(np.int16)).max() > _ROUNDING:
-                raise InputError(f"{name} is not the frame of {data.folder} that was explained; explain it again")
-            assert recording.truth is not None  # a trial that was rebuilt has its truth
-            staged[row] = StagedFrame(
-                id=name,
-                day=infos[trial].day,
-                trial=trial,
-                number=number,
-                safety_margin=float(recording.safety_margin[number]),
-                baseline_frame=explained.frames[row].baseline_frame,
-                neutral_frame=neutral_frame(recording.safety_margin, number),
-                contact_map=recording.truth.contact_map[number],
-                scene=scene,
-                reference=recording.reference,
-                markers=visible_markers(scene.film.sensor),
-            )
+        for row in rows:
+            staged[row] = _stage(explained.frames[row], scene, recording, size=trained.manifest.image_size)
     return tuple(staged[row] for row in range(len(explained.frames)))
+
+
+def _stage(explained: ExplainedFrame, scene: FilmedTrial, recording: Recording, *, size: int) -> StagedFrame:
+    assert recording.truth is not None  # a trial that was rebuilt has its truth
+    number = int(explained.id.removeprefix(f"{recording.trial}-f"))
+    contact_map, markers = recording.truth.contact_map[number], visible_markers(scene.film.sensor)
+    height, width = contact_map.shape
+    scale, steps = size / width, np.arange(size)
+    centres_px, radius_px = scene.film.outlines(number)
+
+    def from_outline(centres_px: np.ndarray, radius_px: np.ndarray) -> Float[np.ndarray, "circles size size"]:
+        # pixel centres lie at whole numbers, edges half a pixel before
+        centres = (centres_px + 0.5) * scale - 0.5
+        away = np.hypot(steps[None, None, :] - centres[:, :1, None], steps[None, :, None] - centres[:, 1:, None])
+        return away - radius_px[:, None, None] * scale
+
+    rest, now = from_outline(*scene.film.outlines(explained.baseline_frame)), from_outline(centres_px, radius_px)
+    beyond = np.minimum(rest, now)
+    place = np.full(len(centres_px), len(markers))
+    place[markers] = np.arange(len(markers))
+    now_px = centres_px[markers]
+    x, y = np.clip(np.round(now_px).astype(np.int64), 0, [width - 1, height - 1]).T
+    return StagedFrame(
+        explained=explained,
+        number=number,
+        safety_margin=float(recording.safety_margin[number]),
+        neutral_frame=neutral_frame(recording.safety_margin, number),
+        scene=scene,
+        reference=recording.reference,
+        markers=markers,
+        regions=marker_regions((size, size), torch.from_numpy((now_px + 0.5) * scale - 0.5)).numpy(),
+        units=np.where(beyond.min(axis=0) <= _RIM_PX, place[beyond.argmin(axis=0)], len(markers)),
+        edges=np.minimum(np.abs(rest), np.abs(now)).min(axis=0) <= _RIM_PX,
+        now_px=(now_px + 0.5) * scale - 0.5,
+        state=contact_map[y, x].astype(np.int64),
+    )
 
 
 def redrawing(trained: Network, frames: Sequence[StagedFrame], *, to: Sequence[int | None] | None = None) -> Redraw:
@@ -163,41 +153,6 @@ def redrawing(trained: Network, frames: Sequence[StagedFrame], *, to: Sequence[i
         return trained.encode(drawn, frame.reference).to(trained.device)
 
     return redraw
-
-
-def find_places(frame: StagedFrame, *, image_size: int) -> Places:
-    """Where the markers, their rims and the slipping skin are in a network's input."""
-    height, width = frame.contact_map.shape
-    scale = image_size / width
-    steps = np.arange(image_size)
-    centres_px, radius_px = frame.scene.film.outlines(frame.number)
-
-    def from_outline(centres_px: np.ndarray, radius_px: np.ndarray) -> Float[np.ndarray, "circles size size"]:
-        # pixel centres lie at whole numbers, edges half a pixel before
-        centres = (centres_px + 0.5) * scale - 0.5
-        away = np.hypot(steps[None, None, :] - centres[:, :1, None], steps[None, :, None] - centres[:, 1:, None])
-        return away - radius_px[:, None, None] * scale
-
-    rest = from_outline(*frame.scene.film.outlines(frame.baseline_frame))
-    now = from_outline(centres_px, radius_px)
-    beyond = np.minimum(rest, now)
-    nearest = beyond.argmin(axis=0)
-    covered = beyond.min(axis=0) <= _RIM_PX
-    place = np.full(len(centres_px), len(frame.markers))
-    place[frame.markers] = np.arange(len(frame.markers))
-    # the camera's pixel at the middle of the network's, in whole numbers: halves must not be rounded
-    column, row = ((2 * steps + 1) * side // (2 * image_size) for side in (width, height))
-    now_px = centres_px[frame.markers]
-    x, y = np.clip(np.round(now_px).astype(np.int64), 0, [width - 1, height - 1]).T
-    return Places(
-        regions=marker_regions((image_size, image_size), torch.from_numpy((now_px + 0.5) * scale - 0.5)).numpy(),
-        units=np.where(covered, place[nearest], len(frame.markers)),
-        markers=covered,
-        edges=np.minimum(np.abs(rest), np.abs(now)).min(axis=0) <= _RIM_PX,
-        slip_annulus=frame.contact_map[np.ix_(row, column)] == SLIPS,
-        now_px=(now_px + 0.5) * scale - 0.5,
-        state=frame.contact_map[y, x].astype(np.int64),
-    )
 
 
 TRUE_FILL = "true"
@@ -245,21 +200,12 @@ def shuffle_half(values: Float[np.ndarray, " markers"], *, rng: np.random.Genera
     return shuffled
 
 
-def marker_means(maps: Maps, places: Sequence[Places]) -> list[Float[np.ndarray, " markers"]]:
+def marker_means(maps: Maps, frames: Sequence[StagedFrame]) -> list[Float[np.ndarray, " markers"]]:
     """Mean of each frame's map over each of its markers, where it is and where it was."""
     return [
-        unit_means(values.astype(np.float64), place.units)[: len(place.now_px)]
-        for values, place in zip(maps, places, strict=True)
+        unit_means(values.astype(np.float64), frame.units)[: len(frame.markers)]
+        for values, frame in zip(maps, frames, strict=True)
     ]
-
-
-def _by_region(places: Sequence[Places], measure: Callable[[int, np.ndarray], float]) -> dict[str, float | None]:
-    """Means over the frames that have the region: where nothing slips there is nothing to find."""
-    means = {}
-    for region in REGIONS:
-        areas = [getattr(place, region) for place in places]
-        means[region] = mean_of_known(np.array([measure(at, area) for at, area in enumerate(areas) if area.any()]))
-    return means
 
 
 def rank_correlation(first: Float[np.ndarray, " markers"], second: Float[np.ndarray, " markers"]) -> float:
@@ -305,38 +251,6 @@ def reliability_of(values: Float64[np.ndarray, " markers"], errors: Float64[np.n
     return float("nan") if spread == 0 else max(0.0, 1 - float((errors**2).mean()) / spread)
 
 
-def _sum_over_change(effects: Sequence[FrameEffects], change: Float[np.ndarray, " frames"], name: str) -> float | None:
-    """How many times the changes of the answers the effects of a name add up to, over all frames."""
-    sums = np.array([getattr(effect, name).sum() for effect in effects])
-    return float((np.sign(change) * sums).sum() / np.abs(change).sum()) if change.any() else None
-
-
-def _summarise(truth: Truth) -> str:
-    """Write what the effects add up to, how sure they are, and how far they follow the margin."""
-    text = {name: "unknown" if times is None else f"{times:.2f} times" for name, times in truth.sums.items()}
-    summary = (
-        f"Neutral judge: {GROUPS} random groups of markers of each frame are moved to their places at another margin "
-        "of the trial; a map is judged by the correlation of its sums over the groups with the changes of the "
-        "prediction."
-    )
-    if truth.neutral_reliability is not None:
-        summary += f" As many other groups would give scores that correlate by {truth.neutral_reliability:.2f}."
-    summary += (
-        " Put back to rest one at a time, all markers together change the prediction by "
-        f"{text['network']} its whole change; their Shapley values, from {truth.pairs} pairs of scenes a frame, add up "
-        f"to {text['shapley']}."
-    )
-    if truth.reliability is not None:
-        summary += f" A second estimate of these would correlate with this one by {truth.reliability.estimate:.2f}."
-    agreement = truth.shapley_against_margin
-    if agreement is not None:
-        summary += (
-            f" Marker by marker the Shapley values of the answer agree with those of the best reading of the margin by "
-            f"{agreement.estimate:.2f} (Spearman, {tell_ends(agreement, '{:.2f}'.format, title='95 % interval ')})."
-        )
-    return f"{summary} This holds for this network on these days."
-
-
 @dataclass(frozen=True, kw_only=True)
 class JudgingByTruth(Stage[Truth]):
     """Markers of every frame, a part, put back alone and in company, and maps compared with what that does.
@@ -345,7 +259,7 @@ class JudgingByTruth(Stage[Truth]):
     change the prediction. Beside it, marker by marker, the mean of a map is compared with Shapley values of the stick
     game, those of the untouched game, and the change by putting a marker back alone. All are signed, along the change
     of the prediction, which leaves correlations of methods as they are. A control knows no sign: it has the one that
-    suits it where leads are taken. A map's mass is that of its positive part.
+    suits it where leads are taken.
     """
 
     record = FrameEffects
@@ -372,18 +286,17 @@ class JudgingByTruth(Stage[Truth]):
             yield part(index, trial=frame.trial, name=frame.id, recipe="truth", content="", first=index, frames=1)
 
     @cached_property
-    def _staged(self) -> tuple[tuple[StagedFrame, ...], list[Places], int]:
-        """Frames, where the network sees their markers, and the number of pairs."""
+    def _staged(self) -> tuple[tuple[StagedFrame, ...], int]:
+        """Frames, and the number of pairs."""
         frames = stage_frames(self.trained, self.explained, self.data)
-        places = [find_places(frame, image_size=self.trained.manifest.image_size) for frame in frames]
-        return frames, places, max([self.pairs, *(2 * len(frame.markers) for frame in frames)])
+        return frames, max([self.pairs, *(2 * len(frame.markers) for frame in frames)])
 
     def prepare(self) -> MakeRecord:
         """Return the function that puts the markers of a frame back, and tests the fills on what that does."""
         trained, explained, fills, seed = self.trained, self.explained, self.fills, self.seed
-        frames, places, pairs = self._staged
+        frames, pairs = self._staged
         inputs, redraw = network_inputs(trained, explained), redrawing(trained, frames)
-        put_to_baseline = redrawing(trained, frames, to=[frame.baseline_frame for frame in frames])
+        put_to_baseline = redrawing(trained, frames, to=[frame.explained.baseline_frame for frame in frames])
         move = redrawing(trained, frames, to=[frame.neutral_frame for frame in frames])
         references = network_references(trained, explained).to(trained.device)
         # groups, each marker alone, pairs of scenes of two games, and under each fill three maps both ways
@@ -391,7 +304,7 @@ class JudgingByTruth(Stage[Truth]):
         predict = prepare_passes(trained, inputs, passes)
 
         def put_back(index: int) -> FrameEffects:
-            frame, place, towards = frames[index], places[index], float(explained.towards[index])
+            frame, towards = frames[index], float(explained.towards[index])
             count, answer = len(frame.markers), answer_scenes(predict, partial(redraw, index))
             groups = draw_groups(count, rng=np.random.default_rng((seed, index, GROUPS)))
             # the whole image first
@@ -403,14 +316,14 @@ class JudgingByTruth(Stage[Truth]):
             rng = np.random.default_rng((seed, index))
             estimate = shapley_values(lambda stay: answer(~stay), count, pairs=pairs, rng=rng)
             stick, values = np.full(count, np.nan), estimate.values
-            if frame.baseline_frame is not None:
+            if frame.explained.baseline_frame is not None:
                 of_stick = answer_scenes(predict, partial(put_to_baseline, index))
                 stick = values = shapley_values(lambda stay: of_stick(~stay), count, pairs=pairs, rng=rng).values
             shuffled = shuffle_half(values, rng=rng)
-            change = unit_means(change_of(inputs[index], references[index]).cpu().double().numpy(), place.units)[:count]
+            change = unit_means(change_of(inputs[index], references[index]).cpu().double().numpy(), frame.units)[:count]
             maps = [towards * values, towards * shuffled, change]
             orders = [
-                unit_order(place.paint(values), place.units, least_first=least)
+                unit_order(frame.paint(values), frame.units, least_first=least)
                 for values in maps
                 for least in (False, True)
             ]
@@ -449,7 +362,7 @@ class JudgingByTruth(Stage[Truth]):
     def join(self, records: Sequence[FrameEffects]) -> Truth:
         """Compare the maps with what putting the markers back does."""
         trained, explained, seed, effects = self.trained, self.explained, self.seed, records
-        frames, places, pairs = self._staged
+        frames, pairs = self._staged
         size = trained.manifest.image_size
         # along the answer's change, as the maps are
         along = [
@@ -458,13 +371,13 @@ class JudgingByTruth(Stage[Truth]):
         ]
         judged = dict(self.maps) | {
             CHANCE: np.random.default_rng(seed).random((len(frames), size, size)),
-            ORACLE: _paint(places, [rows["oracle"] for rows in along]),
-            DEGRADED: _paint(places, [rows["shuffled"] for rows in along]),
+            ORACLE: _paint(frames, [rows["oracle"] for rows in along]),
+            DEGRADED: _paint(frames, [rows["shuffled"] for rows in along]),
         }
         values = {
             name: [
-                marker_sums(rows, place.regions, markers=len(place.now_px))
-                for rows, place in zip(rows_of_map, places, strict=True)
+                marker_sums(rows, frame.regions, markers=len(frame.markers))
+                for rows, frame in zip(rows_of_map, frames, strict=True)
             ]
             for name, rows_of_map in judged.items()
         }
@@ -475,56 +388,44 @@ class JudgingByTruth(Stage[Truth]):
             name: np.array([correlate_groups(*of_frame) for of_frame in zip(rows, groups, moved, strict=True)])
             for name, rows in values.items()
         }
-        empty = torch.stack([trained.encoding.empty(frame.reference, image_size=size) for frame in frames])
-        untouched = trained.predict(empty).cpu().numpy()
-        change = np.array([frame.prediction for frame in explained.frames]) - untouched
-        painted = {name: _paint(places, [getattr(effect, name) for effect in effects]) for name in _EFFECTS[1:]}
         interval = partial(mean_of_defined, clusters=explained.clusters, seed=seed)
-        alike = partial(interval, limits=(-1.0, 1.0))
-        truth = Truth(
+        return Truth(
             input=explained.input,
             source=explained.source,
             frames=len(frames),
-            # the mass of a map of chance
-            areas=_by_region(places, lambda _, region: float(region.mean())),
-            methods=_judge(judged, places, along, neutral, explained.clusters, seed=seed),
+            methods=_judge(judged, frames, along, neutral, explained.clusters, seed=seed),
             neutral_reliability=split_half_reliability(values, groups, moved),
             pairs=pairs,
             reliability=interval(
                 (reliability_of(effect.shapley, effect.shapley_error) for effect in effects), limits=(0.0, 1.0)
             ),
-            sums={name: _sum_over_change(effects, change, name) for name in ("shapley", "network")},
-            shapley_against_margin=alike(rank_correlation(effect.shapley, effect.margin) for effect in effects),
             meta=meta_test(effects, interval),
-            summary="",
-            effects=_table(frames, places, effects),
+            effects=_table(frames, effects),
             neutral=NeutralScores.joined(
                 [
                     NeutralScores(
-                        frame_id=np.array([frame.id for frame in frames]),
-                        day=np.array([frame.day for frame in frames]),
-                        trial=np.array([frame.trial for frame in frames]),
+                        frame_id=np.array([frame.id for frame in explained.frames]),
+                        day=np.array([frame.day for frame in explained.frames]),
+                        trial=np.array([frame.trial for frame in explained.frames]),
                         method=np.repeat(name, len(frames)),
                         correlation=correlations,
                     )
                     for name, correlations in neutral.items()
                 ]
             ),
-            **{f"{name}_maps": values.astype(np.float32) for name, values in painted.items()},
         )
-        return replace(truth, summary=_summarise(truth))
 
 
 def _judge(
     maps: Mapping[str, Maps],
-    places: Sequence[Places],
+    frames: Sequence[StagedFrame],
     effects: Sequence[Mapping[str, Float[np.ndarray, " values"]]],
     neutral: Mapping[str, Float[np.ndarray, " frames"]],
     clusters: Shaped[np.ndarray, "2 frames"],
     *,
     seed: int,
 ) -> dict[str, Localisation]:
-    means = {name: marker_means(values, places) for name, values in maps.items()}
+    means = {name: marker_means(values, frames) for name, values in maps.items()}
     alike = {
         name: {
             truth: np.array(
@@ -550,10 +451,9 @@ def _judge(
         others = [method for method in methods if method != name] if name in methods and valid.any() else []
         positive = np.clip(values.astype(np.float64), 0, None)
         on_edges = (
-            relevance_mass(rows, place.edges) - place.edges.mean() for rows, place in zip(positive, places, strict=True)
+            relevance_mass(rows, frame.edges) - frame.edges.mean() for rows, frame in zip(positive, frames, strict=True)
         )
         records[name] = Localisation(
-            mass=_by_region(places, lambda frame, region, maps=positive: relevance_mass(maps[frame], region)),
             neutral=interval(neutral[name]),
             lead_over_controls=lead_over_controls(ranks[name], controls, clusters=of_valid, rng=rng)
             if name in methods and valid.any()
@@ -567,24 +467,24 @@ def _judge(
     return records
 
 
-def _table(frames: Sequence[StagedFrame], places: Sequence[Places], effects: Sequence[FrameEffects]) -> MarkerEffects:
+def _table(frames: Sequence[StagedFrame], effects: Sequence[FrameEffects]) -> MarkerEffects:
     pieces = []
-    for frame, place, effect in zip(frames, places, effects, strict=True):
+    for frame, effect in zip(frames, effects, strict=True):
         count = len(frame.markers)
         rows = MarkerEffects(
-            frame_id=np.repeat(frame.id, count),
-            day=np.repeat(frame.day, count),
-            trial=np.repeat(frame.trial, count),
+            frame_id=np.repeat(frame.explained.id, count),
+            day=np.repeat(frame.explained.day, count),
+            trial=np.repeat(frame.explained.trial, count),
             safety_margin=np.repeat(frame.safety_margin, count),
             marker=frame.markers.astype(np.int64),
-            x_px=place.now_px[:, 0],
-            y_px=place.now_px[:, 1],
+            x_px=frame.now_px[:, 0],
+            y_px=frame.now_px[:, 1],
             shapley=effect.shapley,
             shapley_error=effect.shapley_error,
             stick=effect.stick,
             network=effect.network,
             margin=effect.margin,
-            state=place.state,
+            state=frame.state,
         )
         pieces.append(rows)
     return MarkerEffects.joined(pieces)
@@ -601,18 +501,17 @@ def true_curves(
 ) -> dict[str, RemovalCurve]:
     """Removal curves under the true fill: markers put back, most or least influential first, or in random orders."""
     frames = stage_frames(trained, explained, data)
-    places = [find_places(frame, image_size=trained.manifest.image_size) for frame in frames]
     inputs = network_inputs(trained, explained)
     passes = len(frames) * (2 * len(maps) + random_orders) * (len(SHARES) - 2)
     return score_maps_by_marker(
         prepare_passes(trained, inputs, passes),
-        redrawing(trained, frames, to=[frame.baseline_frame for frame in frames]),
-        {name: np.stack(marker_means(values, places)) for name, values in maps.items()},
+        redrawing(trained, frames, to=[frame.explained.baseline_frame for frame in frames]),
+        {name: np.stack(marker_means(values, frames)) for name, values in maps.items()},
         rng=np.random.default_rng(seed),
         towards=explained.towards,
         random_orders=random_orders,
     )
 
 
-def _paint(places: Sequence[Places], values: Sequence[Float[np.ndarray, " markers"]]) -> Maps:
-    return np.stack([place.paint(value) for place, value in zip(places, values, strict=True)])
+def _paint(frames: Sequence[StagedFrame], values: Sequence[Float[np.ndarray, " markers"]]) -> Maps:
+    return np.stack([frame.paint(value) for frame, value in zip(frames, values, strict=True)])
