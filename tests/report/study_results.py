@@ -84,7 +84,7 @@ def frames_of(made: Made) -> list[ChosenFrame]:
                     level=level,
                     safety_margin=min(1.0, max(0.0, level + 0.002)),
                     scored=level in SCORED,
-                    shown=trial == 0,
+                    pictured=trial == 0,
                 )
             )
     return rows
@@ -139,7 +139,7 @@ def write_choice(workspace: Path, made: Made) -> Path:
 
 
 def write_states(workspace: Path, made: Made) -> Path:
-    shown = [frame for frame in frames_of(made) if frame.shown]
+    shown = [frame for frame in frames_of(made) if frame.pictured]
     size, tables = made.size, []
     x, y = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0.14, 0.86, 6)] * 2))
     for frame in shown:

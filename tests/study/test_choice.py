@@ -38,7 +38,7 @@ def test_each_level_gets_the_frame_whose_label_is_nearest(choice: Choice, fine_d
 
 
 def test_every_trial_has_six_frames_to_look_at_and_three_to_score(choice: Choice):
-    shown = [pick for pick in choice.frames if pick.shown]
+    shown = [pick for pick in choice.frames if pick.pictured]
     assert [pick.level for pick in shown] == [1.0, 0.8, 0.6, 0.4, 0.2, 0.0]
     assert len({pick.trial for pick in shown}) == 1
     scored = [pick for pick in choice.frames if pick.scored]

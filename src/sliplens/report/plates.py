@@ -186,7 +186,7 @@ def frames_by_margin(results: Results, explained: Explanation) -> list[int]:
     """Numbers of the frames to show: those of the study's choice, else a few of one condition; the margin falls."""
     places = {frame.id: index for index, frame in enumerate(explained.frames)}
     choice = results.choice
-    chosen = [frame for frame in choice.frames if frame.shown and frame.id in places] if choice else []
+    chosen = [frame for frame in choice.frames if frame.pictured and frame.id in places] if choice else []
     if chosen:
         chosen = [frame for frame in chosen if frame.trial == chosen[0].trial]
         return [places[frame.id] for frame in sorted(chosen, key=lambda frame: -frame.level)]

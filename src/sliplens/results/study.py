@@ -46,7 +46,7 @@ class ChosenFrame:
     safety_margin: Annotated[float, MARGIN]
     scored: bool
     """True where it counts in the scores."""
-    shown: bool
+    pictured: bool
     """True where the panels show it."""
     day: int = 1
 

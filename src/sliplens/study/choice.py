@@ -95,7 +95,7 @@ def choose_frames(networks: Mapping[str, Network], data: Dataset, config: StudyC
         split=infos[0].split,
         condition=condition,
         trials=tuple(candidate.trial for candidate in taken),
-        frames=tuple(replace(frame, shown=frame.trial == best) for candidate in taken for frame in candidate.frames),
+        frames=tuple(replace(frame, pictured=frame.trial == best) for candidate in taken for frame in candidate.frames),
     )
 
 
@@ -135,7 +135,7 @@ def _measure_trial(
             level=level,
             safety_margin=label,
             scored=level in SCORED_LEVELS,
-            shown=False,
+            pictured=False,
         )
         for level, row, label in zip(LEVELS, rows, margin[rows].tolist(), strict=True)
     )

@@ -312,7 +312,7 @@ def estimate_minutes(records: Records) -> float:
 
 def _show_trial(records: Records) -> Strip:
     """Explain the trial of the panels from stick to slip, with the first network."""
-    trial = next(frame.trial for frame in records["choice"].frames if frame.shown)
+    trial = next(frame.trial for frame in records["choice"].frames if frame.pictured)
     method = RECOMMENDED_METHOD if RECOMMENDED_METHOD in records.config.methods else records.config.methods[0]
     return make_strip(
         next(iter(records.networks.values())),
