@@ -26,6 +26,7 @@ from sliplens.report.verdict import (
     SECONDS,
     ClaimRow,
     MethodRow,
+    Outcome,
     judge_accuracy,
     settings,
     thesis_row,
@@ -92,6 +93,10 @@ def _best(text: str, best: bool) -> Cell:
     return Cell(text=text, kind="best" if best else "number")
 
 
+def _outcome(outcome: Outcome) -> Cell:
+    return Cell(text="open" if outcome == "undecided" else outcome, kind="outcome")
+
+
 def table_methods(rows: Sequence[MethodRow]) -> CellTable:
     """Tabulate every method beside the best control."""
     return make_table(
@@ -124,7 +129,7 @@ def table_claims(caption: str, rows: Sequence[ClaimRow]) -> CellTable:
             "Claim": lambda row: row.claim,
             **places,
             "Network": lambda row: row.subject,
-            "Outcome": lambda row: Cell(text="open" if row.outcome == "undecided" else row.outcome, kind="outcome"),
+            "Outcome": lambda row: _outcome(row.outcome),
             **numbers,
             "Ours" if of_thesis else "Number": lambda row: row.ours,
             "Why": lambda row: Cell(text=row.why, kind="name"),
@@ -163,7 +168,7 @@ def table_accuracy(results: Results) -> CellTable:
             "R²": lambda row: decimals(row[2].r2, 3),
             "R², thesis": lambda row: decimals(row[3][1], 2),
             "MAE (points)": lambda row: decimals(100 * row[2].mae, 1),
-            "Outcome": lambda row: Cell(text=judge_accuracy(row[2]), kind="outcome"),
+            "Outcome": lambda row: _outcome(judge_accuracy(row[2])),
             "Frames / trials": lambda row: f"{row[2].frames} / {row[2].trials}",
         },
         rows,
@@ -177,7 +182,7 @@ def table_scores(name: str, faithful: Faithfulness | None, scored: DeletionScore
     plain = {} if scored is None else scored.methods
     methods = {*(method for _, _, method in scores), *plain}
     lowest = min((score.mean for method, score in plain.items() if not is_control(method)), default=None)
-    over = next((f"over {score.srg.over} " for score in scores.values()), "")
+    over = next((f" over {score.srg.over}" for score in scores.values()), "")
 
     def deletion(method: str) -> Cell:
         score = plain.get(method)
@@ -192,7 +197,7 @@ def table_scores(name: str, faithful: Faithfulness | None, scored: DeletionScore
         for setting in (settings(faithful) if faithful else ())
     }
     text = (
-        f" Symmetric relevance gain, SRG, in margin units (0 = uninformative), with 95 % intervals {over}; * = "
+        f" Symmetric relevance gain, SRG, in margin units (0 = uninformative), with 95 % intervals{over}; * = "
         "excludes zero. Bold: ahead of every control beyond the interval of the difference; otherwise the method has "
         "shown nothing about this network under that fill."
     )
