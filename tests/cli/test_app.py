@@ -118,10 +118,10 @@ def test_messages_name_options_as_they_are_typed():
     ("words", "message"),
     [
         ("prdict cup.mp4", "did you mean predict?"),
-        ("predict a b --frction 0.7", "Did you mean --friction?"),
-        ("label a -o b --reference-fram 3", "--reference-frame"),
-        ("predict a b c", "'c'"),
-        ("predict a --batch-size many", "--batch-size"),
+        ("predict chromatouch-pair . --frction 0.7", "Did you mean --friction?"),
+        ("label . -o b --reference-fram 3", "--reference-frame"),
+        ("predict chromatouch-pair . c", "'c'"),
+        ("predict . --batch-size many", "--batch-size"),
         ("sensor", "did you mean sensor new or sensor list?"),
     ],
 )

@@ -65,6 +65,9 @@ def call_command(words: list[str]) -> list[str]:
         near = under or get_close_matches(" ".join(words[:2]), names, n=1) or get_close_matches(words[0], names, n=1)
         meant = f"did you mean {' or '.join(near)}? " if near else ""
         raise InputError(f"there is no command {words[0]}; {meant}`sliplens --help` lists all")
+    words = words[len(name.split()) :]
+    if "--help" not in words:
+        COMMANDS[name].refuse_early(words)
     function, options = adapt(COMMANDS[name])
     app = cyclopts.App(
         name=f"sliplens {name}",
@@ -77,7 +80,7 @@ def call_command(words: list[str]) -> list[str]:
     app.default(function)
     app["--help"].show = False
     try:
-        app(words[len(name.split()) :], exit_on_error=False, print_error=False)
+        app(words, exit_on_error=False, print_error=False)
     except cyclopts.CycloptsError as error:
         text = " ".join(str(error).split()).rstrip(".")
         raise InputError(f"{text[:1].lower()}{text[1:]}; `sliplens {name} --help` lists the options") from None
