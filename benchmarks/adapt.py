@@ -181,7 +181,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print what was measured, as a table or as JSON."""
+    """Print what was measured as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--start-from", default="chromatouch-difference", help="network to adapt")
     parser.add_argument("--sensors", nargs="+", default=list(SENSORS), choices=SENSORS)
@@ -203,13 +203,7 @@ def main() -> None:
         found = measure(options)
     except SliplensError as error:
         sys.exit(f"{Path(__file__).name}: {error}")
-    if options.json:
-        print(json.dumps(found))
-        return
-    for name, rows in found["r2_by_trials"].items():
-        for start, row in rows.items():
-            for trials, one in row.items():
-                print(f"{name:10} {start:8} {trials:>4} trials  dry {one['dry']:6.3f}  wet {one['wet']:6.3f}")
+    print(json.dumps(found, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

@@ -462,12 +462,9 @@ def main() -> None:
     )
     if options.write:
         save_record(record, RECORD)
-    if options.json:
-        outcomes = {f"{row.claim}, {row.subject}": [row.outcome, row.thesis, row.ours] for row in record.claims}
-        print(json.dumps({"claims": outcomes, "shift": {point.shift_px: point.r2 for point in shift}}))
-        return
-    for row in record.claims:
-        print(f"{row.outcome:14} {row.source:16} {row.subject:18} {row.claim}: {row.thesis} | {row.ours}")
+    outcomes = {f"{row.claim}, {row.subject}": [row.outcome, row.thesis, row.ours] for row in record.claims}
+    result = {"claims": outcomes, "shift": {point.shift_px: point.r2 for point in shift}}
+    print(json.dumps(result, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

@@ -186,7 +186,7 @@ def by_markers(moved_px: np.ndarray, force_n: np.ndarray, states: np.ndarray, *,
 
 
 def main() -> None:
-    """Print what was measured, as a table or as JSON."""
+    """Print what was measured as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference")) / "fingervision"
     parser.add_argument("--data", type=Path, default=default, help="folder with states.csv and its frames")
@@ -224,11 +224,7 @@ def main() -> None:
             for name in ("markers", "load_given")
         }
         found["adapted_r2"] = {name: adapt(options.data, options.adapt, start=start) for name, start in starts.items()}
-    if options.json:
-        print(json.dumps(found))
-        return
-    for name, value in found.items():
-        print(f"{name:22} {value}")
+    print(json.dumps(found, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

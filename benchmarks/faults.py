@@ -367,7 +367,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the trials and of what spoils them")
     parser.add_argument("--seeds", type=int, default=1, help="pool so many seeds, from --seed on")
     parser.add_argument("--kinds", nargs="+", default=(), help="measure these kinds alone")
-    parser.add_argument("--verbose", action="store_true", help="list the trials whose labels are off or refused")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     arguments = parser.parse_args()
     outcomes = [
@@ -377,22 +376,11 @@ def main() -> None:
             seed, dry=arguments.dry, wet=arguments.wet, noise_n=arguments.noise, kinds=arguments.kinds
         )
     ]
-    if arguments.verbose:
-        for one in outcomes:
-            if one.off > 0.02 * one.valid or one.refusal or one.kept < 0.9 * one.clean:
-                print(one)
-    numbers, rows = summarise(outcomes), summarise_faults(outcomes)
-    for name, value in numbers.items():
-        print(f"{name:28s} {value:.4g}")
-    print(f"{'':22s} {'false':>7s} {'by strength':>22s} {'kept':>7s} {'refused':>8s} {'flagged':>8s}")
-    for fault, row in rows.items():
-        parts = " ".join(f"{share:6.3f}" for share in row.false_valid_by_strength)
-        print(
-            f"{fault:22s} {row.false_valid_share:7.4f} {parts:>22s} {row.valid_kept_share:7.3f} "
-            f"{row.refused_share:8.2f} {row.flagged_share:8.2f}"
-        )
-    if arguments.json:
-        print(json.dumps({**numbers, "by_fault": {fault: asdict(row) for fault, row in rows.items()}}))
+    numbers = {
+        **summarise(outcomes),
+        "by_fault": {fault: asdict(row) for fault, row in summarise_faults(outcomes).items()},
+    }
+    print(json.dumps(numbers, indent=None if arguments.json else 2))
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 
 def main() -> None:
-    """Print the seconds, as text or as JSON."""
+    """Print the seconds as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--from-scratch", action="store_true", help="set up a clone first, and time that too")
     parser.add_argument("--keep", type=Path, help="keep the demo in this folder, which must not exist")
@@ -46,12 +46,7 @@ def main() -> None:
         "cores": os.cpu_count(),
         "load_before": os.getloadavg()[2],
     }
-    if options.json:
-        print(json.dumps(result))
-        return
-    if set_up_seconds is not None:
-        print(f"{set_up_seconds:.0f} s to set up")
-    print(f"{seconds_to_page:.0f} s to the first page, {seconds_all:.0f} s to all of it")
+    print(json.dumps(result, indent=None if options.json else 2))
 
 
 def time_demo(python: str, output: Path, *options: str) -> tuple[float, float]:

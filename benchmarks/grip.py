@@ -235,10 +235,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", action="store_true", help="end with one line of JSON")
     options = parser.parse_args(arguments)
     found = compare_all(options, np.random.default_rng(0))
-    for name, value in found.items():
-        print(f"{name}: {json.dumps(value)}")
-    if options.json:
-        print(json.dumps(found))
+    print(json.dumps(found, indent=None if options.json else 2))
 
 
 def compare_all(options: argparse.Namespace, rng: np.random.Generator) -> dict[str, object]:
@@ -270,7 +267,6 @@ def compare_all(options: argparse.Namespace, rng: np.random.Generator) -> dict[s
         own = hold(controller, {}, scripts)
         groups = {"all": np.ones(len(labels), dtype=bool), **{name: labels == name for name in conditions}}
         by_name[controller] = {name: compare(own, fixed, rows, rng) for name, rows in groups.items()}
-        print(controller, json.dumps(by_name[controller]["all"]))
     found["controllers"] = by_name
     everything = by_name.get("margin", {}).get("all", {})
     found |= {name: everything.get(name) for name in ("excess_ratio", "drop_ratio")}

@@ -20,8 +20,7 @@ without any fault is no matter of health: `auroc_caused` leaves out the frames t
 `Estimate.known` alone. `withheld_healthy` is the share of the frames without a fault whose margin is withheld.
 
 With --choose, on other days and sensors, the quantiles of healthy values are printed, from which the limits were
-chosen, and the numbers of `margin_risk`; with --fit networks get their novelty, from simulated trials or those they
-were trained on. Choice, fit and test share no day and no sensor.
+chosen, and the numbers of `margin_risk`. Choice and test share no day and no sensor.
 """
 
 import argparse
@@ -30,29 +29,24 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from sliplens.codec import load_record, save_record
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import Check, HealthMonitor, LiveFrame
 from sliplens.live.health import check_direction, check_novelty, margin_risk, severity
 from sliplens.live.reading import OFF
 from sliplens.markers import Tracker
 from sliplens.models import Network, load
-from sliplens.models.checkpoint import MANIFEST_FILE, Manifest
-from sliplens.models.novelty import fit_novelty
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.dataset import load_dataset
 from sliplens.simulation import TrialPlan, make_recipe, plan_trials
 from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import Loading, load_at_margins
 from sliplens.simulation.trials import prepare_trial
-from sliplens.training.evaluation import auroc, risk_coverage
+from sliplens.training.evaluation import auroc
 
 Fault = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
 
@@ -394,8 +388,8 @@ def count_withheld(cases: list[Case]) -> dict[str, object]:
 
 
 def summarise(cases: list[Case]) -> dict[str, object]:
-    """Ranking, withheld frames, by fault and strength, and the error of what is told as more is withheld."""
-    errors, off = np.array([case.error for case in cases]), np.array([case.error > OFF for case in cases])
+    """Ranking and withheld frames, by fault and strength."""
+    off = np.array([case.error > OFF for case in cases])
     risk = np.array([margin_risk(case.checks, case.beyond) for case in cases])
     worst, known = np.array([case.worst for case in cases]), np.array([case.known for case in cases])
     told = off_elsewhere(cases, off)
@@ -406,9 +400,6 @@ def summarise(cases: list[Case]) -> dict[str, object]:
         by_strength[case.name].append(case)
     kinds = np.array([case.fault for case in cases])
     healthy, faults = kinds == "none", sorted(set(kinds) - {"none"})
-    touched = np.isfinite(errors)
-    kept = risk_coverage(errors[touched], {"risk": -risk[touched]})
-    bands = np.digitize(risk, np.linspace(0, 1, 6)[1:-1])
     return {
         "auroc": auroc(risk[off], risk[~off]),
         "auroc_worst": auroc(worst[off], worst[~off]),
@@ -418,16 +409,8 @@ def summarise(cases: list[Case]) -> dict[str, object]:
         | {"all": auroc(worst[~healthy], worst[healthy])},
         "seen_by_network": {name: auroc(-known[kinds == name], -known[healthy]) for name in faults}
         | {"all": auroc(-known[~healthy], -known[healthy])},
-        "off_by_risk": {
-            f"{band / 5:g} to {(band + 1) / 5:g}": (int((bands == band).sum()), float(off[bands == band].mean()))
-            for band in sorted(set(bands.tolist()))
-        },
         "withheld_healthy": float(np.mean([bool(case.failed) for case in by_fault["none"]])),
-        "healthy_off": float(off[healthy].mean()),
         "off_told": float(np.mean([bool(case.failed) for case, wrong in zip(cases, off, strict=True) if wrong])),
-        "mean_error_by_share_withheld": {
-            f"{1 - share:g}": kept.error_at("risk", share) for share in (1.0, 0.8, 0.6, 0.4, 0.2)
-        },
         "by_fault": {name: count_withheld(some) for name, some in by_fault.items()},
         "by_strength": {name: count_withheld(some) for name, some in by_strength.items()},
         "frames": len(cases),
@@ -465,48 +448,17 @@ def choose(cases: list[Case]) -> dict[str, object]:
     return found
 
 
-def fit(folders: list[Path], *, trials: int, data: Path | None) -> None:
-    """Fit the novelty of networks on simulated trials of half the days, what is usual on those of the others.
-
-    `data`: their own training and validation trials instead.
-    """
-    parts: list[list[tuple[np.ndarray, np.ndarray]]]
-    if data is None:
-        drawn = []
-        for plan in plan_some("health-fit", trials):
-            loading, film = prepare_trial(plan)
-            images = np.stack([draw(film, at) for at in touching(loading.safety_margin, 8)])
-            drawn.append((images, film.draw_reference().numpy()))
-        parts = [drawn[: len(drawn) // 2], drawn[len(drawn) // 2 :]]
-    else:
-        dataset, parts = load_dataset(data), []
-        for split in ("train", "validation"):
-            offered = dataset.select(split=split)  # of all days
-            kept = [dataset.load(trial) for trial in offered[:: max(1, len(offered) // trials)]]
-            parts.append([(one.frames[touching(one.safety_margin, 24)], one.reference) for one in kept])
-    for folder in folders:
-        run = load(folder)
-        train, validation = ([run.encode(images, untouched) for images, untouched in part] for part in parts)
-        manifest = load_record(folder / MANIFEST_FILE, Manifest, command="sliplens train")
-        save_record(replace(manifest, novelty=fit_novelty(run.model, train, validation)), folder / MANIFEST_FILE)
-
-
 def main() -> None:
-    """Print what health told, as a table or as JSON."""
+    """Print what health told as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--network", default=DEFAULT_NETWORK, help="name or folder of a network")
     parser.add_argument("--trials", type=int, default=8, help="one a day")
     parser.add_argument("--frames", type=int, default=5, help="of each trial")
     parser.add_argument("--choose", action="store_true", help="print what limits and risk are chosen from")
-    parser.add_argument("--fit", type=Path, nargs="+", help="folders of networks that get their novelty")
-    parser.add_argument("--data", type=Path, help="for --fit: data set that they were trained on")
     parser.add_argument("--threads", type=int, default=2, help="of torch")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    if options.fit is not None:
-        fit(options.fit, trials=options.trials, data=options.data)
-        return
     run = load(options.network)
     series = "health-choose" if options.choose else "health-test"
     pull_deg = run.manifest.pull_direction_deg
@@ -518,11 +470,7 @@ def main() -> None:
         for case in judge_trial(run, plan, trial=trial, frames=options.frames, other=other)
     ]
     found = choose(cases) if options.choose else summarise(cases)
-    if options.json:
-        print(json.dumps(found))
-        return
-    for name, value in found.items():
-        print(f"{name:30} {value}")
+    print(json.dumps(found, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

@@ -221,12 +221,7 @@ def main() -> None:
         return
     passed = modules_predict_passes()
     facts = asdict(measure()) | {"modules_predict_passes": len(passed)}
-    if options.json:
-        print(json.dumps(facts))
-        return
-    for name, value in facts.items():
-        print(f"{name}: {value}")
-    print("a frame passes", ", ".join(passed))
+    print(json.dumps(facts, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

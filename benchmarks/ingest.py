@@ -86,11 +86,7 @@ def main() -> None:
         "frames": data.frames,
         "cores": os.cpu_count(),
     }
-    if options.json:
-        print(json.dumps(result, indent=2))
-        return
-    for name, value in result.items():
-        print(f"{name:20s} {value:.4g}" if isinstance(value, float) else f"{name:20s} {value}")
+    print(json.dumps(result, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

@@ -368,11 +368,7 @@ def main() -> None:
         network, shown = sl.load(options.network), options.page == "browser"
         result = measure_pace(frames, untouched, network=network, seconds=60 * options.minutes, shown=shown)
     result["load"] = round(os.getloadavg()[0], 1)
-    if options.json:
-        print(json.dumps(result))
-        return
-    for name, value in result.items():
-        print(f"{name:20} {value}")
+    print(json.dumps(result, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

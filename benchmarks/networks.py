@@ -175,16 +175,10 @@ def friction_of(plan: TrialPlan) -> float:
     return float(np.median(loading.static_friction))
 
 
-def earlier_grasp(
-    plan: TrialPlan, friction: float, *, rng: np.random.Generator, spread: float | None = None
-) -> TrialPlan:
-    """An earlier grasp of the same object on the same day, filmed at 30 Hz.
-
-    Its friction lies within a tenth of the object's, or evenly around it with another standard deviation, a share.
-    """
+def earlier_grasp(plan: TrialPlan, friction: float, *, rng: np.random.Generator) -> TrialPlan:
+    """An earlier grasp of the same object on the same day, at 30 Hz; its friction within a tenth of the object's."""
     nuisances, day = plan.recipe.nuisances, plan.day_draw
-    reach = 0.0 if spread is None else 3**0.5 * spread
-    factor = rng.uniform(*(nuisances.dry_friction_factor if spread is None else (1 - reach, 1 + reach)))
+    factor = rng.uniform(*nuisances.dry_friction_factor)
     if plan.condition == "wet":
         # the object's friction is not drawn, only that of its trials: this one is off by a factor as well
         value = friction / rng.uniform(*nuisances.dry_friction_factor) * factor
@@ -233,9 +227,9 @@ class Read:
         return np.concatenate([one.margin for one in self.told[name]])
 
 
-def read_frames(run: Network, name: str, *, trials: int | None = None, grasp_spread: float | None = None) -> Read:
+def read_frames(run: Network, name: str, *, trials: int | None = None) -> Read:
     """Read a few frames of each trial of a set, told more or less of its friction."""
-    rng, aside = np.random.default_rng(DRAWS[name]), np.random.default_rng(22)
+    rng = np.random.default_rng(DRAWS[name])
     told: dict[str, list[Estimate]] = {}
     truth, ratios, days, wet, pulled = [], [], [], [], []
     for plan in plans_of_set(name, trials=trials):
@@ -252,11 +246,6 @@ def read_frames(run: Network, name: str, *, trials: int | None = None, grasp_spr
                 "told_within_10": Friction.between((1 - WITHIN) * wrong, (1 + WITHIN) * wrong),
                 "one_slip": learn(slipped),
             }
-        if slipped is not None and grasp_spread is not None:
-            unlike = earlier_grasp(plan, friction, rng=aside, spread=grasp_spread)
-            slipped = run.estimate(draw(run, unlike, rng=aside, before_slip=BEFORE_SLIP).inputs).ratio
-            assert slipped is not None
-            known |= {"one_slip_unlike": learn(slipped), "one_slip_unlike_told": learn(slipped, spread=grasp_spread)}
         for what, one in known.items():
             traction = run.require_ratio()
             estimate = untold.with_friction(
@@ -312,9 +301,11 @@ def leads(read: Read, other: Read) -> dict[str, float]:
     return dict(sorted(found.items()))
 
 
-def learn(slipped: Ratio, spread: float = GRASP_SPREAD) -> Friction:
-    """Friction from the readings before one slip, as of a grasp that differs by so much."""
-    return Friction.from_slips([float(slipped.mean.mean())], sigma=float(slipped.sigma.mean()), grasp_spread=spread)
+def learn(slipped: Ratio) -> Friction:
+    """Friction from the readings before one slip."""
+    return Friction.from_slips(
+        [float(slipped.mean.mean())], sigma=float(slipped.sigma.mean()), grasp_spread=GRASP_SPREAD
+    )
 
 
 def held(truth: np.ndarray, ends: Sequence[tuple[np.ndarray, np.ndarray] | None], rows: np.ndarray) -> float:
@@ -441,7 +432,7 @@ def measure_directions(run: Network, name: str, *, trials: int | None = None) ->
 
 
 def main() -> None:
-    """Print what was measured, as a table or as JSON."""
+    """Print what was measured as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path("chromatouch-pair"), help="a trained network")
     parser.add_argument("--against", type=Path, help="another network; told is what the first is ahead of it")
@@ -450,13 +441,8 @@ def main() -> None:
     parser.add_argument("--sequences", action="store_true", help="only what several frames tell")
     parser.add_argument("--known", action="store_true", help="only how far it knows its own kind of sensor, and others")
     parser.add_argument("--directions", action="store_true", help="only R2 by the direction of the pull")
-    parser.add_argument(
-        "--grasp-spread", type=float, help="also: an earlier grasp whose friction differs by this share"
-    )
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    if options.grasp_spread is not None and not 0 < options.grasp_spread < 0.5:
-        parser.error("--grasp-spread is a share between 0 and 0.5")
     try:
         run, other = load(options.run), options.against and load(options.against)
     except SliplensError as error:
@@ -469,20 +455,16 @@ def main() -> None:
         return
     found |= measure_known(run, trials=options.trials) if options.known else {"set": options.set}
     if not (options.known or options.sequences):
-        read = read_frames(run, **chosen, grasp_spread=options.grasp_spread)
+        read = read_frames(run, **chosen)
         found |= summarise(read)
         if other is not None:
-            found |= leads(read, read_frames(other, **chosen, grasp_spread=options.grasp_spread))
+            found |= leads(read, read_frames(other, **chosen))
     if run.sequence is not None and not options.known:
         followed = follow_all(run, **chosen)
         found |= summarise_sequences(followed)
         if other is not None and other.sequence is not None:
             found |= sequence_leads(followed, follow_all(other, **chosen))
-    if options.json:
-        print(json.dumps(found))
-        return
-    for name, value in found.items():
-        print(f"{name:32}", f"{value:.3f}" if isinstance(value, float) else value)
+    print(json.dumps(found, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

@@ -178,11 +178,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     exact_ms, fast_ms = ([times[place] for times in gpu if times[place] is not None] for place in (0, 1))
     result |= {"gpu_exact_ms": max(exact_ms, default=None), "gpu_fast_ms": max(fast_ms, default=None)}
-    for key, value in result.items():
-        print(f"{key:20} {'not measured' if value is None else format(value, '.4g')}")
-    if options.json:
-        more = {"budget": options.budget, "threads": torch.get_num_threads(), "load_average": load_average}
-        print(json.dumps({**result, **more, "networks": found, "machine": machine(), "versions": versions()}))
+    more = {"budget": options.budget, "threads": torch.get_num_threads(), "load_average": load_average}
+    result |= {**more, "networks": found, "machine": machine(), "versions": versions()}
+    print(json.dumps(result, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

@@ -197,24 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "machine": machine(),
         "versions": versions(),
     }
-    print(f"{'engine':12s} {'p50 ms':>8s} {'p99 ms':>8s} {'of torch':>9s} {'off torch':>10s} {'ready s':>8s}")
-    slow = float(np.median(times["torch"])) if "torch" in times else float("nan")
-    for name in times:
-        p50 = result["p50_ms"][name]
-        print(
-            f"{name:12s} {p50:8.2f} {result['p99_ms'][name]:8.2f} {p50 / slow:9.2f} {result['parity'][name]:10.1e} "
-            f"{ready_s[name]:8.1f}"
-        )
-    for name, values in encode_times.items():
-        print(f"encoding {name}: {np.percentile(values, 50):.2f} ms, p99 {np.percentile(values, 99):.2f} ms")
-    for engine, ratios in result["fps_ratios"].items():
-        told = ", ".join(f"{name} {value:.2f}" for name, value in ratios.items())
-        print(f"frames a second by {engine}: {told}")
-    for name, why in missing.items():
-        print(f"{name}: {why}")
-    print(f"{options.threads} threads, {options.size} px, load average {load[0]:.1f} before and {load[1]:.1f} after")
-    if options.json:
-        print(json.dumps(result))
+    print(json.dumps(result, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

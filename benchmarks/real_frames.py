@@ -75,7 +75,7 @@ def read_real_frames(run: Path, frames: Path, *, draws: int = 40) -> dict[str, A
 
 
 def main() -> None:
-    """Print the answers, as a table or as JSON."""
+    """Print the answers as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, default=Path(NETWORK), help="a trained network, or one of the package")
     parser.add_argument("--frames", type=Path, default=FRAMES, help="folder of images whose names end in _GG.png")
@@ -85,19 +85,7 @@ def main() -> None:
         told = read_real_frames(options.run, options.frames)
     except SliplensError as error:
         sys.exit(f"{Path(__file__).name}: {error}")
-    if options.json:
-        print(json.dumps(told))
-        return
-    print(told["note"])
-    for name, margin in told["predictions"].items():
-        low, high = told.get("intervals_90", {}).get(name, (np.nan, np.nan))
-        spread = 100 * told["jittered_sd"][name]
-        print(
-            f"{name:24} true {100 * told['labels'][name]:4.0f} %   read {100 * margin:6.1f} %   "
-            f"90 % interval {100 * low:.0f} to {100 * high:.0f} %   under jitter +- {spread:.1f}"
-        )
-    print(f"mean absolute error {told['mae']:.3f}, order {'right' if told['order_right'] else 'wrong'}")
-    print(f"under jitter {told['jittered_mae']['mean']:.3f} +- {told['jittered_mae']['sd']:.3f}")
+    print(json.dumps(told, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

@@ -141,7 +141,7 @@ def run_clips(folder: Path) -> dict[str, float | int]:
 
 
 def main() -> None:
-    """Print delays, misses and false alarms, as a table or as JSON."""
+    """Print delays, misses and false alarms as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=4, help="of each sensor, dry and wet")
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="200 or more: those below were looked at before")
@@ -161,11 +161,7 @@ def main() -> None:
     found |= {"drawn": not options.positions, "by_case": {name: summarise(some) for name, some in outcomes.items()}}
     if options.clips is not None:
         found["clips"] = run_clips(options.clips)
-    if options.json:
-        print(json.dumps(found))
-        return
-    for name, value in found.items():
-        print(f"{name:22} {value}")
+    print(json.dumps(found, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

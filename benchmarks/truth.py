@@ -141,19 +141,8 @@ def pool(studies: Sequence[Study], name: str) -> dict[str, Any]:
     }
 
 
-def show(title: str, pooled: dict[str, Any]) -> None:
-    """Print the judgement of an input, the best method first."""
-    print(f"{title}: recommended {pooled['recommended'] or 'none'}; {pooled['over']}")
-    neutral = pooled["neutral"]
-    for method in sorted(neutral, key=lambda method: -neutral[method][0]):
-        estimate, low, high = neutral[method]
-        print(f"  {method:32} {estimate:+.2f}" + ("" if low is None else f" ({low:+.2f} to {high:+.2f})"))
-    for rival, gap in pooled["lead_over_rivals"].items():
-        print(f"  lead of {pooled['best']} over {rival}: {gap}")
-
-
 def main() -> None:
-    """Print correlations, leads and verdicts by input, as text or as JSON."""
+    """Print correlations, leads and verdicts by input as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     default = ["thesis-difference", "thesis-raw"]
     parser.add_argument("--network", nargs="+", default=default, help="networks, several an input: folders or names")
@@ -183,14 +172,9 @@ def main() -> None:
     for name in sorted({name for study in judged[0] for name in study.truth}):
         first, *others = [pool(studies, name) for studies in judged if any(name in study.truth for study in studies)]
         second = others[0] if others else None
-        if not options.json:
-            show(name, first)
-            if second:
-                show(f"{name}, second set", second)
         same = None if second is None else second["recommended"] == first["recommended"]
         result[name] = {**first, "second_set": second, "same_verdict_second_set": same}
-    if options.json:
-        print(json.dumps(result))
+    print(json.dumps(result, indent=None if options.json else 2))
 
 
 if __name__ == "__main__":

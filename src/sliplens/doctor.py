@@ -1,6 +1,5 @@
-"""Check of an installation: versions, networks, engines, extras, cameras, reference data."""
+"""Check of an installation: versions, networks, engines, extras, cameras."""
 
-import os
 import re
 import time
 from collections.abc import Callable
@@ -8,14 +7,12 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module, metadata
 from itertools import islice
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from sliplens.errors import InputError, SliplensError
 from sliplens.files import machine, scratch_folder, shipped_names, versions
-from sliplens.images import list_images, read_image
 from sliplens.live.sources import list_cameras
 from sliplens.models.checkpoint import Network, load
 from sliplens.models.engines import ENGINES, find_obstacle, prepare
@@ -38,22 +35,14 @@ class Item:
     """Version or size, or the error and its cure."""
 
 
-def examine_installation(*, reference: Path | None = None, on_progress: OnProgress | None = None) -> tuple[Item, ...]:
+def examine_installation(*, on_progress: OnProgress | None = None) -> tuple[Item, ...]:
     """Try each part of this installation once; what fails is told and does not stop the others.
-
-    Parameters
-    ----------
-    reference
-        Folder of the real recordings; that of the environment variable SLIPLENS_REFERENCE, else `../shared/reference`,
-        if None.
 
     Returns
     -------
     tuple[Item, ...]
-        Versions, the data store, each network, engine, extra and camera, and each set of reference data.
+        Versions, the data store, and each network, engine, extra and camera.
     """
-    folder = reference or Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference"))
-    sets = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     parts: list[tuple[str, Callable[[], str]]] = [
         ("versions", _versions),
         ("data store", _store),
@@ -62,10 +51,7 @@ def examine_installation(*, reference: Path | None = None, on_progress: OnProgre
         *((f"engine {name}", partial(_engine, name)) for name in ENGINES),
         *((f"extra {name}", partial(_extra, name, needs)) for name, needs in _extras().items()),
         ("cameras", _cameras),
-        *((f"reference {path.name}", partial(_reference, path)) for path in sets),
     ]
-    if not sets:
-        parts.append(("reference data", partial(_absent, f"not at {folder}; set SLIPLENS_REFERENCE")))
     with reporting(on_progress):
         return tuple(_try(name, part) for name, part in report_each(parts))
 
@@ -171,16 +157,6 @@ def _cameras() -> str:
     if not any(camera.formats for camera in cameras):
         raise InputError(f"{cameras[0].path} {cameras[0].name}; close what holds it, or join the group video")
     return ", ".join(f"{camera.path} {camera.name} ({number_of(len(camera.formats), 'format')})" for camera in cameras)
-
-
-def _reference(folder: Path) -> str:
-    """Read one image of each folder of images below."""
-    files = [path for path in folder.rglob("*") if path.is_file()]
-    sizes = {
-        read_image(list_images(each)[0]).shape[:2] for each in {path.parent for path in files if path.suffix == ".png"}
-    }
-    read = ", ".join(f"images of {height} x {width} pixels" for height, width in sorted(sizes))
-    return "; ".join(filter(None, (number_of(len(files), "file"), read)))
 
 
 __all__ = ["Item", "examine_installation"]

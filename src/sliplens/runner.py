@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from contextvars import copy_context
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache, partial
 from pathlib import Path
@@ -158,12 +158,18 @@ def run_parts(
     """
     name, _, argument = on.partition("=")
     executor = pick(EXECUTORS, name, noun="executor")
-    tally = _Tally(total=sum(each.frames for each in parts), on_part=on_part)
-    missing: deque[Part] = deque()
+    frames = sum(each.frames for each in parts)
+    tally, missing = _Tally(frames), deque[Part]()
+
+    def made(each: Part) -> None:
+        _failure_file(folder, each).unlink(missing_ok=True)  # a process may have ended before it could remove it
+        tally.count(each, 1, 1)
+        if on_part is not None:
+            on_part(each)
+
     for each in parts:
         if (folder / each.path).exists():
-            _failure_file(folder, each).unlink(missing_ok=True)  # ended before it could remove it
-            tally.add(each)
+            made(each)
         elif retry_failed or not _load_failure(folder, each).set_aside:
             if retry_failed:
                 _failure_file(folder, each).unlink(missing_ok=True)
@@ -173,10 +179,10 @@ def run_parts(
         for draft in folder.glob("trial=*/.*.draft"):  # of processes that were killed
             remove(draft)
         (folder / _STATE).mkdir(parents=True, exist_ok=True)
-        plan = _Plan(title=title, parts=len(parts), frames=tally.total, started_s=time.time(), on=on)
+        plan = Status(title=title, parts=len(parts), frames=frames, started_s=time.time(), on=on)
         save_record(plan, folder / _STATE / "plan.json")
         with executor(work, argument, len(missing)) as pool:
-            error = _run(pool, missing, folder, tally)
+            error = _run(pool, missing, folder, tally.count, made)
     failures = [failure for each in parts if (failure := _load_failure(folder, each)).errors]
     if failures and len(parts) == 1 and error is not None:
         remove(folder / _STATE)
@@ -187,7 +193,13 @@ def run_parts(
         remove(folder / _STATE)
 
 
-def _run(pool: "_Pool", missing: deque[Part], folder: Path, tally: "_Tally") -> Exception | None:
+def _run(
+    pool: "_Pool",
+    missing: deque[Part],
+    folder: Path,
+    count: Callable[[Part, int, int], None],
+    made: Callable[[Part], None],
+) -> Exception | None:
     """Submit parts until none is missing; return the last error of a part."""
     running: dict[Future, Part] = {}
     alone: deque[Part] = deque()  # a process ended while they were made: which of them is at fault shows one by one
@@ -197,7 +209,7 @@ def _run(pool: "_Pool", missing: deque[Part], folder: Path, tally: "_Tally") -> 
         while waiting and len(running) < most:
             each = waiting.popleft()
             try:
-                running[pool.submit(folder, each, partial(tally.within, each))] = each
+                running[pool.submit(folder, each, partial(count, each))] = each
             except pool.lost:
                 alone.append(each)
                 break
@@ -208,15 +220,14 @@ def _run(pool: "_Pool", missing: deque[Part], folder: Path, tally: "_Tally") -> 
             except pool.lost:
                 queue, error = alone, SliplensError("its process was ended from outside, perhaps for want of memory")
             if error is None:
-                _failure_file(folder, each).unlink(missing_ok=True)
-                tally.add(each)
+                made(each)
                 continue
             if isinstance(error, _PreparationError):
                 raise error.args[0]
             if isinstance(error, OSError) and error.errno in _FATAL:
                 raise error
             last = error
-            tally.partly.pop(each.key, None)
+            count(each, 0, 1)
             sentence = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
             failure = _load_failure(folder, each)
             final = isinstance(error, RecordingError)
@@ -251,36 +262,22 @@ def _make(prepare: Callable[[], MakePart], folder: Path, each: Part) -> Exceptio
     return None
 
 
-@dataclass(kw_only=True)
 class _Tally:
     """Frames done so far, reported as they change."""
 
-    total: int
-    on_part: Callable[[Part], None] | None
-    report: OnProgress = field(default_factory=current_reporter)
-    done: int = 0
-    reported: int = 0
-    partly: dict[str, int] = field(default_factory=dict)
-    """Frames done of the parts that are being made, by key."""
-    lock: Any = field(default_factory=threading.Lock)
+    def __init__(self, total: int) -> None:
+        self._total, self._done, self._by_part = total, 0, dict[str, int]()
+        self._report, self._lock = current_reporter(), threading.Lock()
 
-    def add(self, each: Part) -> None:
-        with self.lock:
-            self.partly.pop(each.key, None)
-            self.done += each.frames
-            self._report()
-        if self.on_part is not None:
-            self.on_part(each)
-
-    def within(self, each: Part, done: int, total: int) -> None:
-        with self.lock:
-            self.partly[each.key] = each.frames * done // max(total, 1)
-            self._report()
-
-    def _report(self) -> None:
-        if (frames := self.done + sum(self.partly.values())) != self.reported:
-            self.reported = frames
-            self.report(frames, self.total)
+    def count(self, each: Part, done: int, total: int) -> None:
+        """Report that a share of a part is done; 0 again if it failed."""
+        with self._lock:
+            frames = each.frames * done // max(total, 1)
+            more = frames - self._by_part.get(each.key, 0)
+            self._by_part[each.key] = frames
+            self._done += more
+            if more > 0:
+                self._report(self._done, self._total)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -445,12 +442,10 @@ def run_table(
 
     def rows(folder: Path) -> Iterator[pa.Table]:
         for each in parts:
-            file = open_table(folder / each.path)
-            if on_rows is None:
-                yield from map(file.read_row_group, range(file.num_row_groups))
-            else:
-                on_rows(table := file.read())
-                yield table
+            table = open_table(folder / each.path).read()
+            if on_rows is not None:
+                on_rows(table)
+            yield table
 
     if out is not None and not out.suffix:
         every = hashlib.sha256("".join(each.path for each in parts).encode())  # changed frames make another result
@@ -459,8 +454,7 @@ def run_table(
             config["made"] = secrets.token_hex(8)
         with output_folder(out, stage=title, config=config, overwrite=overwrite) as output:
             schema = make(output.folder)
-            if on_rows is not None:
-                deque(rows(output.folder), maxlen=0)
+            deque(rows(output.folder) if on_rows is not None else (), maxlen=0)
             return schema, None
     if out is None:
         with scratch_folder() as folder:
@@ -521,15 +515,6 @@ def _load_failure(folder: Path, each: Part) -> Failure:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Plan:
-    title: str
-    parts: int
-    frames: int
-    started_s: float
-    on: str
-
-
-@dataclass(frozen=True, kw_only=True)
 class Status:
     """Progress of a work, counted from its parts."""
 
@@ -537,17 +522,19 @@ class Status:
     on: str
     """Executor, as in `--on`."""
     parts: int
-    done: int
-    """Number of parts that exist."""
     frames: int
     """Number of frames of all parts; of maps if each is a part."""
-    frames_done: int
-    failed: tuple[Failure, ...]
-    running: bool
+    started_s: float
+    """Time of the last start, in seconds since 1970."""
+    done: int = 0
+    """Number of parts that exist."""
+    frames_done: int = 0
+    failed: tuple[Failure, ...] = ()
+    running: bool = False
     """True if a process is making the result."""
-    frames_per_s: float | None
+    frames_per_s: float | None = None
     """Rate since the last start; None if no part is newer."""
-    ends: str | None
+    ends: str | None = None
     """Date and time in UTC at which the work ends at that rate (ISO 8601); None if nothing is running."""
 
 
@@ -583,7 +570,7 @@ def read_status(out: Path | str) -> list[Status]:
 
 
 def _read_status(state: Path, *, running: bool) -> Status:
-    plan = load_record(state / "plan.json", _Plan, command=_COMMAND)
+    plan = load_record(state / "plan.json", Status, command=_COMMAND)
     made = [
         (int(match[1]), path.stat().st_mtime)
         for path in state.parent.glob("trial=*/*")
@@ -597,12 +584,9 @@ def _read_status(state: Path, *, running: bool) -> Status:
     if rate is not None and running:
         end = datetime.fromtimestamp(last_s, UTC) + timedelta(seconds=(plan.frames - done) / rate)
         ends = end.isoformat(timespec="seconds")
-    return Status(
-        title=plan.title,
-        on=plan.on,
-        parts=plan.parts,
+    return replace(
+        plan,
         done=len(made),
-        frames=plan.frames,
         frames_done=done,
         failed=tuple(load_record(path, Failure, command=_COMMAND) for path in sorted(state.glob("*.failed"))),
         running=running,

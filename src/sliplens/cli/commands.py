@@ -1,7 +1,7 @@
 """The commands: each calls a function of the library and prints its result."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +37,33 @@ def command(
         return run
 
     return register
+
+
+def require_out(call: Any, what: str, *, example: str = "FOLDER") -> Path:
+    """Return the path that a command writes; refuse a command without one."""
+    if "out" not in call.keywords:
+        raise InputError(f"name the {what} with -o {example}")
+    return Path(call.keywords["out"])
+
+
+class _Log:
+    """Lines of a running work: one a second, and each warning once, aside from the results."""
+
+    def __init__(self) -> None:
+        self._printed_s, self._warnings = -1.0, set[str]()
+
+    def due(self) -> bool:
+        """Return True once a second."""
+        due = time.monotonic() - self._printed_s >= 1
+        self._printed_s = time.monotonic() if due else self._printed_s
+        return due
+
+    def warn(self, warnings: Iterable[str | None]) -> None:
+        """Print warnings that are new."""
+        for warning in dict.fromkeys(filter(None, warnings)):
+            if warning not in self._warnings:
+                self._warnings.add(warning)
+                say(warning, aside=True)
 
 
 @command("demo", "demo:run_demo", "sliplens demo runs/demo")
@@ -152,18 +179,14 @@ def _served(reader: "LiveReader", *, waits: bool, **settings: Any):  # noqa: ANN
 
 def _watch(reader: "LiveReader", *, quiet: bool, lines: bool) -> None:
     """Print a line a second, and each warning once."""
-    printed_s, printed = -1.0, set[str]()
+    log = _Log()
     for reading in reader.readings():
-        if time.monotonic() - printed_s < 1:
+        if not log.due():
             continue
-        printed_s = time.monotonic()
-        if not quiet:
-            for sender in reader.senders:
-                if sender.error:
-                    raise sender.error
-        for warning in {*reader.doubts, *reader.troubles} - printed:
-            printed.add(warning)
-            say(warning, aside=True)
+        for sender in () if quiet else reader.senders:
+            if sender.error:
+                raise sender.error
+        log.warn((*reader.doubts, *reader.troubles))
         if lines:
             say(str(reading))
 
@@ -397,8 +420,7 @@ def call_track(call: Any, *, video: Path | None = None) -> None:
     from sliplens.recordings.source import SourceOptions, open_source
 
     arguments = call.keywords
-    if "out" not in arguments:
-        raise InputError("name the table to write with -o markers.parquet")
+    require_out(call, "table to write", example="markers.parquet")
     if "markers" not in arguments and "sensor" in arguments:
         arguments["markers"] = load_profile(arguments["sensor"]).markers or "auto"
     clip = nullcontext()
@@ -430,10 +452,7 @@ def call_train(call: Any) -> None:
     from sliplens.plots.figure import plot
     from sliplens.plots.style import save_page
 
-    if "out" not in call.keywords:
-        raise InputError("name the folder of the network with -o FOLDER")
-    network, out = call(), Path(call.keywords["out"])
-    picture = out / "curves.png"
+    picture, network = require_out(call, "folder of the network") / "curves.png", call()
     if network.training is not None and not picture.is_file():
         save_page(plot(network), picture)
 
@@ -536,8 +555,7 @@ def call_export_dataset(call: Any) -> None:
 )
 def call_explain(call: Any) -> None:
     """Write the maps."""
-    if "out" not in call.keywords:
-        raise InputError("name the folder of the maps with -o FOLDER")
+    require_out(call, "folder of the maps")
     call()
 
 
@@ -556,10 +574,9 @@ def call_score(call: Any) -> None:
 )
 def call_study(call: Any) -> None:
     """Draw the page."""
-    if "out" not in call.keywords:
-        raise InputError("name the folder of the study with -o FOLDER")
+    out = require_out(call, "folder of the study")
     call()
-    output.draw_report(Path(call.keywords["out"]))
+    output.draw_report(out)
 
 
 @command("status", "runner:read_status", "sliplens status runs/mine/margins")
@@ -577,9 +594,7 @@ def call_status(call: Any) -> None:
 )
 def call_grip(call: Any) -> None:
     """Print what became of the episodes, and draw the page."""
-    if "out" not in call.keywords:
-        raise InputError("name the folder to make with -o FOLDER")
-    out = Path(call.keywords["out"])
+    out = require_out(call, "folder to make")
     output.print_grip(call(out=out / "grip"))
     output.draw_report(out)
 
@@ -629,6 +644,7 @@ def call_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
     from sliplens.grip.source import open_grip, usual_network
     from sliplens.live import LiveReader
     from sliplens.live.contract import LiveOptions
+    from sliplens.live.frame_reader import ReaderSettings
     from sliplens.models import load
     from sliplens.recordings.sensor import load_profile
 
@@ -649,24 +665,23 @@ def call_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
     with ExitStack() as stack:
         if gripper not in GRIPPERS:
             gripper = stack.enter_context(closing(open_gripper(gripper, messages=messages, joint=options.get("joint"))))
+        settings = {name: options[name] for name in options.keys() & ReaderSettings.__annotations__.keys() - {"device"}}
         readers = [
             stack.enter_context(
-                LiveReader(
-                    source,
-                    None if network is None else loaded[network],
-                    reference=image,
-                    sensor=profile,
-                    friction=options.get("friction"),
-                    same_object=options.get("same_object", False),
-                    sequence=options.get("sequence", False),
-                    engine=options.get("engine", "auto"),
-                )
+                LiveReader(source, loaded.get(network), **settings | {"reference": image, "sensor": profile})
             )
             for source, network, image in zip(sources, networks, reference or [None] * len(sources), strict=True)
         ]
-        result = call(
-            source=readers, gripper=gripper, network=None, on_step=_Steps(readers, json=options.get("json", False))
-        )
+        log = _Log()
+
+        def on_step(step: "HoldStep") -> None:
+            log.warn((step.trouble, *(doubt for reader in readers for doubt in reader.doubts)))
+            if options.get("json"):
+                print(msgspec.json.encode(to_builtins(step)).decode(), flush=True)
+            elif log.due():
+                say(str(step))
+
+        result = call(source=readers, gripper=gripper, network=None, on_step=on_step)
     say(result.why, aside=True)
     for name, reader in zip(names, readers, strict=True):
         if reader.lesson is not None:
@@ -675,24 +690,6 @@ def call_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
         print_file(Path(arguments["out"]), number_of(len(result.steps), "command"))
     if result.ended == "failed":
         raise SliplensError(result.why)
-
-
-class _Steps:
-    """Printer of commands: a line of JSON each, or one a second, and each warning once."""
-
-    def __init__(self, readers: "Sequence[LiveReader]", *, json: bool) -> None:
-        self._readers, self._json, self._printed_s, self._printed = readers, json, -1.0, set[str]()
-
-    def __call__(self, step: "HoldStep") -> None:
-        for warning in (step.trouble, *(doubt for reader in self._readers for doubt in reader.doubts)):
-            if warning is not None and warning not in self._printed:
-                self._printed.add(warning)
-                say(warning, aside=True)
-        if self._json:
-            print(msgspec.json.encode(to_builtins(step)).decode(), flush=True)
-        elif time.monotonic() - self._printed_s >= 1:
-            self._printed_s = time.monotonic()
-            say(str(step))
 
 
 @command("report", "report.page:write_report", "sliplens report runs/mine")
