@@ -12,7 +12,6 @@ import pytest
 from command_line import refused, run
 
 import sliplens
-from sliplens.cli import TASKS
 from sliplens.cli.app import adapt, constants, name_options, typed_kind
 from sliplens.cli.commands import COMMANDS
 from sliplens.errors import InputError
@@ -61,17 +60,6 @@ def test_examples_can_be_typed(name: str):
     app.default(adapt(COMMANDS[name])[0])
     _, bound, _ = app.parse_args(words[len(name.split()) :], exit_on_error=False, print_error=False)
     assert len(bound.arguments) >= 0
-
-
-def test_tasks_name_commands(capsys: pytest.CaptureFixture[str]):
-    assert run("help") == 0
-    everything = capsys.readouterr().out
-    for name, (title, commands) in TASKS.items():
-        assert f"{title} ({name})" in everything
-        assert run("help", name) == 0
-        lines = [line.strip() for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
-        assert lines == [COMMANDS[command].example for command in commands]
-    assert "choose one of start, predict" in refused(capsys, "help", "fly")
 
 
 def test_the_overview_has_a_line_for_each_command(capsys: pytest.CaptureFixture[str]):

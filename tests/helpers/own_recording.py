@@ -1,6 +1,8 @@
 """A recording as a user brings it: a video of the frames, and a table of what a force sensor saw."""
 
 import csv
+from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -29,11 +31,44 @@ def write_forces(trial: Recording, path: Path) -> Path:
 
 def write_video(trial: Recording, path: Path) -> Path:
     """Frames of a trial as a lossless video, 30 a second."""
-    with av.open(str(path), "w", format="matroska") as container:
-        stream = container.add_stream("ffv1", rate=30)
-        stream.height, stream.width = trial.reference.shape[:2]
-        stream.pix_fmt = "bgr0"
-        for frame in trial.frames:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
-        container.mux(stream.encode())
+    return write_frames(path, trial.frames, rate=30)
+
+
+def write_frames(
+    path: Path,
+    frames: Sequence[np.ndarray] | np.ndarray,
+    *,
+    codec: str = "ffv1",
+    pixels: str = "bgr0",
+    rate: int = 25,
+    stamps_ms: list[int] | None = None,
+    reordered: int = 0,
+    title: str = "",
+    options: dict[str, str] | None = None,
+) -> Path:
+    """Frames at a rate, or at milliseconds as they are given; `reordered` B-frames in a row."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        container.metadata["title"] = title
+        stream = container.add_stream(codec, rate=rate, options=options or {})
+        assert isinstance(stream, av.VideoStream)
+        stream.height, stream.width = frames[0].shape[:2] if len(frames) else (64, 96)
+        stream.pix_fmt = pixels
+        if options is None:
+            stream.codec_context.max_b_frames = reordered
+            stream.codec_context.gop_size = 12
+            stream.codec_context.bit_rate = 4_000_000
+        if codec == "libx264":
+            # keep the B-frames that were asked for
+            stream.options = {"b-adapt": "0", "threads": "1"}
+        tick = Fraction(1, rate) if stamps_ms is None else Fraction(1, 1000)
+        stream.codec_context.time_base = stream.time_base = tick
+        for index, pixel in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(pixel, format="rgb24")
+            frame.pts, frame.time_base = index if stamps_ms is None else stamps_ms[index], tick
+            container.mux(stream.encode(frame))
+        if len(frames):
+            container.mux(stream.encode())
+        else:
+            container.start_encoding()
     return path

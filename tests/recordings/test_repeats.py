@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
+from own_recording import write_frames
 from readers import read_video
 
 from sliplens.images import soften
@@ -19,21 +19,6 @@ CODECS = {
 }
 
 
-def write_video(path: Path, frames: np.ndarray, places: np.ndarray, *, codec: str) -> Path:
-    pixels, suffix = CODECS[codec]
-    path = path.with_suffix(f".{suffix}")
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=30)
-        assert isinstance(stream, av.VideoStream)
-        stream.height, stream.width = frames.shape[1:3]
-        stream.pix_fmt = pixels
-        stream.codec_context.bit_rate = 4_000_000
-        for place in places:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(frames[place], format="rgb24")))
-        container.mux(stream.encode())
-    return path
-
-
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("camera_hz", [30, 24, 15, 10])
 def test_a_camera_slower_than_its_file_is_noticed(
@@ -41,7 +26,9 @@ def test_a_camera_slower_than_its_file_is_noticed(
 ):
     frames = trials["chromatouch"].frames
     shown = np.arange(len(frames) * 30 // camera_hz) * camera_hz // 30
-    capture = read_video(write_video(tmp_path / "a", frames, shown, codec=codec))
+    pixels, suffix = CODECS[codec]
+    path = write_frames(tmp_path / f"a.{suffix}", frames[shown], codec=codec, pixels=pixels, rate=30)
+    capture = read_video(path)
     assert capture.time_s is not None
     note = describe_repeats(measure_motion(map(soften, capture.read_frames())), capture.time_s)
     assert (note is not None) == (camera_hz < 30)

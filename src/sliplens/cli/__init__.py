@@ -15,33 +15,12 @@ from sliplens.cli.commands import COMMANDS
 from sliplens.cli.console import OUT, fail, say
 from sliplens.errors import InputError, PartError, SliplensError
 
-TASKS = {
-    "start": ("See what sliplens does, without any data", ("demo",)),
-    "predict": ("Predict the safety margin from images, a video or a bag", ("sensor new", "predict", "view")),
-    "explain": ("See which parts of an image a margin comes from", ("explain", "score")),
-    "train": ("Train a network for your own sensor", ("sensor new", "import", "check", "label", "train", "evaluate")),
-    "judge": ("Find out which explanation can be trusted", ("study",)),
-    "live": ("Predict from a running camera, and hold a grip", ("live", "grip", "hold")),
-}
-"""Tasks of users, and the commands of each in their order."""
 _DESCRIPTION = (
     "Predict how close a soft robotic fingertip is to losing its grip, from the images of the camera inside it, and "
-    "show why the network says so. Start with `sliplens demo runs/demo`; `sliplens help` lists the commands by task."
+    "show why the network says so. Start with `sliplens demo runs/demo`; `sliplens COMMAND --help` lists the options."
 )
 _NO_MEMORY = "allocate memory|out of memory|bad_alloc|start new thread|failed to map segment|create a primitive"
 """Messages of torch, threads and libraries where Python raises MemoryError."""
-
-
-def _help(words: Sequence[str]) -> None:
-    """Print the commands of a task, or of all."""
-    if words and words[0] not in TASKS:
-        raise InputError(f"there is no help on {words[0]!r}; choose one of {', '.join(TASKS)}")
-    for name in words[:1] or TASKS:
-        title, commands = TASKS[name]
-        say(f"{title} ({name})")
-        for command in commands:
-            say(f"  {COMMANDS[command].example}")
-    say("`sliplens COMMAND --help` lists every option of a command.")
 
 
 def _overview() -> None:
@@ -52,7 +31,6 @@ def _overview() -> None:
     table = Table.grid(padding=(0, 2, 0, 2))
     for name, command in COMMANDS.items():
         table.add_row(name, command.summary)
-    table.add_row("help", "Show which commands do what you came for.")
     OUT.print(table, highlight=False)
 
 
@@ -60,9 +38,9 @@ def call_command(words: list[str]) -> list[str]:
     """Call the command that the words name; returns the names of its options for the messages of its errors."""
     name = next((" ".join(words[:count]) for count in (2, 1) if " ".join(words[:count]) in COMMANDS), None)
     if name is None:
-        names = [*COMMANDS, "help"]
-        under = [each for each in names if each.startswith(f"{words[0]} ")]
-        near = under or get_close_matches(" ".join(words[:2]), names, n=1) or get_close_matches(words[0], names, n=1)
+        under = [each for each in COMMANDS if each.startswith(f"{words[0]} ")]
+        close = (get_close_matches(text, COMMANDS, n=1) for text in (" ".join(words[:2]), words[0]))
+        near = under or next(filter(None, close), [])
         meant = f"did you mean {' or '.join(near)}? " if near else ""
         raise InputError(f"there is no command {words[0]}; {meant}`sliplens --help` lists all")
     words = words[len(name.split()) :]
@@ -124,8 +102,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             say(f"sliplens {__version__}")
         elif not words or words[0] in {"-h", "--help"}:
             _overview()
-        elif words[0] == "help":
-            _help(words[1:])
         else:
             call_command(words)
     except BrokenPipeError:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, closing, nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -19,7 +19,6 @@ from sliplens.progress import number_of, open_stage, reporting
 
 if TYPE_CHECKING:
     from sliplens.grip.hold import HoldStep
-    from sliplens.live import LiveReader
 
 COMMANDS: dict[str, Command] = {}
 """Commands by name; `sensor new` and the like have two words."""
@@ -154,41 +153,24 @@ def call_live(
             reader.record(record, facts=facts)
         stack.callback(lambda: [say(str(state), aside=True) for state in reader.outputs])
         stack.callback(lambda: reader.lesson and say(reader.lesson, aside=True))
-        with suppress(KeyboardInterrupt), reader:
-            serving = nullcontext()
+        with suppress(KeyboardInterrupt), reader, ExitStack() as serving:
             if page:
-                waits = "seconds" not in arguments and not sink
+                from sliplens.app import LivePage
+
                 into = record or Path("recorded")
-                serving = _served(reader, facts=facts, host=host, port=port, record_into=into, waits=waits)
-            with serving:
-                _watch(reader, quiet=page, lines=not sink)
-
-
-@contextmanager
-def _served(reader: "LiveReader", *, waits: bool, **settings: Any):  # noqa: ANN202
-    """Serve the page of a reader; if it waits, the page stays after the source has ended."""
-    from sliplens.app import LivePage
-
-    with LivePage(reader, **settings) as page:
-        say(f"open {page.address}", aside=True)
-        yield
-        if waits:
-            say(f"{reader.source.name} has ended; the page stays until Ctrl-C", aside=True)
-            Event().wait()
-
-
-def _watch(reader: "LiveReader", *, quiet: bool, lines: bool) -> None:
-    """Print a line a second, and each warning once."""
-    log = _Log()
-    for reading in reader.readings():
-        if not log.due():
-            continue
-        for sender in () if quiet else reader.senders:
-            if sender.error:
-                raise sender.error
-        log.warn((*reader.doubts, *reader.troubles))
-        if lines:
-            say(str(reading))
+                served = serving.enter_context(LivePage(reader, facts=facts, host=host, port=port, record_into=into))
+                say(f"open {served.address}", aside=True)
+            log = _Log()
+            for reading in filter(lambda _: log.due(), reader.readings()):
+                for sender in () if page else reader.senders:
+                    if sender.error:
+                        raise sender.error
+                log.warn((*reader.doubts, *reader.troubles))
+                if not sink:
+                    say(str(reading))
+            if page and not sink and "seconds" not in arguments:
+                say(f"{reader.source.name} has ended; the page stays until Ctrl-C", aside=True)
+                Event().wait()
 
 
 @command(
@@ -236,12 +218,8 @@ def call_simulate(call: Any, *, preview: Path | None = None, video: Path | None 
     if video is not None:
         require_clip_path(video)
     if preview or video:
-        from sliplens.simulation import make_recipe
-
         options = {name: call.keywords[name] for name in call.keywords.keys() - {"out", "overwrite", "on_progress"}}
-        device = options.pop("device", "cpu")
-        recipe = make_recipe(options.pop("preset", "small"), **options)
-        output.draw_simulation(recipe, device=device, preview=preview, video=video)
+        output.draw_simulation(**options, preview=preview, video=video)
     if call.keywords.get("out"):
         frames: dict[str, list[int]] = {}
         for trial in call().trials:

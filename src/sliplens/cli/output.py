@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 from sliplens.cli.console import Terminal, print_file, print_table, say
 from sliplens.errors import InputError
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sliplens.results.evaluation import Evaluation, RegressionScores
     from sliplens.results.faithfulness import Faithfulness
     from sliplens.runner import Status
-    from sliplens.simulation import SimulationRecipe
+    from sliplens.simulation.plan import RecipeChanges
 
 _MOST_ROWS = 24
 """Number of frames or trials that are listed one by one."""
@@ -86,13 +86,21 @@ def _interval(low: float | None, high: float | None) -> str:
     return "-" if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
 
 
-def draw_simulation(recipe: "SimulationRecipe", *, device: str, preview: Path | None, video: Path | None) -> None:
+def draw_simulation(
+    *,
+    preview: Path | None,
+    video: Path | None,
+    preset: str = "small",
+    device: str = "cpu",
+    **changes: "Unpack[RecipeChanges]",
+) -> None:
     """Draw the contact sheet and the clip of a simulated data set."""
     from sliplens.plots.clip import write_clip
     from sliplens.plots.contact_sheet import write_contact_sheet
-    from sliplens.simulation import plan_trials, simulate_examples, simulate_trial
+    from sliplens.simulation import make_recipe, plan_trials, simulate_examples, simulate_trial
     from sliplens.simulation.loading import TRIAL_S
 
+    recipe = make_recipe(preset, **changes)
     with reporting(Terminal()):
         if preview is not None:
             with open_stage("Simulating trials for the preview"):

@@ -3,15 +3,18 @@
 import contextlib
 import json
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+<<<<<<< HEAD
+=======
+from own_recording import write_frames
+from PIL import Image
+>>>>>>> 1d032b45 (cli: drop help by task, doctor: drop reference data)
 from readers import read_lerobot, refused
 
 from sliplens.errors import InputError, RecordingError
@@ -23,12 +26,13 @@ LENGTHS = (7, 5, 6)
 FILES = (0, 0, 1)
 """File of each episode: the first two share one, for data and for videos."""
 CAMERA, SCENE, FORCE = "observation.images.tactile", "observation.images.front", "observation.wrench"
-LOSSLESS = {"codec": "libx264rgb", "pix_fmt": "rgb24", "options": {"qp": "0", "g": "2", "bf": "0"}}
+LOSSLESS = {"codec": "libx264rgb", "pixels": "rgb24", "options": {"qp": "0", "g": "2", "bf": "0"}}
 TEMPLATE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 
 Edit = Callable[[dict[str, Any]], object]
 
 
+<<<<<<< HEAD
 def write_video(path: Path, frames: np.ndarray, *, codec: str, pix_fmt: str, options: dict[str, str]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as container:
@@ -40,6 +44,12 @@ def write_video(path: Path, frames: np.ndarray, *, codec: str, pix_fmt: str, opt
             frame.pts, frame.time_base = index, Fraction(1, FPS)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+=======
+def png(pixels: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+>>>>>>> 1d032b45 (cli: drop help by task, doctor: drop reference data)
 
 
 def write_info(folder: Path, edit: Edit | None = None) -> None:
@@ -101,7 +111,7 @@ def write_dataset(
             columns[CAMERA] = [{"bytes": encode_png(pixels), "path": "frame.png"} for pixels in frames[own]]
         else:
             for key, shown in ((CAMERA, frames), (SCENE, 255 - frames)):
-                write_video(folder / "videos" / key / f"{place}.mp4", shown[own], **coding)
+                write_frames(folder / "videos" / key / f"{place}.mp4", shown[own], rate=FPS, **coding)
         write_table(folder / "data" / f"{place}.parquet", columns)
     write_episodes(folder, starts)
     return folder
@@ -257,7 +267,7 @@ def test_a_template_that_leads_out_of_the_data_set_is_refused(dataset, template)
 
 
 def test_a_play_list_dressed_as_a_video_is_not_followed(dataset, tmp_path, frames):
-    write_video(tmp_path / "secret.mp4", frames, **LOSSLESS)
+    write_frames(tmp_path / "secret.mp4", frames, rate=FPS, **LOSSLESS)
     video = dataset / "videos" / CAMERA / "chunk-000" / "file-000.mp4"
     lists = (f"ffconcat version 1.0\nfile '{tmp_path}/secret.mp4'\n", f"#EXTM3U\n#EXTINF:1,\n{tmp_path}/secret.mp4\n")
     for text in lists:
@@ -275,7 +285,7 @@ def test_a_missing_or_damaged_video_is_refused(dataset):
 
 
 def test_a_video_that_ends_too_early_is_refused_when_it_is_read(dataset, frames):
-    write_video(dataset / "videos" / CAMERA / "chunk-000" / "file-000.mp4", frames[:10], **LOSSLESS)
+    write_frames(dataset / "videos" / CAMERA / "chunk-000" / "file-000.mp4", frames[:10], rate=FPS, **LOSSLESS)
     first, second, _ = read_lerobot(dataset)
     assert len(list(first.read_frames())) == 7
     shown = second.read_frames()

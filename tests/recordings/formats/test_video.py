@@ -1,4 +1,3 @@
-from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -6,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from own_recording import write_frames
 from readers import read_video, refused
 
 from sliplens.errors import RecordingError
@@ -14,50 +14,12 @@ from sliplens.recordings.formats.gelsight import is_gelsight, read_gelsight_clip
 from sliplens.recordings.formats.video import count_stale, least_contact, small_copies
 from sliplens.recordings.labelling import Clip
 
-MILLISECOND = Fraction(1, 1000)
 SIZE = 64, 96
 
 
 def brightening(count: int) -> list[np.ndarray]:
     """Frames whose brightness tells their number, even after lossy coding."""
     return [np.full((*SIZE, 3), 20 + 6 * index, dtype=np.uint8) for index in range(count)]
-
-
-def write_video(
-    path: Path,
-    frames: list[np.ndarray],
-    *,
-    codec: str = "ffv1",
-    pixels: str = "bgr0",
-    stamps_ms: list[int] | None = None,
-    reordered: int = 0,
-    title: str = "",
-) -> Path:
-    """Write 25 frames a second, or milliseconds as they are given; `reordered` B-frames in a row."""
-    with av.open(str(path), "w") as container:
-        container.metadata["title"] = title
-        stream = container.add_stream(codec, rate=25)
-        assert isinstance(stream, av.VideoStream)
-        stream.height, stream.width = frames[0].shape[:2] if frames else SIZE
-        stream.pix_fmt = pixels
-        stream.codec_context.max_b_frames = reordered
-        stream.codec_context.gop_size = 12
-        stream.codec_context.bit_rate = 4_000_000
-        if codec == "libx264":
-            # keep the B-frames that were asked for
-            stream.options = {"b-adapt": "0", "threads": "1"}
-        if stamps_ms is not None:
-            stream.codec_context.time_base = stream.time_base = MILLISECOND
-        for index, pixel in enumerate(frames):
-            frame = av.VideoFrame.from_ndarray(pixel, format="rgb24")
-            frame.pts = index if stamps_ms is None else stamps_ms[index]
-            frame.time_base = Fraction(1, 25) if stamps_ms is None else MILLISECOND
-            container.mux(stream.encode(frame))
-        if frames:
-            container.mux(stream.encode())
-        else:
-            container.start_encoding()
-    return path
 
 
 LOSSY = [
@@ -68,7 +30,7 @@ LOSSY = [
 
 def test_a_title_that_is_no_utf8_does_not_matter(tmp_path):
     frames = [np.full((*SIZE, 3), level, dtype=np.uint8) for level in (0, 255)]
-    path = write_video(tmp_path / "pull.mkv", frames, title="Gr\u00fcn")
+    path = write_frames(tmp_path / "pull.mkv", frames, title="Gr\u00fcn")
     coded = path.read_bytes()
     assert "Gr\u00fcn".encode() in coded
     path.write_bytes(coded.replace("Gr\u00fcn".encode(), b"Gr\xff\xffn"))
@@ -77,7 +39,7 @@ def test_a_title_that_is_no_utf8_does_not_matter(tmp_path):
 
 def test_lossless_frames_come_back_as_they_were(tmp_path: Path, rng: np.random.Generator):
     frames = list(rng.integers(0, 256, (5, *SIZE, 3), dtype=np.uint8))
-    capture = read_video(write_video(tmp_path / "trial 1.mkv", frames))
+    capture = read_video(write_frames(tmp_path / "trial 1.mkv", frames))
     np.testing.assert_array_equal(list(capture.read_frames()), frames)
     np.testing.assert_array_equal(list(capture.read_frames()), frames)
     assert (capture.trial, capture.frame_size, capture.forces, capture.notes) == ("trial-1", SIZE, None, ())
@@ -86,7 +48,7 @@ def test_lossless_frames_come_back_as_they_were(tmp_path: Path, rng: np.random.G
 @pytest.mark.parametrize(("name", "codec", "reordered"), LOSSY)
 def test_frames_come_in_the_order_they_are_shown(tmp_path: Path, name: str, codec: str, reordered: int):
     pixels = "yuvj420p" if codec == "mjpeg" else "yuv420p"
-    path = write_video(tmp_path / name, brightening(30), codec=codec, pixels=pixels, reordered=reordered)
+    path = write_frames(tmp_path / name, brightening(30), codec=codec, pixels=pixels, reordered=reordered)
     capture = read_video(path)
     shown = [frame.mean() for frame in capture.read_frames()]
     np.testing.assert_allclose(shown, 20 + 6 * np.arange(30), atol=2.5)
@@ -98,21 +60,21 @@ def test_frames_come_in_the_order_they_are_shown(tmp_path: Path, name: str, code
 def test_a_variable_frame_rate_is_kept(tmp_path: Path, codec: str):
     stamps = [0, 33, 67, 500, 501, 2000, 2040, 2080]
     pixels = "bgr0" if codec == "ffv1" else "yuv420p"
-    path = write_video(tmp_path / "a.mkv", brightening(8), codec=codec, pixels=pixels, stamps_ms=stamps, reordered=0)
+    path = write_frames(tmp_path / "a.mkv", brightening(8), codec=codec, pixels=pixels, stamps_ms=stamps, reordered=0)
     capture = read_video(path)
     np.testing.assert_allclose(capture.frame_time_s, np.array(stamps) / 1000, atol=1e-9)
     assert len(list(capture.read_frames())) == 8
 
 
 def test_a_stream_without_stamps_needs_a_declared_rate(tmp_path: Path):
-    path = write_video(tmp_path / "a.h264", brightening(6), codec="libx264", pixels="yuv420p")
+    path = write_frames(tmp_path / "a.h264", brightening(6), codec="libx264", pixels="yuv420p")
     refused(read_video, path, r"a\.h264 has no presentation stamps; declare its rate with --frame-rate")
     capture = read_video(path, frame_rate=25.0)
     np.testing.assert_allclose([frame.mean() for frame in capture.read_frames()], 20 + 6 * np.arange(6), atol=2.5)
 
 
 def test_skipped_frames_keep_the_times_of_the_rest(tmp_path: Path):
-    path = write_video(tmp_path / "a.mkv", brightening(6))
+    path = write_frames(tmp_path / "a.mkv", brightening(6))
     capture = read_video(path, skip_frames=2)
     np.testing.assert_array_equal(list(capture.read_frames()), brightening(6)[2:])
     np.testing.assert_allclose(capture.frame_time_s, np.arange(2, 6) / 25, atol=1e-3)
@@ -122,7 +84,7 @@ def test_skipped_frames_keep_the_times_of_the_rest(tmp_path: Path):
 
 
 def test_forces_lie_beside_the_video(tmp_path: Path):
-    path = write_video(tmp_path / "a.mkv", brightening(6))
+    path = write_frames(tmp_path / "a.mkv", brightening(6))
     table = tmp_path / "forces.csv"
     table.write_text("t_s,fx,fy,fz\n10,1,2,3\n10.1,4,5,6\n")
     capture = read_video(path, forces=table, start_s=10.0, skip_frames=1)
@@ -146,7 +108,7 @@ def test_forces_lie_beside_the_video(tmp_path: Path):
 )
 def test_a_truncated_video_is_refused(tmp_path: Path, rng: np.random.Generator, name: str, codec: str, message: str):
     noise = list(rng.integers(0, 256, (20, *SIZE, 3), dtype=np.uint8))
-    path = write_video(tmp_path / name, noise, codec=codec, pixels="bgr0" if codec == "ffv1" else "yuv420p")
+    path = write_frames(tmp_path / name, noise, codec=codec, pixels="bgr0" if codec == "ffv1" else "yuv420p")
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 6 // 10])
     refused(read_video, path, message)
@@ -155,7 +117,7 @@ def test_a_truncated_video_is_refused(tmp_path: Path, rng: np.random.Generator, 
 @pytest.mark.parametrize("kept", [1, 2, 19])
 def test_not_one_frame_may_be_missing_at_the_end(tmp_path: Path, rng: np.random.Generator, kept: int):
     noise = list(rng.integers(0, 256, (20, *SIZE, 3), dtype=np.uint8))
-    path = write_video(tmp_path / "a.mkv", noise)
+    path = write_frames(tmp_path / "a.mkv", noise)
     with av.open(str(path)) as container:
         starts = [packet.pos for packet in container.demux(video=0) if packet.pos is not None]
     path.write_bytes(path.read_bytes()[: starts[kept]])
@@ -164,7 +126,7 @@ def test_not_one_frame_may_be_missing_at_the_end(tmp_path: Path, rng: np.random.
 
 def test_damage_within_a_video_is_found_at_the_frame(tmp_path: Path, rng: np.random.Generator):
     noise = list(rng.integers(0, 256, (30, *SIZE, 3), dtype=np.uint8))
-    path = write_video(tmp_path / "a.avi", noise, codec="mpeg4", pixels="yuv420p")
+    path = write_frames(tmp_path / "a.avi", noise, codec="mpeg4", pixels="yuv420p")
     data = bytearray(path.read_bytes())
     middle = data.index(b"00dc", len(data) // 2) + 200  # within the data of a frame
     data[middle : middle + 300] = rng.bytes(300)
@@ -192,7 +154,7 @@ def test_a_file_that_is_no_video_is_refused(tmp_path: Path, rng: np.random.Gener
 
 
 def test_an_absurd_frame_size_is_refused(tmp_path: Path):
-    path = write_video(tmp_path / "a.avi", brightening(2))
+    path = write_frames(tmp_path / "a.avi", brightening(2))
     data = path.read_bytes()
     header = data.index(b"strf") + 12  # width and height in the header of the stream
     size = np.array([60_000, 60_000], dtype="<i4").tobytes()
@@ -236,7 +198,7 @@ def test_the_candidate_for_a_reference_shows_no_relief(rng: np.random.Generator)
 def test_a_video_can_leave_out_its_stale_frames(tmp_path: Path, rng: np.random.Generator):
     frames = scene(rng, 40)
     frames[:3] //= 2
-    capture = read_video(write_video(tmp_path / "a.mkv", list(frames)), skip_stale=True)
+    capture = read_video(write_frames(tmp_path / "a.mkv", list(frames)), skip_stale=True)
     np.testing.assert_array_equal(list(capture.read_frames()), frames[3:])
     assert capture.notes == ("a.mkv: the first 3 of 40 frames were left out.",)
 
@@ -330,7 +292,7 @@ def test_a_turn_that_is_no_right_angle_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("pixels", ["gray10le", "gray12le", "gbrp10le", "gbrp12le", "gray16le", "rgb48le"])
 def test_a_video_of_10_or_12_bits_keeps_its_brightness_and_one_of_16_is_refused(tmp_path: Path, pixels: str):
-    path = write_video(tmp_path / "a.mkv", brightening(3), pixels=pixels)
+    path = write_frames(tmp_path / "a.mkv", brightening(3), pixels=pixels)
     if pixels in {"gray16le", "rgb48le"}:
         refused(read_video, path, "16 bits a channel.*export it with 8")
         return
