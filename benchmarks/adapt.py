@@ -3,11 +3,11 @@
 Three sensors that no network of the package has seen: a dome with other rings of markers in another colour, the flat
 gel, and the ChromaTouch's dome behind another lens, under other lamps. Of each, one piece is built; its owner records
 dry trials on some days, takes them in turn from all days, and holds out a fifth (one at least). The test is ten other
-days of the same piece, dry and wet. The recipe was chosen with `--selection`, on other days, pieces and trials of these
+days of the same piece, dry and wet. The recipe was chosen on other days, pieces and trials of these
 sensors, whose seeds share nothing with those of the test. From scratch means the recipe `default` with as many images.
 
 What was trained is kept in `--cache`, by the hash of all that shaped it: an interrupted run goes on, and a change
-trains only what it changes. `--quick` takes one sensor, 1 and 3 trials and small images, to see that it works.
+trains only what it changes.
 """
 
 import argparse
@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 import sliplens as sl
-from sliplens.errors import SliplensError
 from sliplens.files import hash_json, output_folder, write_json
 from sliplens.models import Network
 from sliplens.recordings import Dataset, TrialInfo
@@ -68,7 +67,7 @@ class Plan:
     changes: dict[str, Any]
 
 
-def recipe_of(sensor: Sensor, *, most: int, seed: int, selection: bool) -> SimulationRecipe:
+def recipe_of(sensor: Sensor, *, most: int, seed: int) -> SimulationRecipe:
     """Trials of one piece of a sensor: enough to record, and the test."""
     return SimulationRecipe(
         dry_trials=(-(-most // DAYS),) * DAYS + (TEST_TRIALS,) * TEST_DAYS,
@@ -79,7 +78,7 @@ def recipe_of(sensor: Sensor, *, most: int, seed: int, selection: bool) -> Simul
         sensor=sensor,
         sensors=1,
         seed=seed,
-        series="adapt, selection" if selection else "adapt, test",
+        series="adapt, test",
     )
 
 
@@ -114,7 +113,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     found: dict[str, dict[str, dict[str, list[dict[str, float]]]]] = {}
     sensors: list[str] = options.sensors
     for name, seed in product(sensors, range(options.seeds)):
-        recipe = recipe_of(SENSORS[name], most=max(options.trials), seed=seed, selection=options.selection)
+        recipe = recipe_of(SENSORS[name], most=max(options.trials), seed=seed)
         folder = options.cache / f"data-{recipe.hash}"
         with output_folder(folder, stage="adapt", config={"recipe": recipe.to_json()}, overwrite=False) as output:
             if not output.complete:
@@ -190,19 +189,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--image-size", type=int, help="that of the network if not given")
     parser.add_argument("--changes", default="{}", help="fields of the recipes that are to differ, as JSON")
-    parser.add_argument("--selection", action="store_true", help="the days on which recipes are compared")
     parser.add_argument("--cache", type=Path, default=Path("runs/adapt"))
-    parser.add_argument("--quick", action="store_true", help="one sensor, few trials and small images: does it work?")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    if options.quick:
-        options.sensors, options.trials, options.seeds, options.image_size = ["dome"], [0, 2, 3], 1, 64
-        options.changes = '{"epochs": 3, "epoch_frames": 128}'
     options.cache.mkdir(parents=True, exist_ok=True)
-    try:
-        found = measure(options)
-    except SliplensError as error:
-        sys.exit(f"{Path(__file__).name}: {error}")
+    found = measure(options)
     print(json.dumps(found, indent=None if options.json else 2))
 
 

@@ -30,7 +30,6 @@ Intervals hold 95 % over days.
 
 import argparse
 import json
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,7 +40,6 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
 from adapt import SENSORS
-from sliplens.errors import SliplensError
 from sliplens.friction import GRASP_SPREAD, Friction
 from sliplens.models import Estimate, Network
 from sliplens.models.checkpoint import Ratio, load
@@ -443,10 +441,7 @@ def main() -> None:
     parser.add_argument("--directions", action="store_true", help="only R2 by the direction of the pull")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    try:
-        run, other = load(options.run), options.against and load(options.against)
-    except SliplensError as error:
-        sys.exit(f"{Path(__file__).name}: {error}")
+    run, other = load(options.run), options.against and load(options.against)
     found: dict[str, Any] = {"weights_sha256": run.manifest.weights_sha256}
     chosen = {"name": options.set, "trials": options.trials}
     if options.directions:

@@ -9,9 +9,7 @@ scaled up: a pass costs the same whatever its mask.
 
 import argparse
 import json
-import math
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -25,7 +23,6 @@ import torch
 from torch import Tensor
 
 from fairness import at_its_best, busy_process
-from sliplens.errors import SliplensError
 from sliplens.explainers.attribution import pearson_r, resize, to_masks, top_overlap
 from sliplens.explainers.cam import capture, find_layers
 from sliplens.explainers.frames import FrameSelection, frames_from_dataset, frames_from_folder
@@ -87,8 +84,7 @@ def measure(run: Path, images: Tensor, references: Tensor, *, options: argparse.
         loop_s, _ = at_its_best(plain_loop, run, image.numpy(), reference.numpy(), options.loop_passes)
         whole = exact(model, image[None], reference=reference[None])
         quick = fast(model, image[None], reference=reference[None])
-        oracle = plain(model, image[None], reference=reference[None]) if options.oracle else None
-        (told,) = quick.approximations
+        oracle = plain(model, image[None], reference=reference[None])
         rows.append(
             {
                 "prediction": float(whole.prediction),
@@ -96,15 +92,11 @@ def measure(run: Path, images: Tensor, references: Tensor, *, options: argparse.
                 "loop_s": loop_s,
                 "exact_s": whole.seconds,
                 "fast_s": quick.seconds,
-                "exact_error": float((whole.saliency - oracle.saliency).abs().max()) if oracle else math.nan,
+                "exact_error": float((whole.saliency - oracle.saliency).abs().max()),
                 "pearson_r": pearson_r(whole.saliency[0], quick.saliency[0]),
                 "top10_overlap": top_overlap(whole.saliency[0], quick.saliency[0]),
-                "told_pearson_r": told.pearson_r,
-                "told_top10_overlap": told.top_overlap,
-                "measured_share": told.measured / told.channels,
             }
         )
-        print(" ".join(f"{key} {value:.4g}" for key, value in rows[-1].items()), flush=True)
     with busy_process():
         busy_loop_s, _ = at_its_best(plain_loop, run, images[-1].numpy(), references[-1].numpy(), options.loop_passes)
         busy_exact_s = exact(model, images[-1:], reference=references[-1:]).seconds
@@ -114,7 +106,7 @@ def measure(run: Path, images: Tensor, references: Tensor, *, options: argparse.
         "loop_busy_s": busy_loop_s,
         "exact_speedup": sum(row["loop_s"] for row in rows) / sum(row["exact_s"] for row in rows),
         "fast_speedup": sum(row["loop_s"] for row in rows) / sum(row["fast_s"] for row in rows),
-        "exact_max_error": max(row["exact_error"] for row in rows) if options.oracle else None,
+        "exact_max_error": max(row["exact_error"] for row in rows),
         "fast_pearson_r": min(row["pearson_r"] for row in rows),
         "fast_top10_overlap": min(row["top10_overlap"] for row in rows),
         "first_frame_s": preparation,
@@ -122,16 +114,6 @@ def measure(run: Path, images: Tensor, references: Tensor, *, options: argparse.
         "image_size": trained.manifest.image_size,
         "frames": rows,
     }
-
-
-def gpu_milliseconds(trained: Network, image: Tensor, reference: Tensor, *, budget: float) -> float | None:
-    """Milliseconds an image on a graphics card, warmed up and waited for; None without one."""
-    if not torch.cuda.is_available():
-        return None
-    model, explain = trained.model.to("cuda"), PolyCam(budget=budget)
-    seconds = [explain(model, image[None], reference=reference[None]).seconds for _ in range(4)]
-    trained.model.to("cpu")
-    return 1000 * min(seconds[1:])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -143,30 +125,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=6, help="for each network")
     parser.add_argument("--budget", type=float, default=BUDGET)
     parser.add_argument("--loop-passes", type=int, default=600, help="of the plain loop for each frame; 0 for all")
-    parser.add_argument(
-        "--no-oracle", dest="oracle", action="store_false", help="leave out the exact map by torch alone"
-    )
     parser.add_argument("--json", action="store_true", help="end with one line of JSON")
     options = parser.parse_args(arguments)
     load_average = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as scratch:
-        try:
-            if options.data is None:
-                data = simulate_dataset(Path(scratch) / "data", RECIPE)
-            else:
-                data = load_dataset(options.data)
-            found, gpu = {}, []
-            for run in options.run:
-                trained = load(run)
-                images, references = pick_inputs(trained, data, real=options.real, count=options.frames)
-                found[str(run)] = measure(run, images, references, options=options)
-                gpu.append(
-                    [gpu_milliseconds(trained, images[-1], references[-1], budget=one) for one in (1.0, options.budget)]
-                )
-        except SliplensError as error:
-            sys.exit(f"{Path(__file__).name}: {error}")
+        data = simulate_dataset(Path(scratch) / "data", RECIPE) if options.data is None else load_dataset(options.data)
+        found = {}
+        for run in options.run:
+            images, references = pick_inputs(load(run), data, real=options.real, count=options.frames)
+            found[str(run)] = measure(run, images, references, options=options)
     result: dict[str, Any] = {
-        key: None if None in (values := [one[key] for one in found.values()]) else least(values)
+        key: least(one[key] for one in found.values())
         for key, least in (
             ("exact_speedup", min),
             ("exact_speedup_beside_busy", min),
@@ -176,8 +145,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ("fast_top10_overlap", min),
         )
     }
-    exact_ms, fast_ms = ([times[place] for times in gpu if times[place] is not None] for place in (0, 1))
-    result |= {"gpu_exact_ms": max(exact_ms, default=None), "gpu_fast_ms": max(fast_ms, default=None)}
     more = {"budget": options.budget, "threads": torch.get_num_threads(), "load_average": load_average}
     result |= {**more, "networks": found, "machine": machine(), "versions": versions()}
     print(json.dumps(result, indent=None if options.json else 2))

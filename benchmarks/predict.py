@@ -1,14 +1,11 @@
 """Time the inference engines side by side: one frame at a time, as on a robot, on an untrained ShuffleNetV2.
 
 In every round each engine predicts once, in an order that turns, so that whatever else the machine does hits all alike.
-Decoding is left out; encoding (compare, resize, normalise) is reported apart. The answers of each engine are compared
-with those of `torch`.
+Decoding and encoding are left out. The answers of each engine are compared with those of `torch`.
 
 `fps_ratios` compares whole calls of `predict` by each engine, in turn too: frames a second of `chromatouch-pair` over
-those of `chromatouch-difference`, as they come (112 and 224 px) and both at 224 px, of frames in order over frames
-one by one, and of `chromatouch-pair` over the same network without its `novelty`, which tells no `known`.
-`python benchmarks/predict.py --rounds 100 --json` takes two minutes. With
-`--json` the last line is one JSON object.
+those of `chromatouch-difference`, as they come (112 and 224 px) and both at 224 px, and of frames in order over frames
+one by one. `python benchmarks/predict.py --rounds 100 --json` takes two minutes.
 """
 
 import argparse
@@ -37,8 +34,6 @@ from sliplens.recordings.source import open_source
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
 WARM_UP = 5
-ENCODED = ((224, 224), (480, 640))
-"""Heights and widths of camera frames."""
 
 
 def build(*, size: int, head: str) -> Network:
@@ -104,16 +99,6 @@ def time_rounds(work: dict[str, Callable[[], object]], *, rounds: int, warm_up: 
     return {name: np.array(times[warm_up:]) for name, times in found.items()}
 
 
-def encoders(trained: Network) -> dict[str, Callable[[], object]]:
-    """Encoding of one frame, by the size of the camera's frames."""
-    rng, work = np.random.default_rng(0), {}
-    encode = partial(trained.encoding.encode, image_size=trained.manifest.image_size)
-    for height, width in ENCODED:
-        frame, reference = rng.integers(0, 256, (2, height, width, 3), dtype=np.uint8)
-        work[f"{width}x{height}"] = partial(encode, frame[None], reference)
-    return work
-
-
 def parity(trained: Network, engine: Engine, plain: Engine, inputs: Tensor) -> float:
     """Largest difference between the margins of an engine and those of `torch`."""
     return difference(engine.estimate(trained, inputs).margin, plain.estimate(trained, inputs).margin)
@@ -124,7 +109,6 @@ RATIOS = {
     "pair_at_224": ("pair_at_224", "difference"),
     "sequence_of_difference": ("difference_sequence", "difference"),
     "sequence_of_pair": ("pair_sequence", "pair"),
-    "known_of_pair": ("pair", "pair_without_known"),
 }
 """Ways to read that are compared, the one over the other."""
 
@@ -134,10 +118,9 @@ def whole_calls(engine: str, *, frames: int) -> dict[str, Callable[[], object]]:
     grip = simulate_trial(replace(plan_trials(PRESETS["small"])[0], frames=frames))
     trials = [replace(open_source(grip.frames, reference=grip.reference)[0], frame_time_s=grip.time_s)]
     # each of its own: an engine is kept for the last size of images that a network was asked for
-    difference, pair, enlarged, plain = (sl.load(f"chromatouch-{name}") for name in ("difference", *3 * ("pair",)))
+    difference, pair, enlarged = (sl.load(f"chromatouch-{name}") for name in ("difference", "pair", "pair"))
     enlarged = replace(enlarged, manifest=replace(enlarged.manifest, image_size=difference.manifest.image_size))
-    plain = replace(plain, manifest=replace(plain.manifest, novelty=None))
-    networks = {"difference": difference, "pair": pair, "pair_at_224": enlarged, "pair_without_known": plain}
+    networks = {"difference": difference, "pair": pair, "pair_at_224": enlarged}
     one_by_one = {name: partial(sl.predict, network, trials, engine=engine) for name, network in networks.items()}
     in_order = {f"{name}_sequence": partial(one_by_one[name], sequence=True) for name in ("difference", "pair")}
     return {**one_by_one, **in_order}
@@ -169,7 +152,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     times = time_rounds(work, rounds=options.rounds)
     load.append(os.getloadavg()[0])
-    encode_times = time_rounds(encoders(trained), rounds=options.rounds)
     fps = time_calls(list(engines), frames=120, rounds=max(1, options.rounds // 20))
     plain = make_engine("torch", trained, batch_size=1, streams=1)
     result = {
@@ -180,8 +162,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "ready_s": ready_s,
         "missing": missing,
         "margin_sd": float(plain.estimate(trained, inputs).margin.std()),
-        "encode_p50_ms": {name: float(np.percentile(values, 50)) for name, values in encode_times.items()},
-        "encode_p99_ms": {name: float(np.percentile(values, 99)) for name, values in encode_times.items()},
         "fps": {
             engine: {name: float(np.median(values)) for name, values in own.items()} for engine, own in fps.items()
         },

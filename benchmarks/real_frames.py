@@ -10,7 +10,6 @@ these figures.
 import argparse
 import json
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from sliplens.errors import SliplensError
 from sliplens.explainers.frames import frames_from_folder
 from sliplens.models.checkpoint import load
 
@@ -81,10 +79,7 @@ def main() -> None:
     parser.add_argument("--frames", type=Path, default=FRAMES, help="folder of images whose names end in _GG.png")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    try:
-        told = read_real_frames(options.run, options.frames)
-    except SliplensError as error:
-        sys.exit(f"{Path(__file__).name}: {error}")
+    told = read_real_frames(options.run, options.frames)
     print(json.dumps(told, indent=None if options.json else 2))
 
 

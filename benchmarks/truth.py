@@ -13,7 +13,6 @@ sensor. Each network's study can be interrupted and continues where it stopped (
 import argparse
 import json
 import os
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -26,7 +25,6 @@ import numpy as np
 
 import sliplens as sl
 from sliplens.cli.console import Terminal
-from sliplens.errors import SliplensError
 from sliplens.faithfulness.controls import lead_over_controls
 from sliplens.intervals import Difference, mean_interval, paired_difference
 from sliplens.models import Network
@@ -160,14 +158,11 @@ def main() -> None:
     sets = [(options.network, options.data, "1", {}), (options.second_network, options.second_data, "2", LATER)]
     with tempfile.TemporaryDirectory() as scratch:
         work = options.keep or Path(scratch)
-        try:
-            judged = [
-                judge_networks(names, data and load_dataset(data), work / folder, days=days, options=options)
-                for names, data, folder, days in sets
-                if names
-            ]
-        except SliplensError as error:
-            sys.exit(f"{Path(__file__).name}: {error}")
+        judged = [
+            judge_networks(names, data and load_dataset(data), work / folder, days=days, options=options)
+            for names, data, folder, days in sets
+            if names
+        ]
     result = {}
     for name in sorted({name for study in judged[0] for name in study.truth}):
         first, *others = [pool(studies, name) for studies in judged if any(name in study.truth for study in studies)]
