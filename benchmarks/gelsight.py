@@ -512,7 +512,7 @@ def _score_all(chance: np.ndarray, cases: Cases) -> dict[str, object]:
             **score(chance[cases.full], full.slipped, full.grasped),
         },
         "rank_correlation_with_length": {
-            kind: float(spearmanr(chance[rows], cases.frames[rows])[0])
+            kind: float(np.asarray(spearmanr(chance[rows], cases.frames[rows]))[0])
             for kind, rows in (("slip", cases.slipped), ("no_slip", ~cases.slipped))
         },
     }
