@@ -242,10 +242,7 @@ def call_import(call: Any, *, audit: bool = True) -> None:
         Draw a page for each trial, in `audit/` of the folder, from which to judge its labels.
     """
     data = call()
-    if audit:
-        output.draw_audits(data, data.folder / "audit")
-    output.show_labelling("Imported", data)
-    output.show_trials_page(data)
+    output.show_labelled("Imported", data, audit=audit)
     if data.left_out:
         print_table("Left out", ("trial", "why"), [(trial.trial, trial.why) for trial in data.left_out])
         raise SystemExit(1)
@@ -281,11 +278,7 @@ def call_label(call: Any, *, draft: Path | None = None, audit: bool = True, audi
     if audit_only:
         output.draw_audits(data, out / "audit")
         return
-    labelled = call(data=data, out=out)
-    if audit:
-        output.draw_audits(labelled, out / "audit")
-    output.show_labelling("Labelled", labelled)
-    output.show_trials_page(labelled)
+    output.show_labelled("Labelled", call(data=data, out=out), audit=audit)
 
 
 @command("recover", "recordings.dataset:recover_dataset", "sliplens recover runs/mine/data")
@@ -501,28 +494,17 @@ def call_predict(call: Any, *, plot: Path | None = None) -> None:
     suffixes=(".onnx",),
 )
 def call_export_onnx(call: Any) -> None:
-    """Print what will be written, then that it was."""
-    from sliplens.models.checkpoint import load
-
-    network = load(call.keywords["run"])
-    manifest = network.manifest
-    about = f"{manifest.backbone}, {manifest.head} head, {manifest.image_size} px, {manifest.input} images"
-    say(f"writing {call.keywords['out']}: {about}; it appears once ONNX Runtime predicts the same as the network")
-    with OUT.status("Exporting and comparing"):
-        path = call(run=network)
+    """Print what was written."""
+    with OUT.status("Exporting; the file appears once ONNX Runtime predicts the same as the network"):
+        path = call()
     print_file(path, "predicts as the network does")
 
 
 @command("export lerobot", "recordings.exporting:export_lerobot", "sliplens export lerobot runs/mine/data -o lerobot")
 @command("export mcap", "recordings.exporting:export_mcap", "sliplens export mcap runs/mine/data -o mcap")
 def call_export_dataset(call: Any) -> None:
-    """Print what will be written, and write it."""
-    from sliplens.recordings.dataset import load_dataset
-
-    data = load_dataset(call.keywords["data"])
-    trials = number_of(len(call.keywords.get("trials") or data.trials), "trial")
-    say(f"writing {call.keywords['out']}: {trials} of {data.folder}")
-    call(data=data)
+    """Write the data set."""
+    call()
 
 
 @command(

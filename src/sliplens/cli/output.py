@@ -127,14 +127,17 @@ def draw_audits(data: "Dataset", folder: Path) -> None:
         print_file(folder, "a page for each trial: look at them before you train")
 
 
-def show_trials_page(data: "Dataset") -> None:
-    """Write the page of all trials."""
+def show_labelled(title: str, data: "Dataset", *, audit: bool) -> None:
+    """Draw the pages of a labelled data set, and print what its labels rest on."""
     from sliplens.report.trials import write_trials_page
 
+    if audit:
+        draw_audits(data, data.folder / "audit")
+    _show_labelling(title, data)
     print_file(write_trials_page(data), "all trials at a glance: margins, friction, flags")
 
 
-def show_labelling(title: str, data: "Dataset") -> None:
+def _show_labelling(title: str, data: "Dataset") -> None:
     """Print what the labels of each trial rest on, what was assumed, and which frames have none."""
     rows, notes, invalid = [], [], {}
     for info in data.trials:
