@@ -519,10 +519,9 @@ def call_explain(call: Any) -> None:
     call()
 
 
-@command("score", "study.scoring:score", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score")
-def call_score(call: Any) -> None:
-    """Print the scores."""
-    output.print_faithfulness(call())
+command("score", "study.scoring:score", "sliplens score runs/mine/train runs/mine/explain -o runs/mine/score")(
+    lambda call: output.print_faithfulness(call())
+)
 
 
 @command(
@@ -539,10 +538,9 @@ def call_study(call: Any) -> None:
     output.draw_report(out)
 
 
-@command("status", "runner:read_status", "sliplens status runs/mine/margins")
-def call_status(call: Any) -> None:
-    """Print the progress."""
-    output.print_status(Path(call.keywords["out"]), call())
+command("status", "runner:read_status", "sliplens status runs/mine/margins")(
+    lambda call: output.print_status(Path(call.keywords["out"]), call())
+)
 
 
 @command(
@@ -652,10 +650,7 @@ def call_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
         raise SliplensError(result.why)
 
 
-@command("report", "report.page:write_report", "sliplens report runs/mine")
-def call_report(call: Any) -> None:
-    """Print what was written."""
-    output.print_written(call())
+command("report", "report.page:write_report", "sliplens report runs/mine")(lambda call: output.print_written(call()))
 
 
 @command("doctor", "doctor:examine_installation", "sliplens doctor")
