@@ -13,9 +13,10 @@ over trials.
 
 import argparse
 import json
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -203,7 +204,7 @@ def measure_trial(
     try:
         fine = label(forces)
     except RecordingError as refusal:
-        print(f"{name} without a fault: {refusal}")
+        print(f"{name} without a fault: {refusal}", file=sys.stderr)
         return []
     outcomes = [
         _compare(fine, fine.valid, truth, np.zeros(len(truth), dtype=bool), trial=name, fault="none", strength=0)
@@ -287,17 +288,6 @@ def _compare(
     )
 
 
-@dataclass(frozen=True, kw_only=True)
-class FaultShares:
-    """What comes of one kind of fault."""
-
-    false_valid_share: float
-    valid_kept_share: float
-    refused_share: float
-    flagged_share: float
-    false_valid_by_strength: tuple[float, ...]
-
-
 def summarise(outcomes: list[Outcome]) -> dict[str, float]:
     """Shares over all faults."""
     faulty = [one for one in outcomes if one.fault != "none"]
@@ -313,22 +303,19 @@ def summarise(outcomes: list[Outcome]) -> dict[str, float]:
     }
 
 
-def summarise_faults(outcomes: list[Outcome]) -> dict[str, FaultShares]:
+def summarise_faults(outcomes: list[Outcome]) -> dict[str, dict[str, Any]]:
     """Shares by fault."""
     shares = {}
-    for fault in ("none", *FAULTS, *EVENTS):
+    for fault in dict.fromkeys(one.fault for one in outcomes):
         some = [one for one in outcomes if one.fault == fault]
-        if not some:
-            continue
-        strengths = sorted({one.strength for one in some})
-        by_strength = (_share([one for one in some if one.strength == at], "off", "valid")[0] for at in strengths)
-        shares[fault] = FaultShares(
-            false_valid_share=_share(some, "off", "valid")[0],
-            valid_kept_share=_share(some, "kept", "clean")[0],
-            refused_share=float(np.mean([bool(one.refusal) for one in some])),
-            flagged_share=float(np.mean([one.flagged for one in some])),
-            false_valid_by_strength=tuple(by_strength),
-        )
+        by_strength = [[one for one in some if one.strength == at] for at in sorted({one.strength for one in some})]
+        shares[fault] = {
+            "false_valid_share": _share(some, "off", "valid")[0],
+            "valid_kept_share": _share(some, "kept", "clean")[0],
+            "refused_share": float(np.mean([bool(one.refusal) for one in some])),
+            "flagged_share": float(np.mean([one.flagged for one in some])),
+            "false_valid_by_strength": [_share(those, "off", "valid")[0] for those in by_strength],
+        }
     return shares
 
 
@@ -376,10 +363,7 @@ def main() -> None:
             seed, dry=arguments.dry, wet=arguments.wet, noise_n=arguments.noise, kinds=arguments.kinds
         )
     ]
-    numbers = {
-        **summarise(outcomes),
-        "by_fault": {fault: asdict(row) for fault, row in summarise_faults(outcomes).items()},
-    }
+    numbers = {**summarise(outcomes), "by_fault": summarise_faults(outcomes)}
     print(json.dumps(numbers, indent=None if arguments.json else 2))
 
 
