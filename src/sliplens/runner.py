@@ -442,10 +442,12 @@ def run_table(
 
     def rows(folder: Path) -> Iterator[pa.Table]:
         for each in parts:
-            table = open_table(folder / each.path).read()
-            if on_rows is not None:
-                on_rows(table)
-            yield table
+            file = open_table(folder / each.path)
+            if on_rows is None:
+                yield from map(file.read_row_group, range(file.num_row_groups))
+            else:
+                on_rows(table := file.read())
+                yield table
 
     if out is not None and not out.suffix:
         every = hashlib.sha256("".join(each.path for each in parts).encode())  # changed frames make another result
