@@ -114,7 +114,8 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     module, _, name = command.function.partition(":")
     function = getattr(import_module(module), name)
     hints = get_type_hints(function)
-    hints |= {name: hint for bag in hints.values() if get_origin(bag) is Unpack for name, hint in _bag(bag).items()}
+    for hint in [hint for hint in hints.values() if get_origin(hint) is Unpack]:
+        hints |= get_type_hints(get_args(hint)[0])
     further = _options(command.run, further=True)
     options = sorted((*_options(function), *further), key=lambda option: not option.positional)
     by_name = {option.name: option for option in options}
@@ -128,9 +129,9 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
             if group := by_name[name].group:
                 groups.setdefault(group, {})[name] = value
             else:
-                named = any(_is_constants(member) for member in _members(hints[name]))
-                arguments[name] = constants(value) if named else value
-        arguments |= {group: _options_type(hints[group])(**given) for group, given in groups.items()}
+                numbers = any(_is_constants(member) for member in _members(hints[name]))
+                arguments[name] = constants(value) if numbers else value
+        arguments |= {group: _options_type(hints[group])(**settings) for group, settings in groups.items()}
         command.run(partial(function, **arguments), **further)
 
     parsed = docstring_parser.parse(function.__doc__ or "")
@@ -140,11 +141,6 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     call.__signature__ = Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return call, list(by_name)
-
-
-def _bag(hint: Any) -> dict[str, Any]:
-    """Return the types of the keys of typed keyword arguments."""
-    return get_type_hints(get_args(hint)[0])
 
 
 def _options(function: Callable[..., object], *, further: bool = False) -> list[_Option]:
