@@ -37,9 +37,7 @@ def test_png_in_memory_gives_back_its_pixels(rng: np.random.Generator):
         ("a.tiff", np.full((5, 7), 40_000, np.uint16), r"a\.tiff has 16 bits a channel; divide its levels by 256"),
     ],
 )
-def test_images_of_other_colours_or_sizes_are_refused(
-    tmp_path: Path, name: str, pixels: np.ndarray, message: str
-):
+def test_images_of_other_colours_or_sizes_are_refused(tmp_path: Path, name: str, pixels: np.ndarray, message: str):
     with pytest.raises(ImageError, match=message):
         read_image(save(tmp_path / name, pixels), size=(4, 4))
 

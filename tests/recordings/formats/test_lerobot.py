@@ -10,11 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-<<<<<<< HEAD
-=======
 from own_recording import write_frames
-from PIL import Image
->>>>>>> 1d032b45 (cli: drop help by task, doctor: drop reference data)
 from readers import read_lerobot, refused
 
 from sliplens.errors import InputError, RecordingError
@@ -30,26 +26,6 @@ LOSSLESS = {"codec": "libx264rgb", "pixels": "rgb24", "options": {"qp": "0", "g"
 TEMPLATE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 
 Edit = Callable[[dict[str, Any]], object]
-
-
-<<<<<<< HEAD
-def write_video(path: Path, frames: np.ndarray, *, codec: str, pix_fmt: str, options: dict[str, str]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream: Any = container.add_stream(codec, rate=FPS, options=options)
-        stream.height, stream.width, stream.pix_fmt = *frames.shape[1:3], pix_fmt
-        stream.time_base = Fraction(1, FPS)
-        for index, pixels in enumerate(frames):
-            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
-            frame.pts, frame.time_base = index, Fraction(1, FPS)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-=======
-def png(pixels: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
-    return buffer.getvalue()
->>>>>>> 1d032b45 (cli: drop help by task, doctor: drop reference data)
 
 
 def write_info(folder: Path, edit: Edit | None = None) -> None:
