@@ -52,7 +52,7 @@ from sliplens.cli import main as command  # noqa: E402
 from sliplens.cli.console import say  # noqa: E402
 from sliplens.recordings import load_dataset  # noqa: E402
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table  # noqa: E402
-from sliplens.recordings.journal import journals_of  # noqa: E402
+from sliplens.recordings.journal import JOURNAL_FOLDER  # noqa: E402
 from sliplens.recordings.store import save_recording  # noqa: E402
 from sliplens.results.study import StudyConfig  # noqa: E402
 
@@ -410,7 +410,7 @@ class Bench:
 def journalled(folder: Path) -> int:
     """Whole frames that a recording had handed over when it ended."""
     count = 0
-    for journal in journals_of(folder):
+    for journal in sorted((folder / JOURNAL_FOLDER).glob("*.arrow")):
         with suppress(pa.ArrowInvalid), pa.memory_map(str(journal)) as file:
             reader = pa.ipc.open_stream(file)
             with suppress(StopIteration, OSError):
