@@ -371,7 +371,7 @@ def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> l
         alarms += count_alarm(
             ~np.isfinite(values).all(axis=(1, 2)), f"{method}: {{}} of {{}} maps hold NaN or infinity"
         )
-        flat = np.ptp(values, axis=(1, 2)) == 0
+        flat = np.asarray(values.max(axis=(1, 2)) == values.min(axis=(1, 2)))
         alarms += count_alarm(flat, f"{method}: {{}} of {{}} maps are constant and rank nothing")
     return alarms
 
