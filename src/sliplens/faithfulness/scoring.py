@@ -368,10 +368,9 @@ def flat_maps(maps: Mapping[str, Float[np.ndarray, "images height width"]]) -> l
     """Warn of constant maps and maps with NaN, which rank nothing."""
     alarms = []
     for method, values in maps.items():
-        alarms += count_alarm(
-            ~np.isfinite(values).all(axis=(1, 2)), f"{method}: {{}} of {{}} maps hold NaN or infinity"
-        )
-        flat = np.asarray(values.max(axis=(1, 2)) == values.min(axis=(1, 2)))
+        finite = np.all(np.isfinite(values), axis=(1, 2))
+        alarms += count_alarm(np.logical_not(finite), f"{method}: {{}} of {{}} maps hold NaN or infinity")
+        flat = np.equal(values.max(axis=(1, 2)), values.min(axis=(1, 2)))
         alarms += count_alarm(flat, f"{method}: {{}} of {{}} maps are constant and rank nothing")
     return alarms
 
