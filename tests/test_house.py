@@ -26,15 +26,15 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 43_250,
-    "modules": 175,
-    "riddles_per_1000": 0.35,
+    "lines": 40_930,
+    "modules": 169,
+    "riddles_per_1000": 0.3,
     "vague_docstrings": 0,
     "most_parameters": 12,
-    "functions_with_on_progress": 18,
+    "functions_with_on_progress": 17,
     "functions_with_out": 22,
     "functions_with_overwrite": 22,
-    "functions_with_device": 20,
+    "functions_with_device": 19,
     "names_defined_twice": 0,
     "dicts_across_functions": 0,
 }
