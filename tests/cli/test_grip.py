@@ -33,7 +33,7 @@ def test_many_episodes_make_a_record_and_a_page_and_are_kept(tmp_path: Path, cap
     assert set(grip.episodes.mass_kg) == {0.05}
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "What the margin holds" in page
-    assert "4 episodes: cup" in page
+    assert "Of 4 episodes 0 fell" in page
     assert (tmp_path / "figures" / "grip-episode.pdf").is_file()
     assert len(sl.plot(grip).axes[0].lines) >= 2
     assert run(*words) == 0
