@@ -115,7 +115,7 @@ def draw_strip(strip: Strip) -> Figure:
             words = f"{number + 1}: {read}\ntrue {percent(float(readings.safety_margin[frame]))}"
             axes[number].set_title(words, fontsize=9.5, loc="center", fontweight="normal")
         bar = figure.colorbar(ScalarMappable(Normalize(-limit, limit), SIGN_COLOURS), ax=axes, aspect=15)
-        bar.set_label("points of margin\nper 1 % of\nthe image", fontsize=8)
+        bar.set_label("points of margin\nper 1 % of image", fontsize=8)
         plot_readings(strip, ax=figure.add_subplot(grid[1, :]))
     return figure
 
