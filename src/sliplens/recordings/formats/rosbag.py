@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import av
 import numpy as np
 
 from sliplens.errors import RecordingError, SliplensError
@@ -28,8 +29,17 @@ if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
-_TYPES = {"image": ("sensor_msgs/msg/Image", COMPRESSED), "wrench": (TOPICS[WRENCH],)}
-_CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
+_TYPES = {"image": ("sensor_msgs/msg/Image", COMPRESSED), "wrench": (TOPICS[WRENCH], "geometry_msgs/msg/Wrench")}
+_ENCODINGS = {
+    "rgb8": (3, "rgb24"),
+    **dict.fromkeys(("bgr8", "8UC3"), (3, "bgr24")),
+    **dict.fromkeys(("mono8", "8UC1"), (1, "gray")),
+    "rgba8": (4, "rgba"),
+    **dict.fromkeys(("bgra8", "8UC4"), (4, "bgra")),
+    **dict.fromkeys(("yuv422", "uyvy", "yuv422_yuy2", "yuyv"), (2, "yuyv422")),
+    **{f"bayer_{order}8": (1, f"bayer_{order}8") for order in ("rggb", "bggr", "gbrg", "grbg")},
+}
+"""Bytes a pixel of each encoding, and FFmpeg's name of its format."""
 _STORAGE = (".mcap", ".db3")
 _CLOCKS = ("header", "bag")  # of the stamp in a message, and of its arrival at the bag
 
@@ -38,12 +48,17 @@ def _message_size(message: Any, *, where: str) -> tuple[int, int]:
     """Return height and width of an image, in pixels, without decoding it."""
     if message.__msgtype__ == COMPRESSED:
         return image_size(message.data, where=f"{where}, of format {message.format[:40]!r},")
-    channels = _CHANNELS.get(message.encoding)
-    if channels is None:
+    if message.encoding not in _ENCODINGS:
         raise RecordingError(f"{where} has encoding {message.encoding[:40]!r}; record it as rgb8, bgr8, mono8 or PNG")
+    channels, _ = _ENCODINGS[message.encoding]
     height, width, step = message.height, message.width, message.step
     # nothing has the claimed size until it is known to be there
-    if min(height, width) == 0 or step < width * channels or height * step > len(message.data):
+    if (
+        min(height, width) == 0
+        or step < width * channels
+        or height * step > len(message.data)
+        or (channels == 2 and width % 2)
+    ):
         claims = f"claims {height} rows of {step} bytes for {width} pixels of {message.encoding}"
         raise RecordingError(f"{where} {claims} but holds {len(message.data)} bytes; mend it or record it again")
     return height, width
@@ -190,10 +205,10 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
             if before not in {None, size}:
                 raise RecordingError(f"{where} is of another size than those before it; cut the bag there")
         else:
-            force = message.wrench.force
+            force = getattr(message, "wrench", message).force
             forces_n.extend((force.x, force.y, force.z))
-        stamp = message.header.stamp
-        stamps_ns[name]["header"].append(stamp.sec * 1_000_000_000 + stamp.nanosec)
+        stamp = message.header.stamp if hasattr(message, "header") else None
+        stamps_ns[name]["header"].append(0 if stamp is None else stamp.sec * 1_000_000_000 + stamp.nanosec)
         stamps_ns[name]["bag"].append(bag_ns)
     if size is None:
         raise RecordingError(f"{images} of {path} has no frame; leave it out or record it again")
@@ -225,11 +240,15 @@ def _read_frames(path: Path, images: str, kind: str) -> Iterator[Frame]:
             yield read_image(message.data, where=where)
             continue
         height, width = _message_size(message, where=where)
-        channels = _CHANNELS[message.encoding]
+        channels, form = _ENCODINGS[message.encoding]
         # rows may be padded: step counts the padding too
         rows = message.data[: height * message.step].reshape(height, message.step)[:, : width * channels]
-        pixels = rows.reshape(height, width, channels)[..., :: -1 if message.encoding == "bgr8" else 1]
-        yield np.repeat(pixels, 3, axis=2) if channels == 1 else np.array(pixels, order="C")
+        swapped = form == "bgr24" or message.encoding in {"yuv422", "uyvy"}
+        pixels = np.ascontiguousarray(rows.reshape(height, width, channels)[..., :: -1 if swapped else 1])
+        if form not in {"rgb24", "bgr24", "gray"}:
+            frame = av.VideoFrame.from_ndarray(pixels if channels > 1 else pixels[..., 0], format=form)
+            pixels = frame.to_ndarray(format="rgb24")
+        yield np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels
 
 
 def _choose(topics: Mapping[str, str], name: str | None, *, what: str, path: Path) -> str | None:
