@@ -26,7 +26,7 @@ def read(one: int, told: dict[str, Any], **more: object) -> int:
 def _read() -> dict[str, object]: ...
 '''
 ALLOWED = {
-    "lines": 40_930,
+    "lines": 40_950,
     "modules": 169,
     "riddles_per_1000": 0.3,
     "vague_docstrings": 0,

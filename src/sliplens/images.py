@@ -167,7 +167,9 @@ def list_images(folder: Path) -> list[Path]:
         If the folder is missing, or holds no image.
     """
     require_folder(folder, what="the image folder")
-    images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES]
+    # macOS writes `._NAME` beside a file on other disks
+    files = (path for path in folder.iterdir() if not path.name.startswith("._"))
+    images = [path for path in files if path.suffix.lower() in IMAGE_SUFFIXES]
     for path in images:
         # without a frame that is a dead link, all later ones would move up
         require_file(path)

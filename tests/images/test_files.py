@@ -59,8 +59,10 @@ def test_what_is_no_whole_image_is_refused(tmp_path: Path, rng: np.random.Genera
 
 
 def test_images_are_listed_in_natural_order(tmp_path: Path):
-    for name in ("frame10.png", "frame2.png", "frame1.PNG", "notes.txt"):
-        write_png(tmp_path / name, np.zeros((2, 2, 3), np.uint8)) if name[-3:] != "txt" else (tmp_path / name).touch()
+    for name in ("frame10.png", "frame2.png", "frame1.PNG"):
+        write_png(tmp_path / name, np.zeros((2, 2, 3), np.uint8))
+    for name in ("notes.txt", "._frame2.png"):  # the latter by macOS
+        (tmp_path / name).touch()
     assert [path.name for path in list_images(tmp_path)] == ["frame1.PNG", "frame2.png", "frame10.png"]
 
 
