@@ -146,9 +146,9 @@ def _words(value: object, unit: str = "") -> str:
             text = text if len(value) < 4 else f"{len(value)}: {text}; ..."
         case _ if is_dataclass(value) and type(value).__str__ is object.__str__:
             kind = type(value)
-            simple = {name: part for name, part in vars(value).items() if isinstance(part, _SCALARS)}
-            texts = (f"{name} {_words(part, _unit(kind, name))}" for name, part in islice(simple.items(), 5))
-            text = ", ".join(texts)
+            simple = [part for part in vars(value).items() if not isinstance(part[1], tuple | Mapping | np.ndarray)]
+            texts = ((name, _words(part, _unit(kind, name))) for name, part in simple)
+            text = ", ".join(f"{name} {words}" for name, words in islice(texts, 5) if words)
         case _:
             text = f"{value} {unit}".rstrip() if is_dataclass(value) else str(value)
     return text
