@@ -129,8 +129,10 @@ def label_by_friction(labels: Labels, friction: float) -> Labels:
     Raises
     ------
     RecordingError
-        If F_t / F_n of a frame exceeds that friction.
+        If F_t / F_n of a frame exceeds that friction, or no force is known.
     """
+    if np.isnan(labels.normal_force_n).all():
+        raise RecordingError("a friction gives no margin without forces; leave out --mu")
     pressed = labels.normal_force_n > 0
     ratio = np.where(pressed, labels.tangential_force_n, 0) / np.where(pressed, labels.normal_force_n, 1)
     if (most := ratio.max(initial=0)) > friction:

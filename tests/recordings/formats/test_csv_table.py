@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from readers import read_force_table, refused
 
+from sliplens.recordings.formats.tables import open_text_table
+
 TIME = [0.0, 0.01, 0.02]
 FORCE = [[0.5, -0.25, 2.0], [0.75, -0.5, 4.0], [1.0, -0.75, 6.0]]
 
@@ -82,6 +84,11 @@ def test_samples_that_share_the_stamp_of_a_coarse_clock_are_spread(tmp_path: Pat
     forces, notes = read_force_table(write(tmp_path, text))
     np.testing.assert_allclose(forces.time_s, np.arange(20) * 0.0025)
     assert "15 samples share a stamp" in notes[0]
+
+
+def test_a_row_of_labels_is_no_row_of_units(tmp_path: Path):
+    opened = open_text_table(write(tmp_path, "file,slips,who\na.avi,n,me\nb.avi,s,me\n"))
+    assert [cells[:2] for _, cells in opened.rows] == [["a.avi", "n"], ["b.avi", "s"]]
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-8"])

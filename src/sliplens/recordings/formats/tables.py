@@ -114,7 +114,8 @@ def open_text_table(path: Path) -> TextTable:
     if first is not None:
         units = [cell.strip("[]()") for cell in first[1]]
         measures = [unit for quantity in UNITS for unit in units if _find_unit(unit.lower(), quantity)]
-        if measures and not any(map(str.isdecimal, "".join(units))):
+        # most of them, for a letter may be a label
+        if 2 * len(measures) > len(list(filter(None, units))) and not any(map(str.isdecimal, "".join(units))):
             header = [f"{name} [{unit}]" if unit.strip("-") else name for name, unit in zip(header, units, strict=True)]
         else:
             rows = chain([first], rows)
