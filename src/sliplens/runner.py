@@ -176,7 +176,7 @@ def run_parts(
             missing.append(each)
     error: Exception | None = None
     if missing:
-        for draft in folder.glob("trial=*/.*.draft"):  # of processes that were killed
+        for draft in folder.glob("trial=*/.*.draft*"):  # of processes that were killed, perhaps while writing
             remove(draft)
         (folder / _STATE).mkdir(parents=True, exist_ok=True)
         plan = Status(title=title, parts=len(parts), frames=frames, started_s=time.time(), on=on)
