@@ -17,7 +17,7 @@ from sliplens.cli import main
 from sliplens.errors import InputError, PartError
 from sliplens.files import hash_file, locked
 from sliplens.progress import reporting
-from sliplens.runner import TRIES, Part, part, read_status, require_new_table, run_parts, run_table
+from sliplens.runner import Part, part, read_status, require_new_table, run_parts, run_table
 
 TITLE = "Counting"
 
@@ -82,41 +82,25 @@ def test_an_interruption_loses_only_the_part_being_made(log: Path, out: Path):
     assert Count(log=log).tries() == {"a": 1, "b": 1, "c": 2, "d": 1, "e": 1}
 
 
-@pytest.mark.parametrize(("fault", "tries"), [("refuse", TRIES), ("damaged", 1)])
-def test_a_part_that_fails_is_set_aside_until_it_is_retried(log: Path, out: Path, fault: str, tries: int):
+@pytest.mark.parametrize("fault", ["refuse", "damaged"])
+def test_a_part_that_fails_stops_no_other_and_is_tried_again_by_the_next_call(log: Path, out: Path, fault: str):
     work = Count(log=log, **{fault: frozenset("bd")})  # pyright: ignore[reportArgumentType]
-    with pytest.raises(PartError, match=r"2 of 5 could not be done.*--retry-failed") as raised:
+    with pytest.raises(PartError, match="2 of 5 could not be done") as raised:
         make(work, out)
     assert set(raised.value.errors) == {"b", "d"}
-    assert work.tries() == {"a": 1, "b": tries, "c": 1, "d": tries, "e": 1}
+    assert work.tries() == dict.fromkeys("abcde", 1)
     (status,) = read_status(out)
     assert (status.done, status.parts, status.frames_done, status.frames) == (3, 5, 9, 15)
-    assert {failure.name: len(failure.errors) for failure in status.failed} == {"b": tries, "d": tries}
-    with pytest.raises(PartError):
-        make(Count(log=log), out)
-    assert Count(log=log).tries()["b"] == tries  # not tried again
-    make(Count(log=log), out, retry_failed=True)
+    make(Count(log=log), out)
     assert sorted(content(out)) == [each.path for each in parts()]
+    assert Count(log=log).tries() == {"a": 1, "b": 2, "c": 1, "d": 2, "e": 1}
     assert read_status(out) == []
 
 
-def test_a_part_that_exists_has_not_failed(log: Path, out: Path):
-    with pytest.raises(PartError):
-        make(Count(log=log, refuse=frozenset("b")), out)
-    [failed] = out.rglob("*.failed")
-    note = failed.read_bytes()
-    make(Count(log=log), out, retry_failed=True)
-    failed.parent.mkdir()  # as if killed before the note was removed
-    failed.write_bytes(note)
-    make(Count(log=log), out)
-    assert sorted(content(out)) == [each.path for each in parts()]
-
-
-def test_a_full_disk_ends_the_work_and_sets_nothing_aside(log: Path, out: Path):
-    for _ in range(TRIES):
-        with pytest.raises(OSError, match="No space left"):
-            make(Count(log=log, no_room=frozenset("b")), out)
-    assert Count(log=log).tries() == {"a": 1, "b": TRIES}
+def test_a_full_disk_ends_the_work(log: Path, out: Path):
+    with pytest.raises(OSError, match="No space left"):
+        make(Count(log=log, no_room=frozenset("b")), out)
+    assert Count(log=log).tries() == {"a": 1, "b": 1}
     make(Count(log=log), out)
     assert sorted(content(out)) == [each.path for each in parts()]
 
@@ -144,7 +128,7 @@ def test_threads_make_the_same_bytes_and_an_interruption_ends_them(log: Path, ou
     with pytest.raises(PartError, match="1 of 5"):
         make(work, tmp_path / "other", listener=lambda done, _: calls.append(done))
     assert calls[-1] == 12
-    make(Count(log=work.log), tmp_path / "other", retry_failed=True)
+    make(Count(log=work.log), tmp_path / "other")
     assert content(tmp_path / "other") == content(out)
 
 
@@ -157,13 +141,17 @@ def test_a_single_part_fails_with_its_own_error_and_leaves_nothing(log: Path, ou
 def test_processes_make_the_same_bytes_and_survive_a_kill(log: Path, out: Path, tmp_path: Path):
     (tmp_path / "log-2").mkdir()
     make(Count(log=log), out)
+    left = tmp_path / "other" / "trial=a"  # by a process that was killed while it made a part, and while it wrote
+    left.mkdir(parents=True)
+    for name in (".x.parquet.1.draft", "..x.parquet.1.draft.part"):
+        (left / name).touch()
     work = Count(log=tmp_path / "log-2", kill=frozenset("b"), refuse=frozenset("e"))
     with pytest.raises(PartError, match="1 of 5") as raised:
         make(work, tmp_path / "other", on="processes=2")
     assert set(raised.value.errors) == {"e"}
     assert work.tries()["b"] == 2
     assert os.getpid() not in {int(path.read_text()) for path in work.log.iterdir()}
-    make(Count(log=work.log), tmp_path / "other", retry_failed=True)
+    make(Count(log=work.log), tmp_path / "other")
     assert content(tmp_path / "other") == content(out)
 
 

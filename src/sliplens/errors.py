@@ -37,13 +37,13 @@ class CheckpointError(InputError):
 
 
 class PartError(SliplensError):
-    """Some parts of a work failed repeatedly while all others were made; the command line exits with code 1."""
+    """Some parts of a work failed while all others were made; the command line exits with code 1."""
 
     def __init__(self, errors: Mapping[str, str], *, parts: int) -> None:
         self.errors = dict(errors)
         """Message of each part by its name."""
         failed = f"{len(self.errors)} of {parts} could not be done, all others are"
-        self.summary = f"{failed}; correct the errors and give the same command with --retry-failed:"
+        self.summary = f"{failed}; correct the errors and give the same command again:"
         """First line of the message: how many parts failed, and how to retry."""
         lines = [f"{name}: {sentence}" for name, sentence in self.errors.items()]
         super().__init__("\n  ".join([self.summary, *lines]))

@@ -35,7 +35,7 @@ from loky.process_executor import BrokenProcessPool
 
 from sliplens._version import __version__
 from sliplens.codec import load_record, open_table, regrouped, save_record, write_tables
-from sliplens.errors import InputError, PartError, RecordingError, SliplensError
+from sliplens.errors import InputError, PartError, SliplensError
 from sliplens.extras import pick, require_packages
 from sliplens.files import (
     hash_json,
@@ -52,8 +52,6 @@ from sliplens.progress import OnProgress, counting, current_reporter, open_stage
 
 LONGEST = 8192
 """Largest number of frames of a part; a longer trial is divided."""
-TRIES = 3
-"""Number of times a part is tried before it is set aside; once if its recording is damaged."""
 _LONGEST_NAME = 200  # of a folder; file systems take 255 bytes
 _STATE = "_parts"  # readers of Parquet data sets skip names that begin with an underscore
 _COMMAND = "the interrupted command"
@@ -131,12 +129,11 @@ def run_parts(
     *,
     title: str,
     on: str = "serial",
-    retry_failed: bool = False,
     on_part: Callable[[Part], None] | None = None,
 ) -> None:
-    """Make the parts that are missing in a folder.
+    """Make the parts that are missing in a folder; one that fails does not stop the others.
 
-    A part that fails `TRIES` times, or once with a `RecordingError`, is set aside, and the others are made.
+    A part whose process ended is tried once more, by itself.
 
     Parameters
     ----------
@@ -144,15 +141,13 @@ def run_parts(
         Description of the work for `read_status`.
     on
         Row of `EXECUTORS` with its argument: `serial`, `processes`, `processes=4`, `ray`, `ray=ADDRESS`.
-    retry_failed
-        If True, parts that were set aside before are tried again.
     on_part
         Called with each part once it exists.
 
     Raises
     ------
     PartError
-        If parts were set aside, after all others were made; the error of the part itself if there is only one.
+        If parts failed, after all others were made; the error of the part itself if there is only one.
     InputError
         If the executor is unknown, or the work cannot be prepared.
     """
@@ -162,7 +157,6 @@ def run_parts(
     tally, missing = _Tally(frames), deque[Part]()
 
     def made(each: Part) -> None:
-        _failure_file(folder, each).unlink(missing_ok=True)  # a process may have ended before it could remove it
         tally.count(each, 1, 1)
         if on_part is not None:
             on_part(each)
@@ -170,11 +164,9 @@ def run_parts(
     for each in parts:
         if (folder / each.path).exists():
             made(each)
-        elif retry_failed or not _load_failure(folder, each).set_aside:
-            if retry_failed:
-                _failure_file(folder, each).unlink(missing_ok=True)
+        else:
             missing.append(each)
-    error: Exception | None = None
+    errors: dict[str, Exception] = {}
     if missing:
         for draft in folder.glob("trial=*/.*.draft*"):  # of processes that were killed, perhaps while writing
             remove(draft)
@@ -182,15 +174,18 @@ def run_parts(
         plan = Status(title=title, parts=len(parts), frames=frames, started_s=time.time(), on=on)
         save_record(plan, folder / _STATE / "plan.json")
         with executor(work, argument, len(missing)) as pool:
-            error = _run(pool, missing, folder, tally.count, made)
-    failures = [failure for each in parts if (failure := _load_failure(folder, each)).errors]
-    if failures and len(parts) == 1 and error is not None:
-        remove(folder / _STATE)
+            errors = _run(pool, missing, folder, tally.count, made)
+    if not errors or len(parts) == 1:
+        with suppress(OSError):
+            remove(folder / _STATE)
+    for error in errors.values() if len(parts) == 1 else ():
         raise error
-    if failures:
-        raise PartError({failure.name: failure.errors[-1] for failure in failures}, parts=len(parts))
-    with suppress(OSError):
-        remove(folder / _STATE)
+    if errors:
+        raise PartError({name: _sentence(error) for name, error in errors.items()}, parts=len(parts))
+
+
+def _sentence(error: Exception) -> str:
+    return str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
 
 
 def _run(
@@ -199,11 +194,11 @@ def _run(
     folder: Path,
     count: Callable[[Part, int, int], None],
     made: Callable[[Part], None],
-) -> Exception | None:
-    """Submit parts until none is missing; return the last error of a part."""
+) -> dict[str, Exception]:
+    """Submit parts until none is missing; return the errors by the name of the part."""
     running: dict[Future, Part] = {}
     alone: deque[Part] = deque()  # a process ended while they were made: which of them is at fault shows one by one
-    last: Exception | None = None
+    lost, errors = set[str](), dict[str, Exception]()
     while missing or alone or running:
         waiting, most = (alone, 1) if alone else (missing, pool.workers)
         while waiting and len(running) < most:
@@ -214,11 +209,15 @@ def _run(
                 alone.append(each)
                 break
         for future in wait(running, return_when=FIRST_COMPLETED).done:
-            each, queue = running.pop(future), missing
+            each = running.pop(future)
             try:
                 error = future.result()
             except pool.lost:
-                queue, error = alone, SliplensError("its process was ended from outside, perhaps for want of memory")
+                error = SliplensError("its process was ended from outside, perhaps for want of memory")
+                if each.key not in lost:
+                    lost.add(each.key)
+                    alone.append(each)
+                    continue
             if error is None:
                 made(each)
                 continue
@@ -226,16 +225,9 @@ def _run(
                 raise error.args[0]
             if isinstance(error, OSError) and error.errno in _FATAL:
                 raise error
-            last = error
+            errors[each.name] = error
             count(each, 0, 1)
-            sentence = str(error) if isinstance(error, SliplensError) else f"{type(error).__name__}: {error}"
-            failure = _load_failure(folder, each)
-            final = isinstance(error, RecordingError)
-            failure = replace(failure, errors=(*failure.errors, sentence), final=final)
-            save_record(failure, _failure_file(folder, each))
-            if not failure.set_aside:
-                queue.append(each)
-    return last
+    return errors
 
 
 class _PreparationError(Exception):
@@ -425,7 +417,6 @@ def run_table(
     recipe: object,
     resumable: bool = True,
     on: str = "serial",
-    retry_failed: bool = False,
     overwrite: bool = False,
     on_rows: Callable[[pa.Table], None] | None = None,
 ) -> tuple[pa.Schema, pa.Table | None]:
@@ -437,7 +428,7 @@ def run_table(
 
     def make(folder: Path) -> pa.Schema:
         with open_stage(title):
-            run_parts(work, parts, folder, title=title, on=on, retry_failed=retry_failed)
+            run_parts(work, parts, folder, title=title, on=on)
         return open_table(folder / parts[0].path).schema_arrow
 
     def rows(folder: Path) -> Iterator[pa.Table]:
@@ -492,31 +483,6 @@ def require_new_table(path: Path, *, suffix: str | Sequence[str], overwrite: boo
 
 
 @dataclass(frozen=True, kw_only=True)
-class Failure:
-    """Errors of a part that could not be made."""
-
-    name: str
-    errors: tuple[str, ...] = ()
-    """Message of each try."""
-    final: bool = False
-    """True if the recording is damaged, so that no further try can succeed."""
-
-    @property
-    def set_aside(self) -> bool:
-        """True if the part is not tried again unless the user retries failed parts."""
-        return self.final or len(self.errors) >= TRIES
-
-
-def _failure_file(folder: Path, each: Part) -> Path:
-    return folder / _STATE / f"{each.key}.failed"
-
-
-def _load_failure(folder: Path, each: Part) -> Failure:
-    path = _failure_file(folder, each)
-    return load_record(path, Failure, command=_COMMAND) if path.is_file() else Failure(name=each.name)
-
-
-@dataclass(frozen=True, kw_only=True)
 class Status:
     """Progress of a work, counted from its parts."""
 
@@ -531,7 +497,6 @@ class Status:
     done: int = 0
     """Number of parts that exist."""
     frames_done: int = 0
-    failed: tuple[Failure, ...] = ()
     running: bool = False
     """True if a process is making the result."""
     frames_per_s: float | None = None
@@ -590,11 +555,10 @@ def _read_status(state: Path, *, running: bool) -> Status:
         plan,
         done=len(made),
         frames_done=done,
-        failed=tuple(load_record(path, Failure, command=_COMMAND) for path in sorted(state.glob("*.failed"))),
         running=running,
         frames_per_s=rate,
         ends=ends,
     )
 
 
-__all__ = ["Failure", "Part", "Status", "Work", "part", "read_status", "run_parts", "run_table"]
+__all__ = ["Part", "Status", "Work", "part", "read_status", "run_parts", "run_table"]

@@ -302,9 +302,6 @@ def print_status(path: Path, works: "Sequence[Status]") -> None:
             say(f"  {work.frames_per_s:.3g} a second" + (f", done at {work.ends}" if work.ends else ""))
         if not work.running:
             say("  not running; give the same command again to continue")
-        for failure in work.failed[:_MOST_ROWS]:
-            times = "once" if len(failure.errors) == 1 else f"{len(failure.errors)} times"
-            say(f"  failed, {times}: {failure.name}: {failure.errors[-1]}")
 
 
 def print_grip(result: "Grip") -> None:

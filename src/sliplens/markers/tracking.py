@@ -89,7 +89,6 @@ def track(
     *,
     markers: str = "auto",
     on: str = "serial",
-    retry_failed: bool = False,
     out: Path | str | None = None,
     overwrite: bool = False,
     on_tracked: OnTracked | None = None,
@@ -108,9 +107,8 @@ def track(
     source_options
         `reference`, `reference_frame`, `split`, `trial`, `format`, `options` and `sensor` of `open_source`. Without a
         reference, displacements count from the first frame.
-    on, retry_failed
-        Where the trials are tracked, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`; and
-        whether trials that failed three times are tried again.
+    on
+        Where the trials are tracked, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`, `ray`.
     out
         Parquet file to write; without a suffix a folder, a Parquet data set with a file a trial. It appears when
         complete, and an interrupted call continues after its last trial. If None, rows stay in memory.
@@ -161,7 +159,6 @@ def track(
             recipe=recipe,
             resumable=trials.travels and on_tracked is None,
             on=on,
-            retry_failed=retry_failed,
             overwrite=overwrite,
             on_rows=lambda trial_rows: outcomes.append(_outcome(trial_rows)),
         )

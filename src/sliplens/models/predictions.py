@@ -139,7 +139,6 @@ class _Options(SourceOptions, total=False):
     """Options of `predict` besides its own parameters."""
 
     on: str
-    retry_failed: bool
     preprocess: Preprocess | None
 
 
@@ -190,8 +189,8 @@ def predict(
     options
         `reference`, the untouched sensor as an image, or `reference_frame`, the number of the frame that shows it; for
         a recording without either, its first frame is assumed, with a note. `split`, `format`, `options` and `sensor`
-        as `open_source` takes them. `on`, the executor: `serial`, `processes`, `processes=4` or `ray`; `retry_failed`,
-        if True, tries trials again that failed three times before. `preprocess`, for a module, as `wrap` takes it.
+        as `open_source` takes them. `on`, the executor: `serial`, `processes`, `processes=4` or `ray`.
+        `preprocess`, for a module, as `wrap` takes it.
 
     Raises
     ------
@@ -213,7 +212,7 @@ def predict(
     >>> list(predictions.frame().columns)[:4]
     ['trial', 'frame', 'time_s', 'prediction']
     """
-    on, retry_failed = options.pop("on", "serial"), options.pop("retry_failed", False)
+    on = options.pop("on", "serial")
     preprocess = options.pop("preprocess", None)
     source_options: SourceOptions = {**options}  # pyright: ignore[reportAssignmentType]
     path = None if out is None else Path(out)
@@ -263,7 +262,6 @@ def predict(
             recipe=recipe,
             resumable=trials.travels,
             on=on,
-            retry_failed=retry_failed,
             overwrite=overwrite,
         )
     name = (written.metadata or {})[b"sliplens.engine"].decode()

@@ -138,7 +138,6 @@ def label_dataset(
     labelling: LabelSettings | None = None,
     corrections: Mapping[str, Corrections] | Path | str | None = None,
     on: str = "serial",
-    retry_failed: bool = False,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Dataset:
@@ -155,7 +154,7 @@ def label_dataset(
     corrections
         Table of corrections (`sliplens.recordings.corrections`), or the corrections of each trial by its name. They
         replace those of the last call, and take precedence over `labelling`. If None, those of the last call hold.
-    on, retry_failed
+    on
         See `import_recordings`.
     """
     with reporting(on_progress):
@@ -182,7 +181,7 @@ def label_dataset(
             if not output.complete:
                 folder = output.folder
                 items = [(number, info.trial, info.frames) for number, info in enumerate(data.trials)]
-                rows, _ = write_trials(work, items, folder, title="Labelling frames", on=on, retry_failed=retry_failed)
+                rows, _ = write_trials(work, items, folder, title="Labelling frames", on=on)
                 table = [replace(row, split=info.split) for row, info in zip(rows, data.trials, strict=True)]
                 write_dataset_table(folder, table, simulated=data.simulated, left_out=data.left_out)
                 copy_profiles(data.folder, folder)

@@ -48,8 +48,6 @@ class ImportOptions(TypedDict, total=False):
     """Number of trials to validate: the last before those that test."""
     test_trials: int | None
     """Number of trials to test: the last ones."""
-    retry_failed: bool
-    """Try again the trials that failed three times before."""
 
 
 def import_recordings(
@@ -140,7 +138,6 @@ def import_recordings(
                     folder,
                     title="Importing frames",
                     on=on,
-                    retry_failed=options.get("retry_failed", False),
                     optional={capture.trial: capture.source for capture in listed},
                 )
                 names = {info.trial for info in new}

@@ -82,7 +82,6 @@ def write_trials(
     *,
     title: str,
     on: str,
-    retry_failed: bool,
     optional: Mapping[str, str] | None = None,
 ) -> tuple[list[TrialInfo], list[LeftOut]]:
     """Write trials (item, name, number of frames) into the folder of a data set; return their rows.
@@ -94,7 +93,7 @@ def write_trials(
     left_out: list[LeftOut] = []
     with threadpool_limits(1, user_api="blas"), open_stage(title):
         try:
-            run_parts(work, every, folder / PARTS, title=title, on=on, retry_failed=retry_failed)
+            run_parts(work, every, folder / PARTS, title=title, on=on)
         except PartError as error:
             if not error.errors.keys() <= (optional or {}).keys():
                 raise

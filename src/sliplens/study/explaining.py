@@ -63,8 +63,6 @@ class Running(TypedDict, total=False):
     """Device of the network: `cpu`, `cuda` or `cuda:1`; `cpu` by default."""
     on: str
     """Row of `runner.EXECUTORS`: `serial` (default), `processes`, `processes=4`."""
-    retry_failed: bool
-    """If True, parts that failed three times before are tried again."""
     overwrite: bool
     """If True, replace the folder `out`."""
     preprocess: Preprocess | None
@@ -178,8 +176,7 @@ def explain(
                 warnings=warnings,
             )
             with open_stage(title):
-                on, retry_failed = running.get("on", "serial"), running.get("retry_failed", False)
-                explanation = work.make(parts, on=on, retry_failed=retry_failed)
+                explanation = work.make(parts, on=running.get("on", "serial"))
                 notes = explanation.methods
                 # inside the stage: warnings that differ in numbers alone are then shown once
                 for warning in dict.fromkeys(text for each in notes.values() for text in each.warnings):

@@ -78,7 +78,6 @@ def run_study(
     out: Path | str | None = None,
     device: str = "cpu",
     on: str = "serial",
-    retry_failed: bool = False,
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
 ) -> Study:
@@ -103,8 +102,6 @@ def run_study(
     on
         Where maps are made and judged, a row of `runner.EXECUTORS`: `serial`, `processes`, `processes=4`. Processes
         need a script that starts its work under `if __name__ == "__main__":`.
-    retry_failed
-        If True, try again what failed three times before.
 
     Raises
     ------
@@ -141,7 +138,6 @@ def run_study(
             networks=load_networks(networks, device=device),
             config=config,
             on=on,
-            retry_failed=retry_failed,
             overwrite=overwrite,
         )
         if not (records.folder / CONFIG_FILE).exists():
@@ -208,7 +204,6 @@ class Records:
     networks: Mapping[str, Network]
     config: StudyConfig
     on: str = "serial"
-    retry_failed: bool = False
     overwrite: bool = False
     network: str = ""
 
@@ -487,7 +482,7 @@ def _run_step(step: Step, records: Records) -> None:
             record = step.make(records)
             if isinstance(record, Stage):
                 work = _StepWork(step.name, records)
-                record = record.make(parts, work=work, on=records.on, retry_failed=records.retry_failed)
+                record = record.make(parts, work=work, on=records.on)
         if alarms := getattr(record, "alarms", ()):
             add_note(f"{folder.name}: {number_of(len(alarms), 'alarm')}, such as: {alarms[0]}")
         return record

@@ -139,11 +139,11 @@ def score(
         stages.append(PixelDeletion(trained=network, explained=explanation, steps=steps, seed=seed))
 
     def make(folder: Path | None) -> Faithfulness:
-        results, on, retry_failed = [], running.get("on", "serial"), running.get("retry_failed", False)
+        results = []
         for stage in stages:
             with open_stage(stage.title):
                 parts = folder and folder / type(stage).__name__
-                results.append(stage.make(parts, on=on, retry_failed=retry_failed))
+                results.append(stage.make(parts, on=running.get("on", "serial")))
         faithfulness, *deletions = results
         for scores in deletions:
             deletion = Deletion(**{field.name: getattr(scores, field.name) for field in fields(Deletion)})

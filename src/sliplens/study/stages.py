@@ -66,7 +66,6 @@ class Stage(Work, Generic[Result]):
         *,
         work: Work | None = None,
         on: str = "serial",
-        retry_failed: bool = False,
     ) -> Result:
         """Make the result, in memory or of the records in a folder, of which those that exist are not made again.
 
@@ -77,7 +76,7 @@ class Stage(Work, Generic[Result]):
             make_record = self.prepare()
             sizes = [each.frames for each in every]
             return self.join([make_record(each.item) for each in report_each(every, sizes=sizes)])
-        run_parts(work or self, every, folder, title=self.title, on=on, retry_failed=retry_failed)
+        run_parts(work or self, every, folder, title=self.title, on=on)
         command = "the interrupted command"
         return self.join([load_result(folder / each.path, self.record, command=command) for each in every])
 
