@@ -160,22 +160,14 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         for name, rows in found.items()
     }
     result: dict[str, Any] = {"r2_by_trials": means, "by_seed": found, "seeds": options.seeds}
-    most, ten = str(max(options.trials)), "10"
-    if "adapted" in options.starts and ten in map(str, options.trials):
-        result |= {"most_trials": int(most)}
-        result["share_at_10"] = {
-            name: {key: rows["adapted"][ten][key] / rows["adapted"][most][key] for key in ("dry", "wet")}
-            for name, rows in means.items()
-        }
-        result["share_at_10_by_seed"] = {
-            name: {
-                key: [
-                    few[key] / many[key] for few, many in zip(rows["adapted"][ten], rows["adapted"][most], strict=True)
-                ]
-                for key in ("dry", "wet")
-            }
-            for name, rows in found.items()
-        }
+    if "adapted" in options.starts and 10 in options.trials:
+        most = str(max(options.trials))
+        for name, rows in found.items():
+            few, many = (np.array([[seed["dry"], seed["wet"]] for seed in rows["adapted"][at]]) for at in ("10", most))
+            shares = few.mean(axis=0) / many.mean(axis=0)
+            result.setdefault("share_at_10", {})[name] = dict(zip(("dry", "wet"), shares.tolist(), strict=True))
+            by_seed = dict(zip(("dry", "wet"), (few / many).T.tolist(), strict=True))
+            result.setdefault("share_at_10_by_seed", {})[name] = by_seed
     return result
 
 

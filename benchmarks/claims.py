@@ -368,17 +368,12 @@ def _reasoning(results: Results, name: str, rng: np.random.Generator) -> Iterato
         f"it takes {np.median(half):.0f} markers (median). Effects that simply add up would pass. Ours: share less 0.5."
     )
     yield _row(figure, "The network looks at two markers (over half of the change)", name, "two markers", gap, why=why)
-    for method, title in ((POLY_CAM, "Poly-CAM, as published, shows what moves the prediction"),):
-        judged = truth.methods[method]
-        lead = judged.lead_over_controls
-        why = (
-            f"Correlation with the effects of moved markers {_estimate(judged.neutral)}. Ours: less the best control's."
-        )
-        yield _row("Conclusion", title, name, "yes", lead and lead.gap, why=why)
+    judged = truth.methods[POLY_CAM]
+    lead, title = judged.lead_over_controls, "Poly-CAM, as published, shows what moves the prediction"
+    why = f"Correlation with the effects of moved markers {_estimate(judged.neutral)}. Ours: less the best control's."
+    yield _row("Conclusion", title, name, "yes", lead and lead.gap, why=why)
     why = "Share of Poly-CAM's relevance on edges less their share of the image."
-    yield _row(
-        figure, "Poly-CAM highlights the edges of markers", name, "by eye", truth.methods[POLY_CAM].edges, why=why
-    )
+    yield _row(figure, "Poly-CAM highlights the edges of markers", name, "by eye", judged.edges, why=why)
     if name == "raw":
         contact = [
             np.abs(frame.stick)[frame.state > 0].sum() / np.abs(frame.stick).sum() - (frame.state > 0).mean()

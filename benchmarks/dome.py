@@ -8,8 +8,6 @@ mounting. Every number is of states that the calibration never saw.
   under tilt; the load is taken from the markers. `load_given` has it measured, as a gripper does; `five_states` is
   calibrated on four tilts of 135.6 g and 1011.3 g alone. `ridge` is a ridge of forces on raw displacements, the best
   of three penalties on the states asked about: what the model has to beat.
-- `fitted_to_itself`: the same model calibrated on the states that it is asked about, with the load given. It has more
-  weights than states, so this is no accuracy.
 - `adapted_r2` (with --adapt): R2 of F_t / F_n by a network, means over the repeats of a state, on tilts that its
   training never saw. Friction is set to 1, so that the margin is 1 - F_t / F_n. `ten` trains on ten states (five
   tilts of both masses); `mass`, `tilt` and `direction` leave out each of two halves in
@@ -190,8 +188,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = Path(os.environ.get("SLIPLENS_REFERENCE", "../shared/reference")) / "fingervision"
     parser.add_argument("--data", type=Path, default=default, help="folder with states.csv and its frames")
-    parser.add_argument("--calibrate", type=float, default=LIGHT_G, help="mass of the tilted calibration states, in g")
-    parser.add_argument("--ask", type=float, default=HEAVY_G, help="mass of the states that are asked about, in g")
     parser.add_argument("--adapt", type=Path, metavar="FOLDER", help="train 14 networks there, about an hour")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
@@ -199,8 +195,8 @@ def main() -> None:
         parser.error(f"{options.data} has no states.csv; name the folder of the dome's frames with --data")
     moved_px, force_n, states = read_states(options.data)
     tilted = np.any(states[:, 1:] != 0, axis=1)
-    asked = np.abs(states[:, 0] - options.ask) < 0.05
-    known = ~asked & (~tilted | (np.abs(states[:, 0] - options.calibrate) < 0.5))
+    asked = np.abs(states[:, 0] - HEAVY_G) < 0.05
+    known = ~asked & (~tilted | (np.abs(states[:, 0] - LIGHT_G) < 0.5))
     axes = np.sum(states[:, 1:] != 0, axis=1) == 1
     steep = np.abs(states[:, 1:]).max(axis=1) == np.abs(states[:, 1:]).max()
     five = (known & tilted & axes & steep) | (np.abs(states[:, 0] - 1011.3) < 0.05)
@@ -213,7 +209,6 @@ def main() -> None:
             for name in ("markers", "load_given")
         },
         "ridge": ridge(moved_px, force_n, known, asked),
-        "fitted_to_itself": compare(ask(moved_px, force_n, asked, asked, given=True), force_n[asked]),
         "leave_out": leave_out(moved_px, force_n, states, given=False),
         "leave_out_load_given": leave_out(moved_px, force_n, states, given=True),
     }

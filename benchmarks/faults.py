@@ -15,7 +15,7 @@ import argparse
 import json
 import sys
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,10 +40,10 @@ from sliplens.recordings.labels import LARGEST_SIGMA, FoundLabels, LabelSettings
 from sliplens.simulation import SimulationRecipe, plan_trials
 from sliplens.simulation.loading import TRIAL_S
 
-SELECTION_SEED = 100
-"""Seed on which thresholds were chosen; the benchmark's own begin at 0."""
 _SLOWER = 5  # a second rate of samples, as a part of the first
 _SIGMAS = 3.0
+NOISE_N = 0.02
+"""Standard deviation of a force sample."""
 _NEAR_S = 0.06  # frames as near to a faulty sample may lose their label: a frame's time and some samples
 
 Samples = Float[np.ndarray, "samples 3"]
@@ -111,16 +111,6 @@ def clipping(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.G
     return where
 
 
-def _dropped(value: float) -> Fault:
-    def drop(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
-        length_s = _LENGTH_S[strength]
-        where = _span(time_s, _anywhere(time_s, rng, length_s=length_s), length_s)
-        force[where] = value
-        return where
-
-    return drop
-
-
 def stuck_sample(force: Samples, time_s: np.ndarray, strength: int, rng: np.random.Generator) -> np.ndarray:
     """A sample that is repeated for some 10, 20 or 50 ms, at ten moments."""
     count = np.searchsorted(time_s - time_s[0], (0.01, 0.02, 0.05)[strength])
@@ -156,14 +146,14 @@ FAULTS: dict[str, Fault] = {
     "step": step,
     "drift": drift,
     "clipping": clipping,
-    "drop-out, no number": _dropped(float("nan")),
-    "drop-out, zero": _dropped(0.0),
+    "drop-out, no number": _changed(lambda force: np.full_like(force, np.nan)),
+    "drop-out, zero": _changed(np.zeros_like),
     "stuck sample": stuck_sample,
     "stuck span": stuck,
     "sign flip": _changed(lambda force: -force),
     "swapped axes": _changed(lambda force: force[:, [1, 0, 2]]),
     "scaled": _changed(lambda force: 2 * force),
-    "time gap": _dropped(float("inf")),
+    "time gap": _changed(lambda force: np.full_like(force, np.inf)),
 }
 """A time gap is cut out where the samples are infinite."""
 
@@ -187,11 +177,9 @@ class Outcome:
     refusal: str = ""
 
 
-def measure_trial(
-    seen: Seen, *, rate: int, rng: np.random.Generator, noise_n: float, kinds: Sequence[str] = ()
-) -> list[Outcome]:
-    """Label a trial without a fault and with each, the same but for it; with some kinds alone if they are named."""
-    forces, _, _ = spoil(seen, noise_n=noise_n, rng=rng)
+def measure_trial(seen: Seen, *, rate: int, rng: np.random.Generator) -> list[Outcome]:
+    """Label a trial without a fault and with each, the same but for it."""
+    forces, _, _ = spoil(seen, noise_n=NOISE_N, rng=rng)
     forces = replace(forces, time_s=forces.time_s[::rate], force_n=forces.force_n[::rate])
     time_s = seen.loading.time_s[seen.frames] + rng.uniform(-LONGEST_LAG_S, LONGEST_LAG_S)
     truth, seed = seen.loading.safety_margin[seen.frames], int(rng.integers(2**32))
@@ -210,8 +198,6 @@ def measure_trial(
         _compare(fine, fine.valid, truth, np.zeros(len(truth), dtype=bool), trial=name, fault="none", strength=0)
     ]
     for fault, spoiled in FAULTS.items():
-        if kinds and fault not in kinds:
-            continue
         for strength in range(3):
             force = forces.force_n.copy()
             wrong = spoiled(force, forces.time_s, strength, rng)
@@ -232,20 +218,19 @@ def measure_trial(
                 outcomes.append(Outcome(**facts, **nothing, clean=clean, refusal=str(refusal)))
                 continue
             outcomes.append(_compare(found, fine.valid, truth, near, **facts))
-    for event in kinds or EVENTS:
-        for strength in range(3) if event in EVENTS else ():
-            case = EVENTS[event](seen, strength, rng)
+    for event, change in EVENTS.items():
+        for strength in range(3):
             facts = {"trial": name, "fault": event, "strength": strength}
-            outcomes.append(_measure_event(case, fine, rate=rate, rng=rng, noise_n=noise_n, facts=facts))
+            outcomes.append(_measure_event(change(seen, strength, rng), fine, rate=rate, rng=rng, facts=facts))
     return outcomes
 
 
 def _measure_event(
-    case: Case, fine: FoundLabels, *, rate: int, rng: np.random.Generator, noise_n: float, facts: dict[str, Any]
+    case: Case, fine: FoundLabels, *, rate: int, rng: np.random.Generator, facts: dict[str, Any]
 ) -> Outcome:
     """Label a trial to which something happened."""
     seen = case.seen
-    forces, normal, _ = spoil(seen, noise_n=noise_n, rng=rng)
+    forces, normal, _ = spoil(seen, noise_n=NOISE_N, rng=rng)
     if case.tilt_deg:
         forces = replace(forces, force_n=tilt(forces.force_n, normal, case.tilt_deg, rng))
     forces = replace(forces, time_s=forces.time_s[::rate], force_n=forces.force_n[::rate])
@@ -331,7 +316,7 @@ def _share(outcomes: list[Outcome], part: str, whole: str) -> tuple[float, float
     return parts.total() / total, float(error)
 
 
-def measure_seed(seed: int, *, dry: int, wet: int, noise_n: float, kinds: Sequence[str] = ()) -> list[Outcome]:
+def measure_seed(seed: int, *, dry: int, wet: int) -> list[Outcome]:
     """Measure the trials of a seed."""
     rng, outcomes = np.random.default_rng(seed), []
     for release in (False, True):
@@ -340,7 +325,7 @@ def measure_seed(seed: int, *, dry: int, wet: int, noise_n: float, kinds: Sequen
         )
         for number, plan in enumerate(plan_trials(recipe)):
             seen, rate = film_trial(plan), (1, _SLOWER)[number % 2]
-            some = measure_trial(seen, rate=rate, rng=rng, noise_n=noise_n, kinds=kinds)
+            some = measure_trial(seen, rate=rate, rng=rng)
             outcomes += [replace(one, trial=f"{one.trial}-{'released' if release else 'held'}") for one in some]
     return outcomes
 
@@ -350,19 +335,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--dry", type=int, default=4, help="dry trials, over four days, held and let go")
     parser.add_argument("--wet", type=int, default=1, help="wet trials, held and let go")
-    parser.add_argument("--noise", type=float, default=0.02, help="standard deviation of a force sample, in newtons")
-    parser.add_argument("--seed", type=int, default=0, help="of the trials and of what spoils them")
-    parser.add_argument("--seeds", type=int, default=1, help="pool so many seeds, from --seed on")
-    parser.add_argument("--kinds", nargs="+", default=(), help="measure these kinds alone")
+    parser.add_argument("--seeds", type=int, default=1, help="number of seeds to pool")
     parser.add_argument("--json", action="store_true", help="print one JSON object as the last line")
     arguments = parser.parse_args()
-    outcomes = [
-        outcome
-        for seed in range(arguments.seed, arguments.seed + arguments.seeds)
-        for outcome in measure_seed(
-            seed, dry=arguments.dry, wet=arguments.wet, noise_n=arguments.noise, kinds=arguments.kinds
-        )
-    ]
+    seeds = range(arguments.seeds)
+    outcomes = [outcome for seed in seeds for outcome in measure_seed(seed, dry=arguments.dry, wet=arguments.wet)]
     numbers = {**summarise(outcomes), "by_fault": summarise_faults(outcomes)}
     print(json.dumps(numbers, indent=None if arguments.json else 2))
 

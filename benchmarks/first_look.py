@@ -23,11 +23,8 @@ def main() -> None:
     """Print the seconds as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--from-scratch", action="store_true", help="set up a clone first, and time that too")
-    parser.add_argument("--keep", type=Path, help="keep the demo in this folder, which must not exist")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    if options.keep is not None and options.keep.exists():
-        parser.error(f"{options.keep} exists; name a new folder, so that the whole demo is timed")
     with tempfile.TemporaryDirectory() as scratch:
         python, set_up_seconds = sys.executable, None
         if options.from_scratch:
@@ -37,8 +34,7 @@ def main() -> None:
             subprocess.run(["make", "install"], cwd=clone, check=True, stdout=sys.stderr)
             set_up_seconds = time.perf_counter() - started
             python = str(clone / ".venv" / "bin" / "python")
-        output = options.keep or Path(scratch) / "demo"
-        seconds_to_page, seconds_all = time_demo(python, output)
+        seconds_to_page, seconds_all = time_demo(python, Path(scratch) / "demo")
     result = {
         "seconds_to_page": seconds_to_page,
         "seconds_all": seconds_all,
@@ -49,10 +45,10 @@ def main() -> None:
     print(json.dumps(result, indent=None if options.json else 2))
 
 
-def time_demo(python: str, output: Path, *options: str) -> tuple[float, float]:
+def time_demo(python: str, output: Path) -> tuple[float, float]:
     """Seconds from the start of the demo to its first page, and to its end."""
     started = time.perf_counter()
-    process = subprocess.Popen([python, "-m", "sliplens", "demo", str(output), *options], stdout=sys.stderr)
+    process = subprocess.Popen([python, "-m", "sliplens", "demo", str(output)], stdout=sys.stderr)
     try:
         page = None
         while process.poll() is None:

@@ -8,14 +8,12 @@ training had no such pulls: all others are pulled as in that. `half stale` and `
 second with the samples of a force sensor, in which the lower half of the picture, or all of it under fresh noise, has
 stayed as it was 0.5 or 1 s ago; the last frame of each such sequence is also read without the fault. A margin is off
 where it errs by more than 0.2; without contact there is none, so any answer counts as off. `shown_wrong_share` is the
-share of a fault's frames that are off and not withheld, `shown_caused_share` that of those which are not off without
-the fault.
+share of a fault's frames that are off and not withheld.
 
 `auroc` ranks all these frames by `margin_risk`, in which all checks and the network's own spread are one number, and
-`auroc_worst` by how far their worst check is from its limit. Two numbers say what can be reached. `auroc_told` is that
+`auroc_worst` by how far their worst check is from its limit. `auroc_told` says what can be reached: that
 of somebody who is told each fault and its strength, and ranks by how often it put the margins of the other trials off:
-a fault that leaves half of the margins right cannot be ranked better, however well it is seen. And a frame that is off
-without any fault is no matter of health: `auroc_caused` leaves out the frames that are off without the fault too.
+a fault that leaves half of the margins right cannot be ranked better, however well it is seen.
 `seen_by_health` and `seen_by_network` are AUROCs of each fault against frames without one, by the worst check and by
 `Estimate.known` alone. `withheld_healthy` is the share of the frames without a fault whose margin is withheld.
 
@@ -60,8 +58,6 @@ class Case:
     strength: float
     error: float
     """Of the margin, infinite without contact."""
-    healthy_error: float
-    """Of the same frame without the fault; infinite where there is none."""
     checks: tuple[Check, ...]
     beyond: float
     """What the network gives for an error above 0.2."""
@@ -216,7 +212,6 @@ class Judge:
         strength: float = 0.0,
         before: Sequence[Shot] = (),
         force_n: np.ndarray | None = None,
-        healthy_error: float = np.inf,
     ) -> Case:
         """Read one frame at the time 0; `before`: what was seen until then."""
         monitor, tracker = HealthMonitor(self._reference), Tracker(self._reference)
@@ -231,7 +226,6 @@ class Judge:
         return Case(
             trial=self._trial, fault=fault, strength=strength, error=error,
             checks=checks if novelty is None else (*checks, novelty),
-            healthy_error=error if fault == "none" else healthy_error,
             beyond=float(estimate.beyond(OFF)[0]), known=1.0 if estimate.known is None else float(estimate.known[0]),
         )  # fmt: skip
 
@@ -285,35 +279,23 @@ STOPPED: dict[str, Callable[[list[Shot], int, np.random.Generator], list[Shot]]]
 
 
 def judge_stopped(
-    judge: Judge,
-    loading: Loading,
-    film: Film,
-    *,
-    chosen: np.ndarray,
-    healthy: dict[int, float],
-    rng: np.random.Generator,
+    judge: Judge, loading: Loading, film: Film, *, chosen: np.ndarray, rng: np.random.Generator
 ) -> Iterator[Case]:
     """Cases of pictures that stay as they were, whole or in part, and of the same sequences without the fault."""
     margins = loading.safety_margin
     for later in (1, 2):  # the picture stays that of an earlier frame, for longer and longer
         for old, now in zip(chosen[:-later], chosen[later:], strict=True):
             image, held_s = draw(film, old), float(loading.time_s[now] - loading.time_s[old])
-            yield judge.say(
-                image, float(margins[now]), fault="stale", strength=float(later),
-                before=[Shot(image=image, time_s=-held_s)], healthy_error=healthy[now],
-            )  # fmt: skip
+            before = [Shot(image=image, time_s=-held_s)]
+            yield judge.say(image, float(margins[now]), fault="stale", strength=float(later), before=before)
     for old, now in pairwise(chosen):
         shots, margin = film_pull(film, loading, old=old, now=now, rng=rng)
         *before, last = shots
-        as_it_is = judge.say(last.image, margin, before=before, force_n=last.force_n)
-        yield as_it_is
+        yield judge.say(last.image, margin, before=before, force_n=last.force_n)
         for fault, stop in STOPPED.items():
             for held_s in FROZEN_S:
                 *before, last = stop(shots, len(shots) - 1 - round(RATE_HZ * held_s), rng)
-                yield judge.say(
-                    last.image, margin, fault=fault, strength=held_s, before=before, force_n=last.force_n,
-                    healthy_error=as_it_is.error,
-                )  # fmt: skip
+                yield judge.say(last.image, margin, fault=fault, strength=held_s, before=before, force_n=last.force_n)
 
 
 def judge_trial(run: Network, plan: TrialPlan, *, trial: int, frames: int, other: TrialPlan) -> Iterator[Case]:
@@ -323,43 +305,37 @@ def judge_trial(run: Network, plan: TrialPlan, *, trial: int, frames: int, other
     judge, margins = Judge(run, film.draw_reference().numpy(), trial=trial), loading.safety_margin
     # the reference's own noise would be shared
     untouched = draw(film, 0)
-    chosen, healthy = touching(margins, frames), {}
+    chosen = touching(margins, frames)
     for at in chosen:
         image, margin = draw(film, at), float(margins[at])
-        as_it_is = judge.say(image, margin)
-        healthy[at] = as_it_is.error
-        yield as_it_is
+        yield judge.say(image, margin)
         for faults, seen in ((FAULTS, True), (SUDDEN, False)):
             for fault, (make, strengths) in faults.items():
                 for strength in strengths:
                     seed = int(rng.integers(2**32))
                     there, free = (make(one, strength, np.random.default_rng(seed)) for one in (image, untouched))
                     before = [Shot(image=free, time_s=-1.0)] if seen else []
-                    yield judge.say(
-                        there, margin, fault=fault, strength=strength, before=before, healthy_error=as_it_is.error
-                    )
+                    yield judge.say(there, margin, fault=fault, strength=strength, before=before)
         for share in (0.1, 0.2, 0.4):
             hidden = draw(hide_markers(film, share, rng), at)
-            yield judge.say(hidden, margin, fault="markers hidden", strength=share, healthy_error=as_it_is.error)
+            yield judge.say(hidden, margin, fault="markers hidden", strength=share)
         for later in (1, 4):
             row = int(rng.uniform(0.25, 0.75) * len(image))
             upper = draw(film, max(0, at - later))
-            yield judge.say(
-                np.concatenate([upper[:row], image[row:]]), margin, fault="torn", strength=float(later),
-                before=[Shot(image=upper, time_s=-0.03)], healthy_error=as_it_is.error,
-            )  # fmt: skip
+            torn, before = np.concatenate([upper[:row], image[row:]]), [Shot(image=upper, time_s=-0.03)]
+            yield judge.say(torn, margin, fault="torn", strength=float(later), before=before)
         for degrees in (180.0, 270.0):
             turned = replace(film, grasp=replace(film.grasp, shear_direction_rad=np.radians(degrees)))
             grasp = replace(film.grasp, normal_force_n=float(loading.normal_force_n[at]))
             pulled = draw(turned.under(load_at_margins(np.array([margin]), grasp=grasp), rng=rng), 0)
-            yield judge.say(pulled, margin, fault="pulled", strength=degrees, healthy_error=as_it_is.error)
-    yield from judge_stopped(judge, loading, film, chosen=chosen, healthy=healthy, rng=rng)
+            yield judge.say(pulled, margin, fault="pulled", strength=degrees)
+    yield from judge_stopped(judge, loading, film, chosen=chosen, rng=rng)
     for at in np.flatnonzero(~np.isfinite(margins))[:2]:
-        yield judge.say(draw(film, at), np.nan, fault="no contact", healthy_error=0.0)
+        yield judge.say(draw(film, at), np.nan, fault="no contact")
     loading, film = prepare_trial(other)
     judge = Judge(run, film.draw_reference().numpy(), trial=trial)
     for at in touching(loading.safety_margin, frames):
-        yield judge.say(draw(film, at), float(loading.safety_margin[at]), fault="another sensor", healthy_error=0.0)
+        yield judge.say(draw(film, at), float(loading.safety_margin[at]), fault="another sensor")
 
 
 def off_elsewhere(cases: list[Case], off: np.ndarray) -> np.ndarray:
@@ -374,37 +350,32 @@ def off_elsewhere(cases: list[Case], off: np.ndarray) -> np.ndarray:
 
 
 def count_withheld(cases: list[Case]) -> dict[str, object]:
-    """Shares of frames that are off, withheld, and off without being withheld, by the fault or in any case."""
-    sound = np.array([case.fault != "none" and case.healthy_error <= OFF for case in cases])
+    """Shares of frames that are off, withheld, and off without being withheld."""
     off, withheld = (np.array(values) for values in zip(*((c.error > OFF, bool(c.failed)) for c in cases), strict=True))
     return {
         "frames": len(cases),
         "off": float(off.mean()),
         "withheld": float(withheld.mean()),
         "shown_wrong_share": float((off & ~withheld).mean()),
-        "shown_caused_share": float((off & ~withheld & sound).mean()),
         "by": sorted({name for case in cases for name in case.failed}),
     }
 
 
 def summarise(cases: list[Case]) -> dict[str, object]:
-    """Ranking and withheld frames, by fault and strength."""
+    """Ranking and withheld frames, by fault."""
     off = np.array([case.error > OFF for case in cases])
     risk = np.array([margin_risk(case.checks, case.beyond) for case in cases])
     worst, known = np.array([case.worst for case in cases]), np.array([case.known for case in cases])
     told = off_elsewhere(cases, off)
-    caused = off & np.array([case.healthy_error <= OFF for case in cases])
-    by_fault, by_strength = defaultdict[str, list[Case]](list), defaultdict[str, list[Case]](list)
+    by_fault = defaultdict[str, list[Case]](list)
     for case in cases:
         by_fault[case.fault].append(case)
-        by_strength[case.name].append(case)
     kinds = np.array([case.fault for case in cases])
     healthy, faults = kinds == "none", sorted(set(kinds) - {"none"})
     return {
         "auroc": auroc(risk[off], risk[~off]),
         "auroc_worst": auroc(worst[off], worst[~off]),
         "auroc_told": auroc(told[off], told[~off]),
-        "auroc_caused": auroc(risk[caused], risk[~off]),
         "seen_by_health": {name: auroc(worst[kinds == name], worst[healthy]) for name in faults}
         | {"all": auroc(worst[~healthy], worst[healthy])},
         "seen_by_network": {name: auroc(-known[kinds == name], -known[healthy]) for name in faults}
@@ -412,7 +383,6 @@ def summarise(cases: list[Case]) -> dict[str, object]:
         "withheld_healthy": float(np.mean([bool(case.failed) for case in by_fault["none"]])),
         "off_told": float(np.mean([bool(case.failed) for case, wrong in zip(cases, off, strict=True) if wrong])),
         "by_fault": {name: count_withheld(some) for name, some in by_fault.items()},
-        "by_strength": {name: count_withheld(some) for name, some in by_strength.items()},
         "frames": len(cases),
     }  # fmt: skip
 
@@ -455,10 +425,9 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=8, help="one a day")
     parser.add_argument("--frames", type=int, default=5, help="of each trial")
     parser.add_argument("--choose", action="store_true", help="print what limits and risk are chosen from")
-    parser.add_argument("--threads", type=int, default=2, help="of torch")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    torch.set_num_threads(options.threads)
+    torch.set_num_threads(2)
     run = load(options.network)
     series = "health-choose" if options.choose else "health-test"
     pull_deg = run.manifest.pull_direction_deg

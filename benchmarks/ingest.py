@@ -2,8 +2,7 @@
 
 One simulated trial is filmed, enlarged to the camera's size and written as video with a table of what a force sensor
 saw; the folder holds it many times. Measured is all of `sliplens import DIR`: pairing, labels, frames without loss, the
-summary page, and `sliplens check`. With --sensor frames are first brought to 224 x 224, as for the shipped networks.
-`cpu_ms_per_frame` is the time of all cores, which does not depend on what else the machine does.
+summary page, and `sliplens check`. `cpu_ms_per_frame` is the time of all cores.
 """
 
 import argparse
@@ -21,7 +20,6 @@ from PIL import Image
 
 from sliplens.files import scratch_folder
 from sliplens.recordings import Recording, check_dataset, import_recordings
-from sliplens.recordings.sensor import SensorProfile
 from sliplens.report.trials import write_trials_page
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -58,10 +56,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--trials", type=int, default=100)
     parser.add_argument("--frames", type=int, default=240, help="of each trial")
-    parser.add_argument("--sensor", action="store_true", help="bring frames to 224 x 224 by a profile")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    square = SensorProfile(name="tip", camera_size_px=_SIZE, crop_px=(80, 0, 480, 480), resize_px=(224, 224))
     with scratch_folder() as scratch:
         source = scratch / "trials"
         source.mkdir()
@@ -71,7 +67,7 @@ def main() -> None:
             for suffix in ("mp4", "csv"):
                 shutil.copyfile(source / f"trial-000.{suffix}", source / f"trial-{number:03d}.{suffix}")
         begun, spent = time.perf_counter(), time.process_time()
-        data = import_recordings(source, out=scratch / "data", sensor=square if options.sensor else "tip")
+        data = import_recordings(source, out=scratch / "data", sensor="tip")
         imported = time.perf_counter()
         write_trials_page(data)
         findings = check_dataset(data)

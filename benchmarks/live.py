@@ -8,18 +8,16 @@
 `p50_ms` and `p99_ms` are from the moment a replayed frame is due to its margin, over the frames that have one, while a
 headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page shows maps,
 twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
-the end than after the first 10 seconds (or a tenth of a shorter run), `opens_s` the time from the browser's connection
-to the first picture that it has drawn, `page_ms_a_second` the processor time of the page's threads. `of_it_ms` says
-where the time of the slowest hundredth went, on average: `network` is what a frame waits for that after its checks,
-`waiting` what none of them took, `gc_ms` the longest pause of Python's garbage collector.
+the end than after the first 10 seconds (or a tenth of a shorter run), `page_ms_a_second` the processor time of the
+page's threads. `of_it_ms` is the mean time of each part over the slowest hundredth of the frames: `network` is what a
+frame waits for that after its checks, `waiting` what none of them took.
 
 `--ratios` compares ways to read, without a page: readers take turns, frame by frame, so that whatever else the machine
 does hits all alike. `p50_ratios` and `p99_ratios` are of `chromatouch-pair` over `chromatouch-difference`, as they come
-(112 and 224 px), both at 224 px, and both told a range of friction, and of frames in order over one by one.
+(112 and 224 px), both at 224 px, both given a range of friction, and of frames in order over one by one.
 """
 
 import argparse
-import gc
 import json
 import os
 import shutil
@@ -29,7 +27,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
@@ -55,43 +53,6 @@ WARM_S = 2.0
 OPENS_S = 120.0
 """Time within which a browser opens the page, however busy the machine."""
 PARTS = ("waiting", "decode", "checks", "encode", "network")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Latencies:
-    """What a run of the loop measured."""
-
-    engine: str
-    total_ms: np.ndarray
-    """Of each frame that has a margin."""
-    parts_ms: np.ndarray
-    """Of the same, by `PARTS`."""
-    readings: int
-    """Frames that were read, with a margin or without."""
-    drops: int
-    memory_growth_mb: float
-    gc_ms: float
-    pictures: int
-    """Pictures that the page had drawn."""
-    maps: int
-    page_ms_a_second: float
-    """Processor time of the page's threads."""
-    opens_s: float
-    """Time from the browser's connection to its first picture; infinite without a page."""
-
-
-class TimedPage(LivePage):
-    """Page that times how long its first viewer takes to draw a picture."""
-
-    asked_s = opens_s = np.inf
-
-    def look(self, *, maps: bool) -> None:
-        """Switch the viewers' maps on or off, and time the first picture."""
-        for viewer in tuple(self.feed.clients):
-            self.asked_s = min(self.asked_s, time.monotonic())
-            viewer.shows_map = maps
-            if np.isinf(self.opens_s) and viewer.answered > 0:
-                self.opens_s = time.monotonic() - self.asked_s
 
 
 def page_s() -> float:
@@ -134,27 +95,9 @@ def browser(address: str) -> Iterator[None]:
                 process.terminate()
 
 
-class Pauses:
-    """Longest pause of the garbage collector since it was entered."""
-
-    def __enter__(self) -> "Pauses":
-        self.longest_ms = self._begun = 0.0
-        gc.callbacks.append(self._take)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        gc.callbacks.remove(self._take)
-
-    def _take(self, phase: str, _: dict[str, int]) -> None:
-        if phase == "start":
-            self._begun = time.perf_counter()
-        else:
-            self.longest_ms = max(self.longest_ms, 1e3 * (time.perf_counter() - self._begun))
-
-
 def measure(
     frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, maps: bool
-) -> Latencies:
+) -> dict[str, object]:
     """Read a repeated grip for a while, with a page or without, and maps on it or not."""
     network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
     source = ReplaySource(open_source(frames)[0], rate_hz=RATE_HZ, repeat=True)
@@ -188,13 +131,13 @@ def measure(
     pictures, explained, spent_s = set[int](), set[int](), 0.0
     with ExitStack() as stack:
         stack.enter_context(reader)
-        page = stack.enter_context(TimedPage(reader, port=0)) if shown else None
+        page = stack.enter_context(LivePage(reader, port=0)) if shown else None
         if page is not None:
             stack.enter_context(browser(page.address))
-        pauses = stack.enter_context(Pauses())
         for reading in reader.readings():
             if page is not None:
-                page.look(maps=maps)
+                for viewer in tuple(page.feed.clients):
+                    viewer.shows_map = maps
                 pictures |= set() if page.feed.picture is None else {page.feed.picture.frame.number}
                 explained |= set() if page.feed.map is None else {page.feed.map.facts.number}
             if np.isinf(begins_s[0]) and (page is None or page.feed.picture is not None):
@@ -211,19 +154,28 @@ def measure(
     if not len(rows):
         raise SystemExit(f"no frame had a margin, so there is nothing to measure; the last: {last[0]}")
     memory_mb = memory_mb[memory_mb >= 0]
-    return Latencies(
-        engine=engine,
-        total_ms=rows[:, 0],
-        parts_ms=rows[:, 1:],
-        readings=kept[0],
-        drops=dropped[1] - dropped[0],
-        memory_growth_mb=memory_mb[-1] - memory_mb[0] if len(memory_mb) else 0.0,
-        gc_ms=pauses.longest_ms,
-        pictures=len(pictures),
-        maps=len(explained),
-        page_ms_a_second=1e3 * spent_s / seconds,
-        opens_s=np.inf if page is None else page.opens_s,
+    return {
+        **summarise(rows[:, 0], rows[:, 1:]),
+        "drops": dropped[1] - dropped[0],
+        "memory_growth_mb": round(float(memory_mb[-1] - memory_mb[0]), 1) if len(memory_mb) else 0.0,
+        "readings": kept[0],
+        "with_a_margin": len(rows),
+        "page_ms_a_second": round(1e3 * spent_s / seconds, 1) if shown else None,
+        "pictures": len(pictures),
+        "maps": len(explained),
+        "engine": engine,
+    }
+
+
+def summarise(total_ms: np.ndarray, parts_ms: np.ndarray) -> dict[str, object]:
+    """Return quantiles of the latency, the medians of its parts, and their means over the slowest hundredth."""
+    slowest = total_ms >= np.quantile(total_ms, 0.99)
+    medians, of_slowest = (
+        {name: round(float(value), 2) for name, value in zip(PARTS, values, strict=True)}
+        for values in (np.median(parts_ms, axis=0), parts_ms[slowest].mean(axis=0))
     )
+    p50_ms, p99_ms = np.quantile(total_ms, (0.5, 0.99)).round(2).tolist()
+    return {"p50_ms": p50_ms, "p99_ms": p99_ms, "parts_ms": medians, "of_it_ms": of_slowest}
 
 
 class TurnSource(LiveSource):
@@ -311,44 +263,17 @@ def compare_ways(frames: np.ndarray, untouched: np.ndarray, *, rounds: int) -> d
     return {**result, "rounds": rounds, "with_a_margin": len(next(iter(totals_ms.values())))}
 
 
-def slowest_parts_ms(latencies: Latencies) -> dict[str, float]:
-    """Mean time of each part over the slowest hundredth of the frames."""
-    slowest = latencies.total_ms >= np.quantile(latencies.total_ms, 0.99)
-    means = latencies.parts_ms[slowest].mean(axis=0)
-    return {name: round(float(value), 1) for name, value in zip(PARTS, means, strict=True)}
-
-
 def measure_pace(
     frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool
 ) -> dict[str, object]:
-    """Latencies at the camera's pace, with a page open or not."""
-    begun = time.monotonic()
+    """Measure latencies at the camera's pace, with a page open or not, and with maps on it."""
     measured = partial(measure, frames, untouched, network=network, shown=shown)
-    alone = measured(seconds=seconds, maps=False)
-    beside = measured(seconds=max(5.0, seconds / 10), maps=True) if shown else None
-    median_ms = np.median(alone.parts_ms, axis=0)
-    return {
-        "p50_ms": round(float(np.median(alone.total_ms)), 2),
-        "p99_ms": round(float(np.quantile(alone.total_ms, 0.99)), 2),
-        "p99_ms_with_maps": None if beside is None else round(float(np.quantile(beside.total_ms, 0.99)), 2),
-        "drops": alone.drops,
-        "memory_growth_mb": round(alone.memory_growth_mb, 1),
-        "seconds": seconds,
-        "readings": alone.readings,
-        "with_a_margin": len(alone.total_ms),
-        **{f"{name}_ms": round(float(value), 2) for name, value in zip(PARTS, median_ms, strict=True)},
-        "of_it_ms": slowest_parts_ms(alone),
-        "of_it_ms_with_maps": None if beside is None else slowest_parts_ms(beside),
-        "drops_with_maps": None if beside is None else beside.drops,
-        "gc_ms": round(alone.gc_ms, 1),
-        "page_ms_a_second": round(alone.page_ms_a_second, 1) if shown else None,
-        "page_ms_a_second_with_maps": None if beside is None else round(beside.page_ms_a_second, 1),
-        "opens_s": round(alone.opens_s, 2) if shown else None,
-        "pictures": alone.pictures,
-        "maps": None if beside is None else beside.maps,
-        "engine": alone.engine,
-        "took_s": round(time.monotonic() - begun, 1),
-    }
+    found = {**measured(seconds=seconds, maps=False), "seconds": seconds}
+    if shown:
+        beside = measured(seconds=max(5.0, seconds / 10), maps=True)
+        found |= {f"{name}_with_maps": beside[name] for name in ("p99_ms", "of_it_ms", "drops", "page_ms_a_second")}
+        found["maps"] = beside["maps"]
+    return found
 
 
 def main() -> None:

@@ -3,8 +3,7 @@
 The trials are of days, sensors, frictions and seeds of their own (a series of its own is drawn into every seed, and the
 seeds are checked against those of the trainings and of the other sets): 120 days, three dry trials each (friction 0.5
 to 1.2 by day) and three wet ones (0.15 to 0.7, drifting). Variants are compared with `--set selection`, on 40 other
-days; the test is for the one that was chosen. `--set first-test` has the 40 days that were the test before it; whatever
-was chosen since knows what earlier networks read on them.
+days; the test is for the one that was chosen.
 
 `--against` names another network: what the first is ahead in R2, the days resampled together.
 
@@ -13,15 +12,12 @@ What is told: nothing; the static friction of each trial, exactly; a number that
 a place, force and stretch of its own; the network reads F_t / F_n in five frames of the last 0.2 s before the slip,
 whose time is the true one. The friction of both grasps lies within a tenth of the object's: so the dry trials of a
 day are drawn, and the spread is the very one that `Friction.from_slips` expects. Wet trials are drawn each with a
-friction of its own, and are given an earlier grasp as if they were of one such object. `--grasp-spread` has the earlier
-grasp differ by more, with the usual spread expected (`one_slip_unlike`) and with the true one (`one_slip_unlike_told`).
+friction of its own, and are given an earlier grasp as if they were of one such object.
 
 `several`, of a network that was taught to: all frames of a trial are read in order. Its pulls are varied (0.8 to 8 s,
 with rests, jerks and lettings back), so that no sequence reads the clock, and `one_of_several` has the same frames one
 by one. `several_gain` is what the first is ahead of the second, resampled together; of fast pulls, which last less than
 3 s from the first tug to the slip, and of slow ones too.
-
-`--directions` pulls the same trials to the right (0 degrees), down (90), to the left and up.
 
 `--known` asks instead how far the network knows frames of its own kind of sensor and of others, on days of their own.
 
@@ -55,18 +51,18 @@ TRIALS, FRAMES, DRAWN = 3, 40, 10
 """Trials of a day and condition; frames of a trial, and how many of them with contact are drawn."""
 SETS = {
     "test": ("networks, second test", 120),
-    "first-test": ("networks, test", 40),
     "selection": ("networks, selection", 40),
 }
 """Series of their own, and days."""
-DRAWS = {"test": 23, "first-test": 20, "selection": 21}
+FIRST_TEST = ("networks, test", 40)
+"""Test of earlier networks, which no set may share."""
+DRAWS = {"test": 23, "selection": 21}
 """Seeds of which frames are drawn, and of earlier grasps."""
 BEFORE_SLIP, RATE_HZ, TRIAL_S = 5, 30, 8
 WITHIN = 0.1
 FAST_S = 3.0
 """A pull that lasts less is fast: about half of the varied ones."""
 KNOWN_DAYS = 10
-DIRECTIONS_DEG = (0, 90, 180, 270)
 RESAMPLES = 2000
 
 
@@ -77,15 +73,10 @@ class Seen:
     inputs: torch.Tensor
     margin: Float[np.ndarray, " frames"]
     ratio: Float[np.ndarray, " frames"]
-    pulled: np.ndarray
-    """Whether the contact was pulled: frames before are read at once, by anyone."""
 
 
-def fresh_days(series: str, days: int, *, pull_deg: float = 90.0) -> SimulationRecipe:
-    """Days to test on, in a series of their own: series share no day, sensor or trial.
-
-    `pull_deg`: direction of the pulls in the image, within 15 degrees; 90 is down. Nothing else depends on it.
-    """
+def fresh_days(series: str, days: int) -> SimulationRecipe:
+    """Return days to test on, in a series of their own: series share no day, sensor or trial."""
     return replace(
         PRESETS["varied"],
         series=series,
@@ -94,13 +85,13 @@ def fresh_days(series: str, days: int, *, pull_deg: float = 90.0) -> SimulationR
         test_days=days,
         dry_trials=TRIALS * (days + 1),
         wet_trials=TRIALS * days,
-        nuisances=Nuisances(shear_direction_deg=(pull_deg - 15, pull_deg + 15)),
+        nuisances=Nuisances(shear_direction_deg=(75.0, 105.0)),
     )
 
 
-def plans_of_set(name: str, *, trials: int | None, pull_deg: float = 90.0) -> list[TrialPlan]:
+def plans_of_set(name: str, *, trials: int | None) -> list[TrialPlan]:
     """Trials of a set, or about so many of them."""
-    plans = [plan for plan in plan_trials(fresh_days(*SETS[name], pull_deg=pull_deg)) if plan.split == "test"]
+    plans = [plan for plan in plan_trials(fresh_days(*SETS[name])) if plan.split == "test"]
     require_disjoint(plans)
     if trials:  # of both conditions, which stand in groups of a day
         plans = sorted(plans, key=lambda plan: plan.condition)[:: max(1, len(plans) // trials)]
@@ -125,7 +116,7 @@ def require_disjoint(plans: Sequence[TrialPlan]) -> None:
         PRESETS["thesis"],
         PRESETS["small"],
     ]
-    for recipe in [*trained, *(fresh_days(*one) for one in SETS.values())]:
+    for recipe in [*trained, *(fresh_days(*one) for one in (*SETS.values(), FIRST_TEST))]:
         if recipe.series and recipe.series == plans[0].recipe.series:
             continue
         theirs = plan_trials(recipe)
@@ -163,7 +154,6 @@ def draw(run: Network, plan: TrialPlan, *, rng: np.random.Generator, before_slip
         inputs=run.encode(frames, reference),
         margin=loading.safety_margin[at],
         ratio=loading.tangential_force_n[at] / loading.normal_force_n[at],
-        pulled=loading.safety_margin[at] < 1,
     )
 
 
@@ -218,7 +208,6 @@ class Read:
     ratio: Float[np.ndarray, " frames"]
     day: Int[np.ndarray, " frames"]
     wet: Bool[np.ndarray, " frames"]
-    pulled: Bool[np.ndarray, " frames"]
 
     def answers(self, name: str) -> Float[np.ndarray, " frames"]:
         """Margins where so much is told."""
@@ -229,7 +218,7 @@ def read_frames(run: Network, name: str, *, trials: int | None = None) -> Read:
     """Read a few frames of each trial of a set, told more or less of its friction."""
     rng = np.random.default_rng(DRAWS[name])
     told: dict[str, list[Estimate]] = {}
-    truth, ratios, days, wet, pulled = [], [], [], [], []
+    truth, ratios, days, wet = [], [], [], []
     for plan in plans_of_set(name, trials=trials):
         seen, friction = draw(run, plan, rng=rng), friction_of(plan)
         untold = run.estimate(seen.inputs)
@@ -252,11 +241,10 @@ def read_frames(run: Network, name: str, *, trials: int | None = None) -> Read:
             told.setdefault(what, []).append(estimate)
         truth.append(seen.margin)
         ratios.append(seen.ratio)
-        pulled.append(seen.pulled)
         days.append(np.full(len(seen.margin), plan.day))
         wet.append(np.full(len(seen.margin), plan.condition == "wet"))
-    margin, ratio, day, is_wet, is_pulled = map(np.concatenate, (truth, ratios, days, wet, pulled))
-    return Read(told=told, margin=margin, ratio=ratio, day=day, wet=is_wet, pulled=is_pulled)
+    margin, ratio, day, is_wet = map(np.concatenate, (truth, ratios, days, wet))
+    return Read(told=told, margin=margin, ratio=ratio, day=day, wet=is_wet)
 
 
 def summarise(read: Read) -> dict[str, Any]:
@@ -275,8 +263,6 @@ def summarise(read: Read) -> dict[str, Any]:
         for name, estimates in read.told.items():
             answer, key = read.answers(name), f"{name}_r2_{condition}"
             found |= r2_over_days(key, read.margin[rows], answer[rows], read.day[rows])
-            some = rows & read.pulled
-            found[f"{key}_pull_alone"] = r2(read.margin[some], answer[some])
             found[f"{name}_in_90_{condition}"] = held(read.margin, [one.interval(0.9) for one in estimates], rows)
     return found
 
@@ -364,15 +350,9 @@ def summarise_sequences(read: Sequence[Followed]) -> dict[str, Any]:
         some = [one for one in read if one.wet == wet]
         margin, day = joined(some, lambda one: one.margin), joined(some, lambda one: one.day)
         one, several = joined(some, lambda one: one.one), joined(some, lambda one: one.several)
-        slipped = joined(some, lambda one: np.cumsum(one.margin == 0) > 0)
         fast = joined(some, lambda one: one.pull_s < FAST_S)
         for name, answer in (("one_of_several", one), ("several", several)):
-            key = f"{name}_r2_{condition}"
-            found |= r2_over_days(key, margin, answer, day)
-            pulled = (margin < 1) & ~slipped
-            found[f"{key}_before_slip"] = r2(margin[pulled], answer[pulled])
-            for when, rows in (("before", ~slipped), ("after", slipped)):
-                found[f"{name}_rmse_{condition}_{when}_slip"] = float(np.sqrt(np.mean((answer - margin)[rows] ** 2)))
+            found |= r2_over_days(f"{name}_r2_{condition}", margin, answer, day)
         found[f"several_in_90_{condition}"] = float(joined(some, lambda one: one.in_90).mean())
         found[f"fast_trials_{condition}"] = sum(each.pull_s < FAST_S for each in some)
         for speed, rows in (("", np.ones(len(day), dtype=bool)), ("_fast", fast), ("_slow", ~fast)):
@@ -410,25 +390,6 @@ def measure_known(run: Network, *, trials: int | None = None) -> dict[str, Any]:
     return found
 
 
-def measure_directions(run: Network, name: str, *, trials: int | None = None) -> dict[str, Any]:
-    """R2 of one frame where the same trials are pulled in each direction, and the largest difference between two."""
-    scores: dict[str, Any] = {}
-    for pull_deg in DIRECTIONS_DEG:
-        rng, plans = np.random.default_rng(DRAWS[name]), plans_of_set(name, trials=trials, pull_deg=pull_deg)
-        seen = [draw(run, plan, rng=rng) for plan in plans]
-        margin = np.concatenate([one.margin for one in seen])
-        answer = np.concatenate([run.estimate(one.inputs).margin for one in seen])
-        rows = {"dry": [plan.condition == "dry" for plan in plans], "wet": [plan.condition == "wet" for plan in plans]}
-        for condition, chosen in rows.items():
-            of = np.repeat(chosen, [len(s.margin) for s in seen])
-            days = np.repeat([plan.day for plan in plans], [len(s.margin) for s in seen])
-            scores |= r2_over_days(f"pull_{pull_deg}_r2_{condition}", margin[of], answer[of], days[of])
-    for condition in ("dry", "wet"):
-        each = [scores[f"pull_{pull_deg}_r2_{condition}"] for pull_deg in DIRECTIONS_DEG]
-        scores[f"pull_spread_{condition}"] = max(each) - min(each)
-    return scores
-
-
 def main() -> None:
     """Print what was measured as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -438,16 +399,11 @@ def main() -> None:
     parser.add_argument("--trials", type=int, help="about so many trials, for a quick look")
     parser.add_argument("--sequences", action="store_true", help="only what several frames tell")
     parser.add_argument("--known", action="store_true", help="only how far it knows its own kind of sensor, and others")
-    parser.add_argument("--directions", action="store_true", help="only R2 by the direction of the pull")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     run, other = load(options.run), options.against and load(options.against)
     found: dict[str, Any] = {"weights_sha256": run.manifest.weights_sha256}
     chosen = {"name": options.set, "trials": options.trials}
-    if options.directions:
-        found |= {"set": options.set} | measure_directions(run, **chosen)
-        print(json.dumps(found, indent=None if options.json else 2))
-        return
     found |= measure_known(run, trials=options.trials) if options.known else {"set": options.set}
     if not (options.known or options.sequences):
         read = read_frames(run, **chosen)

@@ -33,14 +33,14 @@ from sliplens.models.onnx import difference
 from sliplens.recordings.source import open_source
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
-WARM_UP = 5
+WARM_UP, SIZE_PX = 5, 224
 
 
-def build(*, size: int, head: str) -> Network:
-    """Make an untrained network whose batch normalisation has seen images, and whose answers vary with them."""
+def build() -> Network:
+    """Make an untrained network with batch statistics of images, whose predictions vary."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        model = build_model(head=head)
+        model = build_model(head="histogram")
     for one in model.modules():
         if isinstance(one, nn.BatchNorm2d):
             one.momentum = None  # the true statistics; a few steps towards them would let the signal die
@@ -52,11 +52,11 @@ def build(*, size: int, head: str) -> Network:
     manifest = Manifest(
         backbone="shufflenet_v2_x1_0",
         input="difference",
-        image_size=size,
-        frame_size=(size, size),
+        image_size=SIZE_PX,
+        frame_size=(SIZE_PX, SIZE_PX),
         sensor="none",
         data_hash="none",
-        head=head,
+        head="histogram",
     )
     model = model.to(memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
     return Network(model=model, manifest=manifest)
@@ -68,22 +68,17 @@ def clouds(count: int, *, size: int, seed: int) -> Tensor:
     return functional.interpolate(colours, size=(size, size), mode="bilinear")
 
 
-def make_ready(
-    names: Sequence[str], trained: Network, inputs: Tensor
-) -> tuple[dict[str, Engine], dict[str, float], dict[str, str]]:
-    """Engines that can be used here, the seconds until each has answered once, and why the others cannot."""
-    engines, seconds, missing = {}, {}, {}
-    for name in names:
-        start = time.perf_counter()
+def make_ready(trained: Network, inputs: Tensor) -> tuple[dict[str, Engine], dict[str, str]]:
+    """Return the engines that can be used here, and why the others cannot."""
+    engines, missing = {}, {}
+    for name in ENGINES:
         try:
             engines[name] = make_engine(name, trained, batch_size=1, streams=1)
             engines[name].estimate(trained, inputs)
         except SliplensError as error:
             missing[name] = str(error)
             engines.pop(name, None)
-            continue
-        seconds[name] = time.perf_counter() - start
-    return engines, seconds, missing
+    return engines, missing
 
 
 def time_rounds(work: dict[str, Callable[[], object]], *, rounds: int, warm_up: int = WARM_UP) -> dict[str, np.ndarray]:
@@ -132,36 +127,26 @@ def time_calls(engines: Sequence[str], *, frames: int, rounds: int) -> dict[str,
     return {engine: {name: 1e3 * frames / ms for name, ms in times.items()} for engine, times in calls.items()}
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main() -> None:
     """Run the benchmark from the command line."""
-    parser = argparse.ArgumentParser(description="Time the inference engines side by side.")
-    parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=300, help="timed calls of each engine")
-    parser.add_argument("--size", type=int, default=224, help="height and width of the network's input in pixels")
-    parser.add_argument("--head", choices=("point", "histogram"), default="histogram")
-    parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", action="store_true", help="end with one line of JSON")
-    options = parser.parse_args(arguments)
-    torch.set_num_threads(options.threads)
-    trained = build(size=options.size, head=options.head)
-    inputs = clouds(8, size=options.size, seed=3)
-    engines, ready_s, missing = make_ready(options.engines, trained, inputs[:1])
-    load = [os.getloadavg()[0]]
+    options = parser.parse_args()
+    torch.set_num_threads(2)
+    trained, inputs = build(), clouds(8, size=SIZE_PX, seed=3)
+    engines, missing = make_ready(trained, inputs[:1])
     work: dict[str, Callable[[], object]] = {
         name: partial(engine.estimate, trained, inputs[:1]) for name, engine in engines.items()
     }
     times = time_rounds(work, rounds=options.rounds)
-    load.append(os.getloadavg()[0])
     fps = time_calls(list(engines), frames=120, rounds=max(1, options.rounds // 20))
     plain = make_engine("torch", trained, batch_size=1, streams=1)
     result = {
         "p50_ms": {name: float(np.percentile(values, 50)) for name, values in times.items()},
         "p99_ms": {name: float(np.percentile(values, 99)) for name, values in times.items()},
         "parity": {name: parity(trained, engine, plain, inputs) for name, engine in engines.items()},
-        "fastest": min(times, key=lambda name: float(np.median(times[name]))),
-        "ready_s": ready_s,
         "missing": missing,
-        "margin_sd": float(plain.estimate(trained, inputs).margin.std()),
         "fps": {
             engine: {name: float(np.median(values)) for name, values in own.items()} for engine, own in fps.items()
         },
@@ -169,11 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             engine: {name: float(np.median(own[one] / own[other])) for name, (one, other) in RATIOS.items()}
             for engine, own in fps.items()
         },
-        "load_average": load,
-        "rounds": options.rounds,
-        "size": options.size,
-        "head": options.head,
-        "threads": options.threads,
+        "load_average": os.getloadavg()[0],
         "machine": machine(),
         "versions": versions(),
     }

@@ -101,7 +101,7 @@ def resample(networks: Sequence[ScoredFrames], *, wet: bool) -> Iterator[float]:
 
 
 def test_r2(networks: Sequence[ScoredFrames]) -> dict[str, Any]:
-    """R2 over all test days, its interval, and that of each network and day."""
+    """R2 over all test days, its interval, and that of each network."""
     found: dict[str, Any] = {}
     for condition in ("dry", "wet"):
         rows = np.flatnonzero(networks[0].condition == condition)
@@ -110,10 +110,6 @@ def test_r2(networks: Sequence[ScoredFrames]) -> dict[str, Any]:
         found[condition] = float(np.mean(each))
         found[f"{condition}_low"], found[f"{condition}_high"] = np.quantile(drawn, [0.025, 0.975]).tolist()
         found[f"{condition}_networks"] = each
-        found[f"{condition}_days"] = {
-            int(day): float(np.mean([r2(one, rows[one.day[rows] == day]) for one in networks]))
-            for day in np.unique(networks[0].day[rows])
-        }
     return found
 
 
@@ -131,26 +127,20 @@ def close_trials(frames: ScoredFrames) -> set[str]:
 
 def measure(work: Path, data: Dataset, options: argparse.Namespace) -> dict[str, Any]:
     """Predict test and training trials by every network there is."""
-    scores: dict[str, Any] = {"r2": {}, "train_mse": {}, "train_trials_within_3": {}, "epochs": {}}
+    scores: dict[str, Any] = {"r2": {}, "train_mse": {}, "train_trials_within_3": {}}
     within: dict[int, list[set[str]]] = {}
     for name in options.inputs:
         networks = []
         for seed in options.seeds:
             run = sl.load(work / f"{name}-{seed}")
             progress = None if options.json else Terminal()
-            evaluations = {split: sl.evaluate(run, data, split=split, on_progress=progress) for split in options.sets}
-            if "test" in evaluations:
-                networks.append(evaluations["test"].predictions)
-            if "train" in evaluations:
-                seen = evaluations["train"].predictions
-                close = close_trials(seen)
-                within.setdefault(seed, []).append(close)
-                scores["train_mse"][f"{name}-{seed}"] = float(np.mean((seen.prediction - seen.safety_margin) ** 2))
-                scores["train_trials_within_3"][f"{name}-{seed}"] = len(close)
-            if run.training is not None:
-                scores["epochs"][f"{name}-{seed}"] = [run.training.epochs, run.training.minutes]
-        if networks:
-            scores["r2"][name] = test_r2(networks)
+            networks.append(sl.evaluate(run, data, split="test", on_progress=progress).predictions)
+            seen = sl.evaluate(run, data, split="train", on_progress=progress).predictions
+            close = close_trials(seen)
+            within.setdefault(seed, []).append(close)
+            scores["train_mse"][f"{name}-{seed}"] = float(np.mean((seen.prediction - seen.safety_margin) ** 2))
+            scores["train_trials_within_3"][f"{name}-{seed}"] = len(close)
+        scores["r2"][name] = test_r2(networks)
     scores["train_trials_within_3"] |= {
         f"both-{seed}": len(set.intersection(*sets)) for seed, sets in within.items() if len(sets) > 1
     }
@@ -164,7 +154,6 @@ def main() -> None:
     parser.add_argument("--train", action="store_true")
     parser.add_argument("--inputs", nargs="+", default=["difference", "raw"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2], help="of the networks")
-    parser.add_argument("--sets", nargs="+", default=["train", "test"], choices=["train", "validation", "test"])
     parser.add_argument("--data-seed", type=int, default=0)
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--optimizer", default="adamw", choices=["adamw", "ranger21"])

@@ -3,14 +3,12 @@
     python benchmarks/start.py --json
 
 Each command runs in a process of its own, as a user types it, on five images that are drawn here. `predict_s` and
-`refused_s` end with the process, `explain_first_s` when the first picture of a map is on disk. `cpu_predict_s` is the
-processor time of the prediction: on a machine that others use too it says more than the clock.
+`refused_s` end with the process, `explain_first_s` when the first picture of a map is on disk.
 """
 
 import argparse
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -41,10 +39,7 @@ def measure(folder: Path) -> dict[str, float]:
     network = "chromatouch-difference"
     run("--version")  # what lies on disk is then in memory, as after any first command
     predict = ("predict", network, str(images))
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     numbers = {"predict_s": run(*predict, "-o", str(folder / "margins.csv"))}
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    numbers["cpu_predict_s"] = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     numbers["refused_s"] = run(*predict, "-o", str(folder / "margins.txt"), code=2)
     maps = folder / "maps"
     numbers["explain_first_s"] = first_picture(maps, "explain", network, "--frames", str(images), "-o", str(maps))

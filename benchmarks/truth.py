@@ -6,8 +6,8 @@ trials. A method is recommended where it leads every control and every other met
 of the best method over Integrated Gradients and occlusion by marker. With networks and data of a second set
 (`--second-network`, `--second-data`) the whole is done once more and the verdicts are compared.
 
-Data are simulated with the preset `thesis` where none are named; the second set is then of four later days of the same
-sensor. Each network's study can be interrupted and continues where it stopped (`--keep`).
+Data are simulated with the preset `thesis` where none are named. Each network's study can be interrupted and continues
+where it stopped (`--keep`).
 """
 
 import argparse
@@ -34,8 +34,6 @@ from sliplens.results.study import RIVALS, NeutralScores, Study, StudyConfig
 from sliplens.simulation import simulate
 from sliplens.study.run import run_study
 
-LATER: dict[str, Any] = {"dry_trials": 32, "wet_trials": 8, "days": 8, "test_days": 4}
-"""Days 5 to 8 of the preset's sensor, which has four."""
 ORACLES = ("oracle", "degraded-oracle")
 
 
@@ -57,25 +55,19 @@ def each_round(networks: Sequence[Network]) -> Iterator[list[Network]]:
 
 
 def judge_networks(
-    names: Sequence[str], data: Dataset | None, folder: Path, *, days: dict[str, Any], options: argparse.Namespace
+    names: Sequence[str], data: Path | None, folder: Path, *, options: argparse.Namespace
 ) -> list[Study]:
     """Study the explanations of all networks on the same trials, those of the preset if `data` is None."""
-    terminal = Terminal()
+    terminal, frames = Terminal(), options.frames_per_trial
     if data is None:
-        stored, frames = folder / "data", options.frames_per_trial
-        data = (
-            load_dataset(stored)
-            if stored.exists()
-            else simulate(
-                stored, preset="thesis", frames_per_trial=frames, seed=options.seed, on_progress=terminal, **days
-            )
-        )
-    data = test_trials(data, a_day=options.trials_a_day)
+        data = folder / "data"
+        simulate(data, preset="thesis", frames_per_trial=frames, on_progress=terminal)
+    trials = test_trials(load_dataset(data), a_day=options.trials_a_day)
     return [
         run_study(
-            data,
+            trials,
             some,
-            StudyConfig(trials=options.trials or len(data.trials), tests=("truth",)),
+            StudyConfig(trials=options.trials or len(trials.trials), tests=("truth",)),
             out=folder / f"study-{number}",
             on=options.on,
             on_progress=terminal,
@@ -146,8 +138,7 @@ def main() -> None:
     parser.add_argument("--network", nargs="+", default=default, help="networks, several an input: folders or names")
     parser.add_argument("--data", type=Path, help="data set of the networks' sensor; simulated if left out")
     parser.add_argument("--second-network", nargs="+", default=[], help="networks of the second set")
-    parser.add_argument("--second-data", type=Path, help="data set of the second set; simulated if left out")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the simulated trials")
+    parser.add_argument("--second-data", type=Path, help="data set of the second set")
     parser.add_argument("--trials-a-day", type=int, help="dry test trials of each day; all if left out")
     parser.add_argument("--trials", type=int, help="trials of all days, those that qualify first; all if left out")
     parser.add_argument("--frames-per-trial", type=int, default=80)
@@ -155,14 +146,10 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="folder to keep data and studies in, and to continue from")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
-    sets = [(options.network, options.data, "1", {}), (options.second_network, options.second_data, "2", LATER)]
+    sets = [(options.network, options.data, "1"), (options.second_network, options.second_data, "2")]
     with tempfile.TemporaryDirectory() as scratch:
         work = options.keep or Path(scratch)
-        judged = [
-            judge_networks(names, data and load_dataset(data), work / folder, days=days, options=options)
-            for names, data, folder, days in sets
-            if names
-        ]
+        judged = [judge_networks(names, data, work / folder, options=options) for names, data, folder in sets if names]
     result = {}
     for name in sorted({name for study in judged[0] for name in study.truth}):
         first, *others = [pool(studies, name) for studies in judged if any(name in study.truth for study in studies)]

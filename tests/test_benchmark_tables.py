@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).parents[1]
-NO_FIGURES = {"fairness", "contact_events"}
+NO_FIGURES = {"contact_events"}
 """What the scripts share; they measure nothing."""
 
 
