@@ -242,7 +242,6 @@ def hand():
     ("messages", "told"),
     [
         ("gripper-command", [("hand/command", 0.0, 1.25), ("hand/command", 0.0, 0.01)]),
-        ("numbers", [("hand/force", 1.25), ("hand/force", 0.0)]),
         ("controllers", [("hand/effort_controller/commands", [value]) for value in (1.25, 0.0)]),
     ],
 )

@@ -276,7 +276,6 @@ def test_a_hold_is_kept_and_no_other_takes_its_place(tmp_path: Path):
         ),
         ({"gripper": "simulated"}, "`simulated` is the gripper of the source `grip`; a finger has none"),
         ({"gripper": "/dev/no-such-device"}, "no serial device"),
-        ({"network": "chromatouch-difference"}, "a reader has its own network"),
         ({"seconds": 0.0}, "seconds must be positive"),
         ({"ceiling_n": -1.0}, "the ceiling of a guarded gripper must be positive"),
     ],

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lying_gripper import CEILING_N, LIES, WIRE, hold
 
-from sliplens.grip.controllers import CONTROLLERS, FRICTION_CONSTANTS, Holder, MarginLaw, Observation
+from sliplens.grip.controllers import CONTROLLERS, Holder, MarginLaw, Observation
 from sliplens.grip.plant import PERIOD_S
 from sliplens.live.reading import Reading, SlipState
 
@@ -136,12 +136,12 @@ def test_time_begins_at_the_touch_and_what_a_slow_gripper_missed_is_not_made_up_
 def test_laws_aim_at_the_margin_itself_as_soon_as_readings_know_the_friction():
     holder, now_s = holder_of("margin")
     read = MarginLaw.zero + (1 - MarginLaw.zero) * MarginLaw.target  # of which MarginLaw.target is left beyond r_0
-    for friction, aim in (("0.6", FRICTION_CONSTANTS["target"]), (None, read)):
+    for friction, aim in (("0.6", 0.6), (None, read)):
         holder.update_reading(reading_of(0.7, friction=friction), taken_s=now_s)
         assert f"aims at a margin of {100 * aim:.0f} %" in holder.grip_force(now_s, 2.0).why
     holder.update_reading(reading_of(None, friction=None), taken_s=now_s)  # withheld: no news of the friction
     holder.update_reading(reading_of(0.7, friction="0.6"), taken_s=now_s)
-    assert f"aims at a margin of {100 * FRICTION_CONSTANTS['target']:.0f} %" in holder.grip_force(now_s, 2.0).why
+    assert "aims at a margin of 60 %" in holder.grip_force(now_s, 2.0).why
 
 
 def test_what_a_slip_teaches_of_the_friction_makes_no_law_forget_the_slip():
@@ -150,7 +150,7 @@ def test_what_a_slip_teaches_of_the_friction_makes_no_law_forget_the_slip():
     pressed = holder.grip_force(now_s, 2.0)
     assert pressed.slip
     loosened = {}
-    for after_s in (0.1, MarginLaw.calm_s + 0.1):
+    for after_s in (0.1, 1.1):
         holder.update_reading(reading_of(0.95, friction="0.6"), taken_s=now_s + after_s)
         answer = holder.grip_force(now_s + after_s, pressed.command_n)
         loosened[after_s] = answer.command_n < pressed.command_n

@@ -117,7 +117,7 @@ def adapt(command: Command) -> tuple[Callable[..., object], list[str]]:
     for hint in [hint for hint in hints.values() if get_origin(hint) is Unpack]:
         hints |= get_type_hints(get_args(hint)[0])
     further = _options(command.run, further=True)
-    options = sorted((*_options(function), *further), key=lambda option: not option.positional)
+    options = sorted((*_options(function), *further), key=lambda option: 2 - option.further if option.positional else 3)
     by_name = {option.name: option for option in options}
 
     def call(*positional: object, **values: object) -> None:
@@ -164,8 +164,6 @@ def _options(function: Callable[..., object], *, further: bool = False) -> list[
                 positional=parameter.kind is Parameter.POSITIONAL_OR_KEYWORD,
                 further=further,
             )
-        elif default is Parameter.empty:
-            raise TypeError(f"{function.__qualname__} needs {name}, which cannot be typed")
     return list(options.values())
 
 

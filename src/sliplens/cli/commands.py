@@ -548,7 +548,6 @@ command("status", "runner:read_status", "sliplens status runs/mine/margins")(
     "grip.episodes:run_episodes",
     "sliplens grip -o runs/grip --object egg --rendered",
     ("settings", "--set"),
-    ("latency_s", "--latency"),
 )
 def call_grip(call: Any) -> None:
     """Print what became of the episodes, and draw the page."""
@@ -560,10 +559,13 @@ def call_grip(call: Any) -> None:
 class HoldOptions(TypedDict, total=False):
     """Options of `sliplens hold` beside those of `hold_grip`."""
 
+    network: str
+    """Network for the sources; for `grip` that of the package if not given."""
+
     dry_run: bool
     """Send nothing: print what would be sent, as if it were obeyed at once."""
     messages: str
-    """Messages of a ROS 2 gripper: gripper-command (default), numbers or controllers."""
+    """Messages of a ROS 2 gripper: gripper-command (default) or controllers."""
     joint: str
     """Joint of a ROS 2 gripper that has width and force; the first if not given."""
     second: str
@@ -594,11 +596,16 @@ class HoldOptions(TypedDict, total=False):
     ("ceiling_n", "--ceiling"),
     ("watchdog_s", "--watchdog"),
 )
-def call_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
-    """Print the commands."""
+def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
+    """Print the commands.
+
+    Parameters
+    ----------
+    source
+        Source of a fingertip as in `live`; `grip` for a simulated gripper, or `grip:egg`.
+    """
     from sliplens.grip.controllers import make_controller
     from sliplens.grip.gripper import open_gripper
-    from sliplens.grip.hold import GRIPPERS
     from sliplens.grip.source import open_grip, usual_network
     from sliplens.live import LiveReader
     from sliplens.live.contract import LiveOptions
@@ -611,22 +618,22 @@ def call_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
     if gripper is None:
         raise InputError("no gripper is given; name one with --gripper, or see what would be sent with --dry-run")
     make_controller(arguments.get("controller", "margin"), arguments.get("settings"))  # refused before a network loads
-    names = [source for source in (arguments["source"], options.get("second")) if source is not None]
+    names = [name for name in (source, options.get("second")) if name is not None]
     reference, sensor = options.get("reference", ()), options.get("sensor")
     if reference and len(reference) != len(names):
         raise InputError(f"--reference takes an image for each source, {len(names)}, got {len(reference)}")
     profile = None if sensor is None else load_profile(sensor)
     sources = [open_grip(source, LiveOptions()) or source for source in names]
-    networks = [arguments.get("network") or usual_network(source, profile) for source in sources]
+    networks = [options.get("network") or usual_network(source, profile) for source in sources]
     device, messages = options.get("device", "cpu"), options.get("messages", "gripper-command")
     loaded = {name: load(name, device=device) for name in dict.fromkeys(networks) if name is not None}
     with ExitStack() as stack:
-        if gripper not in GRIPPERS:
+        if gripper not in {"simulated", "dry-run"}:
             gripper = stack.enter_context(closing(open_gripper(gripper, messages=messages, joint=options.get("joint"))))
         settings = {name: options[name] for name in options.keys() & ReaderSettings.__annotations__.keys() - {"device"}}
         readers = [
             stack.enter_context(
-                LiveReader(source, loaded.get(network), **settings | {"reference": image, "sensor": profile})
+                LiveReader(source, loaded.get(network or ""), **settings | {"reference": image, "sensor": profile})
             )
             for source, network, image in zip(sources, networks, reference or [None] * len(sources), strict=True)
         ]
@@ -639,7 +646,7 @@ def call_hold(call: Any, **options: Unpack[HoldOptions]) -> None:
             elif log.due():
                 say(str(step))
 
-        result = call(source=readers, gripper=gripper, network=None, on_step=on_step)
+        result = call(readers=readers, gripper=gripper, on_step=on_step)
     say(result.why, aside=True)
     for name, reader in zip(names, readers, strict=True):
         if reader.lesson is not None:

@@ -15,13 +15,20 @@ from sliplens.grip.plant import PERIOD_S, Episodes
 from sliplens.live.reading import Reading, SlipState
 
 _SETTLED_S = 1.0  # time until which the object is being lifted and no grip is loosened
+_START_N, _REFLEX_N, _ASSUMED_N = 2.0, 1.0, 1.5  # forces to lift with, of the margin law and the two others
 _NOISE, _NOISE_SHARE = 0.06, 0.3
 """A margin that differs by less from the last one may be noise (two standard deviations), and moves it by this share:
 as a grip tightens fast and loosens slowly, noise would press harder."""
 _NO_MARGIN = -9.0  # before the first margin, which counts in full
 _HIGHEST_ZERO = 0.6  # largest margin at which a slip counts: with more it is a jolt that ended
 _SAME_SLIP_S = 0.15  # time after a slip in which another one is the same
-_HORIZON_S = 0.1  # age of margins at a command, roughly: the law gives the force so long ahead
+_CALM_S = 1.0  # time after a slip in which the grip is never loosened
+_BOOST = 1.5  # force after a slip over that before it
+_DEAD_BAND = 0.05  # share of the force within which nothing changes
+_UP_N_S, _DOWN_N_S = 40.0, 5.0  # largest rise and fall of the force
+_BLIND_S, _SAFE_N = 0.15, 2.5
+"""Time without any margin after which the force goes to the second number; until then it holds. With more force,
+frames are unknown to the network, and their margins withheld."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,12 +87,11 @@ class AssumedFriction:
     """Assumed coefficient of friction mu_0."""
     target: float = 0.2
     """Target margin Gamma*, as a share."""
-    start_n: float = 1.5
 
     def command(self, observation: Observation, /) -> Episodes:
         """Return the grip force in newtons."""
         force_n = np.maximum(observation.load_n, 0) / (2 * self.friction * (1 - self.target))
-        return np.maximum(force_n, self.start_n if observation.time_s < _SETTLED_S else 0.0)
+        return np.maximum(force_n, _ASSUMED_N if observation.time_s < _SETTLED_S else 0.0)
 
 
 @dataclass(kw_only=True)
@@ -94,46 +100,23 @@ class MarginLaw:
 
     Around the law: dead band, fast up and slow down, reflex, and a safe force without margins.
 
-    The controller acts on r = margin - caution (margin - low), the mean over the fingers that have a margin. A network
-    that cannot see the friction predicts more than 0 for an object that already slides, so the margin is Gamma = (r -
-    r_0) / (1 - r_0): r_0 is `zero` until a slip, and then the r at which the fingers began to slide, if that is more.
+    The controller acts on r, the mean margin of the fingers that have one. A network that cannot see the friction
+    predicts more than 0 for an object that already slides, so the margin is Gamma = (r - r_0) / (1 - r_0): r_0 is
+    `zero` until a slip, and then the r at which the fingers began to slide, if that is more.
     """
 
     target: float = 0.3
     """Target margin Gamma*, as a share of the friction: 0.3 presses 43 % more than the least force that holds."""
-    caution: float = 0.0
-    """Share of the way from the margin to the lower end of its interval; with 1 a `zero` of 0.2 and a `target` of 0.1
-    suit."""
     zero: float = 0.5
     """r_0 before any slip, a share: the prediction that is possible where the object already slides."""
-    start_n: float = 2.0
-    """Force to lift with."""
     least_n: float = 0.5
     """Lowest force: with less the network sees no touch."""
-    dead_band: float = 0.05
-    """Share of the force within which nothing changes."""
-    up_n_s: float = 40.0
-    """Largest rise of the force, in newtons a second."""
-    down_n_s: float = 5.0
-    """Largest fall of the force, in newtons a second."""
-    boost: float = 1.5
-    """Force after a slip over that before it, a ratio."""
-    calm_s: float = 1.0
-    """Time after a slip in which the grip is never loosened."""
-    blind_s: float = 0.15
-    """Time without any margin after which the force goes to `safe_n`; until then it holds."""
-    safe_n: float = 2.5
-    """Force without margins: no more, for beyond it frames are unknown to the network, and their margins withheld."""
     acted: Episodes = field(init=False, repr=False, default_factory=lambda: np.ones(1))
     """Margin acted on last in each episode, a share."""
     _zero: Episodes = field(init=False, repr=False, default_factory=lambda: np.zeros(1))
     _last: Episodes = field(init=False, repr=False, default_factory=lambda: np.full(1, _NO_MARGIN))
     _slipped_s: Episodes = field(init=False, repr=False, default_factory=lambda: np.full(1, -np.inf))
     _margin_s: Episodes = field(init=False, repr=False, default_factory=lambda: np.zeros(1))
-
-    def law(self, force_n: Episodes, margin: Episodes) -> Episodes:
-        """Return the grip force in newtons for a margin, a share."""
-        return force_n * (1 - margin) / (1 - self.target)
 
     @property
     def aim(self) -> Episodes:
@@ -142,9 +125,10 @@ class MarginLaw:
 
     def margin_of(self, observation: Observation) -> Episodes:
         """Return the margin to act on, a share; NaN without a margin."""
-        margin = observation.margin - self.caution * (observation.margin - observation.low)
-        valid = np.isfinite(margin)
-        mean = np.where(valid, margin, 0).sum(axis=1) / np.where(valid.any(axis=1), valid.sum(axis=1), np.nan)
+        valid = np.isfinite(observation.margin)
+        mean = np.where(valid, observation.margin, 0).sum(axis=1) / np.where(
+            valid.any(axis=1), valid.sum(axis=1), np.nan
+        )
         change = mean - self._last
         return np.where(np.abs(change) < _NOISE, self._last + _NOISE_SHARE * change, mean)
 
@@ -158,47 +142,32 @@ class MarginLaw:
         self._zero = np.maximum(self._zero, np.where(slip, np.minimum(self._last, _HIGHEST_ZERO), self.zero))
         self._last = np.where(blind, self._last, margin)
         self.acted = np.clip((margin - self._zero) / (1 - self._zero), -1, 1)
-        goal = np.where(blind, before_n, self.law(observation.force_n, self.acted))
-        goal = np.where(np.abs(goal - before_n) < self.dead_band * before_n, before_n, goal)
-        calm = (time_s - self._slipped_s < self.calm_s) | (time_s < _SETTLED_S)
+        goal = np.where(blind, before_n, observation.force_n * (1 - self.acted) / (1 - self.target))
+        goal = np.where(np.abs(goal - before_n) < _DEAD_BAND * before_n, before_n, goal)
+        calm = (time_s - self._slipped_s < _CALM_S) | (time_s < _SETTLED_S)
         goal = np.where(calm, np.maximum(goal, before_n), goal)
-        goal = np.where(time_s - self._margin_s > self.blind_s, np.maximum(goal, self.safe_n), goal)
-        up, down = self.up_n_s * observation.since_s, self.down_n_s * observation.since_s
+        goal = np.where(time_s - self._margin_s > _BLIND_S, np.maximum(goal, _SAFE_N), goal)
+        up, down = _UP_N_S * observation.since_s, _DOWN_N_S * observation.since_s
         force_n = np.clip(goal, before_n - down, before_n + up)
         # below the target a falling force comes from a wrong measurement
         force_n = np.where(self.acted < self.target, np.maximum(force_n, before_n), force_n)
         # the reflex has no limit of rate
-        force_n = np.where(slip, np.maximum(force_n, self.boost * np.maximum(observation.force_n, before_n)), force_n)
-        return np.maximum(force_n, self.start_n if time_s < _SETTLED_S else self.least_n)
-
-
-@dataclass(kw_only=True)
-class ProportionalLaw(MarginLaw):
-    """dF/dt = K (Gamma* - Gamma): the force grows as long as the margin is below the target."""
-
-    gain_n_s: float = 20.0
-    """K, in newtons a second for a margin of 1."""
-
-    def law(self, force_n: Episodes, margin: Episodes) -> Episodes:
-        """Return the grip force in newtons."""
-        return force_n + self.gain_n_s * (self.target - margin) * _HORIZON_S
+        force_n = np.where(slip, np.maximum(force_n, _BOOST * np.maximum(observation.force_n, before_n)), force_n)
+        return np.maximum(force_n, _START_N if time_s < _SETTLED_S else self.least_n)
 
 
 @dataclass(kw_only=True)
 class Reflex:
-    """F = const until a slip, then `boost` times as much, again and again: markers alone, no margin."""
+    """F = const until a slip, then 1.5 times as much, again and again: markers alone, no margin."""
 
-    start_n: float = 1.0
-    boost: float = 1.5
-    """Force after a slip over that before it, a ratio."""
     _slipped_s: Episodes = field(init=False, repr=False, default_factory=lambda: np.full(1, -np.inf))
 
     def command(self, observation: Observation, /) -> Episodes:
         """Return the grip force in newtons."""
         slip = observation.slip & (observation.time_s - self._slipped_s > _SAME_SLIP_S)
         self._slipped_s = np.where(slip, observation.time_s, self._slipped_s)
-        force_n = np.maximum(observation.command_n, self.start_n)
-        return np.where(slip, self.boost * force_n, force_n)
+        force_n = np.maximum(observation.command_n, _REFLEX_N)
+        return np.where(slip, _BOOST * force_n, force_n)
 
 
 @dataclass(kw_only=True)
@@ -221,14 +190,12 @@ CONTROLLERS = Table(
         "fixed": FixedForce,
         "assumed-friction": AssumedFriction,
         "margin": MarginLaw,
-        "proportional": ProportionalLaw,
         "reflex": Reflex,
         "oracle": Oracle,
     },
 )
 """Controllers by name; an installed package adds its own by the entry point `sliplens.controllers`."""
-FRICTION_CONSTANTS = {"zero": 0.0, "target": 0.6}
-"""Constants of the margin laws where the friction is known: the prediction is then the margin itself."""
+_FRICTION_KNOWN = {"zero": 0.0, "target": 0.6}  # of margin laws: the prediction is then the margin itself
 
 
 def make_controller(
@@ -244,8 +211,8 @@ def make_controller(
     """
     kind, settings = CONTROLLERS.pick(name), dict(settings or {})
     if friction_known and issubclass(kind, MarginLaw):
-        settings = FRICTION_CONSTANTS | settings
-    constants = [field.name for field in fields(kind) if field.init]  # pyright: ignore[reportArgumentType]
+        settings = _FRICTION_KNOWN | settings
+    constants = [item.name for item in fields(kind) if item.init]  # pyright: ignore[reportArgumentType]
     for constant, value in settings.items():
         if constant not in constants:
             raise InputError(f"the controller {name} has no constant {constant!r}; choose of {', '.join(constants)}")
@@ -357,8 +324,12 @@ class Holder:
             if reading.margin is not None:
                 self._with_friction[finger] = reading.friction is not None
                 if self._friction_known != all(self._with_friction):
-                    self._friction_known = not self._friction_known
-                    self._update_constants()
+                    self._friction_known, law = not self._friction_known, self.controller
+                    if isinstance(self._chosen, str) and isinstance(law, MarginLaw):
+                        self.choose(self._chosen)
+                        # the state goes on, but r_0 belongs to the readings before
+                        for name in ("acted", "_last", "_slipped_s", "_margin_s"):
+                            setattr(self.controller, name, getattr(law, name))
             # a slip is judged by commands: the measured force is too noisy to show a slightly looser grip
             self._slip |= bool(
                 self._gates[finger].update(
@@ -369,15 +340,6 @@ class Holder:
                 )
             )
             self._readings[finger] = reading, taken_s
-
-    def _update_constants(self) -> None:
-        """Switch a named margin law to the constants for a known or unknown friction; its state goes on."""
-        before = self.controller
-        if isinstance(self._chosen, str) and isinstance(before, MarginLaw):
-            self.choose(self._chosen)
-            for item in fields(before):
-                if not item.init and item.name != "_zero":  # r_0 belongs to the readings before
-                    setattr(self.controller, item.name, getattr(before, item.name))
 
     def grip_force(self, time_s: float, force_n: float, *, load_n: float = np.nan) -> GripCommand:
         """Return the grip force to command now, from the force measured now; NaN where none is measured."""

@@ -164,7 +164,6 @@ ROS_MESSAGES = {
     "gripper-command": RosCommand(
         "command", "control_msgs/msg/GripperCommand", lambda n: (0.0, max(n, _LEAST_EFFORT_N))
     ),
-    "numbers": RosCommand("force", "std_msgs/msg/Float64", lambda n: (n,)),
     # forward controllers of ros2_control take a number a joint
     "controllers": RosCommand(
         "effort_controller/commands",

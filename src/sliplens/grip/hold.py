@@ -27,17 +27,11 @@ from sliplens.grip.controllers import (
 from sliplens.grip.gripper import DryRun, Gripper, GripperError, GripperState, GuardedGripper, open_gripper
 from sliplens.grip.plant import PERIOD_S
 from sliplens.grip.records import Ending, Hold, HoldSteps
-from sliplens.grip.source import GripSource, open_grip, usual_network
-from sliplens.live.contract import LiveOptions, LiveSource, Pace
+from sliplens.grip.source import GripSource
+from sliplens.live.contract import Pace
 from sliplens.live.loop import LiveReader
 from sliplens.live.reading import LiveFrame, Reading, describe_reading
-from sliplens.models.checkpoint import Network
 
-GRIPPERS = {
-    "simulated": "the gripper of the source `grip`",
-    "dry-run": "none: commands are recorded and not sent",
-}
-"""Names of grippers that are no address, and their meaning."""
 _TRIES = 30  # for the first force, half a second: a driver may start late
 _STUCK_S, _STUCK_M = 2.0, 1e-4
 """Time in which a gripper without any force has to close by a tenth of a millimetre; the simulated one opens for 1.5 s
@@ -72,10 +66,9 @@ class HoldStep(GripCommand):
 
 
 def hold_grip(
-    source: LiveReader | LiveSource | Path | str | Sequence[LiveReader],
-    gripper: Gripper | str | None = None,
+    readers: LiveReader | Sequence[LiveReader],
+    gripper: Gripper | str = "dry-run",
     *,
-    network: Network | Path | str | None = None,
     controller: str | Controller = "margin",
     settings: Mapping[str, float] | None = None,
     ceiling_n: float = 4.0,
@@ -93,14 +86,11 @@ def hold_grip(
 
     Parameters
     ----------
-    source
-        Entered reader, or two for both fingertips of the gripper; or a source that `LiveReader` takes, or `grip` for a
-        simulated gripper (`GripSource`), predicted by `network` until the hold ends.
+    readers
+        Entered reader of a fingertip, or two of both fingertips of the gripper.
     gripper
         Gripper, or an address as in `open_gripper`, whose connection is closed at the end; `simulated` for the gripper
-        of the source `grip`; `dry-run` to record commands as if the gripper obeyed at once. None is refused.
-    network
-        Network for a source; for `grip` and `simulated` that of the package if None.
+        of the source `grip`; `dry-run` to record commands as if the gripper obeyed at once.
     controller
         Row of `CONTROLLERS`, or an object with `command(observation)`.
     settings
@@ -122,7 +112,7 @@ def hold_grip(
     Raises
     ------
     InputError
-        If there is no such source, network, controller or gripper, or they do not go together.
+        If there is no such controller or gripper, or they do not go together.
     GripperError
         If no gripper answers at the address.
 
@@ -140,21 +130,18 @@ def hold_grip(
         raise InputError(f"seconds must be positive, got {seconds:g}")
     if settings and not isinstance(controller, str):
         raise InputError("settings change a controller of the table; set those of your own where you make it")
-    if gripper is None:
-        raise InputError("no gripper is given; name one with --gripper, or record commands with --dry-run")
+    readers = [readers] if isinstance(readers, LiveReader) else list(readers)
+    _require_fit(make_controller(controller, settings) if isinstance(controller, str) else controller, readers)
     with ExitStack() as stack:
         address = gripper if isinstance(gripper, str) else type(gripper).__name__
-        if isinstance(gripper, str) and gripper not in GRIPPERS:
-            gripper = stack.enter_context(closing(open_gripper(gripper)))
-        readers = _enter_readers(source, network, stack)
-        _require_fit(make_controller(controller, settings) if isinstance(controller, str) else controller, readers)
         if gripper == "simulated":
-            simulated = readers[0].source
-            if not isinstance(simulated, GripSource):
-                raise InputError(f"`simulated` is {GRIPPERS['simulated']}; {simulated.name} has none")
+            if not isinstance(simulated := readers[0].source, GripSource):
+                raise InputError(f"`simulated` is the gripper of the source `grip`; {simulated.name} has none")
             gripper = simulated
-        elif isinstance(gripper, str):
+        elif gripper == "dry-run":
             gripper = DryRun()
+        elif isinstance(gripper, str):
+            gripper = stack.enter_context(closing(open_gripper(gripper)))
         name = controller if isinstance(controller, str) else type(controller).__name__
         recipe = {"gripper": address, "controller": name, "begun_s": time.time()}  # no two holds are the same
         output = None
@@ -325,28 +312,12 @@ class HoldLoop:
             )
 
 
-def _enter_readers(
-    source: LiveReader | LiveSource | Path | str | Sequence[LiveReader],
-    network: Network | Path | str | None,
-    stack: ExitStack,
-) -> list[LiveReader]:
-    """Return the readers of the fingertips; a new one reads until the stack is closed."""
-    if isinstance(source, LiveSource | Path | str):
-        if isinstance(source, str):
-            source = open_grip(source, LiveOptions()) or source
-        return [stack.enter_context(LiveReader(source, network or usual_network(source, None)))]
-    readers = [source] if isinstance(source, LiveReader) else list(source)
+def _require_fit(controller: Controller, readers: Sequence[LiveReader]) -> None:
+    """Refuse readers that cannot hold together, and a controller that needs more than they provide."""
     if len(readers) not in {1, 2}:
         raise InputError(f"a gripper has one or two fingertips that are read, got {len(readers)}")
-    if network is not None:
-        raise InputError("a reader has its own network; name it where the reader is made")
     if not all(reader.entered for reader in readers):
         raise InputError("nothing is read yet; enter the reader first, with `with reader:`")
-    return readers
-
-
-def _require_fit(controller: Controller, readers: Sequence[LiveReader]) -> None:
-    """Refuse a controller that needs more than these readers provide."""
     if isinstance(controller, AssumedFriction):
         raise InputError("this controller needs a force sensor at the wrist; choose margin, reflex or fixed")
     for reader in readers:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from threadpoolctl import ThreadpoolController
 from torch import Tensor
 
@@ -15,7 +15,7 @@ from sliplens.errors import InputError
 from sliplens.friction import SlipLearner
 from sliplens.grip.controllers import SPRINGS_BACK_S, Controller, Observation, SlipGate
 from sliplens.grip.fingertip import Fingertip, MarkerField, ReadingTable
-from sliplens.grip.plant import PERIOD_S, Episodes, Fingers, Plant, PlantState, World
+from sliplens.grip.plant import LATENCY_S, PERIOD_S, Episodes, Fingers, Plant, PlantState, World
 from sliplens.live.slip import SlipBatch
 from sliplens.markers import Tracker
 from sliplens.models import Network, make_engine
@@ -37,8 +37,6 @@ class FingertipReading:
     high: Float[np.ndarray, "episodes 2"]
     markers_px: Sequence[Markers] = ()
     """Positions (x, y) of the markers of both fingertips; empty without markers."""
-    frames: UInt8[np.ndarray, "2 height width 3"] | None = None
-    """Camera images, where any were drawn."""
 
 
 class TableSensor:
@@ -156,7 +154,6 @@ class RenderedSensor:
 
     def measure(self, state: PlantState, slipping_s: Episodes) -> FingertipReading:
         """Draw both fingertips, predict their margins and follow their markers."""
-        frames: list[np.ndarray] = []
         markers_px: list[Markers] = []
 
         def inputs() -> Iterator[Tensor]:
@@ -167,7 +164,6 @@ class RenderedSensor:
                 yield encoded
                 with self._threads.limit(limits=1):
                     markers_px.append(tracker.update(frame).position_px[None])
-                frames.append(frame)
 
         friction, learner = None, self._learner
         if learner is not None:
@@ -177,13 +173,7 @@ class RenderedSensor:
         if learner is not None and (ratio := estimate.ratio) is not None:
             learner.note(float(ratio.mean.mean()), sigma=float(ratio.sigma.mean()), time_s=state.time_s)
         low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)
-        return FingertipReading(
-            margin=estimate.margin[None],
-            low=low[None],
-            high=high[None],
-            markers_px=markers_px,
-            frames=np.stack(frames),
-        )
+        return FingertipReading(margin=estimate.margin[None], low=low[None], high=high[None], markers_px=markers_px)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,29 +186,13 @@ class Tick:
     """State after the step."""
     command_n: Episodes
     reading: FingertipReading
-    """Measurement before the step; `observation` holds the earlier one that the controller gets."""
-    observation: Observation
+    """Measurement before the step; the controller gets an earlier one."""
+    slip: Bool[np.ndarray, " episodes"]
+    """True where the controller is told of a slip."""
 
 
 class GripLoop:
-    """Plant, fingertip sensor and controller in a loop of 60 Hz.
-
-    Examples
-    --------
-    Squeeze a cup that stands on the table:
-
-    >>> import numpy as np
-    >>> from sliplens.grip.controllers import make_controller
-    >>> from sliplens.grip.loop import GripLoop
-    >>> from sliplens.grip.plant import OBJECTS, Plant
-    >>> from sliplens.grip.plant import draw_scripts
-    >>> scripts = draw_scripts("cup", "dry", episodes=1, seed=0)
-    >>> loop = GripLoop(Plant(OBJECTS["cup"]), None, make_controller("fixed", {"force_n": 2.0}))
-    >>> for _ in range(30):
-    ...     tick = loop.tick(scripts.world(loop.plant.state.time_s))
-    >>> tick.state.force_n.round(1)
-    array([2.])
-    """
+    """Plant, fingertip sensor and controller in a loop of 60 Hz."""
 
     def __init__(
         self,
@@ -226,7 +200,7 @@ class GripLoop:
         sensor: TableSensor | RenderedSensor | None,
         controller: Controller,
         *,
-        latency_s: float = 0.02,
+        latency_s: float = LATENCY_S,
     ) -> None:
         self.plant, self.sensor, self.controller = plant, sensor, controller
         delay = math.ceil(latency_s / PERIOD_S - 1e-9)
@@ -279,4 +253,4 @@ class GripLoop:
         )
         self._command_n = np.asarray(self.controller.command(observation), dtype=np.float64)
         state = self.plant.step(self._command_n, world)
-        return Tick(world=world, state=state, command_n=self._command_n, reading=reading, observation=observation)
+        return Tick(world=world, state=state, command_n=self._command_n, reading=reading, slip=slip)

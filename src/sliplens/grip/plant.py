@@ -7,7 +7,7 @@ an episode and finger.
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeAlias
 
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from sliplens.codec import Columns
-from sliplens.errors import ContactError, InputError
+from sliplens.errors import InputError
 from sliplens.extras import pick
 from sliplens.mechanics import safety_margin
 
@@ -23,6 +23,8 @@ GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, in metres a second squared."""
 PERIOD_S = 1 / 60
 """Time between two images, and between two commands, in seconds."""
+LATENCY_S = 0.02
+"""Time from an image to the command by it, in seconds."""
 
 Episodes: TypeAlias = Float[np.ndarray, " episodes"]
 Fingers: TypeAlias = Float[np.ndarray, "episodes 2"]
@@ -50,38 +52,20 @@ OBJECTS = {
 }
 """Objects by name."""
 
-
-@dataclass(frozen=True, kw_only=True)
-class GripperModel:
-    """Fingers and force actuator of a gripper; a value that is not positive is a `ContactError`."""
-
-    finger_stiffness_n_m: float = 4_000.0
-    """Stiffness of one fingertip against the press."""
-    shear_stiffness_n_m: float = 1_500.0
-    """Stiffness of one fingertip against the pull; physics of the thesis's sensor (assumed)."""
-    shear_damping_n_s_m: float = 3.0
-    lag_s: float = 0.05
-    """Time constant of the force actuator."""
-    closing_speed_m_s: float = 0.02
-    """Speed of the closing fingers; with the stiffness it limits the rate of the force."""
-    resolution_n: float = 0.02
-    """Step of the commanded forces."""
-    ceiling_n: float = 4.0
-    """Largest force, whatever the command."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not value > 0:
-                raise ContactError(f"{name} of the gripper must be positive, got {value:.3g}")
-
-    def force_rate(self, gripped: GrippedObject) -> float:
-        """Compute the largest rate of the force, in newtons a second: fingers and object are springs in a row."""
-        return self.closing_speed_m_s / (2 / self.finger_stiffness_n_m + 1 / gripped.stiffness_n_m)
+FINGER_STIFFNESS_N_M = 4_000.0
+"""Stiffness of one fingertip against the press."""
+SHEAR_STIFFNESS_N_M, SHEAR_DAMPING_N_S_M = 1_500.0, 3.0
+"""Stiffness and damping of one fingertip against the pull; physics of the thesis's sensor (assumed)."""
+LAG_S = 0.05
+"""Time constant of the force actuator."""
+CLOSING_SPEED_M_S = 0.02
+"""Speed of the closing fingers; with the stiffness it limits the rate of the force."""
+_RESOLUTION_N = 0.02  # step of the commanded forces
 
 
 @dataclass(frozen=True, kw_only=True)
 class World:
-    """Loads on the gripped objects, and the motion of the hand, during one step."""
+    """Loads on the gripped objects during one step."""
 
     mass_kg: Episodes
     friction: Fingers
@@ -90,10 +74,6 @@ class World:
     """Kinetic over static friction."""
     pull_n: Episodes
     """Force on the object besides its weight, positive downwards."""
-    hand_m: Episodes
-    """Height of the hand as the step begins; the object stands on a table at 0."""
-    hand_speed_m_s: Episodes
-    """Speed of the hand upwards through the step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,9 +132,12 @@ class Plant:
     """
 
     def __init__(
-        self, gripped: GrippedObject, *, episodes: int = 1, model: GripperModel | None = None, substeps: int = 16
+        self, gripped: GrippedObject, *, episodes: int = 1, ceiling_n: float = 4.0, substeps: int = 16
     ) -> None:
-        self.gripped, self.model, self.substeps = gripped, GripperModel() if model is None else model, substeps
+        self.gripped, self.ceiling_n, self.substeps = gripped, ceiling_n, substeps
+        # fingers and object are springs in a row
+        self.most_n_s = CLOSING_SPEED_M_S / (2 / FINGER_STIFFNESS_N_M + 1 / gripped.stiffness_n_m)
+        """Largest rate of the force."""
         nothing, fingers = np.zeros(episodes), np.zeros((episodes, 2))
         no = np.zeros(episodes, dtype=bool)
         self.state = PlantState(
@@ -168,12 +151,13 @@ class Plant:
 
         The force stays between 0 and the ceiling, whatever the command; NaN holds. Dropped objects stay unchanged.
         """
-        old, model = self.state, self.model
-        stiffness, damping = model.shear_stiffness_n_m, model.shear_damping_n_s_m
+        old = self.state
+        stiffness, damping = SHEAR_STIFFNESS_N_M, SHEAR_DAMPING_N_S_M
         command_n = np.where(np.isnan(command_n), old.force_n, command_n)
-        command_n = np.clip(np.round(command_n / model.resolution_n) * model.resolution_n, 0, model.ceiling_n)
+        command_n = np.clip(np.round(command_n / _RESOLUTION_N) * _RESOLUTION_N, 0, self.ceiling_n)
         dt = duration_s / self.substeps
-        share, most = 1 - math.exp(-dt / model.lag_s), model.force_rate(self.gripped) * dt
+        share, most = 1 - math.exp(-dt / LAG_S), self.most_n_s * dt
+        hand_m, hand_m_s, _ = hand_motion(old.time_s)
         static, kinetic = world.friction, world.friction * world.kinetic_ratio[:, None]
         weight, inverse = world.mass_kg * GRAVITY_M_S2 + world.pull_n, dt / world.mass_kg
         force, height, speed = old.force_n, old.height_m, old.speed_m_s
@@ -181,9 +165,8 @@ class Plant:
         shear = old.shear_n
         for number in range(self.substeps):
             force = force + np.clip(share * (command_n - force), -most, most)
-            hand = world.hand_m + world.hand_speed_m_s * (number * dt)
-            apart = (hand - height)[:, None]
-            trial = stiffness * (apart - anchor) + damping * (world.hand_speed_m_s - speed)[:, None]
+            apart = (hand_m + hand_m_s * (number * dt) - height)[:, None]
+            trial = stiffness * (apart - anchor) + damping * (hand_m_s - speed)[:, None]
             slides = np.abs(trial) > np.where(sliding, kinetic, static) * force[:, None]
             shear = np.where(slides, np.sign(trial) * kinetic * force[:, None], trial)
             slid = np.where(slides, apart - shear / stiffness - anchor, 0.0)
@@ -211,17 +194,17 @@ class Plant:
         return new
 
 
-def least_force(world: World, *, hand_acceleration_m_s2: float = 0.0) -> Episodes:
-    """Compute the least grip force that holds, in newtons: (m (g + a) + pull) over the sum of both mu_s."""
-    load = world.mass_kg * (GRAVITY_M_S2 + hand_acceleration_m_s2) + world.pull_n
+def least_force(world: World, *, time_s: float) -> Episodes:
+    """Compute the least grip force that holds in the moving hand: (m (g + a) + pull) over the sum of both mu_s."""
+    load = world.mass_kg * (GRAVITY_M_S2 + hand_motion(time_s)[2]) + world.pull_n
     return np.maximum(load, 0) / world.friction.sum(axis=1)
 
 
 EPISODE_S = 6.0
 """Length of an episode in seconds."""
-LIFT_S = 0.5
-"""Time at which the hand begins to rise."""
-_RISE_S, _RISE_M = 1.5, 0.2
+LIFT_S, LIFTED_S = 0.5, 2.0
+"""Time at which the hand begins to rise, and at which it stops."""
+_RISE_S, _RISE_M = LIFTED_S - LIFT_S, 0.2
 _NEVER = 1e9
 _JOLT_S, _POUR_S, _FADE_S = 0.08, 2.0, 3.0
 _PULL_S, _PULL_RAMP_S = 1.5, 0.15
@@ -269,14 +252,11 @@ class Scripts(Columns):
         ramp = np.clip(since / _PULL_RAMP_S, 0, 1) * np.clip((_PULL_S - since) / _PULL_RAMP_S, 0, 1)
         pull = self.pull_n * ramp * (1 + _WOBBLE * np.sin(2 * np.pi * _WOBBLE_HZ * since))
         jolted = np.clip((time_s - self.jolt_at_s) / _JOLT_S, 0, 1)
-        hand, speed, _ = hand_motion(time_s)
         return World(
             mass_kg=self.mass_kg + self.water_kg * np.clip((time_s - self.water_at_s) / _POUR_S, 0, 1),
             friction=friction[:, None] * (1 + gap),
             kinetic_ratio=self.kinetic_ratio,
             pull_n=pull + self.jolt_n * np.sin(np.pi * jolted),
-            hand_m=np.full(len(self), hand),
-            hand_speed_m_s=np.full(len(self), speed),
         )
 
 
@@ -314,51 +294,27 @@ CONDITIONS: dict[str, Draw] = {
 }  # fmt: skip
 """Conditions by name: dry objects of different friction; wet ones; falling friction; friction from a wide range; a wet
 patch at 2.5 s; a jolt; water poured in; a fingertip's lamp that goes out."""
-_BOUNDS = {"mass_kg": 0, "friction": 0, "kinetic_ratio": 0, "patch_factor": 0, "drift": -1, "water_kg": -1e-9}
 
 
-def draw_scripts(
-    gripped: GrippedObject | str,
-    condition: str,
-    *,
-    episodes: int,
-    seed: int,
-    fingertips: int = 64,
-    script: Mapping[str, float] | None = None,
-) -> Scripts:
+def draw_scripts(object: str, condition: str, *, episodes: int, seed: int, fingertips: int = 64) -> Scripts:
     """Draw the events of some episodes; the same seed gives the same events.
 
     Parameters
     ----------
-    gripped
-        Object, or row of `OBJECTS`.
-    condition
-        Row of `CONDITIONS`.
-    episodes, seed
-        Number of episodes, and the seed they are drawn from.
+    object, condition
+        Rows of `OBJECTS` and `CONDITIONS`.
     fingertips
         Number of pairs of fingertips to choose from.
-    script
-        Columns of `Scripts` to set rather than to draw, such as `mass_kg`.
 
     Examples
     --------
     >>> from sliplens.grip.plant import draw_scripts
-    >>> scripts = draw_scripts("cup", "patch", episodes=2, seed=0, script={"mass_kg": 0.06})
-    >>> scripts.mass_kg, scripts.patch_at_s
-    (array([0.06, 0.06]), array([2.5, 2.5]))
+    >>> draw_scripts("cup", "patch", episodes=2, seed=0).patch_at_s
+    array([2.5, 2.5])
     """
-    if isinstance(gripped, str):
-        gripped = pick(OBJECTS, gripped, noun="object")
+    gripped = pick(OBJECTS, object, noun="object")
     if episodes < 1:
         raise InputError(f"{episodes} episodes cannot be run; ask for 1 or more")
-    names, script = {field.name for field in fields(Scripts)}, script or {}
-    for name, value in script.items():
-        if name not in names:
-            raise InputError(f"an episode has no {name}; choose of {', '.join(sorted(names))}")
-        if not _BOUNDS.get(name, -np.inf) < value < np.inf:
-            bound = f"above {_BOUNDS[name]:g}" if name in _BOUNDS else "finite"
-            raise InputError(f"{name} must be {bound}, got {value:g}")
     rng, condition_rng = np.random.default_rng(seed).spawn(2)
     uniform, condition_uniform = (partial(source.uniform, size=episodes) for source in (rng, condition_rng))
     mass = uniform(*gripped.mass_kg)
@@ -370,5 +326,5 @@ def draw_scripts(
         water_kg=nothing, water_at_s=never, lamp_at_s=never,
         fingertips=rng.integers(fingertips, size=episodes).astype(np.float64),
     )  # fmt: skip
-    columns = {**pick(CONDITIONS, condition, noun="condition")(scripts, gripped, condition_uniform), **script}
+    columns = pick(CONDITIONS, condition, noun="condition")(scripts, gripped, condition_uniform)
     return replace(scripts, **{name: np.full(episodes, value, dtype=np.float64) for name, value in columns.items()})

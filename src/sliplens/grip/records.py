@@ -69,8 +69,6 @@ class GripSetup:
     """First 12 hex digits of the hash of its weights."""
     friction: str | None
     """Friction that predictions used, in words; None without one."""
-    latency_s: float
-    """Time from an image to the command by it."""
     rendered: bool
     """True where the fingertips were drawn; False where the network's measured errors were looked up."""
     seed: int

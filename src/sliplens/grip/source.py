@@ -11,20 +11,11 @@ import numpy as np
 from sliplens.errors import InputError
 from sliplens.extras import pick
 from sliplens.files import DEFAULT_NETWORK
+from sliplens.friction import require_friction
 from sliplens.grip.controllers import Holder
 from sliplens.grip.fingertip import Fingertip
 from sliplens.grip.gripper import GripperState
-from sliplens.grip.plant import (
-    LIFT_S,
-    OBJECTS,
-    PERIOD_S,
-    GripperModel,
-    Plant,
-    PlantState,
-    World,
-    hand_motion,
-    least_force,
-)
+from sliplens.grip.plant import LIFT_S, LIFTED_S, OBJECTS, PERIOD_S, Plant, World, least_force
 from sliplens.live.contract import LiveOptions, LiveSource, Pace
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.recordings.capture import Forces
@@ -86,8 +77,7 @@ class GripSource(LiveSource):
         rate_hz: float = 30.0,
         seed: int = 0,
     ) -> None:
-        if not 0 < friction < np.inf:
-            raise InputError(f"a coefficient of friction is a positive number, got {friction:g}")
+        require_friction(friction)
         self._object, self._friction, self._tip = pick(OBJECTS, object, noun="object"), friction, Fingertip(seed=seed)
         self.name, self.rate_hz, self.reference = f"a simulated gripper ({object})", rate_hz, self._tip.reference
         self.size = self.reference.shape[0], self.reference.shape[1]
@@ -102,7 +92,7 @@ class GripSource(LiveSource):
 
     def _begin(self, time_s: float) -> None:
         """Open the fingers, to close them again after `OPEN_S`."""
-        self._plant = Plant(self._object, model=GripperModel(ceiling_n=_CEILING_N))
+        self._plant = Plant(self._object, ceiling_n=_CEILING_N)
         self._grips_s = time_s + OPEN_S
         self._frames.clear()
         self._ended_s: float | None = None
@@ -147,8 +137,7 @@ class GripSource(LiveSource):
 
     def read_state(self) -> GripperState:
         """Return the grip force, and an assumed width."""
-        with self._lock:
-            force_n = float(self._plant.state.force_n[0])
+        force_n = float(self._plant.state.force_n[0])
         return GripperState(force_n=force_n, width_m=_WIDTHS_M[force_n > 0])
 
     def status(self, number: int) -> GripStatus | None:
@@ -161,8 +150,9 @@ class GripSource(LiveSource):
         while pace.wait(number / rate_hz):
             captured_s, time_s = time.monotonic(), number / rate_hz
             with self._lock:
-                state = self._advance(time_s)
-                self._frames[number] = state.time_s, self._describe(state, time_s)
+                self._advance(time_s)
+                state = self._plant.state
+                self._frames[number] = state.time_s, self._describe(time_s)
                 self._frames.pop(number - _MEMORY, None)
             force_n, margin = float(state.force_n[0]), float(state.margin[0, 0])
             yield LiveFrame(
@@ -184,51 +174,46 @@ class GripSource(LiveSource):
         """Stop at the next frame."""
         self._closed.set()
 
-    def _advance(self, time_s: float) -> PlantState:
+    def _advance(self, time_s: float) -> None:
         """Step until a time; begin again some time after a drop."""
         state = self._plant.state
         if self._ended_s is None and (state.dropped[0] or state.crushed[0]):
             self._ended_s = time_s
         if self._ended_s is not None and time_s - self._ended_s >= OPEN_S:
             self._begin(time_s)
-        plant = self._plant
-        while self._grips_s + plant.state.time_s + PERIOD_S <= time_s:
+        while self._grips_s + self._plant.state.time_s + PERIOD_S <= time_s:
             pour, pull = _POURS_KG_S * PERIOD_S, _PULLS_N_S * PERIOD_S
             self._poured_kg += float(np.clip(self.water_kg - self._poured_kg, -pour, pour))
             self._pulled_n += float(np.clip(self.pull_n - self._pulled_n, -pull, pull))
-            command_n, state = self._outside_n, plant.state
+            command_n, state = self._outside_n, self._plant.state
             if command_n is None:
                 command = self._holder.grip_force(state.time_s, float(state.force_n[0]), load_n=float(state.load_n[0]))
                 command_n, self._why = command.command_n, command.why
-            plant.step(np.array([command_n]), self._world())
-        return plant.state
+            self._plant.step(np.array([command_n]), self._world())
 
     def _world(self) -> World:
-        height, speed, _ = hand_motion(self._plant.state.time_s)
         return World(
             mass_kg=np.array([self._object.mass_kg[0] + self._poured_kg]),
             friction=np.full((1, 2), self._friction * (0.5 if self.wet else 1.0)),
             kinetic_ratio=np.array([0.8]),
             pull_n=np.array([self._pulled_n]),
-            hand_m=np.array([height]),
-            hand_speed_m_s=np.array([speed]),
         )
 
-    def _describe(self, state: PlantState, time_s: float) -> GripStatus:
-        least = least_force(self._world(), hand_acceleration_m_s2=hand_motion(state.time_s)[2])
-        if time_s < self._grips_s:
-            phase = "open"
-        elif state.dropped[0] or state.crushed[0]:
-            phase = "dropped" if state.dropped[0] else "crushed"
-        elif state.time_s < LIFT_S:
-            phase = "closing"
-        else:
-            phase = "lifting" if state.time_s < LIFT_S + 1.5 else "holding"
+    def _describe(self, time_s: float) -> GripStatus:
+        state = self._plant.state
+        phases = {
+            "open": time_s < self._grips_s,
+            "dropped": state.dropped[0],
+            "crushed": state.crushed[0],
+            "closing": state.time_s < LIFT_S,
+            "lifting": state.time_s < LIFTED_S,
+            "holding": True,
+        }
         return GripStatus(
             force_n=float(state.force_n[0]),
-            least_force_n=float(least[0]) if state.time_s > LIFT_S else 0.0,
+            least_force_n=float(least_force(self._world(), time_s=state.time_s)[0]) if state.time_s > LIFT_S else 0.0,
             slip_m=float(state.slipped_m[0]),
-            phase=phase,
+            phase=next(phase for phase, holds in phases.items() if holds),
             controller=self.controller if self._outside_n is None else "outside",
             why=self._why,
         )

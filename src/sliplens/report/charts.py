@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import binomtest
 
+from sliplens.grip.plant import LATENCY_S
 from sliplens.grip.records import Grip
 from sliplens.plots import errors, style
 from sliplens.plots.margins import plot_grip
@@ -174,7 +175,7 @@ def plate_trace(grip: Grip) -> Plate:
         alt=f"Force, margin and slip over time: the object {fate}",
         caption=f"A {setup.object}, {setup.condition}, held by the controller {setup.controller}: it {fate}, with a "
         f"mean force of {float(first.mean_force_n[0]):.2f} N, {excess} over the least that holds. Predictions were "
-        f"{source}, with a latency of {1e3 * setup.latency_s:.0f} ms and the actuator's lag. The predicted "
+        f"{source}, with a latency of {1e3 * LATENCY_S:.0f} ms and the actuator's lag. The predicted "
         f"margin is the mean of both fingers, the true one that of the finger with less.{friction} Of "
         f"{number_of(count, 'episode')} {fell} fell ({low} to {high}, 95 % interval), with a median force of "
         f"{style.percent(float(np.median(grip.episodes.force_excess)))} over the least that holds.",
