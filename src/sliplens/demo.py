@@ -61,6 +61,11 @@ def run_demo(
     ------
     InputError
         If the folder holds something else, or there are no real frames where they are named.
+
+    See Also
+    --------
+    examine_installation : Test the installation.
+    run_study : The study on your own data.
     """
     folder = Path(out)
     real = find_real_frames(real_frames)

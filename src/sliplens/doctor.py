@@ -37,6 +37,10 @@ def examine_installation(*, on_progress: OnProgress | None = None) -> tuple[Item
     -------
     tuple[Item, ...]
         Versions, and each network, engine and extra.
+
+    See Also
+    --------
+    run_demo : A first result with the included networks.
     """
     parts: list[tuple[str, Callable[[], str]]] = [
         ("versions", _versions),

@@ -50,6 +50,10 @@ class Friction:
     note
         Origin, for tables and pages.
 
+    See Also
+    --------
+    predict : Takes a friction, for networks that predict F_t / F_n.
+
     Examples
     --------
     >>> from sliplens.friction import Friction

@@ -520,6 +520,10 @@ def read_status(out: Path | str) -> list[Status]:
     InputError
         If nothing of that name was begun.
 
+    See Also
+    --------
+    run_study : A long work whose progress it reports.
+
     Examples
     --------
     >>> from sliplens import read_status

@@ -99,6 +99,11 @@ def run_episodes(
     InputError
         If there is no such object, controller, condition or network, or they do not go together.
 
+    See Also
+    --------
+    hold_grip : Control a gripper.
+    plot : Plot the grip force over time.
+
     Examples
     --------
     >>> import sliplens as sl

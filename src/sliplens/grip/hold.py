@@ -116,6 +116,11 @@ def hold_grip(
     GripperError
         If no gripper answers at the address.
 
+    See Also
+    --------
+    run_episodes : Simulate grips first.
+    LiveReader : Reader of a running fingertip.
+
     Examples
     --------
     >>> import sliplens as sl

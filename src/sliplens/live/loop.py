@@ -108,6 +108,11 @@ class LiveReader(FrameReader):
     ImageError
         If the frames are of another size than those of the network's sensor.
 
+    See Also
+    --------
+    read_live : Iterate over readings, without the rest.
+    hold_grip : Control a gripper by a reader.
+
     Examples
     --------
     >>> import numpy as np
@@ -454,6 +459,11 @@ def read_live(
     ------
     SliplensError
         If the source or the network is not there, does not fit, or breaks off.
+
+    See Also
+    --------
+    LiveReader : Context manager with a new reference, counters and callbacks.
+    predict : Predict recorded frames.
 
     Examples
     --------

@@ -77,6 +77,11 @@ def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str =
     InputError
         If the table lacks a column or has an unknown value, or all clips have one label.
 
+    See Also
+    --------
+    read_live : Detect slips on a running sensor.
+    track : Measure the motion of the markers.
+
     Examples
     --------
     >>> import sliplens as sl

@@ -87,6 +87,10 @@ def view(
     ------
     InputError
         If something is missing, does not fit, or the extra is not installed.
+
+    See Also
+    --------
+    plot : Draw the figure of a result.
     """
     path = None if out is None else Path(out)
     if path is not None:

@@ -125,6 +125,11 @@ def track(
         If the source cannot be read.
     PartError
         If some of many trials failed repeatedly, after all others are complete.
+
+    See Also
+    --------
+    plot : Plot the displacement.
+    view : Show markers over the frames.
     """
     path = None if out is None else Path(out)
     if path is not None and path.suffix:

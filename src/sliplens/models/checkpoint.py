@@ -517,6 +517,11 @@ def load(run: str | Path, *, device: str = "cpu") -> Network:
     CheckpointError
         If a file is missing, damaged, or of an unknown schema.
 
+    See Also
+    --------
+    train : Train a network.
+    wrap : Make a network of a PyTorch module.
+
     Examples
     --------
     >>> import sliplens as sl

@@ -58,6 +58,10 @@ def export_onnx(run: Network | Path | str, out: Path | str, *, overwrite: bool =
         File to write; its name ends in `.onnx`.
     overwrite
         If True, replace a file of that name.
+
+    See Also
+    --------
+    load : Load the network to export.
     """
     path = Path(out)
     require_new_file(path, suffix=".onnx", overwrite=overwrite)

@@ -203,6 +203,12 @@ def predict(
     ShardError
         If some of many trials failed again and again, when all others are there.
 
+    See Also
+    --------
+    evaluate : Compare predictions with labels.
+    explain : Explain predictions.
+    read_live : Predict frames of a running sensor.
+
     Examples
     --------
     >>> import numpy as np

@@ -89,6 +89,11 @@ def wrap(
         If the module is in training mode and has batch normalisation or dropout, does not run on an image, or does not
         return one number an image.
 
+    See Also
+    --------
+    load : Load a network of sliplens.
+    explain : Explain its predictions.
+
     Examples
     --------
     >>> import numpy as np, torch

@@ -74,6 +74,11 @@ def plot(result: Any, ax: Axes | None = None, *, index: int | None = None) -> Fi
     InputError
         If there is no picture of such a result, or it holds nothing to draw.
 
+    See Also
+    --------
+    write_report : Write a page of all results.
+    view : Show a trial in the Rerun viewer.
+
     Examples
     --------
     >>> import numpy as np
@@ -318,6 +323,11 @@ def make_profile(
     ------
     InputError
         If the source cannot be read, its frames show no gel, or the file exists.
+
+    See Also
+    --------
+    import_recordings : Import recordings with a profile.
+    read_live : Read a camera with a profile.
     """
     from sliplens.models.checkpoint import read_manifest  # noqa: PLC0415 (torch takes seconds)
 

@@ -38,6 +38,11 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
     forces and contact states agree, and F_t / F_n stays within the friction by 3 sigma, before a slip and after it. For
     the data set: no trial is listed twice, no file is unlisted, and no recording was cut off. Flags on labels, such as
     faults of the force sensor, are notes: frames at a fault are not valid.
+
+    See Also
+    --------
+    recover_dataset : Recover the trials of an interrupted recording.
+    label_dataset : Compute labels again.
     """
     data = load_dataset(data)
     folder, violations, labellings = data.folder, [], []

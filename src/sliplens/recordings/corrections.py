@@ -92,6 +92,10 @@ def draft_corrections(data: Dataset | Path | str, path: Path | str) -> None:
 
     Columns that begin with `current_` show the values of the present labels and are ignored on reading: write the value
     that should hold instead into the column without that prefix. `sliplens label DATA --corrections` applies the table.
+
+    See Also
+    --------
+    label_dataset : Apply the table.
     """
     data, path = load_dataset(data), Path(path)
     if path.exists():
@@ -156,6 +160,11 @@ def label_dataset(
         replace those of the last call, and take precedence over `labelling`. If None, those of the last call hold.
     on
         See `import_recordings`.
+
+    See Also
+    --------
+    draft_corrections : Write a table of corrections to edit.
+    check_dataset : List the defects of a data set.
     """
     with reporting(on_progress):
         data = load_dataset(data)

@@ -103,6 +103,11 @@ def load_dataset(folder: Dataset | Path | str) -> Dataset:
 
     A recording that was cut off is noted, and no trial of the data set until `recover_dataset` finishes it. An open
     data set is returned as it is.
+
+    See Also
+    --------
+    import_recordings : Make a data set of recordings.
+    simulate : Simulate a data set.
     """
     if isinstance(folder, Dataset):
         return folder
@@ -122,6 +127,11 @@ def recover_dataset(folder: Path | str, *, on_progress: OnProgress | None = None
     """Make trials of recordings that were cut off, up to the last whole frame, and open the data set.
 
     A data set without such a recording stays as it is.
+
+    See Also
+    --------
+    load_dataset : Open a data set without changing it.
+    check_dataset : List the defects of a data set.
     """
     folder = require_folder(Path(folder), what="the data set")
     with reporting(on_progress):

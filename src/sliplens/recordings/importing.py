@@ -97,6 +97,12 @@ def import_recordings(
         `processes=4`, `ray`.
     **options
         `ImportOptions`. By default the reference is that of the source, else one of the frames before the contact.
+
+    See Also
+    --------
+    make_profile : Make the profile of a sensor from a recording.
+    split_dataset : Assign trials to training, validation and test.
+    label_dataset : Compute labels again.
     """
     require_executor(on)
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]

@@ -146,6 +146,11 @@ def split_dataset(
         Seed of the order in which groups are dealt.
     dry_run
         If True, nothing is written.
+
+    See Also
+    --------
+    import_recordings : Import and split in one call.
+    train : Train on a split data set.
     """
     data = load_dataset(data)
     splits = load_splits(splits)

@@ -63,6 +63,11 @@ def write_report(
     ------
     InputError
         If the workspace holds no result or a malformed one, or the file cannot be written.
+
+    See Also
+    --------
+    run_study : Run the study of a data set.
+    plot : Draw a single figure.
     """
     folder = Path(workspace) if isinstance(workspace, str | Path) else workspace.folder
     page = folder / PAGE if out is None else Path(out)

@@ -345,7 +345,12 @@ SETTINGS = (
 
 @dataclass(frozen=True, kw_only=True)
 class StudyConfig:
-    """Options of a study, kept in its folder."""
+    """Options of a study, kept in its folder.
+
+    See Also
+    --------
+    run_study : Run a study with these options.
+    """
 
     methods: tuple[str, ...] = STUDY_METHODS
     """Explainers to compare."""

@@ -115,6 +115,11 @@ def simulate(
     ------
     InputError
         If the recipe cannot be followed, the device is not there, or the folder holds something else.
+
+    See Also
+    --------
+    import_recordings : Import recordings of a sensor.
+    run_episodes : Simulate grips under control.
     """
     require_device(device)
     recipe = make_recipe(preset, sensor=sensor, **changes)

@@ -129,6 +129,12 @@ def explain(
     PartError
         If some of many maps failed three times, when all others are done.
 
+    See Also
+    --------
+    score : Measure the faithfulness of the maps.
+    run_study : Compare methods on a data set.
+    plot : Plot the maps.
+
     Examples
     --------
     >>> import numpy as np

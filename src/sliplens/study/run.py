@@ -112,6 +112,12 @@ def run_study(
     PartError
         If part of a step failed again and again, when all the rest of it is done.
 
+    See Also
+    --------
+    explain : Explain single frames.
+    score : Score the maps of one method.
+    write_report : Write the page of a study.
+
     Examples
     --------
     >>> import sliplens as sl

@@ -115,6 +115,11 @@ def score(
         array has no number below zero for a frame whose prediction fell.
     PartError
         If some of several trials failed three times, when all others are done.
+
+    See Also
+    --------
+    explain : Make maps.
+    run_study : Compare methods on a data set.
     """
     get_fill(fill)
     if random_orders < 1:

@@ -64,6 +64,11 @@ def evaluate(
         If True, replace a folder `out` of other settings.
     on_progress
         Callback for progress.
+
+    See Also
+    --------
+    predict : Predict without labels.
+    score : Measure the faithfulness of explanations.
     """
     network = open_run(run)
     prior = None if friction is None else EACH if friction == EACH else as_friction(friction)

@@ -133,6 +133,12 @@ def train(
         If there is no labelled trial to train or to validate on, or all labels to train on are the same.
     ModelError
         If the network to start from is of another kind, or the loss is no longer finite.
+
+    See Also
+    --------
+    evaluate : Measure the accuracy of the network.
+    load : Load it from its folder.
+    wrap : Use a network trained elsewhere.
     """
     accelerator = options.pop("accelerator", "auto")
     changes: TrainingChanges = {name: value for name, value in options.items() if value is not None}  # pyright: ignore[reportAssignmentType]
