@@ -136,7 +136,7 @@ def write_math(translator: HTML5Translator, node: nodes.math | nodes.math_block)
 
 
 def complete_docstring(_app: Sphinx, what: str, name: str, thing: object, _options: object, lines: list[str]) -> None:
-    """Add what no docstring need say: what a package exports, and the pages of the gallery that use a name."""
+    """Add the name of a module, what it exports, and the pages of the gallery that use a name."""
     # bars are absolute values, |T_n - T_0|, not substitutions of reStructuredText
     lines[:] = [line.replace("|", r"\|") for line in lines]
     if what == "module" and isinstance(thing, ModuleType):
@@ -146,6 +146,7 @@ def complete_docstring(_app: Sphinx, what: str, name: str, thing: object, _optio
             if (inspect.isroutine(getattr(thing, one)) or inspect.isclass(getattr(thing, one)))
             and getattr(getattr(thing, one), "__module__", "").startswith("sliplens")
         ]
+        lines[:0] = [f".. rubric:: {name}", ""]
         lines += [".. autosummary::", "   :nosignatures:", "", *(f"   {one}" for one in names), ""]
     # examples name a class by the shortest path that leads to it, whether or not it is exported there
     for used in dict.fromkeys((name, f"sliplens.{getattr(thing, '__name__', '')}")):
