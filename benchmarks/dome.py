@@ -13,37 +13,58 @@ mounting. Every number is of states that the calibration never saw.
   tilts of both masses); `mass`, `tilt` and `direction` leave out each of two halves in
   turn. Of each training state two repeats of ten are held out to stop the training.
 - `leave_out`: one mass, tilt or direction left out of both masses, the others calibrate.
+- `sim_vs_real`: the simulator's dome with the dots of this one. Its lens and stiffness are fitted to the vertical loads
+  from 584 g, all else of its motion is that of the ChromaTouch. Correlation of simulated and real displacements
+  (all dots, both coordinates), of a press as such and, under tilt, of what differs from the press of the same mass; how
+  many times as large the real motion is; and the power of the load with which the dots spread.
+- `health`: share of the frames that each check of live readings withholds.
 """
 
 import argparse
 import csv
 import json
 import os
+import time
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from sliplens.images import read_image
+from sliplens.live.health import HealthMonitor
+from sliplens.live.reading import LiveFrame
 from sliplens.markers import calibrate_traction, track_markers
+from sliplens.markers.estimators import affine_parts
+from sliplens.markers.tracker import Tracker
 from sliplens.recordings import import_recordings
 from sliplens.recordings.formats.tables import open_text_table
 from sliplens.recordings.options import LabelSettings
+from sliplens.simulation.geometry import Dome
+from sliplens.simulation.loading import load_at_states, move_markers
+from sliplens.simulation.nuisances import Grasp, Touch
+from sliplens.simulation.sensor import CHROMATOUCH
 from sliplens.training import evaluate, train
 
 LIGHT_G, HEAVY_G = 135.6, 584.2
+CENTRE_PX = 152.0, 125.0  # middle of the dome in the picture
 TEN_TILTS = (0, 0), (15, 0), (0, -30), (-15, -15), (-30, 30)
 """Tilts about x and z, in degrees, of five training states for each mass: every F_t / F_n that occurs, once."""
 
 
-def read_states(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean displacement of the markers by state in pixels, forces (shear x, z, normal) in newtons, mass and tilts."""
+def read_states(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Mean displacement of the markers by state in pixels, forces (shear x, z, normal) in newtons, mass and tilts.
+
+    The last are the places of the markers at rest.
+    """
     table = open_text_table(folder / "states.csv")
     rows = [dict(zip(table.header, cells, strict=True)) for _, cells in table.rows]
     states = np.array([[float(row[name]) for name in ("mass_g", "tilt_x_deg", "tilt_z_deg")] for row in rows])
     force_n = np.array([[float(row[name]) for name in ("shear_x_n", "shear_z_n", "normal_n")] for row in rows])
     frames = [read_image(folder / row["file"]) for row in rows]
     untouched = states[:, 0] == 0
-    moved_px = track_markers(frames, frames[int(np.flatnonzero(untouched)[0])]).displacement_px
+    tracks = track_markers(frames, frames[int(np.flatnonzero(untouched)[0])])
+    moved_px = tracks.displacement_px
     moved_px = moved_px - np.nanmean(moved_px[untouched], axis=0)
     kinds, number = np.unique(states[~untouched], axis=0, return_inverse=True)
     means, forces = [], []
@@ -52,7 +73,7 @@ def read_states(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         seen = np.isfinite(moved_px[of]).all(axis=2).mean(axis=0) >= 0.5
         means.append(np.where(seen[:, None], np.nanmean(np.where(seen[:, None], moved_px[of], 0), axis=0), np.nan))
         forces.append(force_n[of[0]])
-    return np.stack(means), np.stack(forces), kinds
+    return np.stack(means), np.stack(forces), kinds, tracks.rest_px
 
 
 def compare(vector: np.ndarray, force_n: np.ndarray) -> dict[str, object]:
@@ -183,6 +204,102 @@ def by_markers(moved_px: np.ndarray, force_n: np.ndarray, states: np.ndarray, *,
     return found
 
 
+@dataclass(frozen=True, kw_only=True)
+class SeenDome(Dome):
+    """A dome whose dots lie where they are seen."""
+
+    seen_px: tuple[tuple[float, float], ...]
+
+    def marker_positions(self, depth_m: float = 0.0) -> np.ndarray:
+        """Places of the dots under the skin, in metres: where their lines of sight meet the sphere."""
+        away = (np.array(self.seen_px) - self.centre_px) / self.focal_px_per_rad
+        angle = np.linalg.norm(away, axis=1, keepdims=True)
+        sight = np.concatenate([away * np.sinc(angle / np.pi), np.cos(angle)], axis=1)
+        behind_m, radius_m = self.camera_offset * self.radius_m, self.radius_m - depth_m
+        along = behind_m * sight[:, 2:]
+        return sight * (along + np.sqrt(along**2 + radius_m**2 - behind_m**2)) - [0, 0, behind_m]
+
+
+def simulate(dome: SeenDome, stiffness: float, model: str, force_n: np.ndarray) -> np.ndarray:
+    """Displacements of the dots under forces (shear x, z, normal), in pixels; friction 1, under which nothing slips."""
+    sensor = replace(
+        CHROMATOUCH,
+        geometry=dome,
+        effective_modulus_pa=(CHROMATOUCH.effective_modulus_pa or 0) * stiffness,
+        youngs_modulus_pa=CHROMATOUCH.youngs_modulus_pa * stiffness,
+    )
+    fields = []
+    for x_n, z_n, normal_n in force_n:
+        margin, one = np.array([1 - np.hypot(x_n, z_n) / normal_n]), np.ones(1)
+        grasp = Grasp(friction=1.0, contact_offset=(0.0, 0.0), shear_direction_rad=float(np.arctan2(z_n, x_n)))
+        loading = load_at_states(normal_n * one, friction=one, margins=margin)
+        motion = move_markers(sensor, Touch(grasp=grasp), loading=loading, displacement=model)
+        fields.append(motion.centres_px[0] - motion.rest_px)
+    return np.array(fields)
+
+
+def compare_motion(simulated: np.ndarray, real: np.ndarray) -> dict[str, float]:
+    """Correlation about zero of two fields of displacements, and how many times as large the real one is."""
+    seen = np.isfinite(real)
+    one, other = simulated[seen], real[seen]
+    return {
+        "correlation": float(one @ other / np.sqrt(one @ one * (other @ other))),
+        "real_over_simulated": float(one @ other / (one @ one)),
+    }
+
+
+def sim_vs_real(
+    moved_px: np.ndarray, force_n: np.ndarray, states: np.ndarray, rest_px: np.ndarray
+) -> dict[str, object]:
+    """Compare the motion of the simulator's dome with that of the real one, by displacement model."""
+    mass, tilted = states[:, 0], np.any(states[:, 1:] != 0, axis=1)
+    vertical = ~tilted & (mass > HEAVY_G - 1)
+    load_n, found = force_n[vertical, 2], {}
+    for model, stiffnesses in (("calibrated", (12, 24, 48, 96)), ("half-space", (0.6, 1.2, 2.4, 4.8))):
+        fits = []
+        for focal, offset, stiffness in product((130.0, 160.0, 190.0, 230.0), (0.0, 0.2, 0.4, 0.6), stiffnesses):
+            dome = SeenDome(
+                radius_m=0.020, camera_offset=offset, focal_px_per_rad=focal, centre_px=CENTRE_PX,
+                ring_spacing_deg=10.0, ring_counts=(1,), ring_scale=(1.0,), seen_px=tuple(map(tuple, rest_px.tolist())),
+            )  # fmt: skip
+            error = simulate(dome, stiffness, model, force_n[vertical]) - moved_px[vertical]
+            fits.append((float(np.nansum(error**2)), focal, offset, stiffness, dome))
+        _, focal, offset, stiffness, dome = min(fits, key=lambda fit: fit[0])
+        pressed = simulate(dome, stiffness, model, force_n[vertical])
+        spreads = [affine_parts(rest_px, field)[:, 2] for field in (pressed, moved_px[vertical])]
+        powers = [float(np.polyfit(np.log(load_n), np.log(spread), 1)[0]) for spread in spreads]
+        scores: dict[str, object] = {
+            "focal_px_per_rad": focal,
+            "camera_offset": offset,
+            "stiffness": stiffness,
+            "press": compare_motion(pressed, moved_px[vertical]),
+            "power_of_load": {"simulated": powers[0], "real": powers[1]},
+        }
+        for name, grams in (("light", LIGHT_G), ("heavy", HEAVY_G)):
+            of = np.abs(mass - grams) < 0.5
+            press_px, press_n = np.nanmean(moved_px[of & ~tilted], axis=0), force_n[of & ~tilted].mean(axis=0)
+            sheared = simulate(dome, stiffness, model, force_n[of & tilted])
+            sheared = sheared - simulate(dome, stiffness, model, press_n[None])
+            scores[f"shear_{name}"] = compare_motion(sheared, moved_px[of & tilted] - press_px)
+        found[model] = scores
+    return found
+
+
+def health(folder: Path) -> dict[str, float]:
+    """Share of the loaded frames that each check withholds, against the first untouched frame."""
+    with (folder / "states.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    frames = {row["file"]: read_image(folder / row["file"]) for row in rows}
+    untouched = next(frames[row["file"]] for row in rows if float(row["mass_g"]) == 0)
+    monitor, tracker, withheld = HealthMonitor(untouched), Tracker(untouched), dict[str, int]()
+    loaded = [row["file"] for row in rows if float(row["mass_g"]) > 0]
+    for number, name in enumerate(loaded):
+        frame = LiveFrame(image=frames[name], number=number, time_s=number / 2, captured_s=time.monotonic())
+        for check in monitor.check(frame, tracker.update(frame.image)):
+            withheld[check.name] = withheld.get(check.name, 0) + (not check.ok)
+    return {name: count / len(loaded) for name, count in withheld.items() if count} | {"frames": len(loaded)}
+
+
 def main() -> None:
     """Print what was measured as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -193,7 +310,7 @@ def main() -> None:
     options = parser.parse_args()
     if not (options.data / "states.csv").is_file():
         parser.error(f"{options.data} has no states.csv; name the folder of the dome's frames with --data")
-    moved_px, force_n, states = read_states(options.data)
+    moved_px, force_n, states, rest_px = read_states(options.data)
     tilted = np.any(states[:, 1:] != 0, axis=1)
     asked = np.abs(states[:, 0] - HEAVY_G) < 0.05
     known = ~asked & (~tilted | (np.abs(states[:, 0] - LIGHT_G) < 0.5))
@@ -211,6 +328,8 @@ def main() -> None:
         "ridge": ridge(moved_px, force_n, known, asked),
         "leave_out": leave_out(moved_px, force_n, states, given=False),
         "leave_out_load_given": leave_out(moved_px, force_n, states, given=True),
+        "sim_vs_real": sim_vs_real(moved_px, force_n, states, rest_px),
+        "health": health(options.data),
     }
     if options.adapt is not None:
         starts = {"chromatouch-pair": "chromatouch-pair", "scratch": None}
