@@ -64,31 +64,8 @@ def find(name: str) -> object:
         return getattr(find(owner), last)
 
 
-@PAGE
-def test_what_a_page_imports_is_there(page: Path):
-    names = [
-        f"{node.module}.{alias.name}"
-        for code in code_of(page)
-        for node in ast.walk(code)
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("sliplens")
-        for alias in node.names
-    ]
-    assert not [name for name in names if not exists(name)]
-
-
-@PAGE
-def test_what_a_page_calls_is_public(page: Path):
-    calls = {
-        node.attr
-        for code in code_of(page)
-        for node in ast.walk(code)
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in {"sl", "sliplens"}
-    }
-    assert calls <= set(sliplens.__all__)
-
-
 def calls_of(code: ast.Module) -> Iterator[tuple[ast.Call, object]]:
-    """Calls of names of `sliplens`, and what each name stands for."""
+    """Calls of names of `sliplens`, and what each name stands for; an import that is not there fails."""
     imported = {
         alias.asname or alias.name: find(f"{node.module}.{alias.name}")
         for node in ast.walk(code)
@@ -105,9 +82,12 @@ def calls_of(code: ast.Module) -> Iterator[tuple[ast.Call, object]]:
 
 
 @PAGE
-def test_what_a_page_calls_takes_what_it_is_given(page: Path):
-    """What would break an example is told without running it; `make docs` runs them all."""
+def test_what_a_page_imports_and_calls_is_there_and_takes_its_arguments(page: Path):
+    """Examples are not run here; `make docs` runs them all."""
     for code in code_of(page):
+        names = (node for node in ast.walk(code) if isinstance(node, ast.Attribute))
+        used = {each.attr for each in names if isinstance(each.value, ast.Name) and each.value.id in {"sl", "sliplens"}}
+        assert used <= set(sliplens.__all__)
         for call, thing in calls_of(code):
             assert callable(thing)
             given = [argument for argument in call.args if not isinstance(argument, ast.Starred)]
