@@ -66,6 +66,12 @@ def run_demo(
     --------
     examine_installation : Test the installation.
     run_study : The study on your own data.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> sl.run_demo("runs/demo")  # doctest: +SKIP
+    PosixPath('runs/demo/report.html')
     """
     folder = Path(out)
     real = find_real_frames(real_frames)

@@ -41,6 +41,12 @@ def examine_installation(*, on_progress: OnProgress | None = None) -> tuple[Item
     See Also
     --------
     run_demo : A first result with the included networks.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> [item.name for item in sl.examine_installation() if not item.works]  # doctest: +SKIP
+    ['extra ray']
     """
     parts: list[tuple[str, Callable[[], str]]] = [
         ("versions", _versions),

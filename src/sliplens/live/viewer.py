@@ -91,6 +91,11 @@ def view(
     See Also
     --------
     plot : Draw the figure of a result.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> sl.view("data", out="trial.rrd")  # doctest: +SKIP
     """
     path = None if out is None else Path(out)
     if path is not None:

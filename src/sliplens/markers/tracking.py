@@ -130,6 +130,13 @@ def track(
     --------
     plot : Plot the displacement.
     view : Show markers over the frames.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> table = sl.track("clip.avi", markers="gelsight-mini").frame()  # doctest: +SKIP
+    >>> list(table.columns)[:4]  # doctest: +SKIP
+    ['trial', 'frame', 'time_s', 'marker']
     """
     path = None if out is None else Path(out)
     if path is not None and path.suffix:

@@ -62,6 +62,12 @@ def export_onnx(run: Network | Path | str, out: Path | str, *, overwrite: bool =
     See Also
     --------
     load : Load the network to export.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> sl.export_onnx("chromatouch-pair", "tip.onnx")  # doctest: +SKIP
+    PosixPath('tip.onnx')
     """
     path = Path(out)
     require_new_file(path, suffix=".onnx", overwrite=overwrite)

@@ -328,6 +328,12 @@ def make_profile(
     --------
     import_recordings : Import recordings with a profile.
     read_live : Read a camera with a profile.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> sl.make_profile("tip.mp4", "tip.toml").profile.name  # doctest: +SKIP
+    'tip'
     """
     from sliplens.models.checkpoint import read_manifest  # noqa: PLC0415 (torch takes seconds)
 

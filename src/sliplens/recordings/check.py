@@ -43,6 +43,12 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
     --------
     recover_dataset : Recover the trials of an interrupted recording.
     label_dataset : Compute labels again.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> sl.check_dataset(sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20))
+    ()
     """
     data = load_dataset(data)
     folder, violations, labellings = data.folder, [], []

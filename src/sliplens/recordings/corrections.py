@@ -96,6 +96,12 @@ def draft_corrections(data: Dataset | Path | str, path: Path | str) -> None:
     See Also
     --------
     label_dataset : Apply the table.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> sl.draft_corrections("data", "corrections.csv")  # doctest: +SKIP
+    >>> sl.label_dataset("data", corrections="corrections.csv")  # doctest: +SKIP
     """
     data, path = load_dataset(data), Path(path)
     if path.exists():
@@ -165,6 +171,12 @@ def label_dataset(
     --------
     draft_corrections : Write a table of corrections to edit.
     check_dataset : List the defects of a data set.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> from sliplens.recordings import LabelSettings
+    >>> data = sl.label_dataset("data", out="other", labelling=LabelSettings(mu=0.8))  # doctest: +SKIP
     """
     with reporting(on_progress):
         data = load_dataset(data)

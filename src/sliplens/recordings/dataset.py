@@ -108,6 +108,13 @@ def load_dataset(folder: Dataset | Path | str) -> Dataset:
     --------
     import_recordings : Make a data set of recordings.
     simulate : Simulate a data set.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> data = sl.load_dataset("data")  # doctest: +SKIP
+    >>> data.load(data.trials[0]).frames.shape  # doctest: +SKIP
+    (240, 224, 224, 3)
     """
     if isinstance(folder, Dataset):
         return folder
@@ -132,6 +139,12 @@ def recover_dataset(folder: Path | str, *, on_progress: OnProgress | None = None
     --------
     load_dataset : Open a data set without changing it.
     check_dataset : List the defects of a data set.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> [trial.trial for trial in sl.recover_dataset("recorded").trials]  # doctest: +SKIP
+    ['live-1']
     """
     folder = require_folder(Path(folder), what="the data set")
     with reporting(on_progress):

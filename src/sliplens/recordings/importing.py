@@ -103,6 +103,13 @@ def import_recordings(
     make_profile : Make the profile of a sensor from a recording.
     split_dataset : Assign trials to training, validation and test.
     label_dataset : Compute labels again.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> data = sl.import_recordings("cup.mp4", forces="cup.csv", out="data", sensor="tip")  # doctest: +SKIP
+    >>> data.trials[0].trial  # doctest: +SKIP
+    'cup'
     """
     require_executor(on)
     paths = [Path(source) for source in ([sources] if isinstance(sources, Path | str) else sources)]

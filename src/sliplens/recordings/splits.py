@@ -151,6 +151,12 @@ def split_dataset(
     --------
     import_recordings : Import and split in one call.
     train : Train on a split data set.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> sorted(set(sl.split_dataset("data", "object", dry_run=True).splits))  # doctest: +SKIP
+    ['test', 'train', 'validation']
     """
     data = load_dataset(data)
     splits = load_splits(splits)

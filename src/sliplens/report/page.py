@@ -68,6 +68,12 @@ def write_report(
     --------
     run_study : Run the study of a data set.
     plot : Draw a single figure.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> sl.write_report("runs/mine").page  # doctest: +SKIP
+    PosixPath('runs/mine/report.html')
     """
     folder = Path(workspace) if isinstance(workspace, str | Path) else workspace.folder
     page = folder / PAGE if out is None else Path(out)

@@ -350,6 +350,12 @@ class StudyConfig:
     See Also
     --------
     run_study : Run a study with these options.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> sl.StudyConfig(trials=5, methods=("poly-cam", "shapley-marker")).trials
+    5
     """
 
     methods: tuple[str, ...] = STUDY_METHODS

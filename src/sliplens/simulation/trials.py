@@ -120,6 +120,13 @@ def simulate(
     --------
     import_recordings : Import recordings of a sensor.
     run_episodes : Simulate grips under control.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> data = sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20)
+    >>> len(data.trials), data.trials[0].split
+    (3, 'train')
     """
     require_device(device)
     recipe = make_recipe(preset, sensor=sensor, **changes)

@@ -120,6 +120,14 @@ def score(
     --------
     explain : Make maps.
     run_study : Compare methods on a data set.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> maps = sl.explain("chromatouch-pair", frames, reference=untouched)  # doctest: +SKIP
+    >>> score = sl.score("chromatouch-pair", maps).scores[0]  # doctest: +SKIP
+    >>> score.method, round(score.srg.estimate, 2), score.lead_over_controls.control  # doctest: +SKIP
+    ('shapley-marker', 0.81, 'change')
     """
     get_fill(fill)
     if random_orders < 1:

@@ -69,6 +69,13 @@ def evaluate(
     --------
     predict : Predict without labels.
     score : Measure the faithfulness of explanations.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> data = sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20)  # doctest: +SKIP
+    >>> round(sl.evaluate("chromatouch-pair", data).conditions["dry"].r2, 2)  # doctest: +SKIP
+    0.85
     """
     network = open_run(run)
     prior = None if friction is None else EACH if friction == EACH else as_friction(friction)

@@ -139,6 +139,13 @@ def train(
     evaluate : Measure the accuracy of the network.
     load : Load it from its folder.
     wrap : Use a network trained elsewhere.
+
+    Examples
+    --------
+    >>> import sliplens as sl
+    >>> network = sl.train("data", "run", recipe="adapt", start_from="chromatouch-pair")  # doctest: +SKIP
+    >>> network.manifest.input  # doctest: +SKIP
+    'pair'
     """
     accelerator = options.pop("accelerator", "auto")
     changes: TrainingChanges = {name: value for name, value in options.items() if value is not None}  # pyright: ignore[reportAssignmentType]
