@@ -144,9 +144,7 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
                 test[seen] = test.get(seen) or load_frames(
                     data, data.select(split="test"), encoding=run.encoding, image_size=size
                 )
-                minutes = 0.0 if run.training is None or not trials else run.training.minutes
-                write_json(part, {**r2(run, test[seen]), "minutes": minutes})
-                print(f"  {json.loads(part.read_text())}", file=sys.stderr)
+                write_json(part, r2(run, test[seen]))
             row = found.setdefault(name, {}).setdefault(start, {})
             row.setdefault(str(trials), []).append(json.loads(part.read_text()))
     means = {

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from sliplens.images import soften
 from sliplens.mechanics import stick_ratio
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.labels import LabelSettings, measure_motion
+from sliplens.recordings.labels import measure_motion
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.simulation import TrialPlan
 from sliplens.simulation.filming import Film
@@ -297,11 +297,6 @@ def tilt(
         + np.cross(direction, force_n) * np.sin(angle)
         + np.outer(force_n @ direction, direction) * (1 - np.cos(angle))
     )
-
-
-def settings_of(case: Case, *, friction_change: float) -> LabelSettings:
-    """Settings of the labels of a case."""
-    return LabelSettings(friction_change=friction_change, mu=case.mu, slip_s=case.slip_s)
 
 
 def near_events(case: Case, time_s: Float[np.ndarray, " frames"], *, within_s: float) -> Bool[np.ndarray, " frames"]:

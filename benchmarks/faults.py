@@ -30,7 +30,6 @@ from contact_events import (
     Seen,
     film_trial,
     near_events,
-    settings_of,
     spoil,
     tilt,
 )
@@ -173,8 +172,14 @@ class Outcome:
     clean: int
     """Frames that are valid without the fault and that no faulty sample comes near."""
     kept: int
-    flagged: bool
     refusal: str = ""
+
+
+def refused(refusal: RecordingError, clean: int, *, trial: str, fault: str, strength: int) -> Outcome:
+    """Return the outcome of a trial without labels."""
+    return Outcome(
+        trial=trial, fault=fault, strength=strength, valid=0, off=0, loose=0, clean=clean, kept=0, refusal=str(refusal)
+    )
 
 
 def measure_trial(seen: Seen, *, rate: int, rng: np.random.Generator) -> list[Outcome]:
@@ -214,8 +219,7 @@ def measure_trial(seen: Seen, *, rate: int, rng: np.random.Generator) -> list[Ou
                 found = label(replace(forces, time_s=forces.time_s[there], force_n=force[there]))
             except RecordingError as refusal:
                 clean = int(np.sum(fine.valid & ~near))
-                nothing = {"valid": 0, "off": 0, "loose": 0, "kept": 0, "flagged": True}
-                outcomes.append(Outcome(**facts, **nothing, clean=clean, refusal=str(refusal)))
+                outcomes.append(refused(refusal, clean, **facts))
                 continue
             outcomes.append(_compare(found, fine.valid, truth, near, **facts))
     for event, change in EVENTS.items():
@@ -236,14 +240,14 @@ def _measure_event(
     forces = replace(forces, time_s=forces.time_s[::rate], force_n=forces.force_n[::rate])
     frame_s, count = seen.loading.time_s[seen.frames], len(seen.frames)
     near, truth = near_events(case, frame_s, within_s=_NEAR_S + LONGEST_LAG_S), seen.loading.safety_margin[seen.frames]
-    settings = settings_of(case, friction_change=0.0 if seen.plan.condition == "dry" else 0.1)
+    change = 0.0 if seen.plan.condition == "dry" else 0.1
+    settings = LabelSettings(friction_change=change, mu=case.mu, slip_s=case.slip_s)
     lag_s = rng.uniform(-LONGEST_LAG_S, LONGEST_LAG_S)
     before = fine.valid[:count] & np.isfinite(truth) & (truth > 0)
     try:
         found = label_trial(frame_s + lag_s, seen.motion, forces, settings=settings, rng=rng)
     except RecordingError as refusal:
-        nothing = {"valid": 0, "off": 0, "loose": 0, "kept": 0, "flagged": True}
-        return Outcome(**facts, **nothing, clean=int(np.sum(before & ~near)), refusal=str(refusal))
+        return refused(refusal, int(np.sum(before & ~near)), **facts)
     return _compare(found, before, truth, near, **facts)
 
 
@@ -269,7 +273,6 @@ def _compare(
         loose=int(np.sum(valid & (sigma > LARGEST_SIGMA))),
         clean=int(clean.sum()),
         kept=int(np.sum(clean & valid)),
-        flagged=bool(found.basis.flags),
     )
 
 
@@ -298,7 +301,6 @@ def summarise_faults(outcomes: list[Outcome]) -> dict[str, dict[str, Any]]:
             "false_valid_share": _share(some, "off", "valid")[0],
             "valid_kept_share": _share(some, "kept", "clean")[0],
             "refused_share": float(np.mean([bool(one.refusal) for one in some])),
-            "flagged_share": float(np.mean([one.flagged for one in some])),
             "false_valid_by_strength": [_share(those, "off", "valid")[0] for those in by_strength],
         }
     return shares

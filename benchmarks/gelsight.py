@@ -8,15 +8,11 @@ windows, in which their number cannot be seen. Beside them stands what the numbe
 The clips of full length were recorded apart from the shorter ones, of which three in four slip. So clips weigh, in
 training, as if as many slipped as held in either part: knowing which part a clip is of tells nothing.
 
-Objects are left out one at a time (for the network in folds); intervals are of 95 %, from drawing objects again.
-Balanced accuracy and F1 (of slip) are of clips; `grasps` joins both fingers, and so do `balanced_accuracy`, `low` (the
-lower end of its interval) and `frame_count_alone` at the top.
+Objects are left out one at a time (for the network in folds); 95 % intervals are over objects. `grasps` joins both
+fingers, as do the figures at the top.
 
-Rest jitter is measured where the picture says that the sensor is still. The clips are compressed: between key frames,
-one in twelve, what does not change is copied, and a copied dot does not jitter. Key frames are coded anew with the
-camera's noise of their moment, so still are runs of three and more key frames that each differ from the one before by
-no more than the noise of the camera: it leaves 0.9 to 1.5 grey levels on average, by finger, and motion adds to them.
-Slow creep of the gel passes for rest, so what is measured is no less than the noise of the dots.
+Rest jitter is measured over runs of three and more key frames that differ by no more than the noise of the camera (0.9
+to 1.5 grey levels): between key frames the video copies what does not change.
 """
 
 import argparse

@@ -1,21 +1,16 @@
 """Whether health tells that a margin is off: faults at graded strength on simulated trials, and healthy frames.
 
-Each frame in contact of unseen days and sensors is read as it is, and with each fault in each strength; faults of
-camera and light are there since before the touch, a turn and a zoom also in a contact that was never seen without (`in
+Each frame in contact of unseen days and sensors is predicted as it is, and with each fault in each strength. Faults of
+camera and light are there since before the touch; a turn and a zoom also in a contact that was never seen without (`in
 contact`). `dropped` is a picture that falls by 28 pixels at once, `torn` one of the upper part of a frame and the lower
-part of one 0.4 or 1.6 s later, `pulled` a pull towards 180 or 270 degrees, with which a network is only wrong where its
-training had no such pulls: all others are pulled as in that. `half stale` and `frozen` are sequences at 10 frames a
-second with the samples of a force sensor, in which the lower half of the picture, or all of it under fresh noise, has
-stayed as it was 0.5 or 1 s ago; the last frame of each such sequence is also read without the fault. A margin is off
-where it errs by more than 0.2; without contact there is none, so any answer counts as off. `shown_wrong_share` is the
-share of a fault's frames that are off and not withheld.
+part of one 0.4 or 1.6 s later, `pulled` a pull towards 180 or 270 degrees, outside the network's training. In `half
+stale` and `frozen` half of the picture, or all of it under fresh noise, has stood still for 0.5 or 1 s. A margin is off
+where it errs by more than 0.2, or without contact. `shown_wrong_share` is the share of frames off and not withheld.
 
 `auroc` ranks all these frames by `margin_risk`, in which all checks and the network's own spread are one number, and
-`auroc_worst` by how far their worst check is from its limit. `auroc_told` says what can be reached: that
-of somebody who is told each fault and its strength, and ranks by how often it put the margins of the other trials off:
-a fault that leaves half of the margins right cannot be ranked better, however well it is seen.
-`seen_by_health` and `seen_by_network` are AUROCs of each fault against frames without one, by the worst check and by
-`Estimate.known` alone. `withheld_healthy` is the share of the frames without a fault whose margin is withheld.
+`auroc_worst` by how far their worst check is from its limit. `auroc_told` is the best that can be reached: ranking by
+the true fault and strength, and how often it put the margins of the other trials off. `seen_by_network` is the AUROC of
+each fault against frames without one, by `Estimate.known`. `withheld_healthy` is the share of healthy frames withheld.
 
 With --choose, on other days and sensors, the quantiles of healthy values are printed, from which the limits were
 chosen, and the numbers of `margin_risk`. Choice and test share no day and no sensor.
@@ -376,8 +371,6 @@ def summarise(cases: list[Case]) -> dict[str, object]:
         "auroc": auroc(risk[off], risk[~off]),
         "auroc_worst": auroc(worst[off], worst[~off]),
         "auroc_told": auroc(told[off], told[~off]),
-        "seen_by_health": {name: auroc(worst[kinds == name], worst[healthy]) for name in faults}
-        | {"all": auroc(worst[~healthy], worst[healthy])},
         "seen_by_network": {name: auroc(-known[kinds == name], -known[healthy]) for name in faults}
         | {"all": auroc(-known[~healthy], -known[healthy])},
         "withheld_healthy": float(np.mean([bool(case.failed) for case in by_fault["none"]])),

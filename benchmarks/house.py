@@ -21,24 +21,7 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "sliplens"
 RIDDLES = frozenset(
-    [
-        "one",
-        "own",
-        "told",
-        "known",
-        "found",
-        "kept",
-        "left",
-        "held",
-        "named",
-        "shown",
-        "said",
-        "given",
-        "asked",
-        "looked",
-        "wished",
-        "seen",
-    ]
+    "one own told known found kept left held named shown said given asked looked wished seen".split()  # noqa: SIM905
 )
 """Names that say nothing of their value; counted among variables and parameters."""
 VAGUE_OPENINGS = ("What", "Whether", "As", "The same")

@@ -1,27 +1,17 @@
-"""How well a network reads the margin where friction is told, and where it is not, on one untouched test.
+"""Accuracy of a network where friction is known and where it is not, on a held-out test.
 
-The trials are of days, sensors, frictions and seeds of their own (a series of its own is drawn into every seed, and the
-seeds are checked against those of the trainings and of the other sets): 120 days, three dry trials each (friction 0.5
-to 1.2 by day) and three wet ones (0.15 to 0.7, drifting). Variants are compared with `--set selection`, on 40 other
-days; the test is for the one that was chosen.
+The test has 120 days of sensors, frictions and seeds of their own, three dry trials each (friction 0.5 to 1.2 by day)
+and three wet ones (0.15 to 0.7, drifting); seeds are checked against those of trainings and other sets. Variants are
+compared with `--set selection`, on 40 other days. Intervals hold 95 % over days.
 
-`--against` names another network: what the first is ahead in R2, the days resampled together.
+Friction is unknown; exact; wrong by up to 10 %, as a range of 10 % either way; or learnt from one earlier slip: the
+network predicts F_t / F_n in five frames of the last 0.2 s before the slip of an earlier grasp of the object, whose
+friction lies within a tenth of the object's.
 
-What is told: nothing; the static friction of each trial, exactly; a number that is wrong by up to 10 %, as a range of
-10 % either way; or what one earlier slip of the same object has taught. For that the object is grasped once before, at
-a place, force and stretch of its own; the network reads F_t / F_n in five frames of the last 0.2 s before the slip,
-whose time is the true one. The friction of both grasps lies within a tenth of the object's: so the dry trials of a
-day are drawn, and the spread is the very one that `Friction.from_slips` expects. Wet trials are drawn each with a
-friction of its own, and are given an earlier grasp as if they were of one such object.
-
-`several`, of a network that was taught to: all frames of a trial are read in order. Its pulls are varied (0.8 to 8 s,
-with rests, jerks and lettings back), so that no sequence reads the clock, and `one_of_several` has the same frames one
-by one. `several_gain` is what the first is ahead of the second, resampled together; of fast pulls, which last less than
-3 s from the first tug to the slip, and of slow ones too.
-
-`--known` asks instead how far the network knows frames of its own kind of sensor and of others, on days of their own.
-
-Intervals hold 95 % over days.
+`several`, of a network with a head for sequences: all frames of a trial are predicted in order, with varied pulls (0.8
+to 8 s); `one_of_several` has the same frames one by one, `several_gain` the difference in R2, of fast pulls (less than
+3 s from the first tug to the slip) and slow ones too. `--against` names another network, and prints the lead over it.
+`--known` measures instead how well the network recognises frames of its own kind of sensor, on days of their own.
 """
 
 import argparse
@@ -33,14 +23,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 
 from adapt import SENSORS
 from sliplens.friction import GRASP_SPREAD, Friction
 from sliplens.models import Estimate, Network
 from sliplens.models.checkpoint import Ratio, load
 from sliplens.simulation import PRESETS, SimulationRecipe
-from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.nuisances import Nuisances
 from sliplens.simulation.plan import PULLS, TrialPlan, plan_trials
@@ -133,14 +122,6 @@ def draw_in_contact(loading: Loading, *, rng: np.random.Generator) -> Int[np.nda
     return np.sort(rng.choice(contact, min(DRAWN, len(contact)), replace=False))
 
 
-def film_frames(
-    film: Film, at: Int[np.ndarray, " frames"]
-) -> tuple[UInt8[np.ndarray, "frames height width 3"], UInt8[np.ndarray, "height width 3"]]:
-    """Frames of a trial by their numbers, and the sensor untouched."""
-    frames = np.concatenate([film.draw(slice(one, one + 1)).numpy() for one in at.tolist()])
-    return frames, film.draw_reference().numpy()
-
-
 def draw(run: Network, plan: TrialPlan, *, rng: np.random.Generator, before_slip: int = 0) -> Seen:
     """Draw and encode a few frames of a trial: at random among those with contact, or the last before it slips."""
     loading, film = prepare_trial(plan)
@@ -149,9 +130,9 @@ def draw(run: Network, plan: TrialPlan, *, rng: np.random.Generator, before_slip
         at = np.arange(slip - before_slip, slip)
     else:
         at = draw_in_contact(loading, rng=rng)
-    frames, reference = film_frames(film, at)
+    frames = np.concatenate([film.draw(slice(one, one + 1)).numpy() for one in at.tolist()])
     return Seen(
-        inputs=run.encode(frames, reference),
+        inputs=run.encode(frames, film.draw_reference().numpy()),
         margin=loading.safety_margin[at],
         ratio=loading.tangential_force_n[at] / loading.normal_force_n[at],
     )

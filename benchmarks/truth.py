@@ -123,10 +123,7 @@ def pool(studies: Sequence[Study], name: str) -> dict[str, Any]:
             kind: {method: [ends(getattr(truth.methods[method], kind)) for truth in truths] for method in methods}
             for kind in ("stick", "shapley")
         },
-        "neutral_reliability": [truth.neutral_reliability for truth in truths],
         "frames": [truth.frames for truth in truths],
-        "left_out": [study.left_out.get(name) for study in studies],
-        "qualifying_trials": [study.choice and study.choice.qualified_alone.get(name) for study in studies],
         "mean_error": [study.choice and study.choice.mean_error.get(name) for study in studies],
     }
 
