@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 import torch
 from scipy.optimize import minimize
+from scipy.stats import mannwhitneyu
 
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.live import Check, HealthMonitor, LiveFrame
@@ -39,7 +40,6 @@ from sliplens.simulation import TrialPlan, make_recipe, plan_trials
 from sliplens.simulation.filming import Film
 from sliplens.simulation.loading import Loading, load_at_margins
 from sliplens.simulation.trials import prepare_trial
-from sliplens.training.evaluation import auroc
 
 Fault = Callable[[np.ndarray, float, np.random.Generator], np.ndarray]
 
@@ -72,6 +72,12 @@ class Case:
     def name(self) -> str:
         """Fault with its strength."""
         return f"{self.fault} {self.strength:g}".removesuffix(" 0")
+
+
+def auroc(positive: np.ndarray, negative: np.ndarray) -> float | None:
+    """Compute how often a positive scores above a negative, ties half; None where a class is empty."""
+    pairs = len(positive) * len(negative)
+    return float(mannwhitneyu(positive, negative).statistic) / pairs if pairs else None
 
 
 def defocus(image: np.ndarray, sigma_px: float, rng: np.random.Generator) -> np.ndarray:

@@ -40,31 +40,7 @@ def test_several_frames_tell_what_one_does_not(small_dataset: Dataset, start: Pa
         assert torch.equal(values, before.model.state_dict()[name])
     assert run.manifest.calibration == before.manifest.calibration
     assert training.curve.validation_mse.min() == pytest.approx(training.best_validation_mse)
-    assert not (tmp_path / "run" / "answers").exists()
     assert {one.sha256[:12] for one in small_dataset.trials if one.split != "test"} == set(run.manifest.trained_on)
-
-
-def test_interrupted_it_reads_no_trial_twice_and_ends_the_same(
-    small_dataset: Dataset, start: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    whole = teach(small_dataset, start, tmp_path / "whole", epochs=2)
-    read = []
-    load = Dataset.load
-
-    def counting(self, info, **named):
-        read.append(info.trial)
-        if len(read) == 4:
-            raise KeyboardInterrupt
-        return load(self, info, **named)
-
-    monkeypatch.setattr(Dataset, "load", counting)
-    with pytest.raises(KeyboardInterrupt):
-        teach(small_dataset, start, tmp_path / "cut", epochs=2)
-    again = teach(small_dataset, start, tmp_path / "cut", epochs=2)
-    assert len(read) == 4 + 3  # of six trials three were answered
-    for name in ("sequence.safetensors", "model.safetensors"):
-        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
-    assert again.manifest.sequence == whole.manifest.sequence
 
 
 def test_neither_rate_nor_number_of_frames_tells_how_long_a_trial_is(rng: np.random.Generator):

@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import Literal, TypedDict
 
@@ -16,6 +15,19 @@ from sliplens.extras import missing_packages, pick
 from sliplens.models.backbones import DEFAULT_BACKBONE, HEADS
 from sliplens.models.checkpoint import LARGEST_INPUT
 from sliplens.training.data import get_augmentation
+
+_LEAST, _MOST = 1e-12, 1e9
+_LIMITS = {
+    "image_size": (32, LARGEST_INPUT),
+    "epochs": (1, _MOST),
+    "batch_size": (2, _MOST),  # batch normalisation needs more than one image
+    "learning_rate": (_LEAST, _MOST),
+    "max_minutes": (_LEAST, _MOST),
+    "untouched_share": (0, 1),
+    "epoch_frames": (1, _MOST),
+    "patience": (1, _MOST),
+}
+"""Least and largest values of settings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,16 +65,10 @@ class TrainingConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("image_size", "epochs", "batch_size", "learning_rate", "max_minutes", "epoch_frames", "patience"):
+        for name, (low, high) in _LIMITS.items():
             value = getattr(self, name)
-            if value is not None and not (isfinite(value) and value > 0):
-                raise InputError(f"{name} must be positive, got {value}")
-        if not 32 <= self.image_size <= LARGEST_INPUT:
-            raise InputError(f"image_size must be 32 to {LARGEST_INPUT} pixels, got {self.image_size}")
-        if self.batch_size < 2:
-            raise InputError("batch_size must be at least 2, since batch normalisation needs more than one image")
-        if not 0 <= self.untouched_share <= 1:
-            raise InputError(f"untouched_share must lie in [0, 1], got {self.untouched_share:g}")
+            if value is not None and not low <= value <= high:
+                raise InputError(f"{name} must be {low:g} to {high:g}, got {value}")
         if self.optimizer not in {"adamw", "ranger21"}:
             raise InputError(f"there is no optimizer named {self.optimizer!r}; choose adamw or ranger21")
         wrong = self.head != "margin-and-ratio" or self.optimizer != "adamw" or self.augmentation != "none"

@@ -199,9 +199,6 @@ def load_frames(
     `untouched_share` adds the untouched sensor, with the label 1 (the limit of light touches), this often for each
     labelled frame and at least once a trial: a network trained on it gives explanations a meaningful reference.
     """
-    sizes = {(info.height, info.width) for info in trials}
-    if len(sizes) > 1:
-        raise RecordingError(f"{data.folder} mixes frames of {sorted(sizes)} pixels; use one sensor at a time")
 
     def copies_of(labelled: int) -> int:
         return max(1, round(untouched_share * labelled)) if untouched_share > 0 else 0

@@ -111,7 +111,6 @@ def evaluate(
             "friction": prior.digest if isinstance(prior, Friction) else prior,
             "sequence": network.manifest.sequence if sequence else None,
         }
-        recipe = {name: value for name, value in recipe.items() if value is not None}
         with output_folder(Path(out), stage="evaluate", config=recipe, overwrite=overwrite) as output:
             if output.complete:
                 evaluation = load_result(output.folder, Evaluation, command="sliplens evaluate")
@@ -149,9 +148,7 @@ def evaluate_frames(
         traction = network.require_ratio()
         if not np.isfinite(frames.friction).all():
             raise RecordingError("not every trial has a coefficient of friction; set it with --friction")
-        quantiles = np.array(traction.friction)
-        estimate = network.estimate(batches)
-        estimate = estimate.with_friction(frames.friction, trained_friction=quantiles, calibration=traction.told)
+        estimate = network.estimate(batches).with_friction(frames.friction, traction)
     else:
         estimate = network.estimate(batches, friction=friction)
     if sequence:
@@ -180,6 +177,10 @@ def evaluate_frames(
     def score(groups: dict[str, Bool[np.ndarray, " frames"]]) -> dict[str, RegressionScores]:
         return {name: regression_scores(predictions.where(rows)) for name, rows in groups.items()}
 
+    ratio_r2, ratios = {}, frames.traction_ratio.double().numpy()
+    if estimate.ratio is not None:
+        predicted, finite = estimate.ratio.mean, np.isfinite(ratios)
+        ratio_r2 = {name: _r2(ratios[rows & finite], predicted[rows & finite]) for name, rows in conditions.items()}
     covered = {level: (low <= labels) & (labels <= high) for level, (low, high) in intervals.items()}
     return Evaluation(
         input=network.manifest.input,
@@ -199,7 +200,7 @@ def evaluate_frames(
         ),
         sequence=sequence,
         friction="that of each trial, told exactly" if friction == EACH else str(estimate.friction or ""),
-        ratio_r2={} if estimate.ratio is None else _ratio_r2(estimate.ratio.mean, frames),
+        ratio_r2=ratio_r2,
     )
 
 
@@ -221,28 +222,10 @@ def _follow_trials(
     return replace(estimate, margin=margin, probabilities=probabilities, calibration=calibration, alone=single)
 
 
-def _ratio_r2(ratio: Float[np.ndarray, " frames"], frames: FrameSet) -> dict[str, float | None]:
-    truth, condition = frames.traction_ratio.double().numpy(), np.array(frames.condition)
-    rows = {name: (condition == name) & np.isfinite(truth) for name in sorted(set(frames.condition))}
-    return {name: _r2(truth[here], ratio[here]) for name, here in rows.items()}
-
-
 def _r2(truth: Float[np.ndarray, " _"], predicted: Float[np.ndarray, " _"]) -> float | None:
     """Compute the share of the variance that is explained; None where nothing varies."""
     spread = np.sum((truth - truth.mean()) ** 2) if len(truth) else 0.0
     return float(1 - np.sum((predicted - truth) ** 2) / spread) if spread > 0 else None
-
-
-def auroc(positive: Float[np.ndarray, " _"], negative: Float[np.ndarray, " _"]) -> float | None:
-    """Area under the receiver operating characteristic: how often a positive scores above a negative; ties count half.
-
-    None where a class is empty.
-    """
-    if not (len(positive) and len(negative)):
-        return None
-    from scipy.stats import mannwhitneyu  # noqa: PLC0415 (it takes long to import)
-
-    return float(mannwhitneyu(positive, negative).statistic) / (len(positive) * len(negative))
 
 
 _COVERED = tuple(round(1 - step / 20, 2) for step in range(20))

@@ -3,7 +3,6 @@
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import Unpack
@@ -12,7 +11,7 @@ import lightning
 import numpy as np
 import torch
 from jaxtyping import Float
-from lightning.pytorch.callbacks import ModelCheckpoint, Timer
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import Logger
 from torch import nn
 from torch.utils.data import DataLoader
@@ -53,7 +52,6 @@ from sliplens.training.data import (
 from sliplens.training.module import (
     DivergedError,
     Patience,
-    Progress,
     Regressor,
     describe_training,
     make_trainer,
@@ -159,12 +157,8 @@ def train(
         raise InputError("a head of several frames writes metrics.csv alone; leave out --logger")
     data = data if isinstance(data, Dataset) else load_dataset(data)
     encoding, trials = pick(ENCODINGS, input, noun="input"), _choose_trials(data, condition)
-    if (
-        start is not None
-        and "head" not in changes
-        and config.head == "margin-and-ratio"
-        and config.learns not in _KEEP_PREDICTIONS
-    ):
+    grown = start is not None and config.head == "margin-and-ratio" and config.learns not in _KEEP_PREDICTIONS
+    if grown and "head" not in changes:
         # the second output is left out where the labels do not show the ratio
         labelled = all(any(has_ratio(data.read_labels(info)) for info in some) for some in trials)
         config = config if labelled else replace(config, head="histogram")
@@ -174,30 +168,27 @@ def train(
 
     def run(folder: Path, opened: Logger | None = None) -> Training:
         if start is not None and config.learns == "sequence":
-            training = fit_sequence(config, start, data, trials, folder)
-        else:
-            load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=folder)
-            with open_stage(f"Reading training trials ({encoding.name})"):
-                train_frames = load_some(trials[0], untouched_share=config.untouched_share)
-            with open_stage(f"Reading validation trials ({encoding.name})"):
-                validation = load_some(trials[1])
-            info = trials[0][0]
-            manifest = Manifest(
-                backbone=config.backbone,
-                head=config.head,
-                recipe=config.recipe,
-                input=encoding.name,
-                image_size=config.image_size,
-                frame_size=(info.height, info.width),
-                sensor=info.sensor,
-                data_hash=data.hash,
-                colour=has_colour(data.read_labels(info).reference),
-                pull_direction_deg=trained_directions(config, data, trials[0], start),
-                trained_on=tuple(trial.sha256[:12] for some in trials for trial in some),
-            )
-            training = fit(
-                config, train_frames, validation, folder, manifest, start=start, trainer=trainer, logger=opened
-            )
+            return replace(fit_sequence(config, start, data, trials, folder), condition=condition)
+        load_some = partial(load_frames, data, encoding=encoding, image_size=config.image_size, scratch=folder)
+        with open_stage(f"Reading training trials ({encoding.name})"):
+            train_frames = load_some(trials[0], untouched_share=config.untouched_share)
+        with open_stage(f"Reading validation trials ({encoding.name})"):
+            validation = load_some(trials[1])
+        info = trials[0][0]
+        manifest = Manifest(
+            backbone=config.backbone,
+            head=config.head,
+            recipe=config.recipe,
+            input=encoding.name,
+            image_size=config.image_size,
+            frame_size=(info.height, info.width),
+            sensor=info.sensor,
+            data_hash=data.hash,
+            colour=has_colour(data.read_labels(info).reference),
+            pull_direction_deg=trained_directions(config, data, trials[0], start),
+            trained_on=tuple(trial.sha256[:12] for some in trials for trial in some),
+        )
+        training = fit(config, train_frames, validation, folder, manifest, start=start, trainer=trainer, logger=opened)
         return replace(training, condition=condition)
 
     with reporting(on_progress):
@@ -210,11 +201,9 @@ def train(
         out = Path(out)
         with output_folder(out, stage="train", config={**origin, "training": config}, overwrite=overwrite) as output:
             if not output.complete:
-                with open_logger(
-                    logger, output.folder, run_name=out.name, recipe={**asdict(config), **origin}
-                ) as opened:
-                    training = run(output.folder, opened)
-                save_result(training, output.folder)
+                recipe_values = {**asdict(config), **origin}
+                with open_logger(logger, output.folder, run_name=out.name, recipe=recipe_values) as opened:
+                    save_result(run(output.folder, opened), output.folder)
         network = load(out)
         training = network.training
         assert training is not None
@@ -267,16 +256,15 @@ def trained_directions(
     """
     if start is not None and config.learns in _KEEP_PREDICTIONS:
         return start.manifest.pull_direction_deg
-    augmentation = get_augmentation(config.augmentation)
-    turned_deg = getattr(augmentation, "rotation_deg", 0.0)
+    turned_deg = getattr(get_augmentation(config.augmentation), "rotation_deg", 0.0)
     if turned_deg >= 180:
         return FULL_CIRCLE
     few = trials[:: max(1, -(-len(trials) // _DIRECTION_TRIALS))]
     estimates = [pull_direction(data.load(info, truth=False)) for info in few]
-    directions = np.array([direction for direction in estimates if direction is not None])
+    directions = [direction for direction in estimates if direction is not None]
     if len(directions) < _LEAST_DIRECTIONS:
         return None
-    return enclosing_range(directions, margin_deg=_DIRECTION_MARGIN_DEG + turned_deg)
+    return enclosing_range(np.array(directions), margin_deg=_DIRECTION_MARGIN_DEG + turned_deg)
 
 
 def pull_direction(trial: Recording) -> float | None:
@@ -341,10 +329,9 @@ def calibrate(
     of_ratio, ratio_probabilities = calibrate_histogram(
         ratio_logits[finite], model.ratio_edges, model.ratio_temperature, validation.traction_ratio[finite]
     )
-    friction, edges = (
-        np.quantile(trained_friction[np.isfinite(trained_friction)], np.linspace(0, 1, 11)),
-        bin_edges(model),
-    )
+    quantiles = np.quantile(trained_friction[np.isfinite(trained_friction)], np.linspace(0, 1, 11))
+    traction = Traction(calibration=of_ratio, told=of_ratio, friction=tuple(quantiles.tolist()))
+    edges = bin_edges(model)
     estimate = Estimate(
         margin=probabilities[rows] @ model.centres.cpu().double().numpy(),
         probabilities=probabilities[rows],
@@ -352,11 +339,11 @@ def calibrate(
         calibration=None,
         ratio=Ratio(probabilities=ratio_probabilities, edges=model.ratio_edges.cpu().double().numpy()),
     )
-    estimate = estimate.with_friction(validation.friction[rows], trained_friction=friction)
+    estimate = estimate.with_friction(validation.friction[rows], traction)
     with_friction = conformal_calibration(
         estimate.margin, estimate.probabilities, edges, labels[finite], temperature=calibration.temperature
     )
-    return calibration, Traction(calibration=of_ratio, told=with_friction, friction=tuple(friction.tolist()))
+    return calibration, replace(traction, told=with_friction)
 
 
 def fit(
@@ -390,32 +377,26 @@ def fit(
     """
     trainer = trainer or make_trainer(config)
     _check_frames(config, train, validation)
-    model = _begin(config, train.encoding, start)
+    network = model = _begin(config, train.encoding, start)
+    frames, learnt = (train, validation), None
+    if start is not None and config.learns == "ratio":
+        learnt = start.manifest
+        network, frames = _take_last_layer(model, frames, batch_size=config.batch_size)
     shuffle = EpochShuffle(len(train), seed=config.seed, drawn=config.epoch_frames)
-    per_epoch = len(shuffle) // config.batch_size
-    timer = Timer(None if config.max_minutes is None else timedelta(minutes=config.max_minutes), verbose=False)
-    progress = Progress(
+    per_epoch, checkpoints = len(shuffle) // config.batch_size, folder / "checkpoints"
+    module = Regressor(
+        network,
+        config=config,
+        augmentation=get_augmentation(config.augmentation, neutral=train.encoding.neutral),
         steps=config.epochs * per_epoch,
-        timer=timer,
-        max_minutes=config.max_minutes,
         metrics_file=folder / "metrics.csv",
     )
-    frames, network = [train, validation], model
-    if config.learns == "ratio":
-        network = HistogramRegressor(last_layer(model), ratio=True)
-        network.load_state_dict(  # edges of a network of the package are rounded
-            {name: model.get_buffer(name) for name in ("temperature", "edges", "ratio_edges")}, strict=False
-        )
-        with open_stage("Passing frames through the network"):
-            frames = [extract_features(model, some, batch_size=config.batch_size) for some in report_each(frames)]
-    augmentation = get_augmentation(config.augmentation, neutral=train.encoding.neutral)
-    module = Regressor(network, config=config, augmentation=augmentation, progress=progress)
-    best = ModelCheckpoint(dirpath=folder / "checkpoints", filename="best", monitor="validation_mse")
+    best = ModelCheckpoint(dirpath=checkpoints, filename="best", monitor="validation_mse")
     # of every epoch: `save_last` writes one only where the best is written too
-    last = ModelCheckpoint(dirpath=folder / "checkpoints", filename="last", enable_version_counter=False)
+    last = ModelCheckpoint(dirpath=checkpoints, filename="last", enable_version_counter=False)
     # in this order: a checkpoint holds what the stopping has counted of the same epoch, and which was best so far
     early = [Patience("validation_mse", patience=config.patience)] if config.patience else []
-    trainer.callbacks += [timer, progress, *early, best, last]  # pyright: ignore[reportAttributeAccessIssue]
+    trainer.callbacks += [module.timer, *early, best, last]  # pyright: ignore[reportAttributeAccessIssue]
     trainer.loggers = [] if logger is None else [logger]
     trainer.log_every_n_steps = min(50, per_epoch)  # pyright: ignore[reportAttributeAccessIssue]
     # a last small batch would make batch normalisation noisy; `FrameSet.__getitems__` makes batches
@@ -427,7 +408,6 @@ def fit(
         # our own file of tensors and plain numbers, read back without unpickling anything else
         checkpoint = torch.load(best.best_model_path, map_location="cpu", weights_only=True)
         module.load_state_dict(checkpoint["state_dict"])
-        learnt = start.manifest if start is not None and config.learns == "ratio" else None
         calibration, traction = calibrate(
             network,
             frames[1],
@@ -439,13 +419,7 @@ def fit(
             model.load_state_dict(network.state_dict(), strict=False)
             last_layer(model).load_state_dict(last_layer(network).state_dict())
         model.eval()
-        if learnt is None:
-            novelty = fit_novelty(
-                model,
-                *(some.sample(_NOVELTY_FRAMES, batch_size=config.batch_size) for some in (train, validation)),
-            )
-        else:  # the last layer alone was trained: the early layers stay as they were
-            novelty = learnt.novelty
+        samples = (some.sample(_NOVELTY_FRAMES, batch_size=config.batch_size) for some in (train, validation))
         complete = replace(
             manifest,
             trained_on=(*manifest.trained_on, *(start.manifest.trained_on if start else ())),
@@ -454,7 +428,8 @@ def fit(
             metrics={"validation_mse": calibration.mse},
             calibration=calibration,
             traction=traction,
-            novelty=novelty,
+            # where the last layer alone was trained, the early layers stay as they were
+            novelty=learnt.novelty if learnt else fit_novelty(model, *samples),
         )
         save_checkpoint(folder, model, complete)
         # as the file itself has it: after a crash between two files the callback may remember an older one
@@ -462,26 +437,34 @@ def fit(
 
     try:
         with torch.random.fork_rng(devices=[]), open_stage(f"Training ({train.encoding.name})"):
-            run_trainer(trainer, module, loaders, folder / "checkpoints" / "last.ckpt")
+            run_trainer(trainer, module, loaders, checkpoints / "last.ckpt")
     except DivergedError as error:
         if not best.best_model_path:
             raise
         raise ModelError(
             f"{error} (the best network so far, of validation MSE {save_best():.4g}, is in {folder})"
         ) from None
-    late = config.max_minutes is not None and progress.step < progress.steps
-    training = describe_training(
-        manifest,
-        config,
-        progress.rows,
-        frames=(len(train), len(validation)),
-        parameters=sum(value.numel() for value in model.parameters()),
-        minutes=progress.minutes,
+    late = config.max_minutes is not None and module.step < module.steps
+    training = replace(
+        describe_training(manifest, config, module.rows, frames=(len(train), len(validation)), trained=model),
         stopped_by="no gain" if early and early[0].stopped_epoch else "time limit" if late else "epochs",
         best_validation_mse=save_best(),
     )
-    shutil.rmtree(folder / "checkpoints")
+    shutil.rmtree(checkpoints)
     return training
+
+
+def _take_last_layer(
+    model: nn.Module, frames: tuple[FrameSet, FrameSet], *, batch_size: int
+) -> tuple[HistogramRegressor, tuple[FrameSet, FrameSet]]:
+    """Return the last layer of a network as a network of its own, and its inputs."""
+    network = HistogramRegressor(last_layer(model), ratio=True)
+    network.load_state_dict(  # edges of a network of the package are rounded
+        {name: model.get_buffer(name) for name in ("temperature", "edges", "ratio_edges")}, strict=False
+    )
+    with open_stage("Passing frames through the network"):
+        train, validation = [extract_features(model, some, batch_size=batch_size) for some in report_each(frames)]
+    return network, (train, validation)
 
 
 def _begin(config: TrainingConfig, encoding: Encoding, start: Network | None) -> nn.Module:

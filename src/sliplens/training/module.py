@@ -1,4 +1,4 @@
-"""Lightning module, callbacks and trainer of a training, which resumes where it was interrupted."""
+"""Lightning module and trainer of a training, which resumes where it was interrupted."""
 
 import logging
 import math
@@ -7,7 +7,7 @@ import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import Callback, EarlyStopping, Timer
+from lightning.pytorch.callbacks import EarlyStopping, Timer
 from pytorch_optimizer import Ranger21
 from torch import Tensor, nn
 from torch.nn import functional
@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader
 
 from sliplens.errors import InputError, ModelError
 from sliplens.files import whole_file
-from sliplens.models.backbones import BINS, Answers, bin_centres, last_layer, margin_loss, ratio_edges
+from sliplens.models.backbones import BINS, Answers, bin_centres, last_layer, margin_loss
 from sliplens.models.checkpoint import Manifest
 from sliplens.progress import report_progress
 from sliplens.results.evaluation import LearningCurve, Training
@@ -37,13 +37,11 @@ class DivergedError(ModelError):
 
 
 class Regressor(lightning.LightningModule):
-    """Network with its loss, its augmentation and its optimizer.
+    """Network with its loss, its augmentation, its optimizer and its learning curve, which is written after each epoch.
 
     With AdamW the learning rate follows the share of the training that is done, in epochs or in minutes, so that a
     training cut short by its time limit still ends on a small step.
     """
-
-    ratio_centres: Tensor | None
 
     def __init__(
         self,
@@ -51,18 +49,39 @@ class Regressor(lightning.LightningModule):
         *,
         config: TrainingConfig,
         augmentation: Augmentation | None,
-        progress: "Progress",
+        steps: int,
+        metrics_file: Path,
     ) -> None:
         super().__init__()
-        self.model, self.config, self.augmentation, self.progress = model, config, augmentation, progress
-        edges = ratio_edges(model)
-        centres = None if edges is None else torch.from_numpy(bin_centres(edges)).float()
-        self.register_buffer("ratio_centres", centres, persistent=False)
-
+        self.model, self.config, self.augmentation = model, config, augmentation
+        self.steps, self.step, self.rows, self.metrics_file = steps, 0, list[list[float]](), metrics_file
+        limit = None if config.max_minutes is None else timedelta(minutes=config.max_minutes)
+        self.timer = Timer(limit, verbose=False)
+        """Clock, which also stops the training at its time limit; a resumed training has the time that is left."""
         if config.learns == "ratio":
             # without weight decay, a row without a slope stays as it is to the bit
             for value in last_layer(model).parameters():
                 value.register_hook(lambda slope: torch.cat([torch.zeros_like(slope[:BINS]), slope[BINS:]]))
+
+    def fraction(self) -> float:
+        """Share of the training that is done, in steps or in minutes, whichever is larger."""
+        limit = self.config.max_minutes
+        return min(1.0, max(self.step / self.steps, self.timer.time_elapsed("train") / 60 / limit if limit else 0.0))
+
+    def on_save_checkpoint(self, checkpoint: dict) -> None:
+        """Keep the learning curve in a checkpoint."""
+        checkpoint["rows"] = self.rows
+
+    def on_load_checkpoint(self, checkpoint: dict) -> None:
+        """Restore the learning curve of a checkpoint."""
+        self.rows = checkpoint["rows"]
+
+    def on_train_start(self) -> None:
+        """Restore the step of a checkpoint; from now on a request to end is an interruption."""
+        self.step = self.global_step
+        if threading.current_thread() is threading.main_thread():
+            # what was there before comes back when the training is over
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
 
     def on_train_epoch_start(self) -> None:
         """Keep the statistics of batch normalisation where the configuration says so."""
@@ -70,6 +89,17 @@ class Regressor(lightning.LightningModule):
             for module in self.modules():
                 if isinstance(module, nn.modules.batchnorm._BatchNorm):
                     module.eval()
+
+    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
+        """Set the learning rate for the share of the training that is done; Ranger21 sets its own."""
+        if self.config.optimizer != "adamw":
+            return
+        warm_up, done = 0.1, self.fraction()
+        descent = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, (done - warm_up) / (1 - warm_up)))))
+        factor = max(done / warm_up, 0.02) if done < warm_up else max(descent, 0.005)
+        for optimizer in self.trainer.optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = self.config.learning_rate * factor
 
     def training_step(self, batch: tuple[Tensor, Tensor, Tensor], batch_idx: int) -> Tensor:
         """One step; a loss that is not finite stops the training."""
@@ -92,89 +122,35 @@ class Regressor(lightning.LightningModule):
             self.log("learning_rate", rate, on_step=True, on_epoch=False)
         return loss
 
+    def on_train_batch_end(self, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Report the step."""
+        self.step = self.global_step
+        report_progress(round(self.fraction() * self.steps), self.steps)
+
     def validation_step(self, batch: tuple[Tensor, Tensor, Tensor], batch_idx: int) -> None:
         """Log the validation error; of a network with two outputs, over both."""
         images, labels, ratios = batch
         margins, *histograms = Answers(self.model)(images)
-        if self.ratio_centres is not None and (finite := torch.isfinite(ratios)).any():
-            margins = torch.cat([margins, (histograms[1] @ self.ratio_centres)[finite]])
+        if len(histograms) > 1 and (finite := torch.isfinite(ratios)).any():
+            centres = bin_centres(self.model.get_buffer("ratio_edges"))
+            margins = torch.cat([margins, (histograms[1] @ centres)[finite]])
             labels = torch.cat([labels, ratios[finite]])
         self.log("validation_mse", functional.mse_loss(margins, labels), on_epoch=True, batch_size=len(labels))
 
-    def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
-        """Set the learning rate for the share of the training that is done; Ranger21 sets its own."""
-        if self.config.optimizer != "adamw":
-            return
-        warm_up, done = 0.1, self.progress.fraction()
-        descent = 0.5 * (1 + math.cos(math.pi * min(1.0, max(0.0, (done - warm_up) / (1 - warm_up)))))
-        factor = max(done / warm_up, 0.02) if done < warm_up else max(descent, 0.005)
-        for optimizer in self.trainer.optimizers:
-            for group in optimizer.param_groups:
-                group["lr"] = self.config.learning_rate * factor
+    def on_train_epoch_end(self) -> None:
+        """Add the epoch's row to the learning curve; the validation has run by now."""
+        metrics, epoch = self.trainer.callback_metrics, self.step / self.steps * self.config.epochs
+        errors = [metrics[name].item() for name in ("train_mse", "validation_mse")]
+        add_row(self.rows, [epoch, *errors, self.timer.time_elapsed("train") / 60], self.metrics_file)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """AdamW, without weight decay on biases and normalisation; or Ranger21 with its defaults."""
         if self.config.optimizer == "ranger21":
-            return Ranger21(self.parameters(), num_iterations=self.progress.steps, lr=self.config.learning_rate)
+            return Ranger21(self.parameters(), num_iterations=self.steps, lr=self.config.learning_rate)
         decayed = [value for value in self.parameters() if value.ndim > 1]
         others = [value for value in self.parameters() if value.ndim <= 1]
         groups = [{"params": decayed}, {"params": others, "weight_decay": 0.0}]
         return torch.optim.AdamW(groups, lr=self.config.learning_rate, weight_decay=self.config.weight_decay)
-
-
-@dataclass(kw_only=True, eq=False)
-class Progress(Callback):
-    """Count the steps, report them, and write a table row after each epoch.
-
-    Its state is part of the checkpoint.
-    """
-
-    steps: int
-    timer: Timer
-    """Clock of the training, which also stops it at the time limit; a resumed training has the time that is left."""
-    max_minutes: float | None = None
-    metrics_file: Path
-    """File of the table."""
-    step: int = 0
-    rows: list[list[float]] = field(default_factory=list)
-
-    @property
-    def minutes(self) -> float:
-        """Minutes of training, interruptions left out."""
-        return self.timer.time_elapsed("train") / 60
-
-    def fraction(self) -> float:
-        """Share of the training that is done, in steps or in minutes, whichever is larger."""
-        return min(1.0, max(self.step / self.steps, self.minutes / self.max_minutes if self.max_minutes else 0.0))
-
-    def state_dict(self) -> dict[str, list[list[float]]]:
-        """Return the rows, for a checkpoint."""
-        return {"rows": self.rows}
-
-    def load_state_dict(self, state_dict: dict[str, list[list[float]]]) -> None:
-        """Restore the rows of a checkpoint."""
-        self.rows = state_dict["rows"]
-
-    def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Restore the step of a checkpoint; from now on a request to end is an interruption."""
-        self.step = trainer.global_step
-        if threading.current_thread() is threading.main_thread():
-            # what was there before comes back when the training is over
-            signal.signal(signal.SIGTERM, signal.default_int_handler)
-
-    def on_train_batch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        """Report the step."""
-        self.step = trainer.global_step
-        report_progress(round(self.fraction() * self.steps), self.steps)
-
-    def on_train_epoch_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Write the epoch's row; the validation has run by now."""
-        metrics = trainer.callback_metrics
-        epoch = self.step / self.steps * (trainer.max_epochs or 1)
-        row = [epoch, metrics["train_mse"].item(), metrics["validation_mse"].item(), self.minutes]
-        add_row(self.rows, row, self.metrics_file)
 
 
 def add_row(rows: list[list[float]], row: list[float], file: Path) -> None:
@@ -187,25 +163,16 @@ def add_row(rows: list[list[float]], row: list[float], file: Path) -> None:
             f"the validation error is {row[2]} after epoch {len(rows) + 1}; lower the learning rate and try again"
         )
     rows.append(row)
-    lines = ["epoch,train_mse,validation_mse,minutes"]
-    lines += [f"{r[0]:.3f},{r[1]:.6g},{r[2]:.6g},{r[3]:.4f}" for r in rows]
     with whole_file(file) as part:
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        header, formats = "epoch,train_mse,validation_mse,minutes", ("%.3f", "%.6g", "%.6g", "%.4f")
+        np.savetxt(part, rows, fmt=formats, delimiter=",", header=header, comments="")
 
 
 def describe_training(
-    manifest: Manifest,
-    config: TrainingConfig,
-    rows: list[list[float]],
-    *,
-    frames: tuple[int, int],
-    parameters: int,
-    minutes: float,
-    best_validation_mse: float,
-    stopped_by: str = "epochs",
+    manifest: Manifest, config: TrainingConfig, rows: list[list[float]], *, frames: tuple[int, int], trained: nn.Module
 ) -> Training:
     """Make the record of a training; `frames`: numbers of training and validation frames, `rows` those of `add_row`."""
-    epoch, train, validation, until = np.array(rows, dtype=np.float64).reshape(-1, 4).T
+    epoch, train, validation, minutes = np.array(rows, dtype=np.float64).reshape(-1, 4).T
     return Training(
         input=manifest.input,
         backbone=manifest.backbone,
@@ -215,11 +182,11 @@ def describe_training(
         validation_frames=frames[1],
         seed=config.seed,
         epochs=rows[-1][0],
-        minutes=minutes,
-        stopped_by=stopped_by,
-        best_validation_mse=best_validation_mse,
-        parameters=parameters,
-        curve=LearningCurve(epoch=epoch, train_mse=train, validation_mse=validation, minutes=until),
+        minutes=rows[-1][3],
+        stopped_by="epochs",
+        best_validation_mse=float(validation.min()),
+        parameters=sum(values.numel() for values in trained.parameters()),
+        curve=LearningCurve(epoch=epoch, train_mse=train, validation_mse=validation, minutes=minutes),
     )
 
 

@@ -1,6 +1,5 @@
 """Training of a head for several frames, on the outputs of a network for whole trials."""
 
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,13 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
-from safetensors.numpy import load_file, save_file
 from torch import Tensor
 from torch.nn import functional
 from torch.nn.utils.rnn import pad_sequence
 
 from sliplens.errors import InputError, RecordingError
-from sliplens.files import versions, whole_file
+from sliplens.files import versions
 from sliplens.models import Network, make_engine, save_checkpoint
 from sliplens.models.backbones import HistogramRegressor, bin_centres, histogram_targets
 from sliplens.models.calibration import calibrate_histogram
@@ -89,20 +87,10 @@ def fit_sequence(
     trials: tuple[Sequence[TrialInfo], Sequence[TrialInfo]],
     folder: Path,
 ) -> Training:
-    """Train the head of a network for several frames, and save both; predictions for one frame stay.
+    """Train the head of a network for several frames on its outputs, and save both; predictions for one frame stay.
 
-    Trials are predicted once; their outputs stay in the folder until the end, for an interrupted training.
-
-    Parameters
-    ----------
-    config
-        Settings of the training.
-    start
-        Network with two outputs, margin and F_t / F_n.
-    data, trials
-        Data set, and its training and validation trials.
-    folder
-        Gets the files of `save_checkpoint` and `metrics.csv`.
+    `start`: network with two outputs, margin and F_t / F_n; `trials`: training and validation trials. The folder gets
+    the files of `save_checkpoint` and `metrics.csv`.
     """
     model = start.model
     if not isinstance(model, HistogramRegressor) or model.ratio_edges is None:
@@ -111,7 +99,7 @@ def fit_sequence(
             "first with `sliplens train DATA -o RUN --start-from NETWORK --recipe ratio`"
         )
     train, whole = (
-        _predict_trials(start, data, some, folder / "outputs", name=name)
+        _predict_trials(start, data, some, name=name)
         for name, some in zip(("training", "validation"), trials, strict=True)
     )
     validation = [trial.steps() for trial in whole]
@@ -132,51 +120,40 @@ def fit_sequence(
         versions=versions(),
     )
     save_checkpoint(folder, model, manifest, sequence=head)
-    shutil.rmtree(folder / "outputs")
     return describe_training(
         manifest,
         config,
         rows,
         frames=(sum(len(trial.label) for trial in train), len(labels)),
-        parameters=sum(values.numel() for values in head.parameters()),
-        minutes=rows[-1][3],
-        best_validation_mse=min(row[2] for row in rows),
+        trained=head,
     )
 
 
-def _predict_trials(
-    network: Network, data: Dataset, trials: Sequence[TrialInfo], folder: Path, *, name: str
-) -> list[TrialOutputs]:
-    """Predict every trial, or load the outputs of an interrupted training."""
-    folder.mkdir(exist_ok=True)
-    outputs, engine = [], None
+def _predict_trials(network: Network, data: Dataset, trials: Sequence[TrialInfo], *, name: str) -> list[TrialOutputs]:
+    """Predict the labelled frames of every trial, up to the first gap."""
+    engine, outputs = make_engine("auto", network, frames=sum(trial.frames for trial in trials)), []
     with open_stage(f"Reading {name} trials ({network.manifest.input})"):
         for info in report_each(trials):
-            path = folder / f"{info.sha256}.safetensors"
-            if not path.is_file():
-                engine = engine or make_engine("auto", network, frames=sum(trial.frames for trial in trials))
-                recording = data.load(info, truth=False)
-                rows = np.flatnonzero(recording.labelled)
-                require_frequent(recording.time_s[rows], what=f"the trial {info.trial}")
-                images = (
-                    recording.frames[rows[at : at + engine.batch_size]] for at in range(0, len(rows), engine.batch_size)
-                )
-                estimate = engine.estimate(network, (network.encode(batch, recording.reference) for batch in images))
-                assert estimate.probabilities is not None
-                assert estimate.ratio is not None
-                values = {
-                    "margin": estimate.probabilities.astype(np.float32),
-                    "ratio": estimate.ratio.probabilities.astype(np.float32),
-                    "label": recording.safety_margin[rows],
-                    "time_s": recording.time_s[rows],  # in 64 bits: a stamp may be seconds since 1970
-                }
-                with whole_file(path) as part:
-                    save_file(values, part)
-            outputs.append(TrialOutputs(**load_file(path)))
-    labelled = [trial.before_gap() for trial in outputs if len(trial.label)]
-    if not labelled:
+            recording = data.load(info, truth=False)
+            rows = np.flatnonzero(recording.labelled)
+            if not len(rows):
+                continue
+            require_frequent(recording.time_s[rows], what=f"the trial {info.trial}")
+            parts = np.split(rows, range(engine.batch_size, len(rows), engine.batch_size))
+            images = (network.encode(recording.frames[part], recording.reference) for part in parts)
+            estimate = network.estimate(images, engine=engine)
+            assert estimate.probabilities is not None
+            assert estimate.ratio is not None
+            trial = TrialOutputs(
+                margin=estimate.probabilities.astype(np.float32),
+                ratio=estimate.ratio.probabilities.astype(np.float32),
+                label=recording.safety_margin[rows],
+                time_s=recording.time_s[rows],
+            )
+            outputs.append(trial.before_gap())
+    if not outputs:
         raise RecordingError(f"{data.folder}: no frame of the {name} trials has a label; label them first")
-    return labelled
+    return outputs
 
 
 def _fit(
@@ -205,7 +182,7 @@ def _fit(
                 for values in zip(*(_tensors(head, trial) for trial in some), strict=True)
             )
             real = pad_sequence([torch.ones(len(trial.label), dtype=torch.bool) for trial in some], batch_first=True)
-            logits = head(inputs, margin)
+            logits = head.logits(margin) + head(inputs)[0]
             loss = functional.cross_entropy(logits[real], histogram_targets(label[real], head.edges))
             optimizer.zero_grad()
             loss.backward()
@@ -230,7 +207,7 @@ def _logits(head: SequenceHead, trials: Sequence[TrialOutputs]) -> Float[Tensor,
     """Compute logits over the margin of all frames, trial by trial, each trial a contact."""
     head.eval()
     tensors = (_tensors(head, trial) for trial in trials)
-    return torch.cat([head(inputs[None], margin[None])[0] for inputs, margin, _ in tensors])
+    return torch.cat([head.logits(margin) + head(inputs)[0] for inputs, margin, _ in tensors])
 
 
 def _tensors(head: SequenceHead, trial: TrialOutputs) -> tuple[Tensor, ...]:
