@@ -35,7 +35,7 @@ def make_ready(trained: Network, inputs: Tensor) -> tuple[dict[str, Engine], dic
     for name in ENGINES:
         try:
             engines[name] = make_engine(name, trained, batch_size=1, streams=1)
-            engines[name].estimate(trained, inputs)
+            trained.estimate(inputs, engine=engines[name])
         except SliplensError as error:
             missing[name] = str(error)
             engines.pop(name, None)
@@ -68,10 +68,10 @@ def main() -> None:
     inputs = functional.interpolate(colours, size=(trained.manifest.image_size,) * 2, mode="bilinear")
     engines, missing = make_ready(trained, inputs[:1])
     work: dict[str, Callable[[], object]] = {
-        name: partial(engine.estimate, trained, inputs[:1]) for name, engine in engines.items()
+        name: partial(trained.estimate, inputs[:1], engine=engine) for name, engine in engines.items()
     }
     times = time_rounds(work, rounds=options.rounds)
-    margins = {name: engine.estimate(trained, inputs).margin for name, engine in engines.items()}
+    margins = {name: trained.estimate(inputs, engine=engine).margin for name, engine in engines.items()}
     result = {
         "p50_ms": {name: float(np.percentile(values, 50)) for name, values in times.items()},
         "p99_ms": {name: float(np.percentile(values, 99)) for name, values in times.items()},

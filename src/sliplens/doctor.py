@@ -98,7 +98,7 @@ def _engine(name: str) -> str:
     inputs, expected = _predict(network)
     if name == "openvino" and (obstacle := find_obstacle(network.model, inputs)):
         raise _AbsentError(obstacle)
-    engine = prepare(network.model, inputs, expected, passes=1, engine=name)
+    engine = prepare(network.model, inputs, passes=1, engine=name)
     off = max(float((part - whole).abs().max()) for part, whole in zip(engine.run([inputs]), [expected], strict=True))
     if off > TOLERANCE:
         raise InputError(f"its predictions differ by {off:.2g}, {TOLERANCE:g} is allowed; leave out --engine {name}")

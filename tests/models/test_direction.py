@@ -80,9 +80,3 @@ def test_a_network_of_all_directions_withholds_none(pulled_down: Network, live: 
     for directions in (FULL_CIRCLE, None):
         network = replace(pulled_down, manifest=replace(pulled_down.manifest, pull_direction_deg=directions))
         assert not any(withheld_by(network, reference, frames, live=live))
-
-
-@pytest.mark.parametrize("directions", [(105.0, 75.0), (-10.0, 20.0), (0.0, 400.0), (370.0, 380.0)])
-def test_a_range_runs_upwards_and_not_further_than_round(pulled_down: Network, directions: tuple[float, float]):
-    with pytest.raises(ValueError, match="pull_direction_deg"):
-        replace(pulled_down.manifest, pull_direction_deg=directions)

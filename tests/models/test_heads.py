@@ -4,7 +4,7 @@ import torch
 from scipy import stats
 from there import there
 
-from sliplens.errors import ModelError
+from sliplens.errors import InputError, ModelError
 from sliplens.models import build_model
 from sliplens.models.backbones import Answers, HistogramRegressor, histogram_targets, margin_loss
 from sliplens.models.calibration import Calibration, conformal_offset, fit_temperature, quantiles
@@ -106,7 +106,7 @@ def test_an_estimate_tells_its_spread_and_its_interval():
     interval = there(estimate.interval(0.9))
     # 5 % of a distribution that is even from 0.4 to 0.6
     np.testing.assert_allclose([interval[0][0], interval[1][0]], [0.41 - 0.05, 0.59 + 0.05])
-    with pytest.raises(ModelError, match=r"no interval of level 0\.75; choose 0\.9"):
+    with pytest.raises(InputError, match=r"no level named '0\.75'; choose one of 0\.9"):
         estimate.interval(0.75)
 
 

@@ -111,16 +111,16 @@ def test_frames_read_one_by_one_after_a_gap_keep_their_own_intervals(run: Networ
 
 
 def test_frames_are_read_as_the_head_was_taught(run: Network):
-    """Training has whole contacts at once, in torch; reading has one frame after another, in numpy."""
+    """Training has whole contacts at once, reading one frame after another."""
     estimate, head = answers(12), there(run.sequence)
     margin, ratio = (there(one.probabilities).astype("f4") for one in (estimate, there(estimate.ratio)))
     elapsed_s = np.array([1.0, *np.full(11, 0.1)])
     with torch.no_grad():
         told = torch.from_numpy(head.make_inputs(head.summarize(margin, ratio), elapsed_s))
-        logits = head(told[None], torch.from_numpy(margin)[None])
+        logits = head.logits(torch.from_numpy(margin)) + head(told)[0]
     read = run.follow().update(estimate, np.arange(12) / 10, np.ones(12, dtype=bool))
     # floats have 24 bits, and sums of up to 80 of them are added in another order
-    np.testing.assert_allclose(read.margin, logits[0].softmax(-1).numpy() @ head.centres, atol=1e-5)
+    np.testing.assert_allclose(read.margin, logits.softmax(-1).numpy() @ head.centres, atol=1e-5)
 
 
 def test_a_recording_is_read_as_the_follower_reads_it(run: Network, small_dataset: Dataset, tmp_path: Path):

@@ -169,7 +169,7 @@ class RenderedSensor:
         if learner is not None:
             learner.update(state.time_s, slipping_s=None if np.isnan(slipping_s[0]) else float(slipping_s[0]))
             friction = learner.friction
-        estimate = self._engine.estimate(self._network, inputs(), friction=friction)
+        estimate = self._network.estimate(inputs(), friction=friction, engine=self._engine)
         if learner is not None and (ratio := estimate.ratio) is not None:
             learner.note(float(ratio.mean.mean()), sigma=float(ratio.sigma.mean()), time_s=state.time_s)
         low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)

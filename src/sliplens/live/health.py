@@ -14,7 +14,7 @@ from sliplens.markers import MarkerStatus, Tracks
 from sliplens.markers.camera import CAMERA_CURE, CAMERA_LIMIT_PX, CameraWatch, block_means
 from sliplens.models.checkpoint import STRANGE, Estimate, Network
 from sliplens.recordings.capture import Forces, Frame
-from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, Shear
+from sliplens.shear import DIRECTION_LIMIT, Shear
 
 Plane = Float32[np.ndarray, "height width"]
 
@@ -334,9 +334,8 @@ def check_novelty(estimate: Estimate) -> Check | None:
 
 def check_direction(network: Network, shear: Shear) -> Check:
     """Check the direction of the shear against the directions of the training, in standard deviations (`excess`)."""
-    trained = network.manifest.pull_direction_deg or FULL_CIRCLE
     sentence = f"the skin is sheared towards {shear.direction_deg:.0f} degrees (90 is down the image)"
-    return make_check("direction", shear.excess(trained), sentence, cure=network.doubt_shear(shear) or "")
+    return make_check("direction", shear.excess(network.directions), sentence, cure=network.direction_reason)
 
 
 def severity(check: Check) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from math import cos, erfc, radians, sin, sqrt
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -17,14 +17,13 @@ from safetensors.torch import load_file, save
 from torch import Tensor, nn
 
 from sliplens.codec import load_record, load_result, save_record
-from sliplens.errors import CheckpointError, ImageError, InputError, ModelError
+from sliplens.errors import CheckpointError, ImageError, InputError
 from sliplens.extras import pick, require_device
 from sliplens.files import DIFFERENCE_NETWORK, MANIFEST_FILE, find_run, hash_file, require_folder, whole_file
 from sliplens.friction import LEARNT, Friction, FrictionLike, as_friction
-from sliplens.images import MOST_PIXELS, has_colour, require_rgb
+from sliplens.images import has_colour, require_rgb
 from sliplens.models.backbones import (
     Answers,
-    HistogramRegressor,
     RunBatches,
     answer_names,
     bin_centres,
@@ -39,10 +38,12 @@ from sliplens.models.sequence import Follower, SequenceHead, SequenceManifest
 from sliplens.progress import number_of
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.results.evaluation import Training
-from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, Shear, ShearEstimator, range_words
+from sliplens.shear import FULL_CIRCLE, Shear, ShearEstimator, range_words
+
+if TYPE_CHECKING:
+    from sliplens.models.engines import Engine
 
 WEIGHTS_FILE, SEQUENCE_FILE = "model.safetensors", "sequence.safetensors"
-SCHEMA_VERSION = 1
 MODULE = "module"
 """`Manifest.head` of a wrapped module."""
 LARGEST_INPUT = 4096  # pixels along a side, several times what any backbone was made for
@@ -66,7 +67,7 @@ class Manifest:
     unit: str = "margin"
     """Unit of the prediction; `margin` for a safety margin in [0, 1]."""
     weights_sha256: str = ""
-    schema_version: int = SCHEMA_VERSION
+    schema_version: int = 1
     metrics: dict[str, float] = field(default_factory=dict)
     calibration: Calibration | None = None
     traction: Traction | None = None
@@ -83,14 +84,6 @@ class Manifest:
     """First 12 hex digits of the hash of every trial that trained or validated it, or what it started from."""
     started_from: str = ""
     """Hash of the weights it started from; empty for random ones."""
-
-    def __post_init__(self) -> None:
-        height, width = self.frame_size
-        if min(height, width) <= 0 or height * width > MOST_PIXELS:
-            raise ValueError(f"frames of {height} x {width} pixels are too small or too large for a network")
-        low, high = self.pull_direction_deg or FULL_CIRCLE
-        if not 0 <= low <= high <= low + 360 or low > 360:
-            raise ValueError(f"pull_direction_deg is {[low, high]}; give a low from 0 to 360, then a high")
 
 
 _BATCH = 64
@@ -172,14 +165,14 @@ class Network:
         """
         if self.wrapped:
             return
-        level, difference = float(np.median(frame)), self.encoding.empty_is_black
+        level = float(np.median(frame))
         median = f"(median {level:.0f} of 255 grey levels)"
-        if not difference and level < _DARKEST_FRAME and frame.any():
+        if not self.encoding.empty_is_black and level < _DARKEST_FRAME and frame.any():
             raise ImageError(
                 f"{what} is as dark as a difference image {median}, and this network reads camera frames; give those, "
                 f"or a network on difference images such as {DIFFERENCE_NETWORK}"
             )
-        if difference and level > _BRIGHTEST_DIFFERENCE:
+        if self.encoding.empty_is_black and level > _BRIGHTEST_DIFFERENCE:
             raise ImageError(
                 f"{what} is as bright as a camera frame {median}, and without the untouched sensor this network takes "
                 "it for a difference image; name it with --reference IMAGE or --reference-frame N"
@@ -197,7 +190,7 @@ class Network:
 
         `friction`: doubted if most of it lies outside that of the training.
         """
-        trained, directions, doubts = self.manifest, self.manifest.pull_direction_deg, []
+        trained, doubts = self.manifest, []
         if sensor and trained.sensor and sensor_kind(sensor) != sensor_kind(trained.sensor):
             doubts.append(
                 f"the network was trained on {trained.sensor} and reads frames of {sensor}: take margins for a trend "
@@ -217,28 +210,30 @@ class Network:
                     f"the friction {friction.mean:.3g} lies outside that of the network's training, {low:.2g} to "
                     f"{high:.2g}: its intervals were not measured there, so {cure}, or take the margins for a trend"
                 )
-        pull_deg = None if profile is None else profile.pull_direction_deg
-        if profile is not None and pull_deg is not None and directions is not None:
-            pull = Shear(x_px=cos(radians(pull_deg)), y_px=sin(radians(pull_deg)), sigma_px=1.0)
-            if pull.excess(directions):
+        if profile is not None and profile.pull_direction_deg is not None:
+            pull = radians(profile.pull_direction_deg)
+            if Shear(x_px=cos(pull), y_px=sin(pull), sigma_px=1.0).excess(self.directions):
                 doubts.append(
-                    f"the profile {profile.name} says that the sensor is pulled at {pull_deg:g} degrees, and the "
-                    f"network was trained on {range_words(directions)}: margins will be withheld, so {_TURN_CURE}"
+                    f"the profile {profile.name} says that the sensor is pulled at {profile.pull_direction_deg:g} "
+                    f"degrees, so margins will be withheld: {self.direction_reason}"
                 )
         return tuple(doubts)
 
+    @property
+    def directions(self) -> tuple[float, float]:
+        """Directions of the pull that it was trained on, in degrees; all where they are unknown."""
+        return self.manifest.pull_direction_deg or FULL_CIRCLE
+
+    @property
+    def direction_reason(self) -> str:
+        """Reason to withhold the margin of a frame pulled in another direction, with the cure."""
+        return f"pulled outside the trained {range_words(self.directions)} (90 is down); {_TURN_CURE}"
+
     def shear_estimator(self, reference: UInt8[np.ndarray, "height width 3"]) -> ShearEstimator | None:
         """Make the estimator of the shear of frames; None for a network of all directions, or of unknown ones."""
-        if self.manifest.pull_direction_deg in {None, FULL_CIRCLE}:
+        if self.directions == FULL_CIRCLE:
             return None
         return ShearEstimator(reference, sensor_kind(self.manifest.sensor))
-
-    def doubt_shear(self, shear: Shear) -> str | None:
-        """Return the reason to withhold the margin of a frame pulled outside the trained directions; None inside."""
-        trained = self.manifest.pull_direction_deg
-        if trained is None or shear.excess(trained) <= DIRECTION_LIMIT:
-            return None
-        return f"pulled outside the trained {range_words(trained)} (90 is down); {_TURN_CURE}"
 
     def answers(self, batches: Iterable[Tensor], run: RunBatches | None = None) -> tuple[Tensor, ...]:
         """Compute the outputs (`Answers`) for batches of encoded frames, on the network's device or by an engine."""
@@ -254,13 +249,16 @@ class Network:
         inputs: Float[Tensor, "batch colours size size"] | Iterable[Tensor],
         *,
         friction: FrictionLike | None = None,
+        engine: "Engine | None" = None,
     ) -> "Estimate":
         """Predict the safety margin of encoded frames, or batches of them, with its uncertainty.
 
-        `friction` as `predict` takes it.
+        `friction` as `predict` takes it; `engine`: of this network. A batch may be encoded while the one before is
+        worked on.
         """
-        batches = inputs.split(_BATCH) if isinstance(inputs, Tensor) else inputs
-        return self.to_estimate(*self.answers(batches), friction=friction)
+        size = _BATCH if engine is None else engine.batch_size
+        batches = inputs.split(size) if isinstance(inputs, Tensor) else inputs
+        return self.to_estimate(*self.answers(batches, engine and engine.answers), friction=friction)
 
     @property
     def feature_layer(self) -> str | None:
@@ -283,10 +281,7 @@ class Network:
             estimate = replace(estimate, known=self.manifest.novelty.known(values["features"], estimate.sigma))
         if friction is None:
             return estimate
-        traction = self.require_ratio()
-        return estimate.with_friction(
-            as_friction(friction), trained_friction=np.array(traction.friction), calibration=traction.told
-        )
+        return estimate.with_friction(as_friction(friction), self.require_ratio())
 
     def follow(self, *, friction: object = None) -> Follower:
         """Make a corrector of predictions for the frames of a sensor in order; it takes no `friction`."""
@@ -391,18 +386,14 @@ class Estimate:
             mse = self.calibration.mse if self.calibration else 0.0
             return np.full(len(self.margin), erfc(error / sqrt(2 * mse)) if mse > 0 else 0.0)
         # bins beyond 0 and 1 mean the ends
-        centres = np.clip(bin_centres(self.edges), 0, 1)
-        far = np.abs(centres - np.clip(self.margin, 0, 1)[:, None]) > error
+        far = np.abs(np.clip(bin_centres(self.edges), 0, 1) - np.clip(self.margin, 0, 1)[:, None]) > error
         return (self.probabilities * far).sum(axis=1)
 
     def interval(self, level: float) -> tuple[Float[np.ndarray, " frames"], Float[np.ndarray, " frames"]] | None:
         """Return an interval for each margin at a level of confidence, within [0, 1]; None if not calibrated."""
         if self.calibration is None:
             return None
-        if str(level) not in self.calibration.offsets:
-            levels = ", ".join(self.calibration.offsets)
-            raise ModelError(f"there is no interval of level {level:g}; choose {levels}")
-        offset: Any = self.calibration.offsets[str(level)]
+        offset: Any = pick(self.calibration.offsets, str(level), noun="level")
         if self.alone is not None and self.alone[1] is not None:
             single = self.alone[1].offsets.get(str(level), offset)  # calibrations may have other levels
             offset = np.where(self.alone[0], single, offset)
@@ -410,31 +401,25 @@ class Estimate:
         # a label lies in [0, 1], so cutting there loses none
         return np.clip(low - offset, 0, 1), np.clip(high + offset, 0, 1)
 
-    def with_friction(
-        self,
-        friction: Friction | Float[np.ndarray, " frames"],
-        *,
-        trained_friction: Float[np.ndarray, " quantiles"],
-        calibration: Calibration | None = None,
-    ) -> "Estimate":
+    def with_friction(self, friction: Friction | Float[np.ndarray, " frames"], traction: Traction) -> "Estimate":
         """Condition the margins on a friction, or that of each frame (`condition_on_friction`), within [0, 1].
 
-        `calibration`: calibration of such margins; without it they have no intervals.
+        `traction`: that of the network, whose intervals of such margins they get (`Traction.told`).
         """
         assert self.probabilities is not None
         assert self.edges is not None
         assert self.ratio is not None
         common = isinstance(friction, Friction)
+        parts = [(friction, slice(None))] if common else [(Friction(value), friction == value) for value in {*friction}]
         probabilities, margin = np.empty_like(self.probabilities), np.empty_like(self.margin)
-        parts = [(Friction(float(value)), friction == value) for value in ([] if common else np.unique(friction))]
-        for value, rows in [(friction, slice(None))] if common else parts:
+        for value, rows in parts:
             probabilities[rows] = condition_on_friction(
                 self.probabilities[rows],
                 self.ratio.probabilities[rows],
                 edges=self.edges,
                 ratio_edges=self.ratio.edges,
                 friction=value,
-                trained_friction=trained_friction,
+                trained_friction=np.array(traction.friction),
             )
             # bins beyond 0 and 1 mean the ends
             margin[rows] = probabilities[rows] @ np.clip(bin_centres(self.edges), 0, 1)
@@ -442,7 +427,7 @@ class Estimate:
             self,
             margin=margin,
             probabilities=probabilities,
-            calibration=calibration,
+            calibration=traction.told,
             friction=friction if common else None,
             alone=None,
         )
@@ -483,23 +468,14 @@ def _load_weights(path: Path, model: nn.Module, *, what: str, sha256: str) -> No
     if hash_file(path) != sha256:
         raise CheckpointError(f"{path} is not the file its manifest describes; copy the whole folder again")
     try:
-        values, state = load_file(path, device="cpu"), model.state_dict()
-        model.load_state_dict(values)
+        model.load_state_dict(load_file(path, device="cpu"))  # widens halves, as which the package stores networks
     except (SafetensorError, RuntimeError) as error:
         raise CheckpointError(f"{path} does not hold {what} ({str(error).splitlines()[0]})") from None
-    # halves are widened: networks of the package are stored as such
-    for name, tensor in state.items():
-        if values[name].dtype not in {tensor.dtype, torch.float16} or not values[name].isfinite().all():
-            raise CheckpointError(f"{path} holds a value that is no finite number in {name}; train the network again")
 
 
 def read_manifest(run: str | Path) -> Manifest:
     """Load the manifest of a network without its weights, by the name or folder that `load` takes."""
-    path = find_run(Path(run)) / MANIFEST_FILE
-    manifest = load_record(path, Manifest, command="sliplens train")
-    if manifest.schema_version != SCHEMA_VERSION:
-        raise CheckpointError(f"{path} is not a sliplens manifest of schema {SCHEMA_VERSION}; train the network again")
-    return manifest
+    return load_record(find_run(Path(run)) / MANIFEST_FILE, Manifest, command="sliplens train")
 
 
 def load(run: str | Path, *, device: str = "cpu") -> Network:
@@ -515,7 +491,7 @@ def load(run: str | Path, *, device: str = "cpu") -> Network:
     Raises
     ------
     CheckpointError
-        If a file is missing, damaged, or of an unknown schema.
+        If a file is missing or damaged.
 
     See Also
     --------
@@ -533,21 +509,14 @@ def load(run: str | Path, *, device: str = "cpu") -> Network:
     folder = find_run(Path(run))
     require_folder(folder, what="the run")
     manifest = read_manifest(folder)
-    model = build_model(
-        manifest.backbone, head=manifest.head, colours=pick(ENCODINGS, manifest.input, noun="input").colours
-    )
+    encoding, sequence = pick(ENCODINGS, manifest.input, noun="input"), None
+    model = build_model(manifest.backbone, head=manifest.head, colours=encoding.colours)
     what = f"a {manifest.backbone} with a {manifest.head} head"
     _load_weights(folder / WEIGHTS_FILE, model, what=what, sha256=manifest.weights_sha256)
-    if manifest.novelty is not None and manifest.novelty.layer not in dict(model.named_modules()):
-        raise CheckpointError(f"{folder / MANIFEST_FILE} names a layer that the network has not; copy the folder again")
-    sequence = None
     if manifest.sequence is not None:
-        if not isinstance(model, HistogramRegressor) or model.ratio_edges is None:
-            raise CheckpointError(f"{folder / MANIFEST_FILE} tells of several frames, whose head reads F_t / F_n too")
-        sequence = SequenceHead(model.edges, model.ratio_edges)
+        sequence = SequenceHead(model.get_buffer("edges"), model.get_buffer("ratio_edges")).eval()
         hashed = manifest.sequence.weights_sha256
         _load_weights(folder / SEQUENCE_FILE, sequence, what="a head of several frames", sha256=hashed)
-        sequence.eval()
     # channels last: depthwise convolutions run up to half as fast again on a CPU
     model = model.to(device, memory_format=torch.channels_last).eval()  # pyright: ignore[reportCallIssue]
     # the networks of the package come without their learning curve

@@ -16,6 +16,11 @@ Frames = UInt8[np.ndarray, "batch height width 3"]
 Reference = UInt8[np.ndarray, "_ _ 3"]
 
 
+def _keep(frames: Frames, reference: Reference) -> Frames:
+    require_same_size(frames, reference)
+    return frames
+
+
 @dataclass(frozen=True, kw_only=True)
 class Encoding:
     """Way to make a network's input of frames.
@@ -26,8 +31,10 @@ class Encoding:
     """
 
     name: str
-    compare: Callable[[Frames, Reference], Frames]
-    empty_is_black: bool
+    formula: str
+    """Image that the network sees, of the frame T_n and the reference T_0."""
+    compare: Callable[[Frames, Reference], Frames] = _keep
+    empty_is_black: bool = False
     """True where an untouched sensor gives a black image, so that an explanation needs no reference frame."""
     own_maximum: bool = True
     """If True, divide each image by its own maximum, as in the thesis; else by 255, which keeps its amplitude."""
@@ -93,25 +100,17 @@ class Encoding:
             )
         return self.normalise(self.resize(frames, image_size=image_size))
 
-    def empty(self, reference: Reference, *, image_size: int) -> Float[Tensor, "colours size size"]:
-        """Encode the untouched sensor itself, the reference of an explanation."""
-        return self.encode(reference[None], reference, image_size=image_size)[0]
-
-
-def _keep(frames: Frames, reference: Reference) -> Frames:
-    require_same_size(frames, reference)
-    return frames
-
 
 ENCODINGS = {
-    # |T_n - T_0| by its own maximum and T_n itself, both as the thesis; T_n by 255; T_n - T_0; |T_n - T_0| with its
-    # amplitude; T_n and T_0, on one scale
-    "difference": Encoding(name="difference", compare=absolute_difference, empty_is_black=True),
-    "raw": Encoding(name="raw", compare=_keep, empty_is_black=False),
-    "rgb": Encoding(name="rgb", compare=_keep, empty_is_black=False, own_maximum=False),
+    # the first two are divided by their own maximum, as in the thesis
+    "difference": Encoding(name="difference", formula="|T_n - T_0|", compare=absolute_difference, empty_is_black=True),
+    "raw": Encoding(name="raw", formula="T_n"),
+    "rgb": Encoding(name="rgb", formula="T_n", own_maximum=False),
     "signed": Encoding(
-        name="signed", compare=signed_difference, empty_is_black=False, own_maximum=False, neutral=128 / 255
+        name="signed", formula="(T_n - T_0) / 2 + 128", compare=signed_difference, own_maximum=False, neutral=128 / 255
     ),
-    "amplitude": Encoding(name="amplitude", compare=absolute_difference, empty_is_black=True, own_maximum=False),
-    "pair": Encoding(name="pair", compare=_keep, empty_is_black=False, own_maximum=False, beside=True),
+    "amplitude": Encoding(
+        name="amplitude", formula="|T_n - T_0|", compare=absolute_difference, empty_is_black=True, own_maximum=False
+    ),
+    "pair": Encoding(name="pair", formula="T_n, then T_0", own_maximum=False, beside=True),
 }

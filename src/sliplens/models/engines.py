@@ -14,9 +14,8 @@ from torch import Tensor, nn
 
 from sliplens.errors import InputError, ModelError
 from sliplens.extras import import_openvino, missing_packages
-from sliplens.friction import FrictionLike
 from sliplens.models.backbones import Answers, RunBatches, answer_names
-from sliplens.models.checkpoint import Estimate, Network, hash_weights
+from sliplens.models.checkpoint import Network, hash_weights
 from sliplens.models.onnx import TOLERANCE, difference, trial_inputs
 
 ENGINES = ("torch", "openvino")
@@ -40,20 +39,6 @@ class Engine:
         """Predict the safety margins of batches of images, in their order."""
         return (margins for margins, *_ in self.answers(batches))
 
-    def estimate(
-        self,
-        network: Network,
-        inputs: Float[Tensor, "batch colours size size"] | Iterable[Tensor],
-        *,
-        friction: FrictionLike | None = None,
-    ) -> Estimate:
-        """Predict the safety margins of encoded frames, or of batches of them, with their uncertainty.
-
-        A batch may be encoded while the one before is worked on. `network` is that of this engine.
-        """
-        batches = inputs.split(self.batch_size) if isinstance(inputs, Tensor) else inputs
-        return network.to_estimate(*network.answers(batches, self.answers), friction=friction)
-
 
 _EXPECTED: ContextVar[int | None] = ContextVar("expected_passes", default=None)
 
@@ -75,7 +60,6 @@ def expecting(passes: int) -> Iterator[None]:
 def prepare(
     model: nn.Module,
     images: Float[Tensor, "batch colours height width"],
-    predictions: Float[Tensor, " batch"],
     *,
     passes: int,
     engine: str = "auto",
@@ -83,12 +67,12 @@ def prepare(
     streams: int | None = None,
     layer: str | None = None,
 ) -> Engine:
-    """Make an engine for a network, and check that it predicts the same as the network.
+    """Make an engine for a network, and check that it predicts some images as the network does.
 
     Parameters
     ----------
-    images, predictions
-        Images of the size to come, and the network's predictions for them.
+    images
+        Images of the size to come, on the network's device.
     passes
         Number of images to come, for `auto`; within `expecting` that number counts where it is larger.
     engine
@@ -102,15 +86,19 @@ def prepare(
     """
     if engine not in {"auto", *ENGINES}:
         raise InputError(f"there is no engine named {engine!r}; choose one of auto, {', '.join(ENGINES)}")
-    passes = max(passes, _EXPECTED.get() or 0)
-    obstacle = find_obstacle(model, images)
+    passes, obstacle = max(passes, _EXPECTED.get() or 0), find_obstacle(model, images)
+    # a graphics card wants to be filled; on a processor a batch should fit the caches
+    size = batch_size or (16 if images.device.type == "cpu" else 256)
+    plain = Engine(name="torch", batch_size=size, answers=Answers(model, layer).run)
     if engine == "openvino" and obstacle is not None:
         raise InputError(f"the engine openvino cannot be used: {obstacle}")
     if engine == "openvino" or (engine == "auto" and obstacle is None and passes >= _CONVERSION_PAYS_AFTER):
         try:
             converted = _openvino_engine(model, images, batch_size=batch_size, streams=streams, layer=layer)
-            answers = torch.cat(list(converted.run(images.split(converted.batch_size))))
-            error = difference(answers.numpy(), predictions.cpu().numpy())
+            answers, expected = (
+                torch.cat(list(each.run(images.split(each.batch_size)))) for each in (converted, plain)
+            )
+            error = difference(answers.numpy(), expected.numpy())
             if error <= TOLERANCE:
                 return converted
             reason = f"its predictions differ by {error:.2g}, {TOLERANCE:g} is allowed"
@@ -118,9 +106,7 @@ def prepare(
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         if engine == "openvino":
             raise ModelError(f"the engine openvino cannot run {type(model).__name__} ({reason}); choose torch")
-    # a graphics card wants to be filled; on a processor a batch should fit the caches
-    batch_size = batch_size or (16 if images.device.type == "cpu" else 256)
-    return Engine(name="torch", batch_size=batch_size, answers=Answers(model, layer).run)
+    return plain
 
 
 def make_engine(
@@ -138,14 +124,13 @@ def make_engine(
     >>> from sliplens.models.engines import make_engine
     >>> network = sl.load("chromatouch-pair")
     >>> engine = make_engine("torch", network, batch_size=2)
-    >>> engine.estimate(network, torch.zeros(3, 6, 112, 112)).margin.shape
+    >>> network.estimate(torch.zeros(3, 6, 112, 112), engine=engine).margin.shape
     (3,)
     """
     *_, images = trial_inputs(network)
     return prepare(
         network.model,
         images.to(network.device),
-        network.predict(images).to(network.device),
         passes=frames,
         engine=name,
         batch_size=batch_size,

@@ -57,13 +57,6 @@ class Novelty:
     strangeness: tuple[float, ...] = _SHARES
     """Values of `measure_strangeness` that each share of `_SHARES` of the validation frames reaches."""
 
-    def __post_init__(self) -> None:
-        width = len(self.mean)
-        if {len(self.scale), *map(len, self.directions)} - {width} or len(self.variances) != len(self.directions):
-            raise ValueError("mean, scale and directions of features are of different lengths")
-        if len(self.strangeness) != len(_SHARES):
-            raise ValueError(f"strangeness has {len(_SHARES)} levels")
-
     def distance(self, features: Float[np.ndarray, "frames features"]) -> Float[np.ndarray, " frames"]:
         """Compute the distance of features from those of healthy frames."""
         unit = (features - np.array(self.mean)) / np.array(self.scale)

@@ -32,13 +32,6 @@ TOLERANCE = 1e-4
 """Largest difference of an engine's prediction from the network's own, times its size where that is above 1.
 
 Float32 sums in another order move predictions by 4e-5 at most; a wrong kernel or bfloat16 by 1e-3 or more."""
-_COMPARED = {
-    "difference": "|T_n - T_0|",
-    "amplitude": "|T_n - T_0|",
-    "raw": "T_n",
-    "pair": "T_n, then T_0",
-    "signed": "(T_n - T_0) / 2 + 128",
-}
 
 
 def export_onnx(run: Network | Path | str, out: Path | str, *, overwrite: bool = False) -> Path:
@@ -126,7 +119,7 @@ def _describe(proto: "ModelProto", network: Network) -> None:
             "encoding": encoding.name,
             "frame_size": manifest.frame_size,
             "channels": "RGB" * (encoding.colours // 3),
-            "compare": _COMPARED.get(encoding.name, encoding.name),
+            "compare": encoding.formula,
             "image_size": manifest.image_size,
             "resize": "bilinear, antialiased, pixel centres at halves, rounded to 8 bits",
             "scale": "the image's own maximum, at least 1" if encoding.own_maximum else "255",

@@ -10,7 +10,7 @@ from typing import TypeAlias, Unpack
 
 import numpy as np
 import pyarrow as pa
-from jaxtyping import Bool
+from jaxtyping import Bool, Shaped
 from torch import Tensor, nn
 
 from sliplens._version import __version__
@@ -32,34 +32,22 @@ from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.recordings.source import Frame, SourceOptions, Trials, open_trials
 from sliplens.recordings.trial import ContactState
 from sliplens.runner import LONGEST, MakePart, Work, require_new_table, run_table
-from sliplens.shear import FULL_CIRCLE, range_words
+from sliplens.shear import DIRECTION_LIMIT, FULL_CIRCLE, range_words
 
 _CAMERA_EVERY = 4
 """Frames of a recording of which one is compared with the reference for the camera's motion."""
 LEVEL = 0.9
 """Confidence of the intervals."""
-_COLUMNS = {
-    "trial": pa.string(),
-    "frame": pa.int64(),
-    "file": pa.string(),
-    "time_s": pa.float64(),
-    "safety_margin": pa.float64(),
-    "normal_force_n": pa.float64(),
-    "tangential_force_n": pa.float64(),
-    "touches": pa.bool_(),
-    "prediction": pa.float64(),
-    "sigma": pa.float64(),
-    "low_90": pa.float64(),
-    "high_90": pa.float64(),
-    "known": pa.float64(),
-    "withheld": pa.string(),
-    "traction_ratio": pa.float64(),
-    "traction_ratio_sigma": pa.float64(),
-}
-
-
-_Read: TypeAlias = Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]
 _FORCES = ("normal_force_n", "tangential_force_n")
+_NETWORK = ("prediction", "sigma", "low_90", "high_90", "known", "withheld", "traction_ratio", "traction_ratio_sigma")
+_COLUMNS = ("trial", "frame", "file", "time_s", "safety_margin", *_FORCES, "touches", *_NETWORK)
+_TYPES = {
+    **dict.fromkeys(("trial", "file", "withheld"), pa.string()),
+    "frame": pa.int64(),
+    "touches": pa.bool_(),
+}
+"""Types of columns that are no number of 64 bits."""
+_Read: TypeAlias = Callable[[str, int, int], tuple[Capture, Iterator[tuple[int, Frame]]]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,7 +225,11 @@ def predict(
     with reporting(on_progress):
         with open_stage("Opening the source"):
             trials = open_trials(recordings, on=on, resumable=path is not None, **source_options)
-        profile = profile or _recorded_profile(trials.source)
+        data = trials.source
+        if isinstance(data, Path) and (data / DATASET_FILE).is_file():
+            data = load_dataset(data)
+        if profile is None and isinstance(data, Dataset):
+            profile = data.profile(data.trials[0].sensor)
         if network is None:
             name, origin = _choose_network(trials.kinds, profile)
             add_note(f"no network was named, so {name} reads it, {origin}")
@@ -300,13 +292,6 @@ def _list_notes(
     return tuple(dict.fromkeys(notes))
 
 
-def _recorded_profile(source: Path | Dataset | tuple[Capture, ...]) -> SensorProfile | None:
-    """Load the profile that a data set keeps of its first trial's sensor."""
-    if isinstance(source, Path) and (source / DATASET_FILE).is_file():
-        source = load_dataset(source)
-    return source.profile(source.trials[0].sensor) if isinstance(source, Dataset) else None
-
-
 def _choose_network(kinds: Sequence[Capture], profile: SensorProfile | None) -> tuple[str, str]:
     """Choose a network for a source, and say where the choice comes from."""
     if profile is not None and profile.network is not None:
@@ -342,12 +327,11 @@ def _require_comparable(network: Network, trial: Capture) -> Iterator[str]:
         return
     if not _is_recorded(trial):
         network.require_kind(next(trial.read_frames()), what=trial.files[0] if trial.files else "the first frame")
-    directions = network.manifest.pull_direction_deg or FULL_CIRCLE
     if not encoding.compares:
-        if directions != FULL_CIRCLE:
+        if network.directions != FULL_CIRCLE:
             yield (
                 f"{trial.name}: no reference was given, so neither the direction of the pull nor a motion of the "
-                f"camera is checked; the network was trained on {range_words(directions)} (90 is down)."
+                f"camera is checked; the network was trained on {range_words(network.directions)} (90 is down)."
             )
     elif encoding.empty_is_black:
         yield (
@@ -370,7 +354,7 @@ def _schema(network: Network, trials: Sequence[Capture], metadata: dict[str, str
         "touches": all(trial.read_reference or _contact_states(trial) for trial in trials),
         **dict.fromkeys(_FORCES, any(trial.labels is not None for trial in trials)),
     }
-    columns = [pa.field(name, kind) for name, kind in _COLUMNS.items() if present.get(name, True)]
+    columns = [pa.field(name, _TYPES.get(name, pa.float64())) for name in _COLUMNS if present.get(name, True)]
     return pa.schema(columns, metadata={"sliplens.version": __version__, **metadata})
 
 
@@ -422,7 +406,7 @@ class _Prediction(Work):
 
         for begin in range(first, first + count, LONGEST):
             checks: list[tuple[bool, str | None]] = []
-            estimate = engine.estimate(network, batches(islice(frames, LONGEST), checks), friction=self.friction)
+            estimate = network.estimate(batches(islice(frames, LONGEST), checks), friction=self.friction, engine=engine)
             touches = np.array([touch for touch, _ in checks])
             # of a strange picture the direction of the shear says nothing
             withheld = [
@@ -434,11 +418,14 @@ class _Prediction(Work):
             if follower is not None:
                 assert capture.time_s is not None  # `_list_notes`
                 estimate = follower.update(estimate, capture.time_s[here], touches, believed=believed)
-            columns = _columns(estimate, capture, here, believed=believed) | {
-                "touches": pa.array(touches),
-                "withheld": pa.array(withheld, type=pa.string()),
-            }
-            yield pa.table({name: columns[name] for name in self.schema.names}).cast(self.schema)
+            columns = _columns(estimate, capture, here, believed=believed) | {"touches": touches, "withheld": withheld}
+            yield pa.table(
+                [
+                    pa.array([None] * len(checks) if columns[name] is None else columns[name], kind, from_pandas=True)
+                    for name, kind in zip(self.schema.names, self.schema.types, strict=True)
+                ],
+                schema=self.schema,
+            )
 
 
 def _make_check(
@@ -449,7 +436,7 @@ def _make_check(
     if reference is None:
         return lambda number, _: (not states or states[number] != ContactState.NO_CONTACT, None)
     untouched, shear, camera = soften(reference), network.shear_estimator(reference), CameraWatch(reference)
-    moved = False
+    moved, directions, reason = False, network.directions, network.direction_reason
 
     def check(number: int, frame: Frame) -> tuple[bool, str | None]:
         nonlocal moved
@@ -463,16 +450,17 @@ def _make_check(
             moved = motion is not None and motion.excess_px > CAMERA_LIMIT_PX
         if moved:
             return touches, CAMERA_REASON
-        return touches, network.doubt_shear(shear.estimate(frame)) if shear is not None and touches else None
+        turned = shear is not None and touches and shear.estimate(frame).excess(directions) > DIRECTION_LIMIT
+        return touches, reason if turned else None
 
     return check
 
 
 def _columns(
     estimate: Estimate, trial: Capture, here: slice, *, believed: Bool[np.ndarray, " frames"]
-) -> dict[str, pa.Array]:
-    """Make the columns of consecutive frames; NaN becomes null."""
-    count, labels, ratio = len(estimate.margin), trial.labels, estimate.ratio
+) -> dict[str, Shaped[np.ndarray, " frames"] | Sequence[str | None] | None]:
+    """Make the columns of consecutive frames; None for what is unknown, NaN where the network is not believed."""
+    labels, ratio = trial.labels, estimate.ratio
     low, high = estimate.interval(LEVEL) or (None, None)
     numbers = {
         "prediction": estimate.margin,
@@ -482,16 +470,13 @@ def _columns(
         "traction_ratio": ratio and ratio.mean,
         "traction_ratio_sigma": ratio and ratio.sigma,
     }
-    numbers = {name: None if v is None else np.where(believed, v, np.nan) for name, v in numbers.items()}
     recorded = {"time_s": trial.time_s, "safety_margin": trial.safety_margin}
     recorded |= {name: labels and getattr(labels, name) for name in _FORCES}
-    numbers |= {name: None if v is None else v[here] for name, v in recorded.items()} | {"known": estimate.known}
     return {
-        "trial": pa.array([trial.name] * count),
-        "frame": pa.array(range(here.start, here.stop)),
-        "file": pa.array(trial.files[here]) if trial.files else pa.nulls(count, pa.string()),
-        **{
-            name: pa.nulls(count, pa.float64()) if v is None else pa.array(v.astype(np.float64), from_pandas=True)
-            for name, v in numbers.items()
-        },
+        "trial": [trial.name] * len(believed),
+        "frame": np.arange(here.start, here.stop),
+        "file": trial.files and trial.files[here],
+        "known": estimate.known,
+        **{name: None if values is None else np.where(believed, values, np.nan) for name, values in numbers.items()},
+        **{name: None if values is None else values[here] for name, values in recorded.items()},
     }

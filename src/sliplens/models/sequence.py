@@ -1,7 +1,7 @@
 """Sequence head: correct the margin of a frame by the frames of its contact before it."""
 
 from dataclasses import dataclass, replace
-from math import erf, isnan, sqrt
+from math import isnan
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -101,13 +101,20 @@ class SequenceHead(nn.Module):
         return inputs
 
     def forward(
-        self, inputs: Float[Tensor, "batch frames 8"], margin: Float[Tensor, "batch frames bins"]
-    ) -> Float[Tensor, "batch frames bins"]:
-        """Compute logits over the margin in whole contacts, from `make_inputs` and the probabilities of each frame."""
+        self, inputs: Float[Tensor, "*batch frames 8"], memory: Float[Tensor, "1 width"] | None = None
+    ) -> tuple[Float[Tensor, "*batch frames bins"], Tensor]:
+        """Compute the corrections of the logits of frames of a contact, from `make_inputs`, and the memory after them.
+
+        `memory`: that after the frames before them; None at the beginning of a contact.
+        """
         hidden = functional.gelu(self.seen(inputs))
-        memory, _ = self.memory(self.dropout(hidden))
-        correction = self.correction(torch.cat([self.dropout(memory), hidden], dim=-1))
-        return margin.clamp_min(_LEAST).log() + correction
+        states, after = self.memory(self.dropout(hidden), memory)
+        return self.correction(torch.cat([self.dropout(states), hidden], dim=-1)), after
+
+    @staticmethod
+    def logits(margin: Float[Tensor, "*batch bins"]) -> Float[Tensor, "*batch bins"]:
+        """Return the logits of the probabilities of a network, which the head corrects."""
+        return margin.clamp_min(_LEAST).log()
 
 
 def _moments(
@@ -155,14 +162,12 @@ class Follower:
     """
 
     def __init__(self, head: SequenceHead, sequence: SequenceManifest) -> None:
-        self._head, self._sequence = head, sequence
-        self._weights = [values.numpy() for values in head.state_dict().values()]
-        self._centres = head.centres.astype(np.float64)
+        self._head, self._calibration = head, sequence.calibration
         self.forget()
 
     def forget(self) -> None:
         """Clear the memory, for the next contact."""
-        self._memory, self._peak = np.zeros(WIDTH, dtype=np.float32), _LEAST_PEAK
+        self._memory, self._peak = torch.zeros(1, WIDTH), _LEAST_PEAK
         self._time_s = np.nan
         self.lost = False
         """True after a gap in this contact: its frames keep the predictions of single frames."""
@@ -196,34 +201,15 @@ class Follower:
             if not counts[row] or self.lost:
                 continue
             elapsed_s = LONGEST_S if isnan(self._time_s) else now_s - self._time_s
-            [inputs] = self._head.make_inputs(summary[row : row + 1], np.array([elapsed_s]), peak=self._peak)
-            correction[row], memory = self._step(inputs)
-            followed[row] = True
+            inputs = self._head.make_inputs(summary[row : row + 1], np.array([elapsed_s]), peak=self._peak)
+            with torch.no_grad():
+                step, memory = self._head(torch.from_numpy(inputs), self._memory)
+            correction[row], followed[row] = step[0], True
             if elapsed_s >= STEP_S - ROUNDING_S:
-                self._memory, self._peak, self._time_s = memory, float(inputs[_PEAK]), now_s
-        calibration = self._sequence.calibration
-        logits = (np.log(np.maximum(margin, _LEAST)) + correction) / calibration.temperature
-        likely = np.exp(logits - logits.max(axis=1, keepdims=True), dtype=np.float64)
-        likely /= likely.sum(axis=1, keepdims=True)
-        read = np.where(followed, (likely * self._centres).sum(axis=1), estimate.margin)
+                self._memory, self._peak, self._time_s = memory, float(inputs[0, _PEAK]), now_s
+        logits = self._head.logits(torch.from_numpy(margin)) + torch.from_numpy(correction)
+        likely = torch.softmax(logits.double() / self._calibration.temperature, dim=1).numpy()
+        read = np.where(followed, (likely * self._head.centres).sum(axis=1), estimate.margin)
         probabilities = np.where(followed[:, None], likely, estimate.probabilities)
         alone = None if followed.all() else (~followed, estimate.calibration)
-        return replace(estimate, margin=read, probabilities=probabilities, calibration=calibration, alone=alone)
-
-    def _step(
-        self, inputs: Float32[np.ndarray, " 8"]
-    ) -> tuple[Float32[np.ndarray, " bins"], Float32[np.ndarray, " width"]]:
-        """Compute the correction of a frame and the next memory, as `SequenceHead.forward` does.
-
-        In numpy: a call of torch costs more than the computation.
-        """
-        input_weight, input_bias, weight, recurrent, bias, recurrent_bias, out_weight, out_bias = self._weights
-        hidden = input_weight @ inputs + input_bias
-        # the Gaussian error linear unit
-        hidden *= np.array([(1 + erf(value / sqrt(2))) / 2 for value in hidden.tolist()], dtype=np.float32)
-        fed, fed_back = weight @ hidden + bias, recurrent @ self._memory + recurrent_bias
-        gates = (1 + np.tanh((fed + fed_back)[: 2 * WIDTH] / 2)) / 2  # the logistic function
-        reset, update = gates[:WIDTH], gates[WIDTH:]
-        candidate = np.tanh(fed[2 * WIDTH :] + reset * fed_back[2 * WIDTH :])
-        memory = candidate + update * (self._memory - candidate)
-        return out_weight @ np.concatenate([memory, hidden]) + out_bias, memory
+        return replace(estimate, margin=read, probabilities=probabilities, calibration=self._calibration, alone=alone)

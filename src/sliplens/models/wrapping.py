@@ -1,6 +1,6 @@
 """Networks of others: any PyTorch module with one number an image as its output."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -36,20 +36,15 @@ class OneOutput(nn.Module):
         values = self.module(inputs.contiguous())
         if callable(self.output):
             values = self.output(values)
-        elif isinstance(values, Mapping) and self.output is not None:
-            values = values[self.output]
-        elif isinstance(values, tuple | list):
-            if self.output is None and len(values) != 1:
-                raise ModelError(f"the module returns {len(values)} outputs; choose one with output=0")
-            values = values[self.output if isinstance(self.output, int) else 0]
-        elif isinstance(values, Tensor) and isinstance(self.output, int) and values.ndim > 1:
-            values = values[:, self.output]
-        if not isinstance(values, Tensor):
-            raise ModelError(f"the module returns {type(values).__name__}, no tensor; choose its output with output=")
-        if tuple(values.shape) not in {(len(images),), (len(images), 1)}:
+        elif isinstance(values, Tensor):
+            values = values[:, self.output] if isinstance(self.output, int) and values.ndim > 1 else values
+        elif self.output is not None or (isinstance(values, tuple | list) and len(values) == 1):
+            values = values[self.output or 0]  # pyright: ignore[reportCallIssue, reportArgumentType] (its own key)
+        if not isinstance(values, Tensor) or tuple(values.shape) not in {(len(images),), (len(images), 1)}:
+            what = f"shape {tuple(values.shape)}" if isinstance(values, Tensor) else f"type {type(values).__name__}"
             raise ModelError(
-                f"the module's output has shape {tuple(values.shape)} for {len(images)} images; choose one number an "
-                "image with output=, such as output=0"
+                f"the module's output has {what} for {len(images)} images; choose one number an image with output=, "
+                "such as output=0"
             )
         return values.reshape(len(images))
 
