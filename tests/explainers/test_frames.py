@@ -35,7 +35,7 @@ def test_a_raw_frame_is_compared_with_the_untouched_sensor(raw: Network, small_d
     chosen = frames_from_dataset(raw, small_dataset, FrameSelection(levels=(0.0,)))
     recording = small_dataset.load(small_dataset.select(split="test", condition="dry")[0])
     assert torch.equal(
-        raw.encoding.normalise(chosen.references)[0], raw.encoding.empty(recording.reference, image_size=32)
+        raw.encoding.normalise(chosen.references)[0], raw.encode(recording.reference[None], recording.reference)[0]
     )
 
 

@@ -80,28 +80,6 @@ def test_maps_of_one_pixel_are_left_out(network, images):
     assert [layer.name for layer in layers] == ["conv1", "stage2", "stage3"]
 
 
-def test_named_layers_come_in_the_order_in_which_they_run(network, images):
-    layers = find_layers(network("shufflenet"), images, names=["conv5", "stage2.1.branch2.0", "conv1"])
-    assert [layer.name for layer in layers] == ["conv1", "stage2.1.branch2.0", "conv5"]
-
-
-@pytest.mark.parametrize(
-    ("names", "message"),
-    [
-        (
-            ["stage9"],
-            "ShuffleNetV2 has no layer 'stage9'; choose among conv1, stage2, stage3, stage4, conv5 "
-            r"or another name of model.named_modules\(\)",
-        ),
-        (["fc"], "layer 'fc' gives no spatial map; choose among conv1, stage2, stage3, stage4, conv5"),
-        ([], "the list of layers is empty; name at least one, or pass None to have them found"),
-    ],
-)
-def test_rejects_names(names, message, network, images):
-    with pytest.raises(ModelError, match=message):
-        find_layers(network("shufflenet"), images, names=names)
-
-
 def test_a_network_without_maps_is_refused():
     model = nn.Sequential(nn.Flatten(), nn.Linear(3 * 64, 1))
     with pytest.raises(ModelError, match="Sequential has no layer with a spatial map for images of 8 x 8 pixels"):

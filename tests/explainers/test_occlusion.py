@@ -3,7 +3,7 @@ import torch
 from torch import nn
 
 from sliplens.explainers.gradients import IntegratedGradients
-from sliplens.explainers.occlusion import Occlusion, marker_regions, tile_regions
+from sliplens.explainers.occlusion import Occlusion, marker_regions
 
 
 class Linear(nn.Module):
@@ -48,26 +48,10 @@ def test_tiles_are_replaced_one_by_one(tile_px, network, small):
     torch.testing.assert_close(occluded.relevance[0], expected, atol=1e-8, rtol=1e-5)
 
 
-def test_tiles_cover_the_image_without_overlap():
-    regions = tile_regions((5, 7), tile_px=3)
-    assert regions.tolist() == [[0, 0, 0, 1, 1, 1, 2]] * 3 + [[3, 3, 3, 4, 4, 4, 5]] * 2
-
-
-def test_a_pixel_belongs_to_the_nearest_marker_within_reach():
-    # x runs to the right: the second marker lies three columns from the first, in the same row
-    regions = marker_regions((3, 6), torch.tensor([[1.0, 1.0], [4.0, 1.0]]), radius_px=1.2)
-    assert regions.tolist() == [[2, 0, 2, 2, 1, 2], [0, 0, 0, 1, 1, 1], [2, 0, 2, 2, 1, 2]]
-    # without a radius: half of the distance of 3 between neighbours
-    assert torch.equal(
-        marker_regions((3, 6), torch.tensor([[1.0, 1.0], [4.0, 1.0]])),
-        marker_regions((3, 6), torch.tensor([[1.0, 1.0], [4.0, 1.0]]), radius_px=1.5),
-    )
-
-
 def test_markers_of_a_linear_model_add_up(linear, small):
     markers = torch.tensor([[2.0, 2.0], [9.0, 3.0], [5.0, 9.0]])
-    occluded = Occlusion(markers_px=markers, radius_px=2.0)(linear, small)
+    occluded = Occlusion(markers_px=markers)(linear, small)
     torch.testing.assert_close(occluded.relevance.sum(dim=(1, 2)), occluded.change, atol=1e-6, rtol=1e-5)
-    for region in marker_regions((12, 12), markers, radius_px=2.0).unique():
-        inside = marker_regions((12, 12), markers, radius_px=2.0) == region
+    for region in marker_regions((12, 12), markers).unique():
+        inside = marker_regions((12, 12), markers) == region
         assert float(occluded.relevance[0][inside].std()) < 1e-7

@@ -9,7 +9,7 @@ from torchvision import models
 
 from sliplens.errors import InputError, ModelError
 from sliplens.explainers.attribution import spread
-from sliplens.explainers.cam import capture, find_published_layers
+from sliplens.explainers.cam import capture, find_layers, find_published_layers
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.table import get_explainer
 
@@ -32,13 +32,13 @@ def test_finds_the_ten_layers_of_the_public_code():
     model = models.shufflenet_v2_x1_0(weights=None)
     layers = find_published_layers(model, torch.zeros(1, 3, 64, 64))
     assert [layer.name for layer in layers] == PUBLISHED
-    assert sum(layer.channels for layer in layers) == 1208
+    assert sum(layer.shape[0] for layer in layers) == 1208
 
 
 def test_a_network_that_keeps_its_size_has_no_such_layer():
     model = torch.nn.Sequential(torch.nn.Conv2d(3, 2, 3, padding=1), torch.nn.Flatten(), torch.nn.Linear(2 * 64, 1))
-    with pytest.raises(ModelError, match=r"has no layer where the size of the map changes, .*; name layers"):
-        PolyCam(score="thesis")(model, torch.full((1, 3, 8, 8), 0.5))
+    with pytest.raises(ModelError, match=r"has no layer where the size of the map changes, .*; use poly-cam"):
+        PolyCam(published=True)(model, torch.full((1, 3, 8, 8), 0.5))
 
 
 def interpolate(cells, size):
@@ -77,14 +77,16 @@ def by_hand(model, image, *, layers):
 
 
 @pytest.mark.parametrize(("level", "place"), [(0, 1), (1, 0)])  # fine to coarse here, coarse to fine there
-def test_equals_the_public_code(level, place, network, images):
+def test_equals_the_public_code(level, place, network, images, monkeypatch):
     model, layers = network("gap"), ("first", "second")
     with torch.no_grad():
         # the answers near zero, where the sigmoid of a percentage still tells channels apart
         model.fc.bias.sub_(model(images[:1])[0])
         model.fc.weight.mul_(0.05)
         expected = by_hand(model, images[0], layers=layers)[place]
-    explanation = PolyCam(score="thesis", layers=layers, level=level)(model, images[:1], reference=images[1])
+    chosen = [next(layer for layer in find_layers(model, images) if layer.name == name) for name in layers]
+    monkeypatch.setattr("sliplens.explainers.poly_cam.find_published_layers", lambda *_: chosen)
+    explanation = PolyCam(published=True, level=level)(model, images[:1], reference=images[1])
     assert float(expected.max()) > 0
     torch.testing.assert_close(explanation.saliency[0], (expected / expected.max()).float(), atol=1e-5, rtol=0)
 
@@ -93,14 +95,14 @@ def test_its_weights_are_all_one_where_the_sigmoid_is_saturated(network, images)
     model = network("small shufflenet").float()
     with torch.no_grad():
         model.fc.bias.add_(5)  # 17 % is far below every masked image's answer
-    explanation = PolyCam(score="thesis")(model, images[:1].float())
+    explanation = PolyCam(published=True)(model, images[:1].float())
     chose_nothing = [text for text in explanation.warnings if "has the weight 1, so the masked passes chose" in text]
     assert len(chose_nothing) == len(find_published_layers(model, images.float()))
 
 
 def test_a_level_that_is_not_there_is_told(network, images):
-    with pytest.raises(InputError, match="Poly-CAM has no level 5 for 2 layers; count from 0, the finest"):
-        PolyCam(score="thesis", layers=("conv1", "stage2"), level=5)(network("small shufflenet"), images[:1])
+    with pytest.raises(InputError, match=r"Poly-CAM has no level 50 for [0-9]+ layers; count from 0, the finest"):
+        PolyCam(published=True, level=50)(network("small shufflenet"), images[:1])
 
 
 def test_grad_cam_of_the_thesis_is_torch_cams_above_zero_in_its_order(network, images, reference):

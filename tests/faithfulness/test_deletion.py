@@ -5,21 +5,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError
-from sliplens.faithfulness.scoring import (
-    delete_pixels,
-    deletion_order,
-    deletion_score,
-    deletion_steps,
-)
+from sliplens.faithfulness.scoring import delete_pixels, deletion_score, deletion_steps
 
 
 def mean_of_pixels(images: torch.Tensor) -> torch.Tensor:
     return images.mean(dim=(1, 2, 3))
-
-
-def test_the_most_salient_pixels_go_first():
-    saliency = np.array([[0.1, 0.9], [0.5, 0.3]])
-    assert deletion_order(saliency).tolist() == [1, 2, 3, 0]
 
 
 @given(st.floats(0, 1), st.floats(0, 1))
@@ -50,7 +40,7 @@ def test_so_many_pixels_of_an_order_are_gone(rng: np.random.Generator):
         seen.extend(batch)
         return batch.mean(dim=(1, 2, 3))
 
-    delete_pixels(look, images, order[None], fill="black", steps=30, batch_size=7)
+    delete_pixels(look, images, order[None], fill="black", steps=30)
     for step, image in enumerate(seen[:30], start=1):
         for flat in range(30):  # one pixel at a time, the slow way
             row, column = divmod(flat, 5)

@@ -1,10 +1,18 @@
 import numpy as np
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sliplens.errors import InputError, SaliencyError
-from sliplens.faithfulness.controls import relevance_mass, resolution, stability, total_variation
+from sliplens.faithfulness.controls import (
+    infidelity,
+    max_sensitivity,
+    relevance_mass,
+    resolution,
+    stability,
+    total_variation,
+)
 
 
 def test_total_variation_has_its_closed_forms(rng: np.random.Generator):
@@ -44,6 +52,33 @@ def test_stability_is_pearsons_correlation(rng: np.random.Generator):
     np.testing.assert_allclose(stability(maps, others), expected)
     np.testing.assert_allclose(stability(maps, 3 * maps - 1), 1)
     assert np.isnan(stability(np.zeros((1, 4, 4)), np.ones((1, 4, 4))))[0]
+
+
+@pytest.mark.parametrize("colours", [3, 6])
+def test_infidelity_has_its_closed_forms(colours: int):
+    generator = torch.Generator().manual_seed(0)
+    images, references = torch.rand(2, 2, colours, 5, 5, generator=generator)
+    references[:, 3:] = images[:, 3:]  # the reference beside the frame stays
+    weights = torch.rand(colours, 5, 5, generator=generator)
+    exact = (weights * (images - references)).sum(dim=1)
+
+    def infidelities(relevance: torch.Tensor) -> np.ndarray:
+        return infidelity(
+            lambda values: (weights * values).sum(dim=(1, 2, 3)), images, references, relevance, samples=4000
+        )
+
+    np.testing.assert_allclose(infidelities(exact), 0, atol=1e-5)  # the map of a linear network is exact
+    # each pixel is gone with probability 1/2: mean square of a sum of coins, whose standard error is below 4 %
+    expected = (exact.sum(dim=(1, 2)) ** 2 + (exact**2).sum(dim=(1, 2))) / 4
+    np.testing.assert_allclose(infidelities(torch.zeros_like(exact)) ** 2, expected, rtol=0.15)
+
+
+def test_max_sensitivity_has_its_closed_forms():
+    images = torch.full((2, 3, 4, 4), 0.5)
+    assert not max_sensitivity(lambda values: torch.ones(len(values), 4, 4), images).any()
+    largest = max_sensitivity(lambda values: values.mean(dim=1), images, radius=0.02, samples=20)
+    assert (largest > 0).all()
+    assert (largest <= 0.02 / 0.5).all()
 
 
 @pytest.fixture

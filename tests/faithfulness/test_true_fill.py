@@ -22,11 +22,9 @@ class Toy:
     def __init__(self, weights: np.ndarray) -> None:
         self.weights = torch.from_numpy(weights)
         self.drawn = 0
-        self.largest = 0
 
     def redraw(self, image: int, back: Bool[np.ndarray, "variants markers"]) -> Float[Tensor, "variants 3 1 columns"]:
         self.drawn += len(back)
-        self.largest = max(self.largest, len(back))
         moved = torch.from_numpy(~back).double() * self.weights[image]
         return moved[:, None, None].expand(-1, 3, -1, -1)
 
@@ -85,19 +83,6 @@ def test_what_many_orders_ask_for_is_drawn_once(weights, rng):
     assert toy.drawn == IMAGES * (2 + 3 * (len(SHARES) - 2))
 
 
-def test_the_batch_size_bounds_what_is_drawn_at_once_and_changes_nothing(weights):
-    found = []
-    for size in (1, 7, 64):
-        toy = Toy(weights)
-        rng = np.random.default_rng(2)
-        found.append(
-            score_maps_by_marker(toy.predict, toy.redraw, {"truth": weights}, rng=rng, towards=UP, batch_size=size)
-        )
-        assert toy.largest <= size
-    for one in found[1:]:
-        np.testing.assert_allclose(one["truth"].most_first, found[0]["truth"].most_first, atol=1e-12)
-
-
 def test_progress_is_told_in_images(weights, rng):
     toy, heard = Toy(weights), []
     with reporting(lambda *step: heard.append(step)):
@@ -114,10 +99,10 @@ def test_a_marker_without_influence_is_refused(weights, rng):
 
 def test_a_scene_is_drawn_once_for_each_choice(weights, rng):
     toy = Toy(weights)
-    answer = answer_scenes(toy.predict, partial(toy.redraw, 1), batch_size=3)
+    answer = answer_scenes(toy.predict, partial(toy.redraw, 1))
     back = rng.random((8, MARKERS)) < 0.5
     expected = (~back * weights[1]).sum(axis=1)
     np.testing.assert_allclose(answer(np.concatenate([back, back[::-1]])), [*expected, *expected[::-1]], atol=1e-12)
-    assert (toy.drawn, toy.largest) == (8, 3)
+    assert toy.drawn == 8
     np.testing.assert_allclose(answer(back[3:5]), expected[3:5], atol=1e-12)
     assert toy.drawn == 8

@@ -31,7 +31,7 @@ def test_a_pixel_belongs_to_the_nearest_marker_or_to_none():
         for column in range(9):
             distance = np.hypot(centres[:, 0] - column, centres[:, 1] - row)
             assert units[row, column] == (distance.argmin() if distance.min() <= 2 else 2)
-    with pytest.raises(InputError, match="there is no marker to remove"):
+    with pytest.raises(InputError, match="two or more, and there are 0; choose tiles"):
         marker_regions((6, 9), torch.empty(0, 2), radius_px=2.0)
 
 

@@ -12,7 +12,7 @@ MARKERS = torch.tensor([[10.0, 12.0], [40.0, 20.0], [25.0, 50.0]])
 DEFAULTS = {name: get_explainer(name) for name in EXPLAINERS}
 QUICK = {
     "integrated-gradients": SHORT,
-    "expected-gradients": ExpectedGradients(integrated=SHORT),
+    "expected-gradients": ExpectedGradients(steps=8, max_steps=40),
     "smooth-grad": SmoothGrad(samples=2),
     "occlusion": Occlusion(tile_px=32),
     "occlusion-marker": Occlusion(markers_px=MARKERS),

@@ -1,14 +1,12 @@
 """Attribution maps of a batch, their checks, and arithmetic on maps."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
-
-from sliplens.results.explanation import CLOSE
 
 FLOOR = 1e-12
 CHANGE_WINDOW = 15 / 224
@@ -116,10 +114,19 @@ def frame_of(images: Float[Tensor, "*batch colours height width"]) -> Float[Tens
 
 
 def with_reference_of(
-    images: Float[Tensor, "batch _ height width"], image: Float[Tensor, "colours height width"]
+    frames: Float[Tensor, "frames _ height width"], images: Float[Tensor, "images colours height width"]
 ) -> Float[Tensor, "batch colours height width"]:
-    """Frames of some inputs beside the reference of another; the inputs themselves where none is seen beside them."""
-    return torch.cat([frame_of(images), image[3:].expand(len(images), -1, -1, -1)], dim=1)
+    """Frames of some inputs beside the references of others; one may be there for all of the others."""
+    count = max(len(frames), len(images))
+    halves = frame_of(frames), images[:, 3:]
+    return torch.cat([half.expand(count, -1, -1, -1) for half in halves], dim=1)
+
+
+def black_frames(images: Float[Tensor, "*batch colours height width"]) -> Float[Tensor, "*batch colours height width"]:
+    """Return images whose frame is black; the reference beside it, if any, stays."""
+    black = images.clone()
+    frame_of(black).zero_()
+    return black
 
 
 def change_of(
@@ -229,79 +236,3 @@ class Attribution:
         supporting = torch.relu(self.influence)
         peak = supporting.amax(dim=(1, 2), keepdim=True)
         return supporting / torch.where(peak > 0, peak, torch.ones_like(peak))
-
-
-GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
-LOWEST, HIGHEST = -0.1, 1.1  # predictions of a regressor on data like its training data
-ALIKE_R, ALIKE_TOP = 0.99, 0.9  # required likeness of an approximate map to the exact one
-FLAT = 0.1  # share of |f(x) - f(reference)| that gradients at the image must make up, all of one sign
-
-
-def check_maps(
-    relevance: Float[Tensor, "batch height width"],
-    *,
-    prediction: Float[Tensor, " batch"],
-    reference_prediction: Float[Tensor, " batch"],
-    completeness_gap: Float[Tensor, " batch"] | None,
-    close: float = CLOSE,
-    of_margin: bool = True,
-) -> Iterator[str]:
-    """Describe the faults of each map, a sentence a fault, in the order of the images; all in the output's unit."""
-    gaps = torch.zeros_like(prediction) if completeness_gap is None else completeness_gap
-    numbers = (values.tolist() for values in (prediction, reference_prediction, gaps))
-    for index, (image_map, high, low, gap) in enumerate(zip(relevance, *numbers, strict=True)):
-        change, finite = high - low, bool(torch.isfinite(image_map).all())
-        findings = {
-            f"f(x) = {high:.3g} is within {close:.2g} of f(reference) = {low:.3g}, so there is next to nothing to "
-            "explain": abs(change) < close,
-            f"f(reference) = {low:.3g} is no safety margin, so the reference lies far from the data and the map shows "
-            "the way from there": of_margin and not LOWEST <= low <= HIGHEST,
-            "the map holds NaN or infinity and must not be shown or scored": not finite,
-            "the map is zero everywhere and says nothing about the image": finite and not image_map.any(),
-            f"the map leaves {gap:.2g} of f(x) - f(reference) = {change:.2g} unexplained, more than {GAP:.0%}": (
-                gap > GAP * abs(change)
-            ),
-        }
-        yield from (f"image {index}: {finding}" for finding, holds in findings.items() if holds)
-
-
-def check_weights(
-    layers: Sequence[str], weights: Sequence[Sequence[Float[Tensor, " _channels"]]], *, change: Sequence[float]
-) -> Iterator[str]:
-    """Describe the faults of the channel weights, a sentence for each image and layer."""
-    for index, (shares, difference) in enumerate(zip(weights, change, strict=True)):
-        for layer, weight in zip(layers, shares, strict=True):
-            if bad := int((~weight.isfinite()).sum()):
-                yield (
-                    f"image {index}: {bad} of {len(weight)} channels of layer {layer} have no finite weight, "
-                    "so the model cannot predict every masked image"
-                )
-            elif difference and not weight.any():
-                yield f"image {index}: no channel of layer {layer} supports f(x) - f(reference), so the map is zero"
-            elif difference and len(weight) > 1 and bool((weight == weight[0]).all()):
-                yield (
-                    f"image {index}: every channel of layer {layer} has the weight {float(weight[0]):.3g}, "
-                    "so the masked passes chose nothing and the map shows activity only"
-                )
-
-
-def check_approximations(approximations: Sequence[Approximation]) -> Iterator[str]:
-    """Warn of approximate maps that may differ from the exact ones."""
-    for index, map_ in enumerate(approximations):
-        if not (map_.pearson_r >= ALIKE_R and map_.top_overlap >= ALIKE_TOP):
-            yield (
-                f"image {index}: with {map_.measured} of {map_.channels} channels measured the map is expected to "
-                f"correlate with the exact one at {map_.pearson_r:.3f} and to share {map_.top_overlap:.0%} of its "
-                "strongest pixels; raise the budget"
-            )
-
-
-def check_slopes(sizes: Sequence[float], *, change: Sequence[float], close: float = CLOSE) -> Iterator[str]:
-    """Warn of images at which the gradients, even if all of one sign, make up next to none of the change."""
-    for index, (size, difference) in enumerate(zip(sizes, change, strict=True)):
-        if abs(difference) >= close and size < FLAT * abs(difference):
-            yield (
-                f"image {index}: the gradients at the image make up {size / abs(difference):.2g} of "
-                f"f(x) - f(reference) = {difference:.2g}, less than {FLAT:g}: the network is saturated there, so "
-                "compare with poly-cam or occlusion, which need no gradient"
-            )

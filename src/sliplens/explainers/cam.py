@@ -1,11 +1,9 @@
 """Class activation maps that keep their sign, and the activations that they weigh."""
 
 import weakref
-from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from difflib import get_close_matches
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby, pairwise
 from typing import ClassVar, NamedTuple, TypeAlias
@@ -15,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sliplens.errors import ModelError
-from sliplens.explainers.attribution import Attribution, check_slopes, scale_to, spread
-from sliplens.explainers.contract import Comparison, Method, frozen, require_at_least_one
+from sliplens.explainers.attribution import Attribution, scale_to, spread
+from sliplens.explainers.contract import BATCH, Comparison, Method, frozen
 from sliplens.progress import report_each
 
 
@@ -51,11 +49,7 @@ class Layer(NamedTuple):
     name: str
     """Its name in `model.named_modules()`."""
     shape: Shape
-
-    @property
-    def channels(self) -> int:
-        """Channels of the map."""
-        return self.shape[0]
+    """Channels, rows and columns of the map."""
 
 
 class _Call(NamedTuple):
@@ -68,51 +62,41 @@ class _Call(NamedTuple):
     inner: "list[_Call]"
 
 
-def find_layers(
-    model: nn.Module, images: Float[Tensor, "batch colours height width"], *, names: Sequence[str] | None = None
-) -> tuple[Layer, ...]:
+def find_layers(model: nn.Module, images: Float[Tensor, "batch colours height width"]) -> tuple[Layer, ...]:
     """Find the layers to explain, in the order in which they run: fine to coarse in the usual network.
 
     The network is run once, with one image, and its main path followed, not into blocks and their branches but into
     plain `Sequential` containers, wrappers whose output is no map, and blocks that shrink the map by more than two.
     Each resolution and width gives its last map; layers without parameters (pooling) and 1 x 1 maps are left out. For
-    TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and conv5. With `names`, as
-    `model.named_modules()` has them, those modules are taken instead.
+    TorchVision's ShuffleNetV2 these are conv1, stage2, stage3, stage4 and conv5. They are cached per model, its modules
+    and the image size, since the pass is expensive.
 
     Raises
     ------
     ModelError
-        If a name is unknown or its module gives no map, or if the network has no layer with a map, or maps with the
-        channels last, such as a Swin transformer.
+        If the network has no layer with a map, or maps with the channels last, such as a Swin transformer.
     """
-    root = _record(model, images)
-    path = _main_path(root)
-    layers = _distinct(path)
-    if names is None and any(_is_channels_last(step) for step in path):
+    key = (tuple((name, weakref.ref(module)) for name, module in model.named_modules()), tuple(images.shape[1:]))
+    if model in _LAYER_CACHE and _LAYER_CACHE[model][0] == key:
+        return _LAYER_CACHE[model][1]
+    path, layers = _main_path(_record(model, images)), []
+    if any(_is_channels_last(step) for step in path):
         raise ModelError(
             f"{type(model).__name__} has maps with their channels last, which methods of the CAM family do not take; "
             "use integrated-gradients, smooth-grad, occlusion or shapley"
         )
-    if names is not None:
-        return _named(model, root, names, others=layers)
+    for shape, group in groupby(path, key=lambda step: step.output_shape):
+        members = list(group)
+        has_parameters = any(next(step.module.parameters(), None) is not None for step in members)
+        if shape is not None and shape[1] * shape[2] > 1 and has_parameters:
+            layers.append(Layer(members[-1].name, shape))
     if not layers:
         raise ModelError(
             f"{type(model).__name__} has no layer with a spatial map for images of {images.shape[-2]} x "
             f"{images.shape[-1]} pixels; use larger images, a convolutional network, or integrated gradients"
         )
-    return layers
-
-
-def cached_layers(
-    model: nn.Module, images: Float[Tensor, "batch colours height width"], *, names: Sequence[str] | None = None
-) -> tuple[Layer, ...]:
-    """Return the layers that `find_layers` finds, cached per model, image size and names: its pass is expensive."""
-    modules = tuple((name, weakref.ref(module)) for name, module in model.named_modules())
-    key = (modules, tuple(images.shape[1:]), None if names is None else tuple(names))
-    entry = _LAYER_CACHE.get(model)
-    if entry is None or entry[0] != key:
-        _LAYER_CACHE[model] = entry = (key, find_layers(model, images, names=names))
-    return entry[1]
+    _LAYER_CACHE[model] = key, tuple(layers)
+    return tuple(layers)
 
 
 _LAYER_CACHE: weakref.WeakKeyDictionary[nn.Module, tuple[object, tuple[Layer, ...]]] = weakref.WeakKeyDictionary()
@@ -139,8 +123,8 @@ def find_published_layers(model: nn.Module, images: Float[Tensor, "batch colours
                 break
     if not layers:
         raise ModelError(
-            f"{type(model).__name__} has no layer where the size of the map changes, which score='thesis' looks for; "
-            "name layers"
+            f"{type(model).__name__} has no layer where the size of the map changes, which poly-cam-thesis looks for; "
+            "use poly-cam"
         )
     return tuple(layers.values())
 
@@ -168,10 +152,6 @@ def _map_shape(value: object) -> Shape | None:
         return None
     channels, height, width = value.shape[1:]
     return channels, height, width
-
-
-def _is_spatial(shape: Shape | None) -> bool:
-    return shape is not None and shape[1] * shape[2] > 1
 
 
 def _is_channels_last(call: _Call) -> bool:
@@ -202,37 +182,6 @@ def _shrinks_repeatedly(call: _Call) -> bool:
     return call.input_shape[1] > 2 * call.output_shape[1] + 1 or call.input_shape[2] > 2 * call.output_shape[2] + 1
 
 
-def _distinct(steps: list[_Call]) -> tuple[Layer, ...]:
-    layers = []
-    for shape, group in groupby(steps, key=lambda step: step.output_shape):
-        members = list(group)
-        has_parameters = any(next(step.module.parameters(), None) is not None for step in members)
-        if shape is not None and _is_spatial(shape) and has_parameters:
-            layers.append(Layer(members[-1].name, shape))
-    return tuple(layers)
-
-
-def _named(model: nn.Module, root: _Call, names: Sequence[str], *, others: tuple[Layer, ...]) -> tuple[Layer, ...]:
-    """Find modules by name, each where it ended last."""
-    shapes: dict[str, Shape | None] = {}
-    for call in _finished(root):
-        shapes.pop(call.name, None)
-        shapes[call.name] = call.output_shape
-    available, choices = [name for name, _ in model.named_modules() if name], [layer.name for layer in others]
-    for name in names:
-        if name not in available:
-            choices = dict.fromkeys([*choices, *get_close_matches(name, available, n=3)])
-            raise ModelError(
-                f"{type(model).__name__} has no layer {name!r}; choose among {', '.join(choices)} "
-                "or another name of model.named_modules()"
-            )
-        if not _is_spatial(shapes.get(name)):
-            raise ModelError(f"layer {name!r} gives no spatial map; choose among {', '.join(choices) or 'none'}")
-    if not names:
-        raise ModelError("the list of layers is empty; name at least one, or pass None to have them found")
-    return tuple(Layer(name, shape) for name, shape in shapes.items() if shape is not None and name in names)
-
-
 def _finished(call: _Call) -> Iterator[_Call]:
     for inner in call.inner:
         yield from _finished(inner)
@@ -244,93 +193,13 @@ _Cells: TypeAlias = Float[Tensor, "batch rows columns"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Cam(Method):
-    """One layer's cells, weighted by the gradient at the image; the map is bilinear between them and keeps their total.
-
-    The published maps weigh the activations A(x), which for a regressor are mostly the level that every image has. What
-    sets x apart from the reference is the contrast A(x) - A(b), weighted by the same gradient.
-    """
-
-    layer: str | None = None
-    """Name of the layer; by default the last one with a map (`find_layers`)."""
-    contrast: bool = True
-    """Take the reference's activations off. False gives the published map, which does not depend on the reference and
-    has no completeness gap; the reference then only decides what `saliency` shows."""
-    relu: bool = False
-    """Keep the cells above zero alone, as published: those that raise the prediction, whichever way it went. Their map
-    is then scaled to add up to |f(x) - f(b)|, a convention; its pixels are ranked and shown in the published order."""
-    batch_size: int = 32
-
-    one_sided: ClassVar[bool] = False
-    """True if only gradients along the change of the prediction count."""
-
-    @staticmethod
-    @abstractmethod
-    def cells(activations: _Maps, gradients: _Maps) -> _Cells:
-        """Compute the relevance of the layer's cells in margin units, before any ReLU."""
-
-    def __post_init__(self) -> None:
-        require_at_least_one(type(self).__name__, batch_size=self.batch_size)
-
-    def _explain(self, comparison: Comparison) -> Attribution:
-        try:
-            names = None if self.layer is None else (self.layer,)
-            layer = cached_layers(comparison.model, comparison.images[:1], names=names)[-1]
-        except ModelError:
-            _ = comparison.change  # a model that gives no number has a greater fault than one without layers
-            raise
-        maps, predictions, reference_predictions = [], [], []
-        empty = reference_prediction = torch.empty(0)
-        parts = torch.arange(len(comparison.images)).split(self.batch_size)
-        for part in report_each(parts, sizes=[len(part) for part in parts]):
-            # images and references in one pass; a reference shared by all images passes once
-            shared = comparison.references[: 0 if maps else 1]
-            references = comparison.references[part] if len(comparison.references) > 1 else shared
-            activations, gradients, prediction = _differentiate(
-                comparison, torch.cat([comparison.images[part], references]), count=len(part), layer=layer
-            )
-            if len(references):
-                empty, reference_prediction = activations[len(part) :], prediction[len(part) :]
-            activations, prediction = activations[: len(part)], prediction[: len(part)]
-            change = (prediction - reference_prediction)[:, None, None, None]
-            sign = change.sign() if self.one_sided else torch.ones_like(change)
-            cells = self.cells(activations - empty if self.contrast else activations, sign * gradients)
-            cells = torch.relu(cells) if self.relu else sign[:, 0] * cells
-            maps.append(spread(cells, (comparison.images.shape[-2], comparison.images.shape[-1])))
-            predictions.append(prediction)
-            reference_predictions.append(reference_prediction.expand_as(prediction))
-        comparison = comparison.with_predictions(torch.cat(predictions), torch.cat(reference_predictions))
-        relevance = scale_to(torch.cat(maps), total=comparison.change.abs()) if self.relu else torch.cat(maps)
-        attribution = comparison.attribution(
-            relevance,
-            complete=self.contrast and not self.one_sided and not self.relu,
-            target=f"{'f(x) - f(reference)' if self.contrast else 'f(x)'}, through layer {layer.name}",
-            warnings=check_slopes(
-                relevance.abs().sum(dim=(1, 2)).tolist(), change=comparison.change.tolist(), close=comparison.close
-            ),
-        )
-        return replace(attribution, raises_only=self.relu)
-
-
-def _differentiate(comparison: Comparison, batch: Tensor, *, count: int, layer: Layer) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute activations, gradients of the first `count` predictions in them, and predictions of a batch."""
-    with capture(comparison.model, [layer.name], differentiable=True) as outputs:
-        predictions = comparison.predict(batch)
-    if not predictions.requires_grad:
-        raise ModelError(
-            f"the output does not depend on layer {layer.name!r}; choose a layer on the path to the output"
-        )
-    (gradients,) = torch.autograd.grad(predictions[:count].sum(), outputs[layer.name])
-    return outputs[layer.name].detach(), gradients[:count], predictions.detach()
-
-
-@dataclass(frozen=True, kw_only=True)
-class GradCam(_Cam):
-    """Grad-CAM of one layer against the reference, signed, in margin units.
+class GradCam(Method):
+    """Grad-CAM of the last layer with a map against the reference, signed, in margin units.
 
     The relevance of a cell is sum over c of alpha_c (A_c(x) - A_c(b)), alpha_c the mean over space of df/dA_c at x,
-    which for a head linear in the mean over space adds up to f(x) - f(b) exactly. A regressor's negative evidence is
-    evidence, so the ReLU of the published map is left out.
+    which for a head linear in the mean over space adds up to f(x) - f(b) exactly. The published map weighs the
+    activations A(x), which for a regressor are mostly the level that every image has, and its ReLU leaves out negative
+    evidence. The map is bilinear between the cells and keeps their total.
 
     References
     ----------
@@ -339,18 +208,58 @@ class GradCam(_Cam):
     """
 
     method: ClassVar[str] = "grad-cam"
+    one_sided: ClassVar[bool] = False
+    """True if only gradients along the change of the prediction count."""
+    published: bool = False
+    """Weigh A(x) and keep the cells above zero, those that raise the prediction, whichever way it went. The map is then
+    scaled to add up to |f(x) - f(b)|, a convention; its pixels are ranked and shown in the published order."""
 
     @staticmethod
     def cells(activations: _Maps, gradients: _Maps) -> _Cells:
-        """Sum over c of alpha_c A_c."""
+        """Sum over c of alpha_c A_c, in margin units."""
         return (gradients.mean(dim=(2, 3), keepdim=True) * activations).sum(dim=1)
+
+    def _explain(self, comparison: Comparison) -> Attribution:
+        try:
+            layer = find_layers(comparison.model, comparison.images)[-1]
+        except ModelError:
+            _ = comparison.change  # a model that gives no number has a greater fault than one without layers
+            raise
+        shared, maps, predictions = len(comparison.references) == 1, [], []
+        size = comparison.images.shape[-2], comparison.images.shape[-1]
+        parts = comparison.images.split(BATCH)
+        references = [comparison.references] * len(parts) if shared else comparison.references.split(BATCH)
+        pairs = list(zip(parts, references, strict=True))
+        for images, empty in report_each(pairs, sizes=[len(images) for images, _ in pairs]):
+            # images and references in one pass
+            with capture(comparison.model, [layer.name], differentiable=True) as outputs:
+                both = comparison.predict(torch.cat([images, empty]))
+            if not both.requires_grad:
+                raise ModelError(f"the output of {type(comparison.model).__name__} does not depend on {layer.name!r}")
+            (gradients,) = torch.autograd.grad(both[: len(images)].sum(), outputs[layer.name])
+            activations, base = outputs[layer.name].detach().tensor_split([len(images)])
+            prediction, low = both.detach().tensor_split([len(images)])
+            sign = (prediction - low).sign()[:, None, None] if self.one_sided else torch.ones(1, 1, 1).to(prediction)
+            contrast = activations if self.published else activations - base
+            cells = sign * self.cells(contrast, sign[:, None] * gradients[: len(images)])
+            maps.append(spread(torch.relu(cells) if self.published else cells, size))
+            predictions.append(torch.stack([prediction, low.expand_as(prediction)]))
+        comparison.prediction, comparison.reference_prediction = torch.cat(predictions, dim=1)
+        relevance = torch.cat(maps)
+        if self.published:
+            relevance = scale_to(relevance, total=comparison.change.abs())
+        return comparison.attribution(
+            relevance,
+            complete=not self.published and not self.one_sided,
+            target=f"{'f(x)' if self.published else 'f(x) - f(reference)'}, through layer {layer.name}",
+            warnings=comparison.saturated(relevance.abs().sum(dim=(1, 2)).tolist()),
+            raises_only=self.published,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
-class HiResCam(_Cam):
-    """HiResCAM: Grad-CAM with each cell weighted by its own gradient.
-
-    With the mean over space as head the two are the same.
+class HiResCam(GradCam):
+    """HiResCAM: Grad-CAM with each cell weighted by its own gradient; the same where the head is the mean over space.
 
     References
     ----------
@@ -367,7 +276,7 @@ class HiResCam(_Cam):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LayerCam(_Cam):
+class LayerCam(GradCam):
     """LayerCAM: HiResCAM of the gradients that point the way the prediction went.
 
     With s = sign(f(x) - f(b)) the map is s sum over c of relu(s df/dA_c) (A_c(x) - A_c(b)); the published one keeps

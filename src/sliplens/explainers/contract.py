@@ -1,27 +1,34 @@
-"""Base of the explainers: checks of the images, a frozen network, the clock, the record."""
+"""Base of the explainers: checked images, a frozen network, its predictions, warnings and the clock."""
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Protocol, TypeAlias, runtime_checkable
+from typing import ClassVar, TypeAlias
 
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 
-from sliplens.errors import ImageError, InputError, ModelError
-from sliplens.explainers.attribution import CLOSE, Attribution, check_maps, frame_of
+from sliplens.errors import ImageError, ModelError
+from sliplens.explainers.attribution import Approximation, Attribution
 from sliplens.models.engines import Engine, prepare
 from sliplens.models.wrapping import OneOutput
 from sliplens.progress import report_each
+from sliplens.results.explanation import CLOSE
 
 Batch: TypeAlias = Shaped[Tensor, "..."]
 """Images or a reference as a caller gave them, before they are checked."""
+Explainer: TypeAlias = Callable[..., Attribution]
+"""Function that explains a batch, with the arguments of `Method.__call__`."""
+BATCH = 32
+"""Images in a pass, which bounds the memory."""
 _SLACK = 1e-6  # rounding of a resize or a division may step over 1
-_FORWARD_BATCH = 32  # bounds the memory of the plain predictions, whatever the number of images
+_GAP = 0.01  # share of |f(x) - f(reference)| that may stay unexplained
+_LOWEST, _HIGHEST = -0.1, 1.1  # predictions of a regressor on data like its training data
+_FLAT = 0.1  # share of |f(x) - f(reference)| that gradients at the image must make up, all of one sign
 
 
 @contextmanager
@@ -43,11 +50,11 @@ def frozen(model: nn.Module) -> Iterator[None]:
             parameter.requires_grad_(flag)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Comparison:
     """Images compared with their references by a frozen network: f(x) less f(b), in margin units, which is explained.
 
-    Made by `freeze` and valid inside it only; predictions are computed at the first access.
+    Predictions are computed at the first access, unless a method sets those of a pass of its own.
     """
 
     model: nn.Module
@@ -59,15 +66,11 @@ class Comparison:
     def predict(self, images: Float[Tensor, "batch colours height width"]) -> Float[Tensor, " batch"]:
         """Run the network and return one margin an image, with the graph where gradients are on."""
         output = self.model(images)
-        if not isinstance(output, Tensor):
+        if not isinstance(output, Tensor) or tuple(output.shape) not in {(len(images),), (len(images), 1)}:
+            what = f"shape {tuple(output.shape)}" if isinstance(output, Tensor) else f"type {type(output).__name__}"
             raise ModelError(
-                f"the model returns {type(output).__name__} instead of a tensor; "
-                "wrap it so that it gives one margin an image"
-            )
-        if tuple(output.shape) not in {(len(images),), (len(images), 1)}:
-            raise ModelError(
-                f"the model's output has shape {tuple(output.shape)} for {len(images)} image(s), not one number an "
-                "image; end it with one output, such as Linear(features, 1)"
+                f"the model's output has {what} for {len(images)} image(s), not one number an image; end it with one "
+                "output, such as Linear(features, 1), or choose one with sliplens.wrap(model, output=0)"
             )
         if images.requires_grad and torch.is_grad_enabled() and not output.requires_grad:
             raise ModelError(
@@ -89,14 +92,7 @@ class Comparison:
 
     @torch.no_grad()
     def _predict_all(self, images: Tensor, name: str) -> Tensor:
-        return _require_finite(torch.cat([self.predict(part) for part in images.split(_FORWARD_BATCH)]), name)
-
-    def with_predictions(self, prediction: Tensor, reference_prediction: Tensor) -> "Comparison":
-        """Return a comparison with predictions that were made elsewhere, after checking them."""
-        comparison = replace(self)
-        vars(comparison)["prediction"] = _require_finite(prediction, "image")
-        vars(comparison)["reference_prediction"] = _require_finite(reference_prediction, "reference")
-        return comparison
+        return _require_finite(torch.cat([self.predict(part) for part in images.split(BATCH)]), name)
 
     @property
     def close(self) -> float:
@@ -118,11 +114,10 @@ class Comparison:
         """f(x) - f(b), the difference that is explained."""
         return self.prediction - self.reference_prediction
 
-    def prepare(self, passes: int, *, engine: str = "auto", batch_size: int | None = None) -> Engine:
+    def prepare(self, passes: int, *, engine: str = "auto") -> Engine:
         """Prepare an engine for a number of passes of the network (`models.engines.prepare`)."""
-        images = torch.cat([self.images[:1], self.reference[:1]])
-        predictions = torch.stack([self.prediction[0], self.reference_prediction[0]])
-        return prepare(self.model, images, predictions, passes=passes, engine=engine, batch_size=batch_size)
+        _ = self.change  # errors of the predictions are reported first
+        return prepare(self.model, torch.cat([self.images[:1], self.reference[:1]]), passes=passes, engine=engine)
 
     def map_each(
         self, relevance: Callable[[int], Float[Tensor, "height width"]]
@@ -137,44 +132,54 @@ class Comparison:
         complete: bool,
         target: str = "f(x) - f(reference)",
         warnings: Iterable[str] = (),
+        engine: str = "torch",
+        approximations: Sequence[Approximation] = (),
+        raises_only: bool = False,
     ) -> Attribution:
         """Return maps with predictions and warnings; if `complete`, the relevance should add up to the change."""
+        for predictions, name in ((self.prediction, "image"), (self.reference_prediction, "reference")):
+            _require_finite(predictions, name)
         gap = (relevance.sum(dim=(1, 2)) - self.change).abs().float() if complete else None
-        single = relevance.float()
-        checks = check_maps(
-            single,
-            prediction=self.prediction,
-            reference_prediction=self.reference_prediction,
-            completeness_gap=gap,
-            close=self.close,
-            of_margin=self.of_margin,
-        )
         return Attribution(
             images=self.images.float(),
-            relevance=single,
+            relevance=relevance.float(),
             target=target,
             prediction=self.prediction.float(),
             reference_prediction=self.reference_prediction.float(),
             completeness_gap=gap,
-            warnings=(*checks, *warnings),
+            warnings=(*self._faults(relevance.float(), gap), *warnings),
+            engine=engine,
+            approximations=tuple(approximations),
+            raises_only=raises_only,
         )
 
+    def _faults(self, relevance: Tensor, gap: Tensor | None) -> Iterator[str]:
+        """Describe the faults of each map, a sentence a fault, in the order of the images."""
+        gaps = torch.zeros_like(self.prediction) if gap is None else gap
+        numbers = (values.tolist() for values in (self.prediction, self.reference_prediction, gaps))
+        for index, (image_map, high, low, missing) in enumerate(zip(relevance, *numbers, strict=True)):
+            change, finite, close = high - low, bool(torch.isfinite(image_map).all()), self.close
+            findings = {
+                f"f(x) = {high:.3g} is within {close:.2g} of f(reference) = {low:.3g}, so there is next to nothing to "
+                "explain": abs(change) < close,
+                f"f(reference) = {low:.3g} is no safety margin, so the reference lies far from the data and the map "
+                "shows the way from there": self.of_margin and not _LOWEST <= low <= _HIGHEST,
+                "the map holds NaN or infinity and must not be shown or scored": not finite,
+                "the map is zero everywhere and says nothing about the image": finite and not image_map.any(),
+                f"the map leaves {missing:.2g} of f(x) - f(reference) = {change:.2g} unexplained, more than "
+                f"{_GAP:.0%}": missing > _GAP * abs(change),
+            }
+            yield from (f"image {index}: {finding}" for finding, holds in findings.items() if holds)
 
-@contextmanager
-def freeze(model: nn.Module, images: Batch, *, reference: Batch | None) -> Iterator[Comparison]:
-    """Check the images and freeze the network, with gradients on and autocast off whatever the caller's mode."""
-    _require_images(images)
-    reference = _require_reference(reference, images=images)
-    # a caller inside no_grad or inference_mode may still ask for gradients of the output
-    with torch.inference_mode(mode=False), torch.enable_grad(), frozen(model):
-        weights = next((parameter for parameter in model.parameters() if parameter.is_floating_point()), images)
-        # clone: tensors made in inference mode cannot enter a graph
-        images, reference = (
-            tensor.to(device=weights.device, dtype=weights.dtype).detach().clone() for tensor in (images, reference)
-        )
-        # differences of predictions are explained, of which half precision leaves two digits
-        with torch.autocast(images.device.type, enabled=False):
-            yield Comparison(model=model, images=images, references=reference)
+    def saturated(self, sizes: Sequence[float]) -> Iterator[str]:
+        """Warn of images at which the gradients, even if all of one sign, make up next to none of the change."""
+        for index, (size, change) in enumerate(zip(sizes, self.change.tolist(), strict=True)):
+            if abs(change) >= self.close and size < _FLAT * abs(change):
+                yield (
+                    f"image {index}: the gradients at the image make up {size / abs(change):.2g} of "
+                    f"f(x) - f(reference) = {change:.2g}, less than {_FLAT:g}: the network is saturated there, so "
+                    "compare with poly-cam or occlusion, which need no gradient"
+                )
 
 
 def _require_finite(predictions: Tensor, name: str) -> Tensor:
@@ -183,20 +188,23 @@ def _require_finite(predictions: Tensor, name: str) -> Tensor:
     return predictions
 
 
-def _require_images(images: Batch) -> None:
+def require_images(images: Batch, *, name: str = "image") -> None:
     """Refuse images that are not float, finite, in [0, 1] and shaped (batch, 3, height, width)."""
     shape = tuple(images.shape)
-    if len(shape) != 4:
+    if len(shape) != 4 or shape[1] not in {3, 6} or 0 in shape:
         raise ImageError(
-            f"images have shape {shape}, which is not (batch, 3, height, width); add a batch axis with images[None]"
+            f"{name}s have shape {shape}, which is not (batch, 3, height, width) of pixels; pass RGB images, a "
+            "single one as images[None]"
         )
-    if shape[1] not in {3, 6}:
-        raise ImageError(
-            f"images have {shape[1]} channels instead of 3; pass RGB images with the channels on the second axis"
-        )
-    if 0 in shape:
-        raise ImageError(f"images of shape {shape} are empty; pass at least one image with at least one pixel")
-    _require_unit_interval(images, name="image")
+    if not images.is_floating_point():
+        raise ImageError(f"{name} values are {images.dtype} instead of float; divide 8-bit images by 255")
+    for index, image in enumerate(images):
+        low, high = (float(bound) for bound in torch.aminmax(image))
+        if not (low >= -_SLACK and high <= 1 + _SLACK):  # NaN neither
+            raise ImageError(
+                f"{name} {index} has values from {low:.3g} to {high:.3g}, outside [0, 1]; scale it as the network's "
+                "training images were, or drop it from the batch"
+            )
 
 
 def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
@@ -211,37 +219,15 @@ def _require_reference(reference: Tensor | None, *, images: Tensor) -> Tensor:
             f"pass one reference of shape {tuple(images.shape[1:])} or one for each image"
         )
     reference = reference[None] if shared else reference
-    _require_unit_interval(reference, name="reference")
+    require_images(reference, name="reference")
     return reference
 
 
-def black_frames(images: Float[Tensor, "*batch colours height width"]) -> Float[Tensor, "*batch colours height width"]:
-    """Return images whose frame is black; the reference beside it, if any, stays."""
-    black = images.clone()
-    frame_of(black).zero_()
-    return black
+class Method(ABC):
+    """Base of explainers: a subclass computes the maps of checked images with a frozen network."""
 
-
-def _require_unit_interval(images: Tensor, *, name: str) -> None:
-    if not images.is_floating_point():
-        raise ImageError(f"{name} values are {images.dtype} instead of float; divide 8-bit images by 255")
-    for index, image in enumerate(images):
-        if bad := int((~image.isfinite()).sum()):
-            raise ImageError(
-                f"{name} {index} holds NaN or infinity in {bad} of {image.numel()} values; "
-                "read the frame again, or drop it from the batch"
-            )
-        low, high = (float(bound) for bound in torch.aminmax(image))
-        if low < -_SLACK or high > 1 + _SLACK:
-            raise ImageError(
-                f"{name} {index} has values from {low:.3g} to {high:.3g}, outside [0, 1]; "
-                "scale it as the network's training images were"
-            )
-
-
-@runtime_checkable
-class Explainer(Protocol):
-    """A frozen dataclass whose fields are the options of a method and whose call explains a batch."""
+    method: ClassVar[str]
+    """Name of the method in the records of its maps."""
 
     def __call__(self, model: nn.Module, images: Batch, *, reference: Batch | None = None) -> Attribution:
         """Explain f(x) - f(reference) of a regressor with one output.
@@ -265,20 +251,23 @@ class Explainer(Protocol):
         ModelError
             If the network has several outputs, predicts NaN, or lacks a layer that the method needs.
         """
-        ...
-
-
-class Method(ABC):
-    """Base of explainers: a subclass computes the maps of checked images with a frozen network."""
-
-    method: ClassVar[str]
-    """Name of the method in the records of its maps."""
-
-    def __call__(self, model: nn.Module, images: Batch, *, reference: Batch | None = None) -> Attribution:
-        """Explain a batch; see `Explainer` for the arguments and errors."""
         start = time.perf_counter()
-        with freeze(model, images, reference=reference) as comparison:
-            attribution = self._explain(comparison)
+        require_images(images)
+        reference = _require_reference(reference, images=images)
+        weights = next((parameter for parameter in model.parameters() if parameter.is_floating_point()), images)
+        # a caller inside no_grad or inference_mode may still ask for gradients of the output; and differences of
+        # predictions are explained, of which half precision leaves two digits
+        with (
+            torch.inference_mode(mode=False),
+            torch.enable_grad(),
+            frozen(model),
+            torch.autocast(weights.device.type, enabled=False),
+        ):
+            # clone: tensors made in inference mode cannot enter a graph
+            images, reference = (
+                tensor.to(device=weights.device, dtype=weights.dtype).detach().clone() for tensor in (images, reference)
+            )
+            attribution = self._explain(Comparison(model=model, images=images, references=reference))
         if attribution.relevance.is_cuda:
             torch.cuda.synchronize(attribution.relevance.device)
         return replace(attribution, method=self.method, seconds=time.perf_counter() - start)
@@ -286,10 +275,3 @@ class Method(ABC):
     @abstractmethod
     def _explain(self, comparison: Comparison) -> Attribution:
         """Compute the maps (`Comparison.attribution`); gradients are on."""
-
-
-def require_at_least_one(name: str, **options: int) -> None:
-    """Raise an error for options below 1."""
-    for option, value in options.items():
-        if value < 1:
-            raise InputError(f"{name}'s {option} is {value}; give at least 1")

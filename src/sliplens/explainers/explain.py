@@ -10,16 +10,15 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from sliplens.errors import InputError, SliplensError
 from sliplens.explainers.attribution import frame_of
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.frames import ChosenFrames, FindMarkers
-from sliplens.explainers.gradients import ExpectedGradients
 from sliplens.explainers.occlusion import KnownMarkers, RegionMethod, find_markers
-from sliplens.explainers.table import RECOMMENDED_METHOD, get_explainer
+from sliplens.explainers.table import RECOMMENDED_METHOD, Option, get_explainer
 from sliplens.models import Network
 from sliplens.models.engines import expecting
 from sliplens.progress import number_of, report_each
@@ -41,15 +40,10 @@ def choose_explainers(
     If `methods` is None, Shapley values of the markers, or of tiles where no markers are found, with a warning.
     `budget` is the share of the channels that `poly-cam` measures at first; if None, 1 for one frame and
     `STUDY_BUDGET` for several.
-
-    Raises
-    ------
-    InputError
-        If there is no such method, or it needs markers and the frames show none.
     """
     if budget is None:
         budget = 1.0 if len(chosen.ids) == 1 else STUDY_BUDGET
-    poly_cam = get_explainer("poly-cam", budget=budget)  # refuses an impossible budget, whatever the method
+    get_explainer("poly-cam", budget=budget)  # refuses an impossible budget, whatever the method
     if methods is None:
         try:
             return choose_explainers(network, chosen, RECOMMENDED_METHOD)
@@ -57,14 +51,16 @@ def choose_explainers(
             explainers, _ = choose_explainers(network, chosen, RECOMMENDED_METHOD.removesuffix("-marker"))
             return explainers, (f"tiles, not markers: {error}",)
     inputs, explainers = network.encoding.normalise(chosen.images), {}
+    free = torch.from_numpy(chosen.safety_margin >= _FULL_STICK)
+    options: dict[str, dict[str, Option]] = {
+        "poly-cam": {"budget": budget},
+        "expected-gradients": {"background": inputs[free] if free.any() else None},
+    }
     for method in [methods] if isinstance(methods, str) or callable(methods) else methods:
-        if not isinstance(method, str):
-            explainers[getattr(method, "method", type(method).__name__)] = method
-        elif method == "expected-gradients":
-            free = [index for index, margin in enumerate(chosen.safety_margin) if margin >= _FULL_STICK]
-            explainers[method] = ExpectedGradients(background=inputs[free] if free else None)
+        if isinstance(method, str):
+            explainers[method] = get_explainer(method, **options.get(method, {}))
         else:
-            explainers[method] = poly_cam if method == "poly-cam" else get_explainer(method)
+            explainers[getattr(method, "method", type(method).__name__)] = method
 
     def find() -> Sequence[Float[Tensor, "_markers 2"]]:
         if chosen.find_markers is None:
@@ -110,13 +106,7 @@ _FEW_MAPS = 20
 def explain_rows(
     network: Network, chosen: ChosenFrames, explainer: Explainer, rows: Sequence[int], *, maps: int
 ) -> MethodMaps:
-    """Explain some of the frames, by their row numbers, with one explainer; engines are chosen for so many `maps`.
-
-    Raises
-    ------
-    SaliencyError
-        If a map is not finite.
-    """
+    """Explain some of the frames, by their row numbers, with one explainer; engines are chosen for so many `maps`."""
     inputs, references = (
         network.encoding.normalise(values[list(rows)]).to(network.device)
         for values in (chosen.images, chosen.references)
@@ -160,11 +150,10 @@ def join_maps(
     warnings: Sequence[str] = (),
 ) -> Explanation:
     """Make the record of maps, with the predictions of the frames; those of a method are in the order of the frames."""
-    inputs = network.encoding.normalise(chosen.images).to(network.device)
-    references = network.encoding.normalise(chosen.references)
+    normalised, references = (network.encoding.normalise(values) for values in (chosen.images, chosen.references))
     # predicted once for all methods, on all frames
-    estimate, compared = network.estimate(inputs), network.predict(references).tolist()
-    withheld = estimate.withheld(np.ones(len(inputs), dtype=bool))  # frames to explain are taken for ones in contact
+    estimate, compared = network.estimate(normalised.to(network.device)), network.predict(references).tolist()
+    withheld = estimate.withheld(np.ones(len(normalised), dtype=bool))  # all are taken for touches
     return Explanation(
         input=network.encoding.name,
         source=chosen.source,
@@ -187,16 +176,10 @@ def join_maps(
         methods={method: _notes(pieces, chosen.ids, (*chosen.warnings, *warnings)) for method, pieces in maps.items()},
         images=chosen.images.numpy(),
         references=chosen.references.numpy(),
-        pictures=input_pictures(network, chosen),
+        pictures=(255 * frame_of(normalised).permute(0, 2, 3, 1)).round().to(torch.uint8).contiguous().numpy(),
         baseline=chosen.baseline,
         relevance={method: np.concatenate([piece.relevance for piece in pieces]) for method, pieces in maps.items()},
     )
-
-
-def input_pictures(network: Network, chosen: ChosenFrames) -> UInt8[np.ndarray, "frames size size 3"]:
-    """Draw the frames of the network's inputs, 8 bits, for viewing."""
-    pictures = (255 * frame_of(network.encoding.normalise(chosen.images))).round().to(torch.uint8)
-    return pictures.permute(0, 2, 3, 1).contiguous().numpy()
 
 
 _MOST_NAMES = 3

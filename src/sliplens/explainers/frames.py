@@ -97,13 +97,7 @@ def find_stick_frame(
     """Find the last frame before the pull of a trial, from its labels or else by tracking its markers.
 
     By labels it is the last frame before the first full slip whose margin is at least 97 % of the trial's largest.
-
-    Raises
-    ------
-    RecordingError
-        If the labels begin below a margin of 0.9, or the markers show no press.
-    ImageError, InputError
-        If the markers cannot be tracked.
+    `RecordingError` if the labels begin below a margin of 0.9, or the markers show no press.
     """
     if margin is not None and np.isfinite(margin).any():
         slips = np.flatnonzero(margin <= 0)
@@ -215,11 +209,6 @@ def frames_from_dataset(
 
     For each trial and level the frame whose label is nearest is taken; at a level of 0 the first frame of full slip, at
     1 the last frame that is still fully stuck, so that each is next to the change.
-
-    Raises
-    ------
-    RecordingError
-        If there is no such trial, or a trial has no labelled frame.
     """
     rows: list[tuple[str, int]] = []
     for info in data.select(split=selection.split, condition=selection.condition)[: selection.trials]:
@@ -278,25 +267,12 @@ def frames_from_folder(
     They are camera frames if `reference` is set or the source has one, else absolute difference images |T_n - T_0|. If
     `labels_in_names`, names that end in `_GG`, such as `image_433_20.png`, hold the safety margin in percent. If
     `baseline` is None, `stick` for a recording of several frames and `untouched` for a folder of images.
-
-    Raises
-    ------
-    InputError
-        If the folder is missing or empty, a name has no label though `labels_in_names` is set, or a network on raw
-        frames has no reference image.
-    ImageError
-        If an image cannot be read, or has another size or kind of pixels.
     """
     parts, captures = [], open_source(folder, reference=reference, sensor=sensor)
     for opened in captures:
-        ordered = opened.files is None and opened.frames > 1
-        part = _take(
-            network,
-            opened,
-            range(opened.frames),
-            source="real",
-            baseline=("stick" if ordered else "untouched") if baseline is None else baseline,
-        )
+        default = "stick" if opened.files is None and opened.frames > 1 else "untouched"
+        chosen = default if baseline is None else baseline
+        part = _take(network, opened, range(opened.frames), source="real", baseline=chosen)
         part = replace(part, trial=(folder.name if opened.files else opened.name,) * len(part.ids))
         if labels_in_names:
             margin = np.array([_label(folder / name) for name in opened.files or part.ids], dtype=np.float32)
@@ -304,8 +280,7 @@ def frames_from_folder(
         parts.append(part)
 
     def find_markers() -> list[Float[Tensor, "_markers 2"]]:
-        size = network.manifest.image_size
-        captures = open_source(folder, reference=reference, sensor=sensor)
+        captures, size = open_source(folder, reference=reference, sensor=sensor), network.manifest.image_size
         return [markers_in_frame(frame, image_size=size) for capture in captures for frame in capture.read_frames()]
 
     show_markers = all(capture.read_reference is not None for capture in captures)

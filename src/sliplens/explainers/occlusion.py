@@ -1,7 +1,8 @@
 """Occlusion: what the prediction loses when a part of the image is replaced by the reference."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import TypeAlias
 
 import numpy as np
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import Attribution, frame_of
-from sliplens.explainers.contract import Comparison, Method
+from sliplens.explainers.contract import BATCH, Comparison, Method
 from sliplens.markers import detect_markers
 from sliplens.recordings import Recording
 
@@ -98,8 +99,8 @@ def marker_regions(
 
     A marker reaches, by default, half of the median distance between neighbours; pixel centres lie at whole numbers.
     """
-    if not len(centres_px):
-        raise InputError("there is no marker to remove; choose pixels or tiles")
+    if not len(centres_px) or (radius_px is None and len(centres_px) < 2):
+        raise InputError(f"regions around markers need two or more, and there are {len(centres_px)}; choose tiles")
     rows, columns = (torch.arange(length, dtype=torch.float64) for length in size)
     pixels = torch.stack(torch.broadcast_tensors(columns, rows[:, None]), dim=-1).reshape(-1, 2)
     centres = centres_px.double()
@@ -119,25 +120,16 @@ class RegionMethod(Method):
     markers_px: Float[Tensor, "markers 2"] | FindPlaces | None = None
     """x and y of the markers in the image that the network sees, (markers, 2), or what finds them in each image, such
     as `find_markers`; they are then the regions, and what lies between them is one more."""
-    radius_px: float | None = None
-    """How far a marker reaches; see `marker_regions`."""
 
     def __post_init__(self) -> None:
-        if self.tile_px < 1:
-            raise InputError(f"{self._name}'s tile_px is {self.tile_px}; give at least 1 pixel")
+        tile_regions((1, 1), tile_px=self.tile_px)  # refuses an impossible side
         if isinstance(self.markers_px, Tensor):
-            self._require_reach(self.markers_px)
-        if self.radius_px is not None and not self.radius_px > 0:
-            raise InputError(f"{self._name}'s radius_px is {self.radius_px}; give a radius above 0 pixels")
+            marker_regions((1, 1), self.markers_px)
 
     @property
     def method(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Name of the method, with `-marker` where the regions are markers."""
-        return self._name + ("" if self.markers_px is None else "-marker")
-
-    @property
-    def _name(self) -> str:
-        return type(self).__name__.lower()
+        return type(self).__name__.lower() + ("" if self.markers_px is None else "-marker")
 
     @property
     def _unit(self) -> str:
@@ -148,17 +140,7 @@ class RegionMethod(Method):
         if self.markers_px is None:
             return tile_regions(size, tile_px=self.tile_px).to(image.device)
         places = self.markers_px if isinstance(self.markers_px, Tensor) else self.markers_px(image, empty)
-        self._require_reach(places)
-        return marker_regions(size, places, radius_px=self.radius_px).to(image.device)
-
-    def _require_reach(self, places: Tensor) -> None:
-        if not len(places) or (self.radius_px is None and len(places) < 2):
-            raise InputError(
-                f"{self._name} has {len(places)} marker(s) and no radius_px; a single one's reach must be given"
-            )
-
-
-_BATCH = 32  # images made at once, which bounds the memory
+        return marker_regions(size, places).to(image.device)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,14 +170,18 @@ class Occlusion(RegionMethod):
             image, empty = comparison.images[index, None], comparison.reference[index, None]
             regions = self._regions(image[0], empty[0])
             effects = attr.FeatureAblation(predict).attribute(
-                image, baselines=empty, feature_mask=regions[None, None], perturbations_per_eval=_BATCH
+                image, baselines=empty, feature_mask=regions[None, None], perturbations_per_eval=BATCH
             )
             # Captum gives every pixel and channel the whole effect of its region
             return effects[0, 0] / regions.flatten().bincount()[regions]
 
-        attribution = comparison.attribution(
+        return comparison.attribution(
             comparison.map_each(effect),
             complete=False,
             target=f"f(x) - f(x with one region as in the reference), {self._unit}",
+            engine=engine.name,
         )
-        return replace(attribution, engine=engine.name)
+
+
+occlusion_by_marker = partial(Occlusion, markers_px=find_markers)
+"""Occlusion by the markers that an image shows."""

@@ -1,9 +1,9 @@
 """Poly-CAM for a regressor: channel masks, scored by what they keep and what they remove, all of them or some."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from statistics import fmean
 from typing import ClassVar, TypeAlias
 
@@ -14,14 +14,11 @@ from torch.nn import functional
 
 from sliplens.errors import InputError
 from sliplens.explainers.attribution import (
-    ALIKE_R,
-    ALIKE_TOP,
     FLOOR,
     Approximation,
     Attribution,
+    black_frames,
     change_of,
-    check_approximations,
-    check_weights,
     combine,
     layer_map,
     local_change,
@@ -33,14 +30,14 @@ from sliplens.explainers.attribution import (
     widest,
 )
 from sliplens.explainers.cam import capture, find_layers, find_published_layers
-from sliplens.explainers.contract import Comparison, Method, black_frames, require_at_least_one
+from sliplens.explainers.contract import Comparison, Method
 from sliplens.models.engines import Engine
 from sliplens.progress import report_progress
 
-SCORES = ("regression", "thesis")
 _PASSES = 2  # of a channel: the image with only its region, and without it
 Likeness: TypeAlias = tuple[float, float]
 """Required likeness of a map from some channels to the exact one: correlation, and overlap of the strongest tenth."""
+_ALIKE: Likeness = (0.99, 0.9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,16 +50,10 @@ class _Frame:
     prediction: Float[Tensor, ""]
     empty_prediction: Float[Tensor, ""]
     activations: list[Float[Tensor, "_channels _rows _columns"]]
-    visible: Float[Tensor, "height width"]
-    """How much of a change the image shows: where x = b no mask has an effect."""
     published: bool
     """Masks and scores of the public code."""
     engine: Engine
     count: Callable[[int], None]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.image.shape[-2], self.image.shape[-1]
 
     @cached_property
     def masks(self) -> list[Float[Tensor, "_channels _rows _columns"]]:
@@ -74,37 +65,25 @@ class _Frame:
         return torch.nonzero(torch.cat([(masks != 0).flatten(1).any(dim=1) for masks in self.masks])).flatten()
 
     def supports(
-        self, kept: Float[Tensor, " channels"], removed: Float[Tensor, " channels"]
+        self, inside: Float[Tensor, " channels"], outside: Float[Tensor, " channels"]
     ) -> Float[Tensor, " channels"]:
         """Score channels by the predictions with only their regions, and without them: below 0 they get no weight."""
         if self.published:
             # in float32 the sigmoid of a percentage is 1 from 17 % on, so that all weights are 1
-            kept, removed, whole = (torch.sigmoid(100 * value) for value in (kept, removed, self.prediction))
-            return kept + (whole - removed)
+            inside, outside, whole = (torch.sigmoid(100 * value) for value in (inside, outside, self.prediction))
+            return inside + (whole - outside)
         change = self.prediction - self.empty_prediction
-        effect = ((kept - self.empty_prediction) + (self.prediction - removed)) / 2
+        effect = ((inside - self.empty_prediction) + (self.prediction - outside)) / 2
         # no map changes by the division, since each is normalised; it keeps clear of the floor in `combine`
         return effect / change if change else torch.zeros_like(effect)
 
     def measure(self, channels: Int[Tensor, " some"]) -> Float[Tensor, " some"]:
         """Score some channels, in rising order, in batches of the engine."""
-        parts = channels.split(max(1, self.engine.batch_size // _PASSES)) if len(channels) else ()
-
-        def batches() -> Iterator[Tensor]:
-            for part in parts:
-                # in pieces, where even one channel's images are more than a batch
-                yield from self._blend(part).split(self.engine.batch_size)
-
-        waiting, points = list(parts), [self.image.new_zeros(_PASSES, 0)]
-        pieces: list[Tensor] = []
-        for predictions in self.engine.run(batches()):
-            pieces.append(predictions)
-            if sum(map(len, pieces)) == _PASSES * len(waiting[0]):
-                points.append(torch.cat(pieces).reshape(_PASSES, -1))
-                self.count(len(waiting.pop(0)))
-                pieces = []
-        kept, removed = torch.cat(points, dim=1)
-        return self.supports(kept, removed)
+        parts, points = channels.split(self.engine.batch_size // _PASSES), [self.image.new_zeros(_PASSES, 0)]
+        for predictions in self.engine.run(self._blend(part) for part in parts if len(part)):
+            points.append(predictions.reshape(_PASSES, -1))
+            self.count(points[-1].shape[1])
+        return self.supports(*torch.cat(points, dim=1))
 
     def _blend(self, channels: Int[Tensor, " some"]) -> Float[Tensor, "images colours height width"]:
         """Mask images by some channels, in rising order: all that are kept, then all that are removed."""
@@ -112,7 +91,7 @@ class _Frame:
         for masks in self.masks:
             inside = channels[(channels >= first) & (channels < first + len(masks))] - first
             if len(inside):
-                parts.append(resize(masks[inside], self.size))
+                parts.append(resize(masks[inside], (self.image.shape[-2], self.image.shape[-1])))
             first += len(masks)
         content = (self.image - self.empty) * torch.cat(parts)[:, None]
         return torch.cat([self.empty + content, self.image - content])
@@ -125,7 +104,9 @@ class _Frame:
         return list(torch.relu(every).to(at_empty.dtype).split([len(maps) for maps in self.activations]))
 
     def to_map(self, weights: Sequence[Float[Tensor, " _channels"]]) -> Float[Tensor, "height width"]:
-        return combine(self.activations, weights, size=self.size) * self.visible
+        saliency = combine(self.activations, weights, size=(self.image.shape[-2], self.image.shape[-1]))
+        # where x = b no mask has an effect
+        return saliency if self.published else saliency * local_change(self.image, self.empty)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,28 +133,20 @@ class PolyCam(Method):
     """
 
     method: ClassVar[str] = "poly-cam"
-    score: str = "regression"
-    """One of `SCORES`: `thesis` is that of the public code for a network with one output, for comparison with old
-    figures; it takes no reference, and explains nothing."""
-    layers: tuple[str, ...] | None = None
-    """Names of the layers; by default those that belong to the score."""
+    published: bool = False
+    """Score, layers and black masks of the public code for a network with one output, for comparison with old figures;
+    it takes no reference, and explains nothing."""
     level: int = 0
     """Which level's map is the relevance, counted from the finest, 0; the thesis scored `level=5`. Layers finer than
     that have no part in it, and cost no pass."""
     budget: float = 1.0
     """Share of the channels to measure at first, in (0, 1]; 1 for the exact map. The other channels' weights are
     estimated, and `Attribution.approximations` says what the map is expected to have in common with the exact one."""
-    likeness: Likeness | None = (ALIKE_R, ALIKE_TOP)
+    likeness: Likeness | None = _ALIKE
     """Likeness to the exact map until whose expectation channels are measured. None to stop at the budget."""
     engine: str = "auto"
-    batch_size: int | None = None
-    """Masked images in one pass; None for what suits the engine."""
-    seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.score not in SCORES:
-            raise InputError(f"Poly-CAM has no score {self.score!r}; choose among {', '.join(SCORES)}")
-        require_at_least_one("Poly-CAM", batch_size=1 if self.batch_size is None else self.batch_size)
         if not 0 < self.budget <= 1:
             raise InputError(f"Poly-CAM's budget is {self.budget}; give a share of the channels, above 0 and at most 1")
         if self.likeness is not None and not all(0 <= value <= 1 for value in self.likeness):
@@ -181,14 +154,12 @@ class PolyCam(Method):
 
     @torch.no_grad()
     def _explain(self, comparison: Comparison) -> Attribution:
-        change, published = comparison.change.tolist(), self.score == "thesis"
-        find = find_published_layers if published and self.layers is None else partial(find_layers, names=self.layers)
-        layers = find(comparison.model, comparison.images[:1])
+        changes = comparison.change.tolist()
+        layers = (find_published_layers if self.published else find_layers)(comparison.model, comparison.images)
         if not 0 <= self.level < len(layers):
             raise InputError(f"Poly-CAM has no level {self.level} for {len(layers)} layers; count from 0, the finest")
         layers = layers[self.level :]  # a level is made of its own layer and the coarser ones
-        channels = sum(layer.channels for layer in layers)
-        done = 0
+        names, channels, done = [layer.name for layer in layers], sum(layer.shape[0] for layer in layers), 0
 
         def count(channels_done: int) -> None:
             nonlocal done
@@ -196,45 +167,73 @@ class PolyCam(Method):
             report_progress(done, len(comparison.images) * channels)
 
         # one engine for all rounds and images
-        engine = comparison.prepare(
-            len(comparison.images) * round(self.budget * channels) * _PASSES,
-            engine=self.engine,
-            batch_size=self.batch_size,
-        )
-        names = [layer.name for layer in layers]
-        weights, maps, approximations = [], [], []
+        passes = len(comparison.images) * round(self.budget * channels) * _PASSES
+        engine = comparison.prepare(passes, engine=self.engine)
+        maps, approximations, warnings = [], [], []
         for index, image in enumerate(comparison.images):
             with capture(comparison.model, names) as outputs:
                 comparison.predict(image[None])
-            empty = black_frames(image) if published else comparison.reference[index]
+            empty, empty_prediction = comparison.reference[index], comparison.reference_prediction[index]
+            if self.published:
+                empty = black_frames(image)
+                empty_prediction = comparison.predict(empty[None])[0]
             frame = _Frame(
                 image=image,
                 empty=empty,
                 prediction=comparison.prediction[index],
-                empty_prediction=comparison.predict(empty[None])[0]
-                if published
-                else comparison.reference_prediction[index],
+                empty_prediction=empty_prediction,
                 activations=[outputs[name][0] for name in names],
-                visible=torch.ones_like(image[0]) if published else local_change(image, empty),
-                published=published,
+                published=self.published,
                 engine=engine,
                 count=count,
             )
             count(channels - len(frame.active))
+            approximation = None
             if self.budget < 1 and len(frame.active):
-                supports, approximation = _search(frame, budget=self.budget, likeness=self.likeness, seed=self.seed)
+                supports, approximation = _search(frame, budget=self.budget, likeness=self.likeness)
                 count(len(frame.active) - approximation.measured)
                 approximations.append(approximation)
             else:
                 supports = frame.measure(frame.active)
-            weights.append(frame.weights(supports))
-            maps.append(frame.to_map(weights[-1]))
-        attribution = comparison.attribution(
+            weights = frame.weights(supports)
+            maps.append(frame.to_map(weights))
+            faults = [_fault(*pair) for pair in zip(names, weights, strict=True)] if changes[index] else []
+            faults += [] if approximation is None else [_doubt(approximation)]
+            warnings += [f"image {index}: {fault}" for fault in faults if fault is not None]
+        return comparison.attribution(
             scale_to(torch.stack(maps), total=comparison.change),
             complete=True,
-            warnings=(*check_weights(names, weights, change=change), *check_approximations(approximations)),
+            warnings=warnings,
+            approximations=approximations,
+            engine=engine.name,
         )
-        return replace(attribution, approximations=tuple(approximations), engine=engine.name)
+
+
+def _fault(layer: str, weight: Float[Tensor, " channels"]) -> str | None:
+    """Describe the fault of the weights of a layer's channels."""
+    if bad := int((~weight.isfinite()).sum()):
+        return (
+            f"{bad} of {len(weight)} channels of layer {layer} have no finite weight, so the model cannot predict "
+            "every masked image"
+        )
+    if not weight.any():
+        return f"no channel of layer {layer} supports f(x) - f(reference), so the map is zero"
+    if len(weight) > 1 and bool((weight == weight[0]).all()):
+        return (
+            f"every channel of layer {layer} has the weight {float(weight[0]):.3g}, so the masked passes chose nothing "
+            "and the map shows activity only"
+        )
+    return None
+
+
+def _doubt(map_: Approximation) -> str | None:
+    """Return how far an approximate map may differ from the exact one; None if they are expected to be alike."""
+    if map_.pearson_r >= _ALIKE[0] and map_.top_overlap >= _ALIKE[1]:
+        return None
+    return (
+        f"with {map_.measured} of {map_.channels} channels measured the map is expected to correlate with the exact "
+        f"one at {map_.pearson_r:.3f} and to share {map_.top_overlap:.0%} of its strongest pixels; raise the budget"
+    )
 
 
 _GRID = 14  # cells a side on which masks are compared; more cells change nothing
@@ -328,7 +327,7 @@ class GaussianProcess:
 
 
 def _search(
-    frame: _Frame, *, budget: float, likeness: Likeness | None, seed: int
+    frame: _Frame, *, budget: float, likeness: Likeness | None
 ) -> tuple[Float[Tensor, " active"], Approximation]:
     """Measure channels where they matter to the map, and estimate the scores of the others from them.
 
@@ -352,7 +351,7 @@ def _search(
     while True:
         estimate, _ = process.estimate()
         result = frame.to_map(frame.weights(estimate))
-        draws = process.draws(_DRAWS, generator=torch.Generator().manual_seed(seed))
+        draws = process.draws(_DRAWS, generator=torch.Generator().manual_seed(0))
         drawn = [frame.to_map(frame.weights(supports)) for supports in draws]
         approximation = Approximation(
             measured=len(process.chosen),

@@ -1,7 +1,8 @@
 """Shapley values: contribution of each marker or tile to the prediction, averaged over all coalitions."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from sliplens.errors import InputError
 from sliplens.explainers.attribution import Attribution
 from sliplens.explainers.contract import Comparison
 from sliplens.explainers.gradients import IntegratedGradients
-from sliplens.explainers.occlusion import RegionMethod
+from sliplens.explainers.occlusion import RegionMethod, find_markers
 
 _FEW = 20
 """Players of which all coalitions can be counted."""
@@ -163,7 +164,6 @@ class Shapley(RegionMethod):
     tile_px: int = 28
     pairs: int = 200
     """Pairs of coalitions for each image, two passes of the network each."""
-    seed: int = 0
 
     @torch.no_grad()
     def _explain(self, comparison: Comparison) -> Attribution:
@@ -173,8 +173,7 @@ class Shapley(RegionMethod):
         def contribute(index: int) -> Float[Tensor, "height width"]:
             image, empty = comparison.images[index], comparison.reference[index]
             with torch.enable_grad():
-                predictions = comparison.prediction[index], comparison.reference_prediction[index]
-                gradients = _GUESS.integrate(comparison, image, empty, *predictions).relevance.float().cpu().double()
+                gradients = _GUESS.integrate(comparison, index)[0].float().cpu().double()
             regions = self._regions(image, empty)
             # a number that no pixel has, such as that of what lies between markers which cover the image, is no player
             numbers, players = regions.unique(return_inverse=True)
@@ -184,7 +183,7 @@ class Shapley(RegionMethod):
                 batches = (torch.where(part[:, players][:, None], image, empty) for part in taking_part)
                 return torch.cat(list(engine.run(batches))).cpu().double().numpy()
 
-            rng = np.random.default_rng((self.seed, index))
+            rng = np.random.default_rng((0, index))
             guess = players.cpu().flatten().bincount(weights=gradients.flatten()).numpy()
             pairs = max(self.pairs, 2 * len(numbers))
             estimate = shapley_values(worth, len(numbers), pairs=pairs, rng=rng, guess=guess)
@@ -196,10 +195,14 @@ class Shapley(RegionMethod):
         warning = (
             f"contributions hardly surer than they differ in {sum(unsure)} of {len(unsure)} frames; set more pairs"
         )
-        attribution = comparison.attribution(
+        return comparison.attribution(
             relevance,
             complete=True,
             target=f"f(x) - f(reference), shared out among {self._unit}",
             warnings=[warning] if any(unsure) else [],
+            engine=engine.name,
         )
-        return replace(attribution, engine=engine.name)
+
+
+shapley_by_marker = partial(Shapley, markers_px=find_markers)
+"""Shapley values of the markers that an image shows."""

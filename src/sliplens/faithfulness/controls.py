@@ -1,9 +1,10 @@
 """Control maps that use nothing the network learned, networks with new weights, and measures of how maps look."""
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sliplens.errors import InputError, ModelError
-from sliplens.explainers.attribution import change_of, combine, frame_of, local_change, pearson_r
-from sliplens.explainers.cam import cached_layers, capture
+from sliplens.explainers.attribution import change_of, combine, frame_of, local_change, pearson_r, with_reference_of
+from sliplens.explainers.cam import capture, find_layers
 from sliplens.intervals import paired_difference
 from sliplens.results.explanation import require_saliency
 from sliplens.results.faithfulness import CHANCE, Lead
@@ -59,6 +60,60 @@ def stability(
     """Pearson's correlation of each map with its like, such as the next frame's; NaN where a map is constant."""
     pairs = zip(torch.tensor(maps), torch.tensor(others), strict=True)
     return np.array([pearson_r(map_, other) for map_, other in pairs])
+
+
+def infidelity(
+    predict: Callable[[Tensor], Tensor],
+    images: Float[Tensor, "images colours height width"],
+    references: Float[Tensor, "images colours height width"],
+    relevance: Float[Tensor, "images height width"],
+    *,
+    samples: int = 20,
+) -> Float[np.ndarray, " images"]:
+    """Root of Captum's infidelity: error of the change that a map predicts where half of the pixels are replaced.
+
+    The pixels, drawn anew for each sample, become those of the reference; their relevance should sum to the change.
+
+    Yeh et al., *On the (in)fidelity and sensitivity of explanations*, NeurIPS 2019, definition 2.1.
+    """
+    from captum import metrics  # noqa: PLC0415 (takes a second)
+
+    generator, shares = torch.Generator().manual_seed(0), torch.zeros_like(images)
+    frame_of(shares).copy_((relevance.to(images) / 3)[:, None].expand_as(frame_of(images)))
+
+    def replace_half(expanded: Tensor) -> tuple[Tensor, Tensor]:
+        gone = (torch.rand(len(expanded), 1, *images.shape[-2:], generator=generator) < 0.5).to(images)
+        return gone.expand_as(expanded), expanded - gone * (images - references).repeat_interleave(samples, dim=0)
+
+    squares = metrics.infidelity(predict, replace_half, images, shares, n_perturb_samples=samples)
+    return squares.double().sqrt().cpu().numpy()
+
+
+def max_sensitivity(
+    explain: Callable[[Tensor], Float[Tensor, "batch height width"]],
+    images: Float[Tensor, "images colours height width"],
+    *,
+    radius: float = 0.02,
+    samples: int = 2,
+) -> Float[np.ndarray, " images"]:
+    """Largest change of a map under noise of up to a radius on the image, relative to the map's norm; by Captum.
+
+    Yeh et al., *On the (in)fidelity and sensitivity of explanations*, NeurIPS 2019, definition 3.1.
+    """
+    from captum import metrics  # noqa: PLC0415 (takes a second)
+
+    generator = torch.Generator().manual_seed(0)
+
+    def disturb(inputs: Tensor) -> Tensor:
+        noise = radius * (2 * torch.rand(frame_of(inputs).shape, generator=generator) - 1)
+        return with_reference_of((frame_of(inputs) + noise.to(inputs)).clamp(0, 1), inputs)
+
+    def explain_alike(inputs: Tensor | tuple[Tensor]) -> Any:
+        # Captum gives the images themselves as a tuple, and wants the same of their maps
+        return explain(inputs) if isinstance(inputs, Tensor) else (explain(inputs[0]),)
+
+    largest = metrics.sensitivity_max(explain_alike, images, perturb_func=disturb, n_perturb_samples=samples)
+    return largest.double().cpu().numpy()
 
 
 def relevance_mass(saliency: Float[np.ndarray, "_ _"], truth: Bool[np.ndarray, "height width"]) -> float:
@@ -107,7 +162,7 @@ def relative_change(images: Images, references: Images) -> ControlMaps:
 @torch.no_grad()
 def even_channels(model: nn.Module, images: Images, references: Images) -> ControlMaps:
     """Compute Poly-CAM's map with every channel's weight 1, whatever its effect on the prediction."""
-    names, size = [layer.name for layer in cached_layers(model, images)], (images.shape[-2], images.shape[-1])
+    names, size = [layer.name for layer in find_layers(model, images)], (images.shape[-2], images.shape[-1])
     with capture(model, names) as outputs:
         model(images)
     maps = []

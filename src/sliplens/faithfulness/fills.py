@@ -132,10 +132,6 @@ def _constant(level: float) -> Fill:
     return _static(lambda images: torch.full_like(images, level))
 
 
-def _background(images: Images) -> Images:
-    return images.flatten(2).median(dim=2).values[..., None, None].expand_as(images)
-
-
 def _blurred(images: Images) -> Images:
     from torchvision.transforms.v2 import functional as transforms  # noqa: PLC0415 (takes a second)
 
@@ -161,7 +157,7 @@ _ROWS: dict[str, Fill] = {
     "grey": _constant(0.5),
     "black": _constant(0.0),
     "white": _constant(1.0),
-    "background": _static(_background),
+    "background": _static(lambda images: images.flatten(2).median(dim=2).values[..., None, None].expand_as(images)),
     "blur": _static(_blurred),
     "reference": _reference,
     "noisy-linear": _noisy_linear,

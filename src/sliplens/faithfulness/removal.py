@@ -17,6 +17,8 @@ from sliplens.progress import report_each, report_progress
 from sliplens.results.explanation import require_saliency
 from sliplens.results.faithfulness import RemovalCurve
 
+_BATCH = 64
+"""Images in a batch of a function, which bounds the memory; an engine has its own number."""
 Units = Int[np.ndarray, "height width"]
 """Number of what is removed at once, a pixel, a tile or a marker, that each pixel belongs to, from 0."""
 Predict: TypeAlias = Callable[[Tensor], Tensor] | Engine
@@ -76,30 +78,35 @@ class RemovalCurves:
     def by_method(self, names: Iterable[str], *, towards: Float[np.ndarray, " images"]) -> dict[str, RemovalCurve]:
         """Name the curves: most, then least influential first for each method, then the random orders."""
         names, changes = list(names), self.lost(towards)
-        random = changes[2 * len(names) :].mean(axis=0)
+        pairs, random = changes[: 2 * len(names)].reshape(-1, 2, *changes.shape[1:]), changes[2 * len(names) :]
         return {
-            name: RemovalCurve(
-                areas=self.areas, most_first=changes[2 * row], least_first=changes[2 * row + 1], random=random
-            )
-            for row, name in enumerate(names)
+            name: RemovalCurve(areas=self.areas, most_first=most, least_first=least, random=random.mean(axis=0))
+            for name, (most, least) in zip(names, pairs, strict=True)
         }
 
 
+def _as_engine(predict: Predict) -> Engine:
+    """Return an engine that runs a function on each batch, or the engine itself."""
+    if isinstance(predict, Engine):
+        return predict
+    return Engine(name="torch", batch_size=_BATCH, answers=lambda batches: ((predict(batch),) for batch in batches))
+
+
+@torch.no_grad()
 def _answer(
-    predict: Predict, batches: Iterable[Tensor], on_batch: Callable[[int], None] = lambda _: None
+    engine: Engine, batches: Iterable[Tensor], on_batch: Callable[[int], None] = lambda _: None
 ) -> Float64[np.ndarray, " images"]:
-    run = predict.run if isinstance(predict, Engine) else partial(map, predict)
-    answers = []
-    with torch.no_grad():
-        for margins in run(batches):
-            answers.append(margins.cpu().double().numpy())
-            on_batch(len(margins))
-    return np.concatenate(answers) if answers else np.empty(0)
+    answers = [np.empty(0)]
+    for margins in engine.run(batches):
+        answers.append(margins.cpu().double().numpy())
+        on_batch(len(margins))
+    return np.concatenate(answers)
 
 
-def answer_whole(predict: Predict, images: Tensor, *, batch_size: int = 64) -> Float64[np.ndarray, " images"]:
+def answer_whole(predict: Predict, images: Tensor) -> Float64[np.ndarray, " images"]:
     """Predict whole images."""
-    return _answer(predict, images.split(predict.batch_size if isinstance(predict, Engine) else batch_size))
+    engine = _as_engine(predict)
+    return _answer(engine, images.split(engine.batch_size))
 
 
 def _paint(
@@ -129,13 +136,11 @@ def removal_curves(
     references: Float[Tensor, "images colours height width"] | None = None,
     areas: Sequence[float] = AREAS,
     seed: int = 0,
-    batch_size: int = 64,
 ) -> RemovalCurves:
     """Predict inputs while parts of them are removed, in several orders each.
 
     Inputs are in [0, 1], as the references, those of the baseline, where the fill needs them. Orders are flat
     pixel indices, first to be removed first (`unit_order`); areas are shares of the image, rising from 0 to 1.
-    `batch_size` images are made and answered at a time, which bounds the memory.
 
     Raises
     ------
@@ -146,12 +151,11 @@ def removal_curves(
     if shares[0] != 0 or shares[-1] != 1 or np.any(np.diff(shares) <= 0):
         raise InputError(f"areas must rise from 0 to 1, got {list(areas)}")
     removed = np.round(shares * images.shape[-2] * images.shape[-1]).astype(np.int64).tolist()
-    last, jobs = len(shares) - 1, []
+    last, jobs, engine, done = len(shares) - 1, [], _as_engine(predict), 0
     for image in range(len(images)):
         jobs += [(image, order, step) for order in range(len(orders)) for step in range(1, last)]
         # what is left of the image when all is gone depends on no order: answered once
         jobs.append((image, 0, last))
-    done = 0
 
     def count(answered: int) -> None:
         nonlocal done
@@ -163,12 +167,12 @@ def removal_curves(
         orders,
         [(image, order, removed[step]) for image, order, step in jobs],
         images=images,
-        batch_size=predict.batch_size if isinstance(predict, Engine) else batch_size,
+        batch_size=engine.batch_size,
     )
     answers = np.empty((len(orders), len(images), len(shares)))
     image_of, order_of, step_of = np.transpose(jobs)
-    answers[order_of, image_of, step_of] = _answer(predict, batches, count)
-    answers[:, :, 0] = answer_whole(predict, images, batch_size=batch_size)
+    answers[order_of, image_of, step_of] = _answer(engine, batches, count)
+    answers[:, :, 0] = answer_whole(engine, images)
     answers[:, :, -1] = answers[0, :, -1]
     return RemovalCurves(areas=shares, answers=answers)
 
@@ -208,8 +212,6 @@ def score_maps(
 def answer_scenes(
     predict: Predict,
     redraw: Callable[[Bool[np.ndarray, "variants markers"]], Float[Tensor, "variants colours height width"]],
-    *,
-    batch_size: int = 64,
 ) -> Callable[[Bool[np.ndarray, "variants markers"]], Float64[np.ndarray, " variants"]]:
     """Return a function that predicts one scene with markers put back, and caches what it drew."""
     cache: dict[bytes, float] = {}
@@ -218,24 +220,18 @@ def answer_scenes(
         keys_of_rows = [row.tobytes() for row in back]
         new = {key: row for key, row in zip(keys_of_rows, back, strict=True) if key not in cache}
         keys, drawn = list(new), list(new.values())
-        for start in range(0, len(new), batch_size):
-            part = slice(start, start + batch_size)
+        for start in range(0, len(new), _BATCH):
+            part = slice(start, start + _BATCH)
             cache.update(zip(keys[part], answer_whole(predict, redraw(np.stack(drawn[part]))), strict=True))
         return np.array([cache[key] for key in keys_of_rows])
 
     return answer
 
 
-def marker_curves(
-    predict: Predict,
-    redraw: Redraw,
-    orders: Int[np.ndarray, "orders images markers"],
-    *,
-    batch_size: int = 64,
-) -> RemovalCurves:
+def marker_curves(predict: Predict, redraw: Redraw, orders: Int[np.ndarray, "orders images markers"]) -> RemovalCurves:
     """Predict frames while `SHARES` of their markers are put back, in several orders each.
 
-    Scenes that several orders share are drawn once, `batch_size` images at a time, which bounds the memory.
+    Scenes that several orders share are drawn once.
     """
     areas, (_, images, markers) = np.asarray(SHARES), orders.shape
     counts = np.round(areas * markers).astype(np.int64)
@@ -243,7 +239,7 @@ def marker_curves(
     for image in report_each(range(images)):
         rank = np.argsort(orders[:, image], axis=-1)
         back = rank[:, None] < counts[:, None]
-        answer = answer_scenes(predict, partial(redraw, image), batch_size=batch_size)
+        answer = answer_scenes(predict, partial(redraw, image))
         answers[:, image] = answer(back.reshape(-1, markers)).reshape(back.shape[:2])
     return RemovalCurves(areas=areas, answers=answers)
 
@@ -256,7 +252,6 @@ def score_maps_by_marker(
     rng: np.random.Generator,
     towards: Float[np.ndarray, " images"],
     random_orders: int = RANDOM_ORDERS,
-    batch_size: int = 64,
 ) -> dict[str, RemovalCurve]:
     """Score how much each marker matters to several methods (`unit_means`) by putting them back; see `score_maps`."""
     for name, values in influence.items():
@@ -265,5 +260,5 @@ def score_maps_by_marker(
     orders = [influence_orders(values) for values in influence.values()]
     images, markers = orders[0].shape[1:]
     by_chance = [[rng.permutation(markers) for _ in range(images)] for _ in range(random_orders)]
-    curves = marker_curves(predict, redraw, np.concatenate([*orders, np.array(by_chance)]), batch_size=batch_size)
+    curves = marker_curves(predict, redraw, np.concatenate([*orders, np.array(by_chance)]))
     return curves.by_method(influence, towards=towards)

@@ -79,8 +79,7 @@ def require_same_network(network: Network, explanation: Explanation) -> None:
 
 def prepare_passes(network: Network, inputs: Float[Tensor, "images colours size size"], passes: int) -> Engine:
     """Prepare an engine for a number of passes of a network, checked on a few of its inputs, on its device."""
-    some = inputs[:_CHECKED_IMAGES].to(network.device)
-    return prepare(network.model, some, network.predict(some).to(network.device), passes=passes)
+    return prepare(network.model, inputs[:_CHECKED_IMAGES].to(network.device), passes=passes)
 
 
 def influences(network: Network, explanation: Explanation) -> dict[str, Maps]:
@@ -114,41 +113,34 @@ def score_curves(
     explanation: Explanation, curves: Mapping[Setting, SettingCurves], *, random_orders: int, seed: int
 ) -> Faithfulness:
     """Make the scores of the curves of all frames, by setting, with intervals over days and trials."""
-    by_method = {
-        setting: {
-            name: RemovalCurve(areas=part.areas, most_first=most, least_first=least, random=random)
-            for name, (most, least, random) in part.curves.items()
-        }
-        for setting, part in curves.items()
-    }
     rng, clusters, frames = np.random.default_rng(seed), explanation.clusters, explanation.frames
     labels = [np.nan if frame.safety_margin is None else frame.safety_margin for frame in frames]
-    scores, comparisons, tables = [], [], []
-    for setting, of_setting in by_method.items():
-        gains = {name: curve.symmetric_gain for name, curve in of_setting.items()}
-        controls = {name: gain for name, gain in gains.items() if is_control(name)}
-        methods = [name for name in gains if name not in controls]
+    scores, comparisons, tables, gains = [], [], [], {}
+    for setting, part in curves.items():
         where = {"fill": setting.fill, "unit": setting.unit}
-        for name, gain in gains.items():
-            of_control, srg = name in controls, mean_interval(gain, clusters=clusters, rng=rng)
-            lead = None if of_control else lead_over_controls(gain, controls, clusters=clusters, rng=rng)
+        gain = gains[setting] = {
+            name: RemovalCurve(areas=part.areas, most_first=most, least_first=least, random=random).symmetric_gain
+            for name, (most, least, random) in part.curves.items()
+        }
+        controls = {name: values for name, values in gain.items() if is_control(name)}
+        for name, values in gain.items():
+            of_control, srg = name in controls, mean_interval(values, clusters=clusters, rng=rng)
+            lead = None if of_control else lead_over_controls(values, controls, clusters=clusters, rng=rng)
             scores.append(RemovalScore(**where, method=name, control=of_control, srg=srg, lead_over_controls=lead))
-        for first, second in combinations(methods, 2):
-            gap = paired_difference(gains[first], gains[second], clusters=clusters, rng=rng)
+        for first, second in combinations([name for name in gain if name not in controls], 2):
+            gap = paired_difference(gain[first], gain[second], clusters=clusters, rng=rng)
             comparisons.append(RemovalGap(**where, first=first, second=second, gap=gap))
-        for name, curve in of_setting.items():
-            rows, steps = curve.most_first.size, len(curve.areas)
+        for name, (most, least, random) in part.curves.items():
+            rows, steps = most.size, len(part.areas)
             tables.append(
                 RemovalTable(
-                    fill=np.repeat(setting.fill, rows),
-                    unit=np.repeat(setting.unit, rows),
-                    method=np.repeat(name, rows),
+                    **{column: np.repeat(text, rows) for column, text in (where | {"method": name}).items()},
                     **frame_columns(explanation, steps),
                     safety_margin=np.repeat(labels, steps),
-                    area=np.tile(curve.areas, len(frames)),
-                    most_first=curve.most_first.ravel(),
-                    least_first=curve.least_first.ravel(),
-                    random=curve.random.ravel(),
+                    area=np.tile(part.areas, len(frames)),
+                    most_first=most.ravel(),
+                    least_first=least.ravel(),
+                    random=random.ravel(),
                 )
             )
     scale = explanation.scale
@@ -165,11 +157,16 @@ def score_curves(
         scores=tuple(scores),
         comparisons=tuple(comparisons),
         alarms=(
-            *little_to_explain(change, baseline=BASELINES[explanation.baseline]),
+            *count_alarm(
+                np.abs(change) < CLOSE,
+                f"next to nothing to explain in {{}} of {{}} frames: the answer lies within {CLOSE} of that on "
+                f"{BASELINES[explanation.baseline]}, less than networks err by, and the direction that a gain counts "
+                "along is chance; leave them out",
+            ),
             *(saturated(whole) if explanation.unit == "margin" else ()),
             *flat_maps({name: explanation.influence(name) for name in explanation.relevance}),
             *(alarm for fill, gone in blank.items() for alarm in fill_decides(whole, gone, fill=fill)),
-            *ranking_alarms(by_method),
+            *ranking_alarms({setting: {n: float(g.mean()) for n, g in of.items()} for setting, of in gains.items()}),
         ),
         table=RemovalTable.joined(tables),
     )
@@ -221,8 +218,7 @@ def deletion_steps(shape: tuple[int, int], *, steps: int | None = None) -> Int[n
 
     Polak, section 4 (n_masks = 224 for a 224 x 224 image: 224 steps of 224 pixels).
     """
-    pixels = shape[0] * shape[1]
-    count = steps or shape[0]
+    pixels, count = shape[0] * shape[1], steps or shape[0]
     if not 1 <= count <= pixels:
         raise InputError(f"deletion in {count} steps is impossible with {pixels} pixels; choose 1 to {pixels}")
     return np.round(np.linspace(0, pixels, count + 1)[1:]).astype(np.int64)
@@ -235,7 +231,6 @@ def delete_pixels(
     *,
     fill: str,
     steps: int | None = None,
-    batch_size: int = 128,
 ) -> Float64[np.ndarray, "images answers"]:
     """Predict whole images, and then after each step while pixels are removed in an order (`deletion_order`).
 
@@ -253,8 +248,7 @@ def delete_pixels(
     """
     removed = deletion_steps((images.shape[-2], images.shape[-1]), steps=steps)
     areas = [0.0, *removed / removed[-1]]
-    fills = get_fill(fill)
-    return removal_curves(predict, images, orders[None], fill=fills, areas=areas, batch_size=batch_size).answers[0]
+    return removal_curves(predict, images, orders[None], fill=get_fill(fill), areas=areas).answers[0]
 
 
 def score_deletion(
@@ -262,20 +256,37 @@ def score_deletion(
 ) -> DeletionScores:
     """Make the thesis's deletion scores of the predictions of all frames by method (`delete_pixels`)."""
     answers = {name: values / explanation.scale for name, values in answers.items()}
-    frames, chance = explanation.frames, answers[CHANCE]
+    frames, chance = len(explanation.frames), answers[CHANCE]
     removed = deletion_steps((explanation.image_size, explanation.image_size), steps=chance.shape[1] - 1)
+    steps, methods, tables = len(removed), {}, []
+    alarms = [
+        *flat_maps(explanation.saliency),
+        # the fill decides where the filled image is predicted like the whole one
+        *fill_decides(chance[:, 0], chance[:, -1], fill=fill),
+        *(saturated(chance[:, 0]) if explanation.unit == "margin" else ()),
+    ]
     scores = {name: deletion_score(values[:, :1], values[:, 1:]) for name, values in answers.items()}
-    steps, rows = len(removed), len(frames) * len(removed)
-    tables = [
-        DeletionTable(
-            method=np.repeat(name, rows),
-            **frame_columns(explanation, steps),
-            step=np.tile(np.arange(steps), len(frames)),
-            pixels_removed=np.tile(removed, len(frames)),
-            prediction=explanation.scale * answers[name][:, 1:].ravel(),
-            score=values.ravel(),
+    for name, values in scores.items():
+        means, last = values.mean(axis=1), values[:, -1]
+        methods[name] = MethodScore(
+            mean=float(means.mean()), sd=float(means.std()), last_step_mean=float(last.mean()), frames=frames
         )
-        for name, values in scores.items()
+        if name != CHANCE:
+            alarms += follows_last_step(means, last, name=f"D of {name}")
+        tables.append(
+            DeletionTable(
+                method=np.repeat(name, frames * steps),
+                **frame_columns(explanation, steps),
+                step=np.tile(np.arange(steps), frames),
+                pixels_removed=np.tile(removed, frames),
+                prediction=explanation.scale * answers[name][:, 1:].ravel(),
+                score=values.ravel(),
+            )
+        )
+    alarms += [
+        f"{name} does not beat a random order ({method.mean:.3f} against {methods[CHANCE].mean:.3f})"
+        for name, method in methods.items()
+        if name != CHANCE and method.mean >= methods[CHANCE].mean
     ]
     return DeletionScores(
         input=explanation.input,
@@ -283,32 +294,8 @@ def score_deletion(
         fill=fill,
         steps=steps,
         pixels_per_step=int(removed[0]),
-        methods={
-            name: MethodScore(
-                mean=float(values.mean(axis=1).mean()),
-                sd=float(values.mean(axis=1).std()),
-                last_step_mean=float(values[:, -1].mean()),
-                frames=len(frames),
-            )
-            for name, values in scores.items()
-        },
-        alarms=(
-            *flat_maps(explanation.saliency),
-            # the fill decides where the filled image is predicted like the whole one
-            *fill_decides(chance[:, 0], chance[:, -1], fill=fill),
-            *(saturated(chance[:, 0]) if explanation.unit == "margin" else ()),
-            *(
-                alarm
-                for name, values in scores.items()
-                for alarm in follows_last_step(values.mean(axis=1), values[:, -1], name=f"D of {name}")
-                if name != CHANCE
-            ),
-            *(
-                f"{name} does not beat a random order ({values.mean():.3f} against {scores[CHANCE].mean():.3f})"
-                for name, values in scores.items()
-                if name != CHANCE and values.mean() >= scores[CHANCE].mean()
-            ),
-        ),
+        methods=methods,
+        alarms=tuple(alarms),
         table=DeletionTable.joined(tables),
     )
 
@@ -345,15 +332,6 @@ def follows_last_step(
     if tied < _TIED_TO_LAST:
         return []
     return [f"{name} correlates with its last step by {tied:.2f}: it measures the fill rather than the map"]
-
-
-def little_to_explain(change: Float[np.ndarray, " images"], *, baseline: str) -> list[str]:
-    """Warn of frames predicted nearly like the baseline, whose direction is chance."""
-    return count_alarm(
-        np.abs(change) < CLOSE,
-        f"next to nothing to explain in {{}} of {{}} frames: the answer lies within {CLOSE} of that on {baseline}, "
-        "less than networks err by, and the direction that a gain counts along is chance; leave them out",
-    )
 
 
 def saturated(answers: Float[np.ndarray, " images"]) -> list[str]:
@@ -397,20 +375,20 @@ def rankings_disagree(scores: Mapping[str, Mapping[str, float]]) -> list[str]:
     return alarms
 
 
-def ranking_alarms(curves: Mapping[Setting, Mapping[str, RemovalCurve]]) -> list[str]:
-    """Warn where a control wins, and of fills that rank the methods differently."""
+def ranking_alarms(gains: Mapping[Setting, Mapping[str, float]]) -> list[str]:
+    """Warn where a control wins, and of fills that rank the methods differently; mean gains by setting and name."""
     by_fill: dict[str, dict[str, float]] = {}
     alarms = []
-    for setting, of_setting in curves.items():
-        gains = {name: float(curve.symmetric_gain.mean()) for name, curve in of_setting.items()}
-        methods = {name: gain for name, gain in gains.items() if not is_control(name)}
-        best = max(gains.keys() - methods.keys(), key=lambda name: gains[name], default=None)
+    for setting, of_setting in gains.items():
+        methods = {name: gain for name, gain in of_setting.items() if not is_control(name)}
+        best = max(of_setting.keys() - methods.keys(), key=lambda name: of_setting[name], default=None)
         where = f"under {setting.fill}, {setting.unit} by {setting.unit}"
         for name, gain in methods.items():
             if gain <= 0:
                 alarms.append(f"{where}: {name} does not beat a random order: its symmetric gain is {gain:.3f}")
-            elif best is not None and gain <= gains[best]:
-                alarms.append(f"{where}: {name} gains {gain:.3f}, no more than the control {best} ({gains[best]:.3f})")
+            elif best is not None and gain <= of_setting[best]:
+                control = f"the control {best} ({of_setting[best]:.3f})"
+                alarms.append(f"{where}: {name} gains {gain:.3f}, no more than {control}")
         if setting.unit == "pixel":
             by_fill[setting.fill] = methods
     return [*rankings_disagree(by_fill), *alarms]

@@ -223,7 +223,9 @@ def table_properties(results: Results) -> CellTable:
     """Tabulate what the maps of each method look like, whether they depend on the weights, and what they cost."""
     parts = {
         "Resolution: depth of the valley between neighbouring markers (1 = told apart). Total variation: mean step "
-        "between pixels over the map's range (noise has 1/3).": results.map_quality,
+        "between pixels over the map's range (noise has 1/3). Of two frames, infidelity: error of the change that a "
+        "map predicts where half of the pixels become the baseline's, in units of the output; max-sensitivity: largest "
+        "change of a map under noise of 2 %, as a share of the map.": results.map_quality,
         "New weights: similarity of the map to the trained network's once the first layers from the output, or all, "
         "are drawn anew (1 = unchanged: such a map does not depend on what was learned).": results.randomisation,
         "Seconds: median for one frame after a warm-up; the thesis timed 224 px on an RTX 3060 Ti.": results.timing,
@@ -231,6 +233,8 @@ def table_properties(results: Results) -> CellTable:
     columns = {
         "Resolution": (results.map_quality, lambda of: decimals(of.resolution, 3)),
         "Total variation": (results.map_quality, lambda of: decimals(of.total_variation, 3)),
+        "Infidelity": (results.map_quality, lambda of: decimals(of.infidelity, 3)),
+        "Max-sensitivity": (results.map_quality, lambda of: decimals(of.max_sensitivity, 2)),
         "First layers new": (results.randomisation, lambda of: decimals(next(iter(of.similarity), None), 2)),
         "All layers new": (results.randomisation, lambda of: decimals(next(reversed(of.similarity), None), 2)),
         "Seconds": (results.timing, lambda of: decimals(of.seconds, 3)),

@@ -152,6 +152,10 @@ class MapMeasures:
 
     resolution: float | None = None
     total_variation: float | None = None
+    infidelity: Annotated[float, ANSWER] | None = None
+    """Error of the changes that maps of a few frames predict, in margin units (`controls.infidelity`)."""
+    max_sensitivity: float | None = None
+    """Largest relative change of the same maps under small noise (`controls.max_sensitivity`)."""
     layers: tuple[int, ...] = ()
     similarity: tuple[float | None, ...] = ()
     """Of the maps with those of the network with new weights in so many layers."""

@@ -7,13 +7,23 @@ from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from sliplens.errors import ModelError
 from sliplens.explainers.contract import Explainer
 from sliplens.explainers.gradients import IntegratedGradients
 from sliplens.explainers.poly_cam import PolyCam
 from sliplens.explainers.shapley import Shapley
-from sliplens.faithfulness.controls import cascade, even_channels, resolution, stability, total_variation
+from sliplens.faithfulness.controls import (
+    cascade,
+    even_channels,
+    infidelity,
+    max_sensitivity,
+    resolution,
+    stability,
+    total_variation,
+)
 from sliplens.intervals import paired_difference
 from sliplens.models import Network
 from sliplens.progress import report_each
@@ -36,8 +46,9 @@ _FEW_CHANNELS, _FEW_PAIRS = 0.05, 100
 
 
 def measure_maps(material: Material, *, seed: int = 0) -> MapQuality:
-    """Measure resolution, smoothness of the maps, and compare the methods' smoothness."""
-    explained, rng = material.explained, np.random.default_rng(seed)
+    """Measure resolution, smoothness, infidelity and sensitivity of the maps, and compare the methods' smoothness."""
+    explained, rng, model = material.explained, np.random.default_rng(seed), material.trained.model
+    few, compared = material.inputs[:_REDRAWN], material.references[:_REDRAWN]
     measures, roughness = {}, {}
     for method in report_each(list(material.explainers)):
         maps = explained.saliency[method].astype(np.float64)
@@ -47,9 +58,19 @@ def measure_maps(material: Material, *, seed: int = 0) -> MapQuality:
             if frame.id in material.markers
         ]
         roughness[method] = np.array([total_variation(saliency) for saliency in maps])
+        explainer = _shortened(material.explainers[method], passes_matter=True)
+
+        def explain(images: Tensor, explainer: Explainer = explainer) -> Tensor:
+            references = compared.repeat_interleave(len(images) // len(compared), dim=0)
+            return explainer(model, images, reference=references).relevance
+
+        relevance = torch.from_numpy(explained.relevance[method][:_REDRAWN])
+        errors = infidelity(lambda images: model(images).flatten(), few, compared, relevance)
         measures[method] = MapMeasures(
             resolution=mean_of_known(np.array(resolutions, dtype=np.float64)),
             total_variation=mean_of_known(roughness[method]),
+            infidelity=mean_of_known(errors),
+            max_sensitivity=mean_of_known(max_sensitivity(explain, few)),
         )
     return MapQuality(
         input=explained.input,
