@@ -27,13 +27,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import mannwhitneyu
 
 from adapt import SENSORS
-from sliplens.friction import GRASP_SPREAD, Friction
+from sliplens.friction import Friction
 from sliplens.models import Estimate, Network
 from sliplens.models.checkpoint import Ratio, load
 from sliplens.simulation import PRESETS, SimulationRecipe
 from sliplens.simulation.loading import Loading
 from sliplens.simulation.nuisances import Nuisances
-from sliplens.simulation.plan import PULLS, TrialPlan, plan_trials
+from sliplens.simulation.plan import TrialPlan, plan_trials
 from sliplens.simulation.trials import prepare_trial
 
 TRIALS, FRAMES, DRAWN = 3, 40, 10
@@ -264,9 +264,7 @@ def leads(read: Read, other: Read) -> dict[str, float]:
 
 def learn(slipped: Ratio) -> Friction:
     """Friction from the readings before one slip."""
-    return Friction.from_slips(
-        [float(slipped.mean.mean())], sigma=float(slipped.sigma.mean()), grasp_spread=GRASP_SPREAD
-    )
+    return Friction.from_slips([float(slipped.mean.mean())], sigma=float(slipped.sigma.mean()))
 
 
 def held(truth: np.ndarray, ends: Sequence[tuple[np.ndarray, np.ndarray] | None], rows: np.ndarray) -> float:
@@ -312,7 +310,7 @@ def follow(run: Network, plan: TrialPlan) -> Followed:
 def follow_all(run: Network, name: str, *, trials: int | None = None) -> list[Followed]:
     """Read all frames of the trials of a set in order, their pulls varied."""
     plans = plans_of_set(name, trials=trials)
-    return [follow(run, replace(plan, recipe=replace(plan.recipe, pulls=PULLS["varied"]))) for plan in plans]
+    return [follow(run, replace(plan, recipe=replace(plan.recipe, pulls="varied"))) for plan in plans]
 
 
 def joined(read: Sequence[Followed], of: Callable[[Followed], Any]) -> np.ndarray:

@@ -37,19 +37,18 @@ def test_slips_in_any_order_teach_alike_and_exact_friction_stays():
 
 
 def test_another_grasp_is_less_sure_by_its_spread():
-    same, next_one = Friction(0.5), Friction(0.5).next_grasp(0.06)
+    same, next_one = Friction(0.5), Friction(0.5).next_grasp()
     assert same.sigma == 0
     assert next_one.mean == pytest.approx(0.5, rel=0.01)
     assert next_one.sigma == pytest.approx(0.5 * 0.06, rel=0.02)
-    assert Friction(0.5).next_grasp(0.0).mean == 0.5
 
 
 def test_many_slips_leave_the_spread_of_one_grasp(rng: np.random.Generator):
     slips = 0.6 * (1 + 0.06 * rng.standard_normal(400))
-    learnt = Friction.from_slips(slips, sigma=0.01, grasp_spread=0.06)
+    learnt = Friction.from_slips(slips, sigma=0.01)
     assert learnt.mean == pytest.approx(0.6, rel=0.02)
     assert learnt.sigma == pytest.approx(0.6 * 0.06, rel=0.05)
-    one = Friction.from_slips([0.6], sigma=0.01, grasp_spread=0.06)
+    one = Friction.from_slips([0.6], sigma=0.01)
     # twice the spread of a grasp: that of the slip and that of the next one
     assert one.sigma == pytest.approx(0.6 * 0.06 * np.sqrt(2), rel=0.05)
     assert Friction.from_slips([]).sigma > 0.3  # everything is possible
@@ -77,7 +76,6 @@ def test_what_is_no_friction_is_refused(told: object):
         (lambda: Friction.between(0.2, 1.0).update(0.5, 0.0), "a slip needs a positive ratio"),
         (lambda: Friction.between(0.2, 1.0).update(float("nan"), 0.1), "a slip needs a positive ratio"),
         (lambda: Friction(np.array([0.5, 0.6]), np.array([1.0, -1.0])), "2 values of friction need as many weights"),
-        (lambda: Friction(0.5).next_grasp(1.5), "share of the friction"),
     ],
 )
 def test_impossible_slips_weights_and_spreads_are_refused(call: Callable[[], object], words: str):
@@ -202,7 +200,7 @@ def test_without_a_reading_or_a_doubt_a_slip_teaches_nothing(friction: Friction 
 
 def test_friction_of_any_size_stays_in_the_next_grasp_but_for_its_spread():
     for value in (0.02, 0.6, 3.0, 5.0):
-        after = Friction(value).next_grasp(0.06)
+        after = Friction(value).next_grasp()
         # a Gaussian share of 6 %, on a grid of steps of 2 % at most
         assert after.mean == pytest.approx(value, rel=0.01)
         assert after.sigma == pytest.approx(0.06 * value, rel=0.05)

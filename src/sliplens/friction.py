@@ -90,7 +90,7 @@ class Friction:
         return cls(middles, note=f"{low:g} to {high:g}, range")
 
     @classmethod
-    def about(cls, mean: float, sigma: float, *, values: int = 81) -> "Friction":
+    def about(cls, mean: float, sigma: float) -> "Friction":
         """Friction with a mean and a standard deviation, normal in the logarithm and so never negative."""
         if not (0 < mean <= MOST_FRICTION and 0 < sigma < mean):
             raise InputError(
@@ -98,24 +98,17 @@ class Friction:
                 f"{MOST_FRICTION:g}, got {mean:g}+-{sigma:g}; give such as 0.58+-0.05, or the mean alone"
             )
         spread = math.sqrt(math.log1p((sigma / mean) ** 2))
-        steps = np.linspace(-_REACH, _REACH, values)
+        steps = np.linspace(-_REACH, _REACH, 81)
         nodes = mean * np.exp(spread * steps - spread**2 / 2)
         possible = nodes <= MOST_FRICTION
         return cls(nodes[possible], np.exp(-0.5 * steps[possible] ** 2), note="mean and spread")
 
     @classmethod
-    def from_slips(
-        cls,
-        ratios: Sequence[float] | Float[np.ndarray, " slips"],
-        *,
-        sigma: float = 0.05,
-        grasp_spread: float = GRASP_SPREAD,
-        prior: "Friction | None" = None,
-    ) -> "Friction":
+    def from_slips(cls, ratios: Sequence[float] | Float[np.ndarray, " slips"], *, sigma: float = 0.05) -> "Friction":
         """Friction of the next grasp of an object that slipped in earlier ones.
 
-        At gross slip F_t / F_n is the friction of that grasp, which differs from the object's by a Gaussian share, as
-        that of the next grasp will.
+        At gross slip F_t / F_n is the friction of that grasp, which differs from the object's by a Gaussian share
+        (`GRASP_SPREAD`), as that of the next grasp will. Before the slips it is even in the logarithm.
 
         Parameters
         ----------
@@ -123,16 +116,12 @@ class Friction:
             F_t / F_n at which the object slipped, one a grasp: errors within a grasp are correlated.
         sigma
             Standard deviation of each ratio.
-        grasp_spread
-            Standard deviation of friction from one grasp to the next, as a share of it.
-        prior
-            Friction of the object before the slips; any (evenly in the logarithm) if None.
         """
         ratios = np.asarray(ratios, dtype=np.float64)
-        friction = _unknown(ratios) if prior is None else prior
+        friction = _unknown(ratios)
         for ratio in ratios.tolist():
-            friction = friction.update(ratio, math.hypot(sigma, grasp_spread * ratio))
-        return friction.next_grasp(grasp_spread)
+            friction = friction.update(ratio, math.hypot(sigma, GRASP_SPREAD * ratio))
+        return friction.next_grasp()
 
     def update(self, ratio: float, sigma: float) -> "Friction":
         """Update by a gross slip at F_t / F_n = `ratio`, predicted with the standard deviation `sigma` (Bayes' rule).
@@ -148,16 +137,12 @@ class Friction:
             posterior = np.log(weights) - 0.5 * ((values - ratio) / sigma) ** 2
         return _likely(values, np.exp(posterior - posterior.max()), note=LEARNT)
 
-    def next_grasp(self, spread: float = GRASP_SPREAD) -> "Friction":
-        """Friction of another grasp of the same object, whose share differs with the standard deviation `spread`."""
-        if not 0 <= spread < 1:
-            raise InputError(f"the spread from grasp to grasp is a share of the friction, from 0 to 1, got {spread:g}")
-        if spread == 0:
-            return self
+    def next_grasp(self) -> "Friction":
+        """Friction of another grasp of the same object, whose share differs with `GRASP_SPREAD`."""
         # in the logarithm, where no friction becomes negative
         values, weights = self.nodes
-        grid, _ = _unknown(values, spread=spread).nodes
-        share = np.exp(-0.5 * (np.log(grid / values[:, None]) / spread) ** 2)
+        grid, _ = _unknown(values).nodes
+        share = np.exp(-0.5 * (np.log(grid / values[:, None]) / GRASP_SPREAD) ** 2)
         moved = weights @ (share / np.maximum(share.sum(axis=1, keepdims=True), 1e-300))
         return _likely(grid, moved, note=self.note)
 
@@ -297,12 +282,12 @@ def _likely(values: Float[np.ndarray, " values"], weights: Float[np.ndarray, " v
     return Friction(values[likely], weights[likely], note=note)
 
 
-def _unknown(near: Float[np.ndarray, " values"] | None = None, *, spread: float = GRASP_SPREAD) -> Friction:
+def _unknown(near: Float[np.ndarray, " values"] | None = None) -> Friction:
     """Return unknown friction, evenly in the logarithm, over a range that covers some values and their spread."""
     low, high = _LOWEST, _HIGHEST
     if near is not None and len(near) and np.all((near > 0) & np.isfinite(near)):
-        low = min(low, float(near.min()) * math.exp(-_REACH * spread))
-        high = min(MOST_FRICTION, max(high, float(near.max()) * math.exp(_REACH * spread)))
+        low = min(low, float(near.min()) * math.exp(-_REACH * GRASP_SPREAD))
+        high = min(MOST_FRICTION, max(high, float(near.max()) * math.exp(_REACH * GRASP_SPREAD)))
     return Friction(np.geomspace(low, high, _NODES), note="unknown")
 
 

@@ -1,11 +1,9 @@
-import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from command_line import command
 from data_sets import save_dataset
 
-from sliplens.errors import InputError
 from sliplens.images import write_png
 from sliplens.markers import track_markers
 from sliplens.markers.tracking import track
@@ -61,19 +59,15 @@ def test_a_folder_of_parts_holds_the_same_rows_wherever_they_were_made(folder, t
     assert [str(trial) for trial in parts.trials] == [str(trial) for trial in whole.trials]
     assert whole.trials[0].markers == 30
     assert whole.trials[0].followed_share == 1
-    with pytest.raises(InputError, match="leave out --on, or --video"):
-        command("track", source=folder, out=tmp_path / "b.parquet", video=tmp_path / "b.mp4", on="processes")
 
 
 def test_a_data_set_gives_what_the_tracker_gives(trials, tmp_path):
     trial = trials["chromatouch"]
     data = save_dataset(tmp_path / "data", trial, split="test", simulated=True).folder
-    output, clip = tmp_path / "tracks.parquet", tmp_path / "clip.mp4"
-    command("track", source=data, out=output, markers="chromatouch", video=clip)
+    output = tmp_path / "tracks.parquet"
+    command("track", source=data, out=output, markers="chromatouch")
     table = pq.read_table(output)
     tracks = track_markers(trial.frames, trial.reference, "chromatouch")
     expected = tracks.displacement_px[..., 0].ravel().astype(np.float32)
     np.testing.assert_allclose(table["dx_px"].to_numpy(), expected, atol=1e-4)
     np.testing.assert_allclose(np.unique(table["time_s"].to_numpy()), trial.time_s)
-    with av.open(str(clip)) as container:
-        assert sum(1 for _ in container.decode(video=0)) == len(trial)

@@ -15,7 +15,6 @@ from sliplens.files import find_run, shipped_names
 from sliplens.models import Network
 from sliplens.recordings import Recording
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
-from sliplens.simulation.plan import PULLS
 
 
 @pytest.mark.parametrize("name", shipped_names())
@@ -39,7 +38,7 @@ def known_sensor() -> list[Recording]:
 @pytest.fixture(scope="module")
 def pulls() -> list[Recording]:
     """Three trials, no pull like another, of another series and seed than the training's: days it never saw."""
-    recipe = replace(PRESETS["small"], seed=78, frames_per_trial=20, pulls=PULLS["varied"])
+    recipe = replace(PRESETS["small"], seed=78, frames_per_trial=20, pulls="varied")
     return [simulate_trial(plan) for plan in plan_trials(recipe)[:3]]
 
 

@@ -7,7 +7,6 @@ import pytest
 from matplotlib.figure import Figure
 
 from sliplens.errors import InputError
-from sliplens.plots.clip import require_clip_path
 from sliplens.plots.style import name_methods, percent, require_picture_path, save_page, written_whole
 
 
@@ -35,7 +34,6 @@ def test_methods_in_a_text_are_named_and_other_words_stay():
             r"does not end in \.png, .*; name",
         ),
         (lambda path: require_picture_path(path, example="a.png"), "page", "does not end in"),
-        (require_clip_path, "trial.mp4.mkv", r"trial\.mp4\.mkv does not end in \.mp4; name a clip"),
     ],
 )
 def test_another_suffix_is_refused(check, name: str, message: str):

@@ -10,7 +10,6 @@ from sliplens.simulation import (
     FLAT_GEL,
     PRESETS,
     Nuisances,
-    Pulls,
     SimulationRecipe,
     make_recipe,
     plan_trials,
@@ -175,10 +174,7 @@ def test_recipes_have_the_same_hash_only_if_they_are_the_same():
         (Nuisances, {"dry_friction": (0.0, 1.0)}, "dry_friction must be positive, got 0; raise its lower end"),
         (Nuisances, {"marker_depth": (-0.1, 0.1)}, "marker_depth must not be negative, got -0.1; raise its lower end"),
         (Nuisances, {"kinetic_ratio": (0.8, 1.2)}, "kinetic_ratio must be at most 1, got 1.2; lower its upper end"),
-        (Pulls, {"duration_s": (0.0, 8.0)}, "the range of duration_s is .*; give a positive low, then a high"),
-        (Pulls, {"let_back": (0.2, 1.2)}, "let_back must be at most 1, got 1.2; lower its upper end"),
-        (Pulls, {"most_events": 9}, "9 jerks of 0.1 s leave no time in a pull of 0.8 s; make pulls longer"),
-        (Pulls, {"rate": 0.5}, "a rate of 1 or more, got 3 and 0.5"),
+        (SimulationRecipe, {"pulls": "sideways"}, "pulls is 'sideways', but choose steady or varied"),
     ],
 )
 def test_impossible_settings_are_refused(kind, change, message):

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, closing, nullcontext, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -198,28 +198,22 @@ def call_sensor_list(call: Any) -> None:
 
 
 @command("simulate", "simulation.trials:simulate", "sliplens simulate runs/mine/data --preset small")
-def call_simulate(call: Any, *, preview: Path | None = None, video: Path | None = None) -> None:
+def call_simulate(call: Any, *, preview: Path | None = None) -> None:
     """Print the splits.
 
     Parameters
     ----------
     preview
         Picture to write: a contact sheet of four trials (PNG, PDF or SVG). No data set is made without OUT.
-    video
-        Clip to write: one trial with its forces and margin beside it (MP4).
     """
-    from sliplens.plots.clip import require_clip_path
     from sliplens.plots.style import require_picture_path
 
-    if not (call.keywords.get("out") or preview or video):
+    if not (call.keywords.get("out") or preview):
         raise InputError("nothing to do; name a folder to make, or a picture with --preview")
     if preview is not None:
         require_picture_path(preview, example="sheet.png")
-    if video is not None:
-        require_clip_path(video)
-    if preview or video:
         options = {name: call.keywords[name] for name in call.keywords.keys() - {"out", "overwrite", "on_progress"}}
-        output.draw_simulation(**options, preview=preview, video=video)
+        output.draw_simulation(preview, **options)
     if call.keywords.get("out"):
         frames: dict[str, list[int]] = {}
         for trial in call().trials:
@@ -378,39 +372,18 @@ def call_view(call: Any) -> None:
 
 
 @command("track", "markers.tracking:track", "sliplens track cup.mp4 --reference untouched.png -o markers.parquet")
-def call_track(call: Any, *, video: Path | None = None) -> None:
-    """Print how many markers were followed.
-
-    Parameters
-    ----------
-    video
-        Also write a clip with rings and arrows, of one trial (MP4).
-    """
-    from sliplens.plots.clip import clip_writer
+def call_track(call: Any) -> None:
+    """Print how many markers were followed."""
     from sliplens.recordings.sensor import load_profile
-    from sliplens.recordings.source import SourceOptions, open_source
 
     arguments = call.keywords
     require_out(call, "table to write", example="markers.parquet")
     if "markers" not in arguments and "sensor" in arguments:
         arguments["markers"] = load_profile(arguments["sensor"]).markers or "auto"
-    clip = nullcontext()
-    if video is not None:
-        names = SourceOptions.__annotations__
-        trials = open_source(arguments["source"], **{name: arguments[name] for name in names if name in arguments})
-        if len(trials) != 1:
-            raise InputError(f"a clip shows one trial, and the source has {len(trials)}; name one with --trial")
-        if arguments.get("on", "serial") != "serial":
-            raise InputError("a clip is drawn while its trial is tracked; leave out --on, or --video")
-        require_new_file(video, overwrite="overwrite" in arguments)
-        clip = clip_writer(video, size=trials[0].frame_size, frames_per_s=trials[0].frame_rate_hz)
-    with clip as draw:
-        tracking = call(on_tracked=draw)
+    tracking = call()
     for trial in tracking.trials:
         say(str(trial))
     print_file(tracking.path, f"{number_of(tracking.frames, 'frame')} of {number_of(len(tracking.trials), 'trial')}")
-    if video is not None:
-        print_file(video, "to look at: lossy video moves markers")
 
 
 @command(

@@ -2,7 +2,6 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
@@ -31,7 +30,6 @@ _MOST_TRIALS = 40
 """Number of trials with a line each."""
 _MOST_NAMES = 6
 """Number of names in a cell."""
-_CLIP_FRAMES_PER_S = 30.0
 
 
 def show_predictions(predictions: "Predictions") -> None:
@@ -86,37 +84,18 @@ def _interval(low: float | None, high: float | None) -> str:
     return "-" if low is None or high is None else f"{100 * low:.0f} to {100 * high:.0f} %"
 
 
-def draw_simulation(
-    *,
-    preview: Path | None,
-    video: Path | None,
-    preset: str = "small",
-    device: str = "cpu",
-    **changes: "Unpack[RecipeChanges]",
-) -> None:
-    """Draw the contact sheet and the clip of a simulated data set."""
-    from sliplens.plots.clip import write_clip
+def draw_simulation(path: Path, *, preset: str = "small", **changes: "Unpack[RecipeChanges]") -> None:
+    """Draw the contact sheet of a simulated data set."""
     from sliplens.plots.contact_sheet import write_contact_sheet
-    from sliplens.simulation import make_recipe, plan_trials, simulate_examples, simulate_trial
-    from sliplens.simulation.loading import TRIAL_S
+    from sliplens.simulation import make_recipe, simulate_examples
 
     recipe = make_recipe(preset, **changes)
     with reporting(Terminal()):
-        if preview is not None:
-            with open_stage("Simulating trials for the preview"):
-                recordings = simulate_examples(recipe, device=device)
-            title = f"Simulated {recipe.sensor.name}, {recipe.resolved_displacement} displacement, seed {recipe.seed}"
-            write_contact_sheet(recordings, preview, title=title)
-            report_file(preview, f"{len(recordings)} of the trials that this recipe makes")
-        if video is not None:
-            # sampled at the clip's rate: a data set may have few frames a second
-            plan = replace(plan_trials(recipe)[0], frames=round(TRIAL_S * _CLIP_FRAMES_PER_S))
-            with open_stage("Simulating the trial"):
-                recording = simulate_trial(plan, device=device)
-            with open_stage("Writing the clip"):
-                write_clip(recording, video, frames_per_s=_CLIP_FRAMES_PER_S)
-            rate = f"{_CLIP_FRAMES_PER_S:g} frames/s"
-            report_file(video, f"trial {plan.trial} at {rate}; to look at, not to train on: video is lossy")
+        with open_stage("Simulating trials for the preview"):
+            recordings = simulate_examples(recipe)
+        title = f"Simulated {recipe.sensor.name}, {recipe.resolved_displacement} displacement, seed {recipe.seed}"
+        write_contact_sheet(recordings, path, title=title)
+        report_file(path, f"{len(recordings)} of the trials that this recipe makes")
 
 
 def draw_audits(data: "Dataset", folder: Path) -> None:

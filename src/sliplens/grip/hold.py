@@ -159,11 +159,9 @@ def hold_grip(
         for finger, reader in enumerate(readers):
             stack.callback(reader.subscribe(partial(loop.update_reading, finger)))
         ended, why = loop.run(seconds, on_step)
-        last = (
-            f"the gripper keeps the last command of {loop.steps[-1].command_n:.2f} N"
-            if loop.steps
-            else "the gripper got no command"
-        )
+        last = "the gripper got no command"
+        if loop.steps:
+            last = f"the gripper keeps the last command of {loop.steps[-1].command_n:.2f} N"
         kinds = {"slip": bool, "failed": bool, "why": str}
         columns = {
             name: np.array([getattr(step, name) for step in loop.steps], dtype=kinds.get(name, np.float64))

@@ -108,16 +108,15 @@ class GripSource(LiveSource):
         controller: str | None = None,
     ) -> None:
         """Pour water in, pull down, wet (which halves the friction) or choose a controller, from the next frame on."""
-        for name, value in (("water_kg", water_kg), ("pull_n", pull_n)):
-            if value is not None and not 0 <= value < np.inf:
-                raise InputError(f"{name} must be 0 or more, got {value:g}")
+        changes = {"water_kg": water_kg, "pull_n": pull_n, "wet": wet, "controller": controller}
+        changes = {name: value for name, value in changes.items() if value is not None}
+        for name in changes.keys() & {"water_kg", "pull_n"}:
+            if not 0 <= changes[name] < np.inf:
+                raise InputError(f"{name} must be 0 or more, got {changes[name]:g}")
         with self._lock:
-            self.water_kg = self.water_kg if water_kg is None else water_kg
-            self.pull_n = self.pull_n if pull_n is None else pull_n
-            self.wet = self.wet if wet is None else wet
             if controller is not None and controller != self.controller:
                 self._holder.choose(controller)
-                self.controller = controller
+            vars(self).update(changes)
 
     def grip_again(self) -> None:
         """Put the object down, and grip it again."""

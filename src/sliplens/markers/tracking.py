@@ -1,9 +1,9 @@
 """Tracking of the markers of whole sources into one table."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias, Unpack
+from typing import Unpack
 
 import numpy as np
 import pyarrow as pa
@@ -14,16 +14,13 @@ from sliplens.errors import InputError
 from sliplens.extras import import_cv2, pick
 from sliplens.images import Images
 from sliplens.markers.detect import KINDS
-from sliplens.markers.tracker import MarkerStatus, Tracker, Tracks
+from sliplens.markers.tracker import MarkerStatus, Tracker
 from sliplens.progress import OnProgress, add_note, number_of, report_progress, reporting
 from sliplens.recordings import Dataset
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.sensor import load_profile
 from sliplens.recordings.source import Frame, SourceOptions, Trials, open_trials
 from sliplens.runner import MakePart, Work, require_new_table, run_table
-
-OnTracked: TypeAlias = Callable[[Frame, Tracks], None]
-"""Takes a frame and its markers."""
 
 _ROW_GROUP = 50_000
 _NUMBERS = ("x_px", "y_px", "rest_x_px", "rest_y_px", "dx_px", "dy_px", "radius_px", "deviation_px")
@@ -91,7 +88,6 @@ def track(
     on: str = "serial",
     out: Path | str | None = None,
     overwrite: bool = False,
-    on_tracked: OnTracked | None = None,
     on_progress: OnProgress | None = None,
     **source_options: Unpack[SourceOptions],
 ) -> Tracking:
@@ -112,8 +108,6 @@ def track(
     out
         Parquet file to write; without a suffix a folder, a Parquet data set with a file a trial. It appears when
         complete, and an interrupted call continues after its last trial. If None, rows stay in memory.
-    on_tracked
-        Called with each tracked frame, in this process.
 
     Raises
     ------
@@ -163,13 +157,13 @@ def track(
                 )
             add_note(f"{trial.name}: no untouched frame was named, so displacements count from the first frame.")
         _, rows = run_table(
-            _Following(trials=trials, markers=markers, schema=schema, on_tracked=on_tracked),
+            _Following(trials=trials, markers=markers, schema=schema),
             # a marker is followed from the first frame on: a trial is not cut
             trials.parts(recipe, longest=None),
             path,
             title="Following markers",
             recipe=recipe,
-            resumable=trials.travels and on_tracked is None,
+            resumable=trials.travels,
             on=on,
             overwrite=overwrite,
             on_rows=lambda trial_rows: outcomes.append(_outcome(trial_rows)),
@@ -184,7 +178,6 @@ class _Following(Work):
     trials: Trials
     markers: str
     schema: pa.Schema
-    on_tracked: OnTracked | None
 
     def begin(self) -> MakePart:
         read = self.trials.reader()
@@ -212,8 +205,6 @@ class _Following(Work):
                 **{name: pa.array(numbers[:, at], from_pandas=True) for at, name in enumerate(_NUMBERS)},
             }
             yield pa.table(columns, schema=pa.schema(_COLUMNS))
-            if self.on_tracked is not None:
-                self.on_tracked(frame, tracked)
             report_progress(number + 1, trial.frames)
 
 

@@ -1,12 +1,12 @@
 """Simulated trials of a marker-based fingertip, with exact labels."""
 
-from sliplens.simulation.nuisances import Nuisances, Pulls
-from sliplens.simulation.plan import PRESETS, FrameTotals, SimulationRecipe, TrialPlan, make_recipe, plan_trials
+from sliplens.simulation.nuisances import Nuisances
+from sliplens.simulation.plan import PRESETS, SimulationRecipe, TrialPlan, make_recipe, plan_trials
 from sliplens.simulation.sensor import CHROMATOUCH, FLAT_GEL, SENSORS, Sensor
 from sliplens.simulation.trials import simulate, simulate_dataset, simulate_examples, simulate_trial
 
 __all__ = [
-    "CHROMATOUCH", "FLAT_GEL", "PRESETS", "SENSORS", "FrameTotals", "Nuisances", "Pulls", "Sensor",
+    "CHROMATOUCH", "FLAT_GEL", "PRESETS", "SENSORS", "Nuisances", "Sensor",
     "SimulationRecipe", "TrialPlan", "make_recipe", "plan_trials", "simulate",
     "simulate_dataset", "simulate_examples", "simulate_trial"
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Rendering of a loaded fingertip: light, reference frame and the frames of a trial, on any device."""
+"""Rendering of a loaded fingertip: light, reference frame and the frames of a trial."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -18,7 +18,7 @@ from sliplens.simulation.sensor import Sensor, mix_noise, pick_noise
 Planes: TypeAlias = Float32[np.ndarray, "3 height width"]
 Looks: TypeAlias = Float[np.ndarray, "frames markers 3"]
 
-_BATCHES = {"cpu": 4, "cuda": 512}  # frames drawn at once: few enough for a processor's caches, many enough for a GPU
+_BATCH = 4  # frames drawn at once: few enough for a processor's caches
 _PATCH = 32  # side of the square in which a marker is drawn, in pixels: the edge of the widest marker fades within it
 _WHITE = 258.0  # level that glare is limited to, a little above white: markers in it show, noise does not
 _GRAIN_PX = 2.2  # size of the pressed skin's grain
@@ -85,37 +85,36 @@ class Film:
             noise_picks=np.concatenate([self.noise_picks[:1], pick_noise(frames, rng=rng)]),
         )
 
-    def draw_reference(self, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "height width 3"]:
+    def draw_reference(self) -> UInt8[Tensor, "height width 3"]:
         """Draw the untouched sensor."""
-        return self.untouched().draw(slice(0, 1), device=device)[0]
+        return self.untouched().draw(slice(0, 1))[0]
 
-    def draw(self, frames: slice, *, device: str | torch.device = "cpu") -> UInt8[Tensor, "frames height width 3"]:
+    def draw(self, frames: slice) -> UInt8[Tensor, "frames height width 3"]:
         """Draw some of the frames; a frame does not depend on those drawn with it.
 
         Each marker is drawn in a small patch and added to the frame, so that a frame costs little more than its noise.
-        Devices agree within one grey level: they round sums of four terms in another order.
         """
         # one plane a channel: constants of a channel apply to whole rows of pixels, which vectorises
-        sensor, motion, shade = self.sensor, self.motion, self._shade(frames, device=device)
+        sensor, motion, shade = self.sensor, self.motion, self._shade(frames)
         noise = sensor.noise
-        contrast = _tensor(self.light, device)[:, None] * _channels(sensor.look.contrast, device)
-        planes = torch.addcmul(_tensor(self.empty, device)[:, None], shade, contrast, value=-1)
+        contrast = _tensor(self.light)[:, None] * _channels(sensor.look.contrast)
+        planes = torch.addcmul(_tensor(self.empty)[:, None], shade, contrast, value=-1)
         if self.relief is not None:
             slope = normal_slope(
                 np.sqrt(self._face_distance_squared(frames)),
                 contact_radius_m=motion.contact_radius_m[frames, None, None],
                 sphere_radius_m=sensor.geometry.sphere_radius_m,
             )
-            planes *= 1 + _tensor(np.asarray(slope), device) * _tensor(self.relief, device)[:, None]
-        planes.addcmul_(_tensor(motion.touch[frames], device)[:, None, None], _tensor(self.haze, device)[:, None])
-        background = _channels(noise.background, device)
-        excess, share = _channels(noise.marker, device) - background, shade.clamp_(0, 1)
+            planes *= 1 + _tensor(np.asarray(slope)) * _tensor(self.relief)[:, None]
+        planes.addcmul_(_tensor(motion.touch[frames])[:, None, None], _tensor(self.haze)[:, None])
+        background = _channels(noise.background)
+        excess, share = _channels(noise.marker) - background, shade.clamp_(0, 1)
         strength = torch.addcmul((1 + noise.edge) * excess, share, noise.edge * excess, value=-1)
         strength.mul_(share).add_(background)
         picks = self.noise_picks[frames.start + 1 : frames.stop + 1]
-        planes.addcmul_(strength, mix_noise(picks, noise=noise, image_size_px=sensor.image_size_px, device=device))
+        planes.addcmul_(strength, mix_noise(picks, noise=noise, image_size_px=sensor.image_size_px))
         planes.add_(0.5).clamp_(0, 255)
-        pixels = torch.empty((*planes.shape[1:], 3), dtype=torch.uint8, device=device)
+        pixels = torch.empty((*planes.shape[1:], 3), dtype=torch.uint8)
         for channel, plane in enumerate(planes):  # converts and interleaves in one go
             pixels[..., channel].copy_(plane)
         return pixels
@@ -151,8 +150,8 @@ class Film:
         return self.marker_px[frame], self.look(slice(frame, frame + 1))[0][0].max(axis=-1)
 
     def draw_all(self) -> UInt8[np.ndarray, "frames height width 3"]:
-        """Draw every frame on the processor."""
-        return torch.cat([self.draw(part) for part in batches(len(self), device="cpu")]).numpy()
+        """Draw every frame."""
+        return torch.cat([self.draw(part) for part in batches(len(self))]).numpy()
 
     def contact_map(self, frames: slice) -> UInt8[np.ndarray, "frames height width"]:
         """Compute the contact in the camera's image: 0 outside, 1 slipping, 2 sticking.
@@ -169,34 +168,37 @@ class Film:
             self.rays, contact_centre_m=self.motion.contact_centre_m, indentation_m=self.motion.indentation_m[frames]
         )
 
-    def _shade(self, frames: slice, *, device: str | torch.device) -> Float[Tensor, "3 frames height width"]:
+    def _shade(self, frames: slice) -> Float[Tensor, "3 frames height width"]:
         """Compute the share of the markers' contrast in each pixel: 0 in the background, about 1 in a marker."""
         centres_px, noise, size_px = self.marker_px[frames], self.sensor.noise, self.sensor.image_size_px
-        # markers outside the frame are skipped; the padding takes what of the others sticks out
+        # markers outside the frame are skipped
         inside = np.all((centres_px > -_PATCH / 2) & (centres_px < size_px - 1 + _PATCH / 2), axis=-1)
         frame_index, marker_index = np.nonzero(inside)
-        centres = _tensor(centres_px[inside], device)
+        centres = _tensor(centres_px[inside])
         radius, edge, contrast = (
-            _tensor(values[inside], device).T[:, :, None, None].contiguous() for values in self.look(frames)
+            _tensor(values[inside]).T[:, :, None, None].contiguous() for values in self.look(frames)
         )
         corner = torch.floor(centres).to(torch.int64) - _PATCH // 2 + 1
 
-        steps = torch.arange(_PATCH, device=device)
+        steps = torch.arange(_PATCH)
         dx, dy = (corner[:, axis, None] + steps - centres[:, axis, None] for axis in (0, 1))
         distance = torch.sqrt(dy.square()[:, :, None] + dx.square()[:, None, :])
-        texture = _tensor(self.texture, device)[:, torch.as_tensor(marker_index, device=device)]
-        patch = texture * _channels(noise.ragged_px, device)
+        texture = _tensor(self.texture)[:, torch.as_tensor(marker_index)]
+        patch = texture * _channels(noise.ragged_px)
         patch.add_(radius).sub_(distance).div_(edge).sigmoid_()
-        patch.mul_(texture.mul_(_channels(noise.grain, device)).add_(1))
+        patch.mul_(texture.mul_(_channels(noise.grain)).add_(1))
         patch.mul_(contrast)
-        at_once = patch.device.type != "cpu"
-        return place(patch, corner=corner, frame=frame_index, frames=len(centres_px), size_px=size_px, at_once=at_once)
+        # the padding takes what sticks out; one patch after another is several times faster than a single sum
+        side = size_px + 2 * _PATCH
+        canvas = np.zeros((3, len(centres_px), side, side), dtype=np.float32)
+        for item, (index, (x, y)) in enumerate(zip(frame_index.tolist(), (corner + _PATCH).tolist(), strict=True)):
+            canvas[:, index, y : y + _PATCH, x : x + _PATCH] += patch.numpy()[:, item]
+        return torch.from_numpy(canvas)[:, :, _PATCH:-_PATCH, _PATCH:-_PATCH]
 
 
-def batches(frames: int, *, device: str | torch.device) -> list[slice]:
-    """Cut a trial into batches that suit a device; the frames do not depend on it."""
-    step = _BATCHES.get(torch.device(device).type, 64)
-    return [slice(start, min(start + step, frames)) for start in range(0, frames, step)]
+def batches(frames: int) -> list[slice]:
+    """Cut a trial into batches; the frames do not depend on it."""
+    return [slice(start, min(start + _BATCH, frames)) for start in range(0, frames, _BATCH)]
 
 
 def prepare_film(
@@ -351,36 +353,9 @@ def _planes(image: Float[np.ndarray, "height width 3"]) -> Planes:
     return np.ascontiguousarray(np.moveaxis(image, -1, 0), dtype=np.float32)
 
 
-def place(
-    patch: Float[Tensor, "3 items side side"],
-    *,
-    corner: Int[Tensor, "items 2"],
-    frame: Int[np.ndarray, " items"],
-    frames: int,
-    size_px: int,
-    at_once: bool,
-) -> Float[Tensor, "3 frames height width"]:
-    """Add each patch to its frame, its first pixel at a corner (x, y), cut off at the frame's edge.
-
-    `at_once` suits a GPU; on a processor, one patch after another is several times faster.
-    """
-    side, width, corner = size_px + 2 * _PATCH, patch.shape[-1], corner + _PATCH
-    canvas = torch.zeros((3, frames, side, side), dtype=torch.float32, device=patch.device)
-    if at_once:
-        steps = torch.arange(width, device=patch.device)
-        rows = corner[:, 1:] + steps + side * torch.as_tensor(frame, device=patch.device)[:, None]
-        pixels = rows[:, :, None] * side + (corner[:, :1] + steps)[:, None, :]
-        canvas.view(3, -1).index_add_(1, pixels.reshape(-1), patch.reshape(3, -1))
-    else:
-        target, source = canvas.numpy(), patch.numpy()
-        for item, (index, (column, row)) in enumerate(zip(frame.tolist(), corner.tolist(), strict=True)):
-            target[:, index, row : row + width, column : column + width] += source[:, item]
-    return canvas[:, :, _PATCH:-_PATCH, _PATCH:-_PATCH]
+def _tensor(values: np.ndarray) -> Tensor:
+    return torch.as_tensor(values, dtype=torch.float32)
 
 
-def _tensor(values: np.ndarray, device: str | torch.device) -> Tensor:
-    return torch.as_tensor(values, dtype=torch.float32, device=device)
-
-
-def _channels(values: tuple[float, float, float], device: str | torch.device) -> Float[Tensor, "3 1 1 1"]:
-    return torch.tensor(values, dtype=torch.float32, device=device).reshape(3, 1, 1, 1)
+def _channels(values: tuple[float, float, float]) -> Float[Tensor, "3 1 1 1"]:
+    return torch.tensor(values, dtype=torch.float32).reshape(3, 1, 1, 1)

@@ -18,7 +18,7 @@ from sliplens.mechanics import (
 )
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.simulation.geometry import Frames
-from sliplens.simulation.nuisances import Grasp, Pulls, Touch
+from sliplens.simulation.nuisances import Grasp, Touch
 from sliplens.simulation.sensor import Sensor
 
 _FALL_S = 0.06  # time in which friction falls from static to kinetic once the contact slips (assumed)
@@ -132,15 +132,22 @@ class Loading:
         return parts
 
 
-def draw_pull(
-    pulls: Pulls, *, progress: Frames, duration_s: float, rng: np.random.Generator
-) -> tuple[Frames, Frames, Frames]:
-    """Draw a pull that uses the friction up, from 0 at its beginning to 1 at its end.
+_PULLS_S = (0.8, 8.0)  # from the first tug of a varied pull to the slip, drawn evenly in the logarithm: a decade
+_MOST_EVENTS = 3  # rests, jerks and lettings back of a pull
+_RATE = 3.0  # largest ratio of a ramp's rate to that of the whole pull, before all are scaled to fit
+_REST = (0.05, 0.3)  # length of a rest and of each way of a letting back, over that of the pull
+_JERK_S = (0.03, 0.1)
+_LET_BACK = (0.2, 0.8)  # share of the pull that is let back
 
-    `progress` is the time since the first tug over the duration, from 0 to 1. Returns the used share of the friction,
-    and `let_back` and `retaken` of `Loading`.
+
+def draw_pull(*, progress: Frames, duration_s: float, rng: np.random.Generator) -> tuple[Frames, Frames, Frames]:
+    """Draw a varied pull, which uses the friction up from 0 at its beginning to 1 at its end: a chain of ramps.
+
+    Between ramps the pull rests, jerks, or is let back some way and pulled again. `progress` is the time since the
+    first tug over the duration, from 0 to 1. Returns the used share of the friction, and `let_back` and `retaken` of
+    `Loading`.
     """
-    events = rng.choice(["rest", "jerk", "let back"], size=rng.integers(pulls.most_events + 1))
+    events = rng.choice(["rest", "jerk", "let back"], size=rng.integers(_MOST_EVENTS + 1))
     places = np.append(np.sort(rng.uniform(0.05, 0.95, len(events))), 1.0)
     # time and level of each corner; times are weights at first, except those of jerks
     weights, jerks, levels, backs = [0.0], [0.0], [0.0], []
@@ -152,16 +159,16 @@ def draw_pull(
 
     for place, event in zip(places, [*events, "slip"], strict=True):
         level = max(float(place), levels[-1])
-        go(level, weight=(level - levels[-1]) * pulls.rate ** rng.uniform(-1, 1))
+        go(level, weight=(level - levels[-1]) * _RATE ** rng.uniform(-1, 1))
         if event == "rest":
-            go(level, weight=rng.uniform(*pulls.rest))
+            go(level, weight=rng.uniform(*_REST))
         elif event == "jerk":
             following = float(places[np.searchsorted(places, level, side="right")])
-            go(level + rng.uniform(0.3, 0.9) * (following - level), jerk=rng.uniform(*pulls.jerk_s) / duration_s)
+            go(level + rng.uniform(0.3, 0.9) * (following - level), jerk=rng.uniform(*_JERK_S) / duration_s)
         elif event == "let back":
             backs.append(len(levels))
-            go(level * (1 - rng.uniform(*pulls.let_back)), weight=rng.uniform(*pulls.rest))
-            go(level, weight=rng.uniform(*pulls.rest))
+            go(level * (1 - rng.uniform(*_LET_BACK)), weight=rng.uniform(*_REST))
+            go(level, weight=rng.uniform(*_REST))
     shares = np.array(jerks) + np.array(weights) / sum(weights) * (1 - sum(jerks))
     times = np.cumsum(shares) / shares.sum()
     used = np.interp(progress, times, levels)
@@ -176,17 +183,17 @@ def draw_pull(
 
 
 def load_grasp(
-    grasp: Grasp, *, frames: int, rng: np.random.Generator, release: bool = False, pulls: Pulls | None = None
+    grasp: Grasp, *, frames: int, rng: np.random.Generator, release: bool = False, varied: bool = False
 ) -> Loading:
     """Load a grasp: press to its force, hold, pull until the friction is used up, then slide (`slide`).
 
-    With `release` the normal force falls to nothing while the object slides, and the last frames have no contact. With
-    `pulls` the pull is drawn (`draw_pull`) and the trial lasts as long as that takes; if None the margin falls evenly,
-    in a trial of 8 s.
+    With `release` the normal force falls to nothing while the object slides, and the last frames have no contact. A
+    `varied` pull is drawn (`draw_pull`) and the trial lasts as long as that takes; else the margin falls evenly, in a
+    trial of 8 s.
     """
     if frames < MINIMUM_FRAMES:
         raise ContactError(f"a trial of {frames} frames cannot hold all phases; ask for {MINIMUM_FRAMES} or more")
-    trial_s, (touch, pressed, pull, slip, let_go, gone) = _phase_ends(frames, rng, release=release, pulls=pulls)
+    trial_s, (touch, pressed, pull, slip, let_go, gone) = _phase_ends(frames, rng, release=release, varied=varied)
     index = np.arange(frames)
     progress = index / (frames - 1)
     time_s = index * (trial_s / frames)
@@ -201,8 +208,8 @@ def load_grasp(
     static = grasp.friction * (1 + grasp.friction_drift * (progress - 0.5) * 2)
 
     pulled = np.clip((index - pull) / (slip - pull), 0, 1)
-    if pulls is not None:
-        used, *history = draw_pull(pulls, progress=pulled, duration_s=(slip - pull) * trial_s / frames, rng=rng)
+    if varied:
+        used, *history = draw_pull(progress=pulled, duration_s=(slip - pull) * trial_s / frames, rng=rng)
     else:
         # a slow swing of the puller, small enough that the margin never rises
         swing = rng.uniform(-0.5, 0.5) * np.sin(2 * np.pi * pulled) / (2 * np.pi)
@@ -281,15 +288,13 @@ def _label(
     )
 
 
-def _phase_ends(
-    frames: int, rng: np.random.Generator, *, release: bool, pulls: Pulls | None
-) -> tuple[float, tuple[int, ...]]:
+def _phase_ends(frames: int, rng: np.random.Generator, *, release: bool, varied: bool) -> tuple[float, tuple[int, ...]]:
     """Draw the length of the trial in seconds, and the first frame after each phase."""
     shares, trial_s = np.array((*_PHASES, *(_RELEASE if release else (0.0, 0.0)))), TRIAL_S
     factors = rng.uniform(0.8, 1.2, len(shares))
-    if pulls is not None:
+    if varied:
         seconds = TRIAL_S * shares * factors
-        seconds[3] = np.exp(rng.uniform(*np.log(pulls.duration_s)))
+        seconds[3] = np.exp(rng.uniform(*np.log(_PULLS_S)))
         trial_s = float(seconds.sum())
         shares, factors = np.where(shares > 0, seconds / trial_s, 0), np.ones(len(shares))
     lengths = np.round(frames * shares * factors).astype(int)

@@ -102,44 +102,6 @@ _UPPER |= {"kinetic_ratio": 1.0, "stick_slip_share": 1.0, "illumination_gradient
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pulls:
-    """Ranges of pulls that all differ: chains of ramps, each with its own rate.
-
-    Between ramps the pull rests, jerks, or is let back some way and pulled again. A range that is not positive, runs
-    downwards, or lets back more than the whole pull is a `ContactError`.
-    """
-
-    duration_s: Range = (0.8, 8.0)
-    """From the first tug to the slip, drawn evenly in the logarithm: a decade."""
-    most_events: int = 3
-    """Largest number of rests, jerks and lettings back of a pull."""
-    rate: float = 3.0
-    """Largest ratio of a ramp's rate to that of the whole pull, before all are scaled to fit."""
-    rest: Range = (0.05, 0.3)
-    """Length of a rest and of each way of a letting back, over that of the pull."""
-    jerk_s: Range = (0.03, 0.1)
-    let_back: Range = (0.2, 0.8)
-    """Share of the pull that is let back."""
-
-    def __post_init__(self) -> None:
-        for name in ("duration_s", "rest", "jerk_s", "let_back"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high < np.inf:
-                raise ContactError(f"the range of {name} is ({low}, {high}); give a positive low, then a high")
-        if self.let_back[1] > 1:
-            raise ContactError(f"let_back must be at most 1, got {self.let_back[1]:.3g}; lower its upper end")
-        if self.most_events * self.jerk_s[1] >= self.duration_s[0]:
-            raise ContactError(
-                f"{self.most_events} jerks of {self.jerk_s[1]:.3g} s leave no time in a pull of "
-                f"{self.duration_s[0]:.3g} s; make pulls longer or jerks shorter"
-            )
-        if self.most_events < 0 or not self.rate >= 1:
-            raise ContactError(
-                f"pulls have at least 0 events and a rate of 1 or more, got {self.most_events} and {self.rate:.3g}"
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
 class CameraSetup:
     """Pose and light of a camera: its shift and turn in the image, gain, white balance, light gradient and glare."""
 

@@ -2,9 +2,9 @@
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypedDict, Unpack, cast
+from typing import Literal, TypedDict, Unpack, get_type_hints
 
 import msgspec
 import numpy as np
@@ -14,20 +14,11 @@ from sliplens.errors import InputError
 from sliplens.extras import pick
 from sliplens.files import RUN_FILE, hash_json, read_json, to_builtins
 from sliplens.simulation.loading import MINIMUM_FRAMES
-from sliplens.simulation.nuisances import Day, Nuisances, Pulls, draw_camera, draw_day, mount_camera
+from sliplens.simulation.nuisances import Day, Nuisances, draw_camera, draw_day, mount_camera
 from sliplens.simulation.sensor import CHROMATOUCH, SENSORS, Sensor
 
 # branches of the seed: draws of one never change those of another
 _DAYS, _UNITS, _TRIALS, _CAMERAS = range(4)
-
-
-@dataclass(frozen=True, kw_only=True)
-class FrameTotals:
-    """Frames of each split."""
-
-    train: int
-    validation: int
-    test: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,12 +34,13 @@ class SimulationRecipe:
     """Dealt to the days in turn, or one number for each day."""
     wet_trials: int = 10
     frames_per_trial: int = 200
-    frame_totals: FrameTotals | None = None
-    """Frames of each split, if given: trials then differ in length by a tenth to make them up."""
+    frame_totals: dict[str, int] | None = None
+    """Frames of train, validation and test, if given: trials then differ in length by a tenth to make them up."""
     release: bool = False
     """If True, the object is let go at the end of each trial."""
-    pulls: Pulls | None = None
-    """How pulls differ; if None all last about 5.8 s, so that a sequence of frames shows the time."""
+    pulls: Literal["steady", "varied"] = "steady"
+    """`steady` pulls last about 5.8 s and the margin falls evenly, so that a sequence of frames shows the time; no two
+    `varied` ones are alike."""
     days: int = 4
     test_day: int | None = None
     """The last day if None."""
@@ -85,6 +77,7 @@ class SimulationRecipe:
             ("test_days", self.test_days in range(1, days), f"of {days} days the first trains; ask for fewer"),
             ("test_days", self.test_day is None or self.test_days == 1, "test_day tests alone; ask for 1"),
             ("validation_share", 0 < share < 1, "it must lie between 0 and 1"),
+            ("pulls", self.pulls in {"steady", "varied"}, "choose steady or varied"),
             (
                 "displacement",
                 self.resolved_displacement in self.sensor.displacements,
@@ -111,9 +104,9 @@ class SimulationRecipe:
         return hash_json({"recipe": self.to_json(), "sliplens": __version__})
 
     def to_json(self) -> object:
-        """Return the recipe as `run.json` holds it; None for `pulls` is left out, so that hashes stay."""
+        """Return the recipe as `run.json` holds it; steady pulls are left out, so that hashes stay."""
         fields = to_builtins(self)
-        return fields if self.pulls else {name: value for name, value in fields.items() if name != "pulls"}
+        return {name: value for name, value in fields.items() if name != "pulls" or value != "steady"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,16 +145,12 @@ class RecipeChanges(TypedDict, total=False):
     """Number of days, each with its own friction, stiffness and light; the last one tests."""
     test_days: int | None
     """Number of the last days that test."""
-    sensors: int | None
-    """Number of built sensors."""
     displacement: str | None
     """Motion of the markers. calibrated: as in real ChromaTouch images; half-space: exact contact mechanics."""
     release: bool | None
     """If True, let go of the object at the end of each trial."""
-    pulls: str | None
+    pulls: Literal["steady", "varied"] | None
     """steady: in about 5.8 s, the margin falling evenly; varied: in 0.8 to 8 s, with rests, jerks and reversals."""
-    dry_friction: tuple[float, float] | None
-    """Least and largest coefficient of friction of the dry object."""
     nuisances: Nuisances | None
     """Ranges of everything that varies beside the margin."""
     seed: int | None
@@ -183,8 +172,7 @@ def make_recipe(
     sensor
         Row of `SENSORS`; that of the preset if None.
     changes
-        `pulls`, a row of `PULLS`; `dry_friction`, the least and largest coefficient of friction of the dry object; or
-        fields of `SimulationRecipe`, such as `dry_trials`, `frames_per_trial`, `days` or `seed`. None leaves one as it
+        Fields of `SimulationRecipe`, such as `dry_trials`, `frames_per_trial`, `days` or `seed`. None leaves one as it
         is. With other numbers of trials, days or frames the preset's totals no longer hold.
 
     Raises
@@ -205,10 +193,6 @@ def make_recipe(
         fields["frame_totals"] = None
     if sensor is not None:
         fields["sensor"] = pick(SENSORS, sensor, noun="sensor")
-    if "pulls" in fields:
-        fields["pulls"] = pick(PULLS, cast("str", fields["pulls"]), noun="kind of pulls")
-    if (friction := fields.pop("dry_friction", None)) is not None:
-        fields["nuisances"] = replace(start.nuisances, dry_friction=friction)
     return replace(start, **fields)
 
 
@@ -216,18 +200,10 @@ def read_recipe(folder: Path) -> SimulationRecipe:
     """Read the recipe of a data set from its `run.json`."""
     path = folder / RUN_FILE
     try:
-        stored = read_json(path)["config"]["recipe"]
-        dry_trials = stored["dry_trials"]
-        return SimulationRecipe(
-            **stored
-            | {
-                "dry_trials": tuple(dry_trials) if isinstance(dry_trials, list) else dry_trials,
-                "sensor": SENSORS[stored["sensor"]["name"]],
-                "nuisances": msgspec.convert(stored["nuisances"], Nuisances),
-                "frame_totals": msgspec.convert(stored["frame_totals"], FrameTotals | None),
-                "pulls": msgspec.convert(stored.get("pulls"), Pulls | None),
-            }
-        )
+        stored, hints = read_json(path)["config"]["recipe"], get_type_hints(SimulationRecipe)
+        sensor = SENSORS[stored.pop("sensor")["name"]]
+        fields = {name: msgspec.convert(value, hints[name]) for name, value in stored.items()}
+        return SimulationRecipe(sensor=sensor, **fields)
     except (InputError, KeyError, TypeError, AttributeError, ValueError, ArithmeticError):
         raise InputError(
             f"{path} holds no recipe of simulated trials; give the recipe, or a data set that sliplens simulate made"
@@ -298,10 +274,10 @@ def plan_trials(recipe: SimulationRecipe) -> tuple[TrialPlan, ...]:
     return tuple(plans) if recipe.frame_totals is None else _with_totals(plans, recipe.frame_totals)
 
 
-def _with_totals(plans: Sequence[TrialPlan], totals: FrameTotals) -> tuple[TrialPlan, ...]:
+def _with_totals(plans: Sequence[TrialPlan], totals: dict[str, int]) -> tuple[TrialPlan, ...]:
     """Draw the lengths of the trials so that those of a split sum to its total."""
     lengths: dict[str, int] = {}
-    for split, total in asdict(totals).items():
+    for split, total in totals.items():
         chosen = [plan for plan in plans if plan.split == split]
         if total < MINIMUM_FRAMES * len(chosen) or not chosen:
             raise InputError(
@@ -336,14 +312,12 @@ def _seed(recipe: SimulationRecipe, *branch: int) -> int:
     return int(np.random.SeedSequence(recipe.seed, spawn_key=key).generate_state(2, np.uint64)[0])
 
 
-PULLS: dict[str, Pulls | None] = {"steady": None, "varied": Pulls()}
-"""`steady` pulls last about 5.8 s and the margin falls evenly; no two `varied` ones are alike."""
 PRESETS = {
     "small": SimulationRecipe(dry_trials=96, wet_trials=8, frames_per_trial=48, days=12, series="small"),
     "thesis": SimulationRecipe(
         # 160 training, 20 validation and 21 test trials of about 800 frames
         dry_trials=(100, 40, 40, 11), wet_trials=10, frames_per_trial=800,
-        frame_totals=FrameTotals(train=128_043, validation=15_839, test=16_875),
+        frame_totals={"train": 128_043, "validation": 15_839, "test": 16_875},
         days=4, sensors=1, series="thesis",
         # one sensor for all days: camera and lamps are built into it
         nuisances=Nuisances(

@@ -47,14 +47,13 @@ def pick_noise(frames: int, *, rng: np.random.Generator) -> Int[np.ndarray, "fra
 
 
 def mix_noise(
-    picks: Int[np.ndarray, "frames 2 3"], *, noise: Noise, image_size_px: int, device: str | torch.device
+    picks: Int[np.ndarray, "frames 2 3"], *, noise: Noise, image_size_px: int
 ) -> Float[Tensor, "3 frames size size"]:
     """Compute noise of unit variance for each frame.
 
-    The sum of two windows out of 32 fields repeats after some 10^10 frames, costs two reads and an addition, and is the
-    same on every device.
+    The sum of two windows out of 32 fields repeats after some 10^10 frames, and costs two reads and an addition.
     """
-    bank = _noise_bank(noise, image_size_px + _PLAY_PX, str(device))
+    bank = _noise_bank(noise, image_size_px + _PLAY_PX)
     size = image_size_px
     first, second = (
         torch.stack([bank[:, field, row : row + size, column : column + size] for field, row, column in part], dim=1)
@@ -64,14 +63,14 @@ def mix_noise(
 
 
 @lru_cache(maxsize=4)
-def _noise_bank(noise: Noise, side: int, device: str) -> Float[Tensor, "3 fields side side"]:
+def _noise_bank(noise: Noise, side: int) -> Float[Tensor, "3 fields side side"]:
     """Draw fields of variance 1/2, smooth over neighbours, red and green correlated; always the same."""
     white = np.random.default_rng(0).standard_normal((3, _FIELDS, side + 1, side + 1), dtype=np.float32)
     rows = white[:, :, :-1] + noise.smoothness * white[:, :, 1:]
     smooth = rows[..., :-1] + noise.smoothness * rows[..., 1:]
     smooth /= (1 + noise.smoothness**2) * np.sqrt(2)
     smooth[1] = noise.red_in_green * smooth[0] + np.sqrt(1 - noise.red_in_green**2) * smooth[1]
-    return torch.from_numpy(smooth).to(device)
+    return torch.from_numpy(smooth)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,11 +8,9 @@ from pathlib import Path
 from typing import Unpack
 
 import numpy as np
-import torch
 
 from sliplens.codec import Result
 from sliplens.errors import InputError
-from sliplens.extras import require_device
 from sliplens.files import output_folder, scratch_folder
 from sliplens.progress import OnProgress, number_of, open_stage, report_each, report_file, reporting
 from sliplens.recordings import Dataset, GroundTruth, Recording
@@ -30,7 +28,9 @@ def prepare_trial(plan: TrialPlan, *, change: Callable[[Loading], Loading] | Non
     recipe, sensor = plan.recipe, plan.recipe.sensor
     grasp_rng, load_rng, rng = np.random.default_rng(plan.seed).spawn(3)
     grasp = draw_grasp(recipe.nuisances, day=plan.day_draw, wet=plan.condition == "wet", rng=grasp_rng)
-    loading = load_grasp(grasp, frames=plan.frames, rng=load_rng, release=recipe.release, pulls=recipe.pulls)
+    loading = load_grasp(
+        grasp, frames=plan.frames, rng=load_rng, release=recipe.release, varied=recipe.pulls == "varied"
+    )
     if change is not None:
         loading = change(loading)
     film = prepare_film(
@@ -45,15 +45,15 @@ def prepare_trial(plan: TrialPlan, *, change: Callable[[Loading], Loading] | Non
     return loading, move_camera(film, recipe.nuisances, rng=rng)
 
 
-def simulate_trial(plan: TrialPlan, *, device: str | torch.device = "cpu") -> Recording:
+def simulate_trial(plan: TrialPlan) -> Recording:
     """Simulate one trial."""
     loading, film = prepare_trial(plan)
-    reference = film.draw_reference(device=device).cpu().numpy()
+    reference = film.draw_reference().numpy()
     frames = np.empty((plan.frames, *reference.shape), dtype=np.uint8)
     contact_map = np.empty(frames.shape[:3], dtype=np.uint8)
-    parts = batches(plan.frames, device=device)
+    parts = batches(plan.frames)
     for part in report_each(parts, sizes=[part.stop - part.start for part in parts]):
-        frames[part] = film.draw(part, device=device).cpu().numpy()
+        frames[part] = film.draw(part).numpy()
         contact_map[part] = film.contact_map(part)
     return Recording(
         trial=plan.trial,
@@ -76,14 +76,14 @@ def simulate_trial(plan: TrialPlan, *, device: str | torch.device = "cpu") -> Re
     )
 
 
-def simulate_examples(recipe: SimulationRecipe, *, device: str | torch.device = "cpu") -> list[Recording]:
+def simulate_examples(recipe: SimulationRecipe) -> list[Recording]:
     """Simulate up to four trials that show the range of a recipe, a wet one last."""
     plans = plan_trials(recipe)
     dry = [plan for plan in plans if plan.condition == "dry"]
     wet = [plan for plan in plans if plan.condition == "wet"][:1]
     count = min(4 - len(wet), len(dry))
     chosen = [dry[index * (len(dry) - 1) // max(1, count - 1)] for index in range(count)] + wet
-    return [simulate_trial(plan, device=device) for plan in report_each(chosen)]
+    return [simulate_trial(plan) for plan in report_each(chosen)]
 
 
 def simulate(
@@ -91,7 +91,6 @@ def simulate(
     *,
     preset: str = "small",
     sensor: str | None = None,
-    device: str = "cpu",
     overwrite: bool = False,
     on_progress: OnProgress | None = None,
     **changes: Unpack[RecipeChanges],
@@ -108,13 +107,11 @@ def simulate(
         As in `make_recipe`: `preset="small"` is made for a laptop, `"thesis"` has the days and frames of the thesis;
         `pulls="varied"` makes every pull different; `dry_trials`, `wet_trials`, `days`, `frames_per_trial` or `seed`
         change it.
-    device
-        Where to draw the frames: cpu, cuda or cuda:1. A GPU's pixels may differ by one grey level.
 
     Raises
     ------
     InputError
-        If the recipe cannot be followed, the device is not there, or the folder holds something else.
+        If the recipe cannot be followed, or the folder holds something else.
 
     See Also
     --------
@@ -128,33 +125,32 @@ def simulate(
     >>> len(data.trials), data.trials[0].split
     (3, 'train')
     """
-    require_device(device)
     recipe = make_recipe(preset, sensor=sensor, **changes)
     with reporting(on_progress), ExitStack() as stack:
         if out is None:
             folder = stack.enter_context(scratch_folder())
             with open_stage("Simulating frames"):
-                data = simulate_dataset(folder, recipe, device=device)
+                data = simulate_dataset(folder, recipe)
             weakref.finalize(data, stack.pop_all().close)
             return data
-        config = {"recipe": recipe.to_json(), "device": device}
+        config = {"recipe": recipe.to_json()}
         with output_folder(Path(out), stage="simulate", config=config, overwrite=overwrite) as output:
             if not output.complete:
                 with open_stage("Simulating frames"):
-                    simulate_dataset(output.folder, recipe, device=device)
+                    simulate_dataset(output.folder, recipe)
         data = load_dataset(out)
         size = f"{number_of(len(data.trials), 'trial')}, {number_of(data.frames, 'frame')}"
         report_file(Path(out), size, kept=output.complete)
         return data
 
 
-def simulate_dataset(folder: Path, recipe: SimulationRecipe, *, device: str | torch.device = "cpu") -> Dataset:
+def simulate_dataset(folder: Path, recipe: SimulationRecipe) -> Dataset:
     """Simulate `trials/*.parquet` and, last, `dataset.json` into a folder; existing trials are kept."""
     plans, table = plan_trials(recipe), []
     for plan in report_each(plans, sizes=[plan.frames for plan in plans]):
         path = trial_path(folder, plan.trial)
         if not path.is_file():
-            save_recording(simulate_trial(plan, device=device), path)
+            save_recording(simulate_trial(plan), path)
         elif (truth := read_header(path).truth) is None or truth.recipe != plan.recipe.hash:
             raise InputError(f"{path} was made by another recipe; choose another folder")
         table.append(trial_info(path, split=plan.split))
