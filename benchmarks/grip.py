@@ -22,9 +22,8 @@ import numpy as np
 from sliplens.files import DEFAULT_NETWORK
 from sliplens.friction import GRASP_SPREAD, Friction, SlipLearner
 from sliplens.grip.controllers import make_controller
-from sliplens.grip.episodes import run_episodes, run_scripts
-from sliplens.grip.fingertip import ReadingTable, load_readings
-from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor, Tick
+from sliplens.grip.episodes import GripLoop, Tick, run_episodes, run_scripts
+from sliplens.grip.fingertip import ReadingTable, RenderedSensor, TableSensor, load_readings
 from sliplens.grip.plant import CONDITIONS, OBJECTS, Plant, Scripts, draw_scripts
 from sliplens.grip.records import EpisodeTable
 from sliplens.models import load

@@ -15,7 +15,7 @@ from sliplens.files import DEFAULT_NETWORK
 from sliplens.friction import Friction, SlipLearner
 from sliplens.grip import episodes as episodes_module
 from sliplens.grip.controllers import Controller, MarginLaw, make_controller
-from sliplens.grip.episodes import run_episodes, run_scripts
+from sliplens.grip.episodes import GripLoop, run_episodes, run_scripts
 from sliplens.grip.fingertip import (
     FORCES_N,
     FRICTIONS,
@@ -23,9 +23,10 @@ from sliplens.grip.fingertip import (
     Fingertip,
     MarkerField,
     ReadingTable,
+    RenderedSensor,
+    TableSensor,
     load_readings,
 )
-from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor
 from sliplens.grip.plant import EPISODE_S, OBJECTS, Plant, Scripts, draw_scripts, hand_motion
 from sliplens.grip.records import Grip
 from sliplens.models import Network

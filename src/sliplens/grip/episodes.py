@@ -1,42 +1,56 @@
 """Episodes of a grip: many in parallel by the network's measured errors, or one after another through pixels."""
 
+import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from sliplens.codec import keep_part, load_result, save_result
 from sliplens.errors import InputError
 from sliplens.extras import pick
 from sliplens.files import DEFAULT_NETWORK, output_folder, remove, to_builtins
 from sliplens.friction import Friction, FrictionLike, SlipLearner, as_friction
-from sliplens.grip.controllers import Controller, make_controller
-from sliplens.grip.fingertip import ReadingTable, load_readings, measure_readings, require_calibration
-from sliplens.grip.loop import GripLoop, RenderedSensor, TableSensor, Tick
+from sliplens.grip.controllers import SPRINGS_BACK_S, Controller, Observation, SlipGate, make_controller
+from sliplens.grip.fingertip import (
+    FingertipReading,
+    ReadingTable,
+    RenderedSensor,
+    TableSensor,
+    load_readings,
+    measure_readings,
+    require_calibration,
+)
 from sliplens.grip.plant import (
     EPISODE_S,
+    LATENCY_S,
     LIFT_S,
     OBJECTS,
     PERIOD_S,
     Episodes,
     Plant,
+    PlantState,
     Scripts,
+    World,
     draw_scripts,
     least_force,
 )
 from sliplens.grip.records import EpisodeTable, Grip, GripSetup, GripTrace
+from sliplens.live.slip import SlipBatch
 from sliplens.models import Network
 from sliplens.models.wrapping import open_run
 from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_file, reporting
 
 _BATCH = 500  # episodes stepped together: few enough for a processor's caches
 _MEASURED = 32  # fingertips by which the errors of a network without a table are measured
+_STILL_FRAMES = 30  # frames of the untouched fingertips before they close, for the noise of the markers
 _TICKS = round(EPISODE_S / PERIOD_S)
 _HANGS_S = LIFT_S + 0.1  # time from which the least force counts: the object hangs in the hand
 
@@ -205,6 +219,86 @@ def _run_batch(
     if learners:
         done = replace(done, known_friction=np.array([frictions[row].mean for row in rows]))
     return Grip(setup=setup, seconds=0.0, episodes=done, trace=_trace(ticks))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tick:
+    """One turn of the loop."""
+
+    world: World
+    """Loads on the objects during the step."""
+    state: PlantState
+    """State after the step."""
+    command_n: Episodes
+    reading: FingertipReading
+    """Measurement before the step; the controller gets an earlier one."""
+    slip: Bool[np.ndarray, " episodes"]
+    """True where the controller is told of a slip."""
+
+
+class GripLoop:
+    """Plant, fingertip sensor and controller in a loop of 60 Hz."""
+
+    def __init__(
+        self,
+        plant: Plant,
+        sensor: TableSensor | RenderedSensor | None,
+        controller: Controller,
+        *,
+        latency_s: float = LATENCY_S,
+    ) -> None:
+        self.plant, self.sensor, self.controller = plant, sensor, controller
+        delay = math.ceil(latency_s / PERIOD_S - 1e-9)
+        self._past: deque[tuple[PlantState, FingertipReading, Bool[np.ndarray, " episodes"]]] = deque(maxlen=delay + 1)
+        self._fingers: list[tuple[SlipBatch, SlipGate]] = []
+        """Detector and gate of each finger, as in a real hold."""
+        self._forces: deque[Episodes] = deque(maxlen=round(SPRINGS_BACK_S / PERIOD_S) + 1)
+        if sensor is not None:
+            rest, *still = sensor.still_markers(_STILL_FRAMES)
+            self._fingers = [(SlipBatch(places), SlipGate()) for places in rest]
+            for number, frame in enumerate(still):
+                for (batch, _), places in zip(self._fingers, frame, strict=True):
+                    batch.update(places, (number - len(still)) * PERIOD_S)
+        self._command_n = np.zeros(len(plant.state.force_n))
+        self._slipping_s = np.full(len(plant.state.force_n), np.nan)
+
+    def tick(self, world: World, *, dark: Bool[np.ndarray, "episodes 2"] | None = None) -> Tick:
+        """Measure, command and step; `dark` fingers have no margin and no markers."""
+        now, count = self.plant.state, len(self._command_n)
+        nothing, slip, slipped_s = np.full((count, 2), np.nan), np.zeros(count, dtype=bool), np.full(count, np.nan)
+        reading = FingertipReading(margin=nothing, low=nothing, high=nothing)
+        if self.sensor is not None:
+            reading = self.sensor.measure(now, self._slipping_s)
+            markers = reading.markers_px
+            if dark is not None:
+                visible = {name: np.where(dark, np.nan, getattr(reading, name)) for name in ("margin", "low", "high")}
+                markers = [
+                    np.where(hidden[:, None, None], np.nan, at) for hidden, at in zip(dark.T, markers, strict=True)
+                ]
+                reading = replace(reading, markers_px=markers, **visible)
+            self._forces.append(now.force_n)
+            for (batch, gate), places in zip(self._fingers, markers, strict=True):
+                states = batch.update(places, now.time_s)
+                slip |= gate.update(
+                    states.slip, since_touch_s=now.held_s, force_n=now.force_n, earlier_n=self._forces[0]
+                )
+                slipped_s = np.fmax(slipped_s, states.slipped_s)
+            self._slipping_s = slipped_s + PERIOD_S  # at the next measurement
+        self._past.append((now, reading, slip))
+        then, earlier, slip = self._past[0]
+        observation = Observation(
+            time_s=now.time_s,
+            force_n=then.force_n,
+            command_n=self._command_n,
+            load_n=then.load_n,
+            margin=earlier.margin,
+            low=earlier.low,
+            slip=slip,
+            true_margin=np.nan_to_num(then.margin, nan=1.0),
+        )
+        self._command_n = np.asarray(self.controller.command(observation), dtype=np.float64)
+        state = self.plant.step(self._command_n, world)
+        return Tick(world=world, state=state, command_n=self._command_n, reading=reading, slip=slip)
 
 
 def run_scripts(

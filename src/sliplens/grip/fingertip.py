@@ -1,23 +1,28 @@
-"""Simulated fingertips in any state of their contact: images, markers, and a network's errors on them."""
+"""Simulated fingertips in any state of their contact: images, markers, and predictions of a network for them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from threadpoolctl import ThreadpoolController
+from torch import Tensor
 
 from sliplens.codec import load_result
 from sliplens.errors import InputError
 from sliplens.files import find_run, shipped_names
-from sliplens.grip.plant import PlantState
+from sliplens.friction import SlipLearner
+from sliplens.grip.plant import Episodes, Fingers, PlantState
+from sliplens.markers import Tracker
 from sliplens.models import Network, make_engine
 from sliplens.models.predictions import LEVEL
 from sliplens.progress import report_each
 from sliplens.results.evaluation import ANSWER, MARGIN
 from sliplens.simulation.filming import Film, prepare_film, see_markers
+from sliplens.simulation.intervention import NOISE_PX
 from sliplens.simulation.loading import load_at_margins, load_at_states
 from sliplens.simulation.nuisances import Day, Nuisances, draw_day, draw_grasp, draw_unit
 from sliplens.simulation.sensor import CHROMATOUCH, Sensor
@@ -305,3 +310,156 @@ def load_readings(run: Network) -> ReadingTable | None:
             if table.network == run.manifest.weights_sha256:
                 return table
     return None
+
+
+Markers: TypeAlias = Float[np.ndarray, "_ _ 2"]
+"""Positions of a fingertip's markers, in pixels (x, y), by episode and marker."""
+_GAUSSIAN_90 = 1.645  # standard deviations to either side that hold 90 % of a Gaussian
+
+
+@dataclass(frozen=True, kw_only=True)
+class FingertipReading:
+    """Margins and markers of both fingertips at one moment; NaN without a margin."""
+
+    margin: Float[np.ndarray, "episodes 2"]
+    low: Float[np.ndarray, "episodes 2"]
+    high: Float[np.ndarray, "episodes 2"]
+    markers_px: Sequence[Markers] = ()
+    """Positions (x, y) of the markers of both fingertips; empty without markers."""
+
+
+class TableSensor:
+    """Predictions looked up in the measured errors of a network, with noise.
+
+    Where the friction is known, the margin is the expected value of 1 - ratio / mu over the distribution of mu.
+    """
+
+    def __init__(
+        self,
+        table: ReadingTable,
+        *,
+        fingertips: Float[np.ndarray, " episodes"],
+        rng: np.random.Generator,
+        error_scale: float = 1.0,
+        learners: Sequence[SlipLearner] = (),
+    ) -> None:
+        pair = fingertips.astype(np.int64) % (len(table) // 2)
+        pairs, self._gripper = np.unique(pair, return_inverse=True)
+        self._field = MarkerField((table.seed + 2 * pairs).tolist())
+        self._table, self._tips = table, 2 * pair[:, None] + np.arange(2)
+        self._rng, self._scale, self._learners = rng, error_scale, learners
+        if learners and not table.ratio:
+            raise InputError("friction needs F_t / F_n, but this table has margins alone; measure a ratio network")
+
+    def still_markers(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
+        """Return the markers of both untouched fingertips: at rest, then as followed in some frames."""
+        rest = self._field.rest_px[self._gripper]
+        return [(rest[:, 0], rest[:, 1]), *(self._follow(rest) for _ in range(frames))]
+
+    def _follow(self, places_px: Float[np.ndarray, "episodes 2 markers 2"]) -> tuple[Markers, Markers]:
+        """Add the noise of a tracker to the markers of each finger."""
+        followed = self._rng.standard_normal(places_px.shape)
+        followed *= NOISE_PX
+        followed += places_px
+        return followed[:, 0], followed[:, 1]
+
+    def measure(self, state: PlantState, slipping_s: Episodes) -> FingertipReading:
+        """Measure both fingertips of every episode."""
+        pressing = np.isfinite(state.margin)
+        true = np.where(pressing, state.margin, 1.0)
+        force = np.broadcast_to(state.force_n[:, None], true.shape)
+        friction, table, scale = state.holding_friction, self._table, self._scale
+        margin, low, high, *ratio = table.read(self._tips, force, friction=friction, margins=true)
+        noise = self._rng.standard_normal(true.shape)
+        if self._learners:
+            traction = np.where(state.sliding, state.kinetic_ratio[:, None], 1 - true)
+            traction = np.where(pressing, state.friction * traction, 0.0)
+            measured = traction + scale * (ratio[0] - traction + table.ratio_noise * noise)
+            for learner, since_s, mean, sigma in zip(
+                self._learners, slipping_s, measured.mean(axis=1), scale * ratio[1].mean(axis=1), strict=True
+            ):
+                learner.update(state.time_s, slipping_s=None if np.isnan(since_s) else float(since_s))
+                learner.note(float(mean), sigma=float(sigma), time_s=state.time_s)
+            margin, low, high = _margin_of_ratio(measured, scale * ratio[1], self._learners)
+        else:
+            change = (scale - 1) * (margin - true) + table.noise * scale * noise
+            low, high = (end + change + (scale - 1) * (end - margin) for end in (low, high))
+            margin = margin + change
+        places = self._field.at(
+            self._gripper, state.force_n, friction=friction, margins=true, pulled_back=state.shear_n < 0
+        )
+        return FingertipReading(
+            margin=np.where(pressing, margin, 1.0),
+            low=np.where(pressing, np.clip(low, 0, 1), 1.0),
+            high=np.where(pressing, np.clip(high, 0, 1), 1.0),
+            markers_px=self._follow(places),
+        )
+
+
+def _margin_of_ratio(ratio: Fingers, sigma: Fingers, learners: Sequence[SlipLearner]) -> tuple[Fingers, ...]:
+    """Compute the margin and its 90 % interval from F_t / F_n and the friction of each episode."""
+    nodes = [learner.friction.nodes for learner in learners if learner.friction is not None]
+    most = max(len(values) for values, _ in nodes)
+    values, weights = (np.stack([np.pad(pair[row], (0, most - len(pair[row]))) for pair in nodes]) for row in (0, 1))
+    values, weights = np.where(values > 0, values, 1.0)[:, None], weights[:, None]
+    margins = np.clip(1 - ratio[..., None] / values, 0, 1)
+    margin = (weights * margins).sum(axis=-1)
+    variance = (weights * ((margins - margin[..., None]) ** 2 + (sigma[..., None] / values) ** 2)).sum(axis=-1)
+    reach = _GAUSSIAN_90 * np.sqrt(variance)
+    return margin, margin - reach, margin + reach
+
+
+class RenderedSensor:
+    """Predictions of a network for drawn images of two fingertips, with their markers followed; for one episode.
+
+    While the network predicts one finger's frame, the other finger's markers are followed and frame is drawn, by one
+    thread each: threads that share many short steps wait for each other.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        *,
+        seed: int,
+        engine: str = "auto",
+        frames: int = 4000,
+        learner: SlipLearner | None = None,
+    ) -> None:
+        first = Fingertip(seed=seed)
+        self.fingertips = (first, Fingertip(seed=seed + 1, day=first.day))
+        self._network, self._threads, self._learner = network, ThreadpoolController(), learner
+        with self._threads.limit(limits=1):
+            self._engine = make_engine(engine, network, frames=frames, batch_size=1)
+        self._trackers = [Tracker(tip.reference) for tip in self.fingertips]
+
+    def still_markers(self, frames: int) -> Sequence[tuple[Markers, Markers]]:
+        """Return the markers of both untouched fingertips: at rest, then as followed in some frames."""
+        first, second = (
+            [tracker.rest.centre_px[None]]
+            + [tracker.update(tip.draw(0.0, friction=1.0, margin=1.0)).position_px[None] for _ in range(frames)]
+            for tip, tracker in zip(self.fingertips, self._trackers, strict=True)
+        )
+        return list(zip(first, second, strict=True))
+
+    def measure(self, state: PlantState, slipping_s: Episodes) -> FingertipReading:
+        """Draw both fingertips, predict their margins and follow their markers."""
+        markers_px: list[Markers] = []
+
+        def inputs() -> Iterator[Tensor]:
+            for finger, (tip, tracker) in enumerate(zip(self.fingertips, self._trackers, strict=True)):
+                with self._threads.limit(limits=1):
+                    frame = tip.draw_state(state, finger=finger)
+                    encoded = self._network.encode(frame[None], tip.reference)
+                yield encoded
+                with self._threads.limit(limits=1):
+                    markers_px.append(tracker.update(frame).position_px[None])
+
+        friction, learner = None, self._learner
+        if learner is not None:
+            learner.update(state.time_s, slipping_s=None if np.isnan(slipping_s[0]) else float(slipping_s[0]))
+            friction = learner.friction
+        estimate = self._network.estimate(inputs(), friction=friction, engine=self._engine)
+        if learner is not None and (ratio := estimate.ratio) is not None:
+            learner.note(float(ratio.mean.mean()), sigma=float(ratio.sigma.mean()), time_s=state.time_s)
+        low, high = estimate.interval(LEVEL) or (estimate.margin, estimate.margin)
+        return FingertipReading(margin=estimate.margin[None], low=low[None], high=high[None], markers_px=markers_px)

@@ -4,7 +4,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, TypedDict, Unpack, get_type_hints
+from typing import TypedDict, Unpack, get_type_hints
 
 import msgspec
 import numpy as np
@@ -38,7 +38,7 @@ class SimulationRecipe:
     """Frames of train, validation and test, if given: trials then differ in length by a tenth to make them up."""
     release: bool = False
     """If True, the object is let go at the end of each trial."""
-    pulls: Literal["steady", "varied"] = "steady"
+    pulls: str = "steady"
     """`steady` pulls last about 5.8 s and the margin falls evenly, so that a sequence of frames shows the time; no two
     `varied` ones are alike."""
     days: int = 4
@@ -149,7 +149,7 @@ class RecipeChanges(TypedDict, total=False):
     """Motion of the markers. calibrated: as in real ChromaTouch images; half-space: exact contact mechanics."""
     release: bool | None
     """If True, let go of the object at the end of each trial."""
-    pulls: Literal["steady", "varied"] | None
+    pulls: str | None
     """steady: in about 5.8 s, the margin falling evenly; varied: in 0.8 to 8 s, with rests, jerks and reversals."""
     nuisances: Nuisances | None
     """Ranges of everything that varies beside the margin."""
