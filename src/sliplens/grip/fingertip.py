@@ -276,7 +276,7 @@ def measure_readings(run: Network, *, fingertips: int = 96, seed: int = 0, engin
             force_n, friction, margins = (values[drawn][rows] for values in (force, mu, gamma))
             film = tip.film(force_n, friction=friction, margins=margins, held_s=np.ones(len(rows)))
             frames.append(film.draw_all())
-        estimate = ready.estimate(run, run.encode(np.concatenate(frames), tip.reference))
+        estimate = run.estimate(run.encode(np.concatenate(frames), tip.reference), engine=ready)
         ends = estimate.interval(LEVEL)
         assert ends is not None  # it is calibrated
         ratio = [] if estimate.ratio is None else [estimate.ratio.mean, estimate.ratio.sigma]
