@@ -138,7 +138,7 @@ def write_math(translator: HTML5Translator, node: nodes.math | nodes.math_block)
 def complete_docstring(_app: Sphinx, what: str, name: str, thing: object, _options: object, lines: list[str]) -> None:
     """Add the name of a module, what it exports, and the pages of the gallery that use a name."""
     # bars are absolute values, |T_n - T_0|, not substitutions of reStructuredText
-    lines[:] = [line.replace("|", r"\|") for line in lines]
+    lines[:] = [re.sub(r"docs/(\w+)\.md", r":doc:`/\1`", line.replace("|", r"\|")) for line in lines]
     if what == "module" and isinstance(thing, ModuleType):
         names = [
             one

@@ -82,7 +82,8 @@ def run_episodes(
     object
         Row of `OBJECTS`.
     controller
-        Row of `CONTROLLERS`, or an object with `command(observation)`, of which each batch of episodes gets a copy.
+        Row of `CONTROLLERS` (docs/grip.md), or an object with `command(observation)`, of which each batch of episodes
+        gets a copy.
     condition
         Row of `CONDITIONS`, from which the episodes are drawn.
     episodes, seed

@@ -99,7 +99,7 @@ def track(
         Data set, folder of images, video, bag, uint8 RGB frames (frames, height, width, 3), or captures of
         `open_source`.
     markers
-        Row of `KINDS`.
+        Row of `KINDS` (docs/markers.md).
     source_options
         `reference`, `reference_frame`, `split`, `trial`, `format`, `options` and `sensor` of `open_source`. Without a
         reference, displacements count from the first frame.

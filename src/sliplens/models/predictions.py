@@ -157,7 +157,7 @@ def predict(
         `open_source`. Images without a reference are taken for difference images, compared before.
     friction
         Coefficient of friction of the object, for a network that predicts F_t / F_n: a number, (low, high), or a
-        `Friction`, such as one learnt from slips. If None, any friction of the training is possible.
+        `Friction`, such as one learnt from slips (docs/networks.md). If None, any friction of the training is possible.
     sequence
         If True, predict each trial in order and correct a frame by the frames of its contact before it (`Follower`).
         It needs the times of the frames, and no `friction`.

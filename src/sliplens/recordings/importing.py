@@ -67,8 +67,8 @@ def import_recordings(
 ) -> Dataset:
     """Import recordings and label every frame with its safety margin.
 
-    Tare, axes, sign, lag and friction are estimated from each trial unless `labelling` gives them. Labels that come
-    with a recording stay. An import that was interrupted goes on where it stopped.
+    Tare, axes, sign, lag and friction are estimated from each trial unless `labelling` gives them (docs/recordings.md).
+    Labels that come with a recording stay. An import that was interrupted goes on where it stopped.
 
     Parameters
     ----------

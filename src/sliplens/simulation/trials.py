@@ -97,7 +97,7 @@ def simulate(
 ) -> Dataset:
     """Simulate a data set of labelled trials.
 
-    An interrupted call continues after the last whole trial when it is repeated with the same `out`.
+    docs/simulation.md has the mechanics. An interrupted call with the same `out` continues after the last whole trial.
 
     Parameters
     ----------

@@ -102,8 +102,9 @@ def explain(
         and recordings, `untouched` for arrays and folders of images, or `black` where there is no reference. Where no
         stick frame is found, the untouched sensor takes its place, with a warning.
     method
-        Row of `EXPLAINERS`, an explainer such as `get_explainer("occlusion", tile_px=8)`, or several of them. If None,
-        Shapley values of the markers (`RECOMMENDED_METHOD`), or of tiles where no markers are found.
+        Row of `EXPLAINERS` (docs/explainers.md), an explainer such as `get_explainer("occlusion", tile_px=8)`, or
+        several of them. If None, Shapley values of the markers (`RECOMMENDED_METHOD`), or of tiles where no markers are
+        found.
     budget
         Share of the channels that `poly-cam` measures at first; below 1 it is faster. If None, 1 for one frame and 0.15
         for several.

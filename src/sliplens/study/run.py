@@ -85,7 +85,7 @@ def run_study(
 
     Evaluates the networks on the test trials, chooses trials on which they predict well, explains frames from full
     stick to full slip, scores the explanations by removal under several fills against controls, by randomisation and,
-    where the data are simulated, by the truth.
+    where the data are simulated, by the truth (docs/study.md).
     Every step is a folder that is complete or absent: interrupted, the same call goes on where it stopped.
 
     Parameters
