@@ -1,13 +1,9 @@
-"""How many trials of a new sensor a network must be shown: adapted from one that is there, and trained from scratch.
+"""How many trials of a new sensor a network needs: adapted from another network, and trained from scratch.
 
-Three sensors that no network of the package has seen: a dome with other rings of markers in another colour, the flat
-gel, and the ChromaTouch's dome behind another lens, under other lamps. Of each, one piece is built; its owner records
-dry trials on some days, takes them in turn from all days, and holds out a fifth (one at least). The test is ten other
-days of the same piece, dry and wet. The recipe was chosen on other days, pieces and trials of these
-sensors, whose seeds share nothing with those of the test. From scratch means the recipe `default` with as many images.
-
-What was trained is kept in `--cache`, by the hash of all that shaped it: an interrupted run goes on, and a change
-trains only what it changes.
+Three sensors new to every network of the package: a dome with other rings of markers, the flat gel, and the ChromaTouch
+dome behind another lens. Of each one piece is built; dry trials of some days are recorded, a fifth is held out. The
+test is ten other days of the same piece, dry and wet. The recipe was chosen on other days, pieces and trials. From
+scratch means the recipe `default` with as many images. Results are kept in `--cache` by the hash of their settings.
 """
 
 import argparse

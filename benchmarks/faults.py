@@ -1,14 +1,10 @@
-"""How labels stand up to faults of the force sensor and to what is easily taken for one, in simulated trials.
+"""Labels under faults of the force sensor and events that resemble them, in simulated trials.
 
-14 kinds of faults at three strengths, and 10 of events and settings (`contact_events.py`): friction or slip given, a
-fast release, slips that are sudden or that the image hardly shows, a pull that is let go, tilted axes, an image or
-forces at rest.
-
-Each trial is filmed once, seen through noise, offset, lag, turned axes and a wrong sign, and labelled
-without a fault and with each. Of the valid labels is told how many are off by more than 3 sigma, or have no truth; of
-the frames that are valid without a fault, and that no faulty sample comes near, how many still are. Trials alternate
-between forces of 500 and of 100 samples a second, and between held to the end and let go. Shares have standard errors
-over trials.
+14 kinds of faults at three strengths, and 10 of events and settings (`contact_events.py`). Each trial is filmed once,
+recorded with noise, offset, lag, turned axes and a wrong sign, and labelled without a fault and with each. Of the valid
+labels: how many are off by more than 3 sigma, or have no truth; of the frames valid without a fault and far from faulty
+samples: how many still are. Trials alternate between 500 and 100 samples a second, and between held to the end and
+released. Shares have standard errors over trials.
 """
 
 import argparse

@@ -1,13 +1,10 @@
-"""Delay, misses and false alarms of the slip that markers alone tell, on simulated grips whose onset is known.
+"""Delay, misses and false alarms of slip detection from markers, on simulated grips with a known onset.
 
-Each trial is pressed, held and pulled until it slips; its frames are drawn at 60 a second, their markers followed, and
-given to `SlipDetector` as a running sensor would. The onset is the first frame without margin. A slip that is told
-within half a second of it is found, later it is missed; one that is told before it is a false alarm. Seeds below 100
-were looked at while thresholds were chosen, and those from 100 on once before; the benchmark takes others. With
---positions the markers' true places with 0.1 px of noise stand in for drawing and following, which takes a hundredth of
-the time.
-
-With --clips, real GelSight Mini clips of lifts: only whether a slip was told at all is known of each.
+Each trial is pressed, held and pulled until it slips; its frames are drawn at 60 a second, their markers tracked, and
+given to `SlipDetector` as by a running sensor. The onset is the first frame without margin. A slip within half a second
+of it is detected, later it is missed; one before it is a false alarm. Thresholds were chosen on seeds below 200. With
+--positions the true marker positions with 0.1 px of noise replace drawing and tracking, in a hundredth of the time.
+With --clips, real GelSight Mini clips of lifts, of which only slip or not is known.
 """
 
 import argparse
