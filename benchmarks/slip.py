@@ -2,7 +2,7 @@
 
 Each trial is pressed, held and pulled until it slips; its frames are drawn at 60 a second, their markers tracked, and
 given to `SlipDetector` as by a running sensor. The onset is the first frame without margin. A slip within half a second
-of it is detected, later it is missed; one before it is a false alarm. Thresholds were chosen on seeds below 200. With
+of it is detected, later it is missed; one before it is a false alarm. Thresholds were chosen on seeds below 100. With
 --positions the true marker positions with 0.1 px of noise replace drawing and tracking, in a hundredth of the time.
 With --clips, real GelSight Mini clips of lifts, of which only slip or not is known.
 """
