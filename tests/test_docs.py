@@ -1,6 +1,7 @@
 """What the documentation and its gallery name is there: imports, calls and their arguments, files."""
 
 import ast
+import functools
 import importlib
 import inspect
 import re
@@ -15,6 +16,8 @@ import pytest
 
 import sliplens
 from house import sentences
+from sliplens.cli.app import adapt
+from sliplens.cli.commands import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").rglob("plot_*.py"))
@@ -143,6 +146,22 @@ def test_what_a_page_trains_and_evaluates_on_has_trials_for_it(page: Path):
             for data in imported.keys() & set(words[1:]):
                 needed = {"train": "--validation-trials", "evaluate": "--test-trials"}.get(words[0])
                 assert needed is None or {needed, "--splits"} & set(imported[data]), words
+
+
+@functools.cache
+def options_of(name: str) -> set[str]:
+    """Options of a command of sliplens."""
+    _, names = adapt(COMMANDS[name])
+    options = {f"--{prefix}{name.replace('_', '-')}" for name in names for prefix in ("", "no-")}
+    return options | {alias for _, alias in COMMANDS[name].aliases} | {"-o", "--output", "--help"}
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.suffix == ".md"], ids=lambda page: page.stem)
+def test_what_a_page_types_is_a_command_with_its_options(page: Path):
+    for _, code in _CODE.findall(page.read_text(encoding="utf-8")):
+        for words in command_lines(code):
+            name = " ".join(words[:2]) if " ".join(words[:2]) in COMMANDS else words[0]
+            assert {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)} <= options_of(name)
 
 
 def rows_of(page: str) -> list[list[str]]:
