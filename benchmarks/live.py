@@ -6,8 +6,9 @@
     python benchmarks/live.py --ratios --json       # one network over another, in two minutes
 
 `p50_ms` and `p99_ms` are from the moment a replayed frame is due to its margin, over the frames that have one, while a
-headless Chromium beside it draws the page (`--page browser`); `p99_ms_with_maps` is the same while the page shows maps,
-twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
+headless Chromium beside it draws the page (`--page browser`); `p50_first_ms` and `p99_first_ms` are to its first event,
+before markers, slip, focus, light, camera and direction are checked; `p99_ms_with_maps` is the same while the page
+shows maps, twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
 the end than after the first 10 seconds (or a tenth of a shorter run), `page_ms_a_second` the processor time of the
 page's threads. `of_it_ms` is the mean time of each part over the slowest hundredth of the frames: `network` is what a
 frame waits for that after its checks, `waiting` what none of them took.
@@ -29,6 +30,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
+from itertools import cycle, islice
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -95,20 +97,29 @@ def browser(address: str) -> Iterator[None]:
                 process.terminate()
 
 
+def repeat_frames(frames: np.ndarray, *, seconds: float) -> ReplaySource:
+    """Replay frames over and over, for so many seconds."""
+    count = round(RATE_HZ * seconds)
+    capture, time_s = open_source(frames)[0], np.arange(count) / RATE_HZ
+    return ReplaySource(replace(capture, frame_time_s=time_s, read_frames=lambda: islice(cycle(frames), count)))
+
+
 def measure(
     frames: np.ndarray, untouched: np.ndarray, *, network: Network, seconds: float, shown: bool, maps: bool
 ) -> dict[str, object]:
     """Read a repeated grip for a while, with a page or without, and maps on it or not."""
     network = replace(network, manifest=replace(network.manifest, frame_size=SIZE))
-    source = ReplaySource(open_source(frames)[0], rate_hz=RATE_HZ, repeat=True)
+    source = repeat_frames(frames, seconds=seconds + OPENS_S + 60)
     # made beforehand, so that what is kept here does not look like memory that grows
-    table = np.full((round(1.1 * RATE_HZ * seconds) + 600, 2 + len(PARTS)), -1.0)
-    kept, last, begins_s = [0], [""], [np.inf]
+    table = np.full((round(1.1 * RATE_HZ * seconds) + 600, 3 + len(PARTS)), -1.0)
+    kept, last, begins_s, first_ms = [0], [""], [np.inf], [np.inf]
     memory_mb = np.full(round(seconds) + 10, -1.0)
-    dropped = [0, 0]
-    settles_s = min(10.0, seconds / 10)
+    dropped, settles_s = [0, 0], min(10.0, seconds / 10)
 
     def keep(reading: Reading, frame: LiveFrame | None) -> None:
+        if not reading.complete:
+            first_ms[0] = reading.latency.total_ms
+            return
         if frame is None or reading.time_s < begins_s[0]:
             dropped[0] = reading.dropped
             return
@@ -118,7 +129,14 @@ def measure(
         waiting_ms = spent.total_ms - spent.checks_ms - spent.encode_ms - spent.network_ms
         if kept[0] == len(table):
             return
-        table[kept[0]] = (reading.margin is not None, spent.total_ms, waiting_ms, *own_ms)
+        table[kept[0]] = (
+            reading.margin is not None,
+            spent.total_ms,
+            min(spent.total_ms, *first_ms),
+            waiting_ms,
+            *own_ms,
+        )
+        first_ms[0] = np.inf
         kept[0] += 1
         last[0] = str(reading.withheld)
         dropped[1] = reading.dropped
@@ -127,7 +145,7 @@ def measure(
             memory_mb[since_s] = resident_mb()
 
     reader = sl.LiveReader(source, network, reference=untouched)  # for hours, as far as it knows
-    reader.subscribe(keep)
+    reader.subscribe(keep, early=True)
     pictures, explained, spent_s = set[int](), set[int](), 0.0
     with ExitStack() as stack:
         stack.enter_context(reader)
@@ -139,7 +157,7 @@ def measure(
                 for viewer in tuple(page.feed.clients):
                     viewer.shows_map = maps
                 pictures |= set() if page.feed.picture is None else {page.feed.picture.frame.number}
-                explained |= set() if page.feed.map is None else {page.feed.map.facts.number}
+                explained |= set() if page.feed.map is None else {page.feed.map.number}
             if np.isinf(begins_s[0]) and (page is None or page.feed.picture is not None):
                 begins_s[0] = reading.time_s + WARM_S
             if reading.time_s < begins_s[0]:
@@ -155,7 +173,10 @@ def measure(
         raise SystemExit(f"no frame had a margin, so there is nothing to measure; the last: {last[0]}")
     memory_mb = memory_mb[memory_mb >= 0]
     return {
-        **summarise(rows[:, 0], rows[:, 1:]),
+        **summarise(rows[:, 0], rows[:, 2:]),
+        **dict(
+            zip(("p50_first_ms", "p99_first_ms"), np.quantile(rows[:, 1], (0.5, 0.99)).round(2).tolist(), strict=True)
+        ),
         "drops": dropped[1] - dropped[0],
         "memory_growth_mb": round(float(memory_mb[-1] - memory_mb[0]), 1) if len(memory_mb) else 0.0,
         "readings": kept[0],

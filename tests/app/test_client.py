@@ -36,10 +36,8 @@ class Wire:
         self.closed = code
 
     async def send(self, message: bytes) -> None:
-        length = int.from_bytes(message[:4], "little")
-        header = json.loads(message[4 : 4 + length])
-        if "settings" not in header:
-            await self.sent.put(header)
+        if "settings" not in (told := json.loads(message)):
+            await self.sent.put(told)
 
     async def recv(self) -> str:
         answer = await self.answers.get()
@@ -104,7 +102,7 @@ def test_a_slow_client_sees_the_picture_move():
             if number > 2:  # it answers after the next reading has come, never before
                 await wire.draw(owed.pop(0))
             owed.append(await wire.next())
-        assert all(message["picture_bytes"] for message in owed)  # pictures that are new
+        assert all(message["picture"] for message in owed)  # pictures that are new
         assert feed.picture is not None
         assert feed.picture.frame.number >= 4
 

@@ -71,7 +71,7 @@ MISTAKES = {
     "track DATA -o OUT.parquet --video OUT.mp4 --trial train-dry-0 --on processes": "leave out --on, or --video",
     "track FRAMES/good -o OUT.parquet --reference-frame 9": "has no frame 9",
     "track FRAMES/good -o OUT.parquet": "one frame and no reference",
-    "view DATA --trial nobody -o OUT.rrd": "has no trial nobody; it has train-dry-0, ",
+    "view DATA --trial nobody -o OUT.rrd": "has no trial nobody; choose one such as train-dry-0",
     "view DATA -o OUT.html": "does not end in .rrd",
     "view NOTHING": "does not exist",
     "live 99": "the camera /dev/video99 is not there; plug it in",

@@ -18,31 +18,34 @@ from sliplens.recordings.capture import Forces
 SIDE = 112
 
 
+class Scene:
+    """Dark spots on a bright ground, whose untouched picture a monitor has."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        rows, columns = np.mgrid[:SIDE, :SIDE]
+        spots = (np.cos(rows / 2.5) * np.cos(columns / 2.5)).clip(0.2, 0.6)
+        self.rng, self.untouched = rng, 190 - 150 * spots[..., None] * np.array([0.8, 1.0, 0.6])
+        self.monitor = HealthMonitor(self.shot(touches=False).image)
+
+    def shot(
+        self, picture: np.ndarray | None = None, *, number: int = 0, time_s: float = 0.0, touches: bool = True
+    ) -> LiveFrame:
+        """A noisy frame, touched in its middle."""
+        touched = (self.untouched if picture is None else picture).copy()
+        touched[40:72, 40:72] += 12 * touches
+        pixels = np.clip(touched + self.rng.normal(0, 2, touched.shape), 0, 255).astype(np.uint8)
+        return LiveFrame(image=pixels, number=number, time_s=time_s, captured_s=time.monotonic())
+
+    def check(self, frame: LiveFrame) -> dict[str, Check]:
+        return {check.name: check for check in self.monitor.check(frame)}
+
+    def failed(self, frame: LiveFrame) -> set[str]:
+        return {name for name, check in self.check(frame).items() if not check.ok}
+
+
 @pytest.fixture
-def untouched(rng: np.random.Generator) -> np.ndarray:
-    """Dark spots on a bright ground, without noise."""
-    rows, columns = np.mgrid[:SIDE, :SIDE]
-    spots = (np.cos(rows / 2.5) * np.cos(columns / 2.5)).clip(0.2, 0.6)
-    return (190 - 150 * spots[..., None] * np.array([0.8, 1.0, 0.6])).astype(np.float64)
-
-
-def shot(
-    picture: np.ndarray, rng: np.random.Generator, *, number: int = 0, time_s: float = 0.0, touches: bool = True
-) -> LiveFrame:
-    """A noisy frame, touched in its middle."""
-    touched = picture.copy()
-    touched[40:72, 40:72] += 12 * touches
-    pixels = np.clip(touched + rng.normal(0, 2, touched.shape), 0, 255).astype(np.uint8)
-    return LiveFrame(image=pixels, number=number, time_s=time_s, captured_s=time.monotonic())
-
-
-def failed(checks: tuple[Check, ...]) -> set[str]:
-    return {check.name for check in checks if not check.ok}
-
-
-@pytest.fixture
-def monitor(untouched: np.ndarray, rng: np.random.Generator) -> HealthMonitor:
-    return HealthMonitor(np.clip(untouched + rng.normal(0, 2, untouched.shape), 0, 255).astype(np.uint8))
+def scene(rng: np.random.Generator) -> Scene:
+    return Scene(rng)
 
 
 def blurred(picture: np.ndarray) -> np.ndarray:
@@ -53,26 +56,24 @@ def blurred(picture: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("rate_hz", "frames"), [(60.0, 3), (30.0, 3), (5.0, 1)])
 def test_what_changes_slowly_takes_turns_and_is_told_within_a_tenth_of_a_second(
-    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator, rate_hz: float, frames: int
+    scene: Scene, rate_hz: float, frames: int
 ):
     for number in range(4):
-        checks = monitor.check(shot(untouched, rng, number=number, time_s=number / rate_hz))
-        assert failed(checks) == set()
-        ages_s = {check.name: check.age_s for check in checks}
+        checks = scene.check(scene.shot(number=number, time_s=number / rate_hz))
+        assert all(check.ok for check in checks.values())
+        ages_s = {name: check.age_s for name, check in checks.items()}
         assert max(ages_s.values()) < 0.1
         assert {name for name, age_s in ages_s.items() if age_s > 0} <= {"focus", "light", "camera"}
-    bare = np.roll(untouched, 3, axis=1)  # of an untouched sensor: in a contact a shift does not count
+    bare = np.roll(scene.untouched, 3, axis=1)  # of an untouched sensor: in a contact a shift does not count
     times_s = (4 + np.arange(frames)) / rate_hz
-    told = [failed(monitor.check(shot(bare, rng, time_s=time_s, touches=False))) for time_s in times_s]
+    told = [scene.failed(scene.shot(bare, time_s=time_s, touches=False)) for time_s in times_s]
     assert "camera" in told[-1]
     assert times_s[-1] - times_s[0] < 0.1
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.3])
-def test_exposure_tells_the_factor(
-    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator, factor: float
-):
-    checks = {check.name: check for check in monitor.check(shot(factor * untouched, rng))}
+def test_exposure_tells_the_factor(scene: Scene, factor: float):
+    checks = scene.check(scene.shot(factor * scene.untouched))
     assert not checks["exposure"].ok
     assert checks["exposure"].value == pytest.approx(abs(np.log2(factor)), abs=0.03)
     assert f"{factor:.2g} times as bright as the reference; fix exposure" in checks["exposure"].sentence
@@ -81,16 +82,13 @@ def test_exposure_tells_the_factor(
 
 
 @pytest.mark.parametrize(("down", "along"), [(2, 0), (0, -3), (3, 3)])
-def test_a_camera_that_moved_is_told_in_pixels(
-    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator, down: int, along: int
-):
-    moved = np.roll(untouched, (down, along), axis=(0, 1))
+def test_a_camera_that_moved_is_told_in_pixels(scene: Scene, down: int, along: int):
+    moved = np.roll(scene.untouched, (down, along), axis=(0, 1))
     for touches, time_s in ((False, 0.0), (True, 1.0)):  # before a contact, and therefore in it
-        frame = shot(moved, rng, time_s=time_s, touches=touches)
-        checks = {check.name: check for check in monitor.check(frame)}
+        check = scene.check(scene.shot(moved, time_s=time_s, touches=touches))["camera"]
         # in pixels of a picture 224 high
-        assert checks["camera"].value == pytest.approx(2 * np.hypot(down, along), rel=0.1)
-    assert "take a new reference" in checks["camera"].sentence
+        assert check.value == pytest.approx(2 * np.hypot(down, along), rel=0.1)
+    assert "take a new reference" in check.sentence
 
 
 def covered(level: float, picture: np.ndarray) -> np.ndarray:
@@ -107,40 +105,32 @@ def covered(level: float, picture: np.ndarray) -> np.ndarray:
         (partial(covered, 265.0), "saturation"),
     ],
 )
-def test_a_fault_of_the_picture_fails_its_check(
-    fault: Callable[[np.ndarray], np.ndarray],
-    name: str,
-    monitor: HealthMonitor,
-    untouched: np.ndarray,
-    rng: np.random.Generator,
-):
-    assert name in failed(monitor.check(shot(fault(untouched), rng)))
+def test_a_fault_of_the_picture_fails_its_check(fault: Callable[[np.ndarray], np.ndarray], name: str, scene: Scene):
+    assert name in scene.failed(scene.shot(fault(scene.untouched)))
 
 
-def test_frames_that_repeat_come_late_or_are_lost_are_told(
-    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator
-):
-    frame = shot(untouched, rng)
-    assert failed(monitor.check(frame)) == set()
-    assert failed(monitor.check(replace(frame, number=1, time_s=0.1))) == set()
-    assert failed(monitor.check(replace(frame, number=2, time_s=0.3))) == {"repeated"}
-    assert failed(monitor.check(shot(untouched, rng, number=3, time_s=0.4))) == set()
-    late = shot(untouched, rng, number=4, time_s=0.5)
-    assert failed(monitor.check(replace(late, captured_s=late.captured_s - 2))) == {"late"}
-    assert failed(monitor.check(shot(untouched, rng, number=90, time_s=0.6))) == {"drops"}
+def test_frames_that_repeat_come_late_or_are_lost_are_told(scene: Scene):
+    frame = scene.shot()
+    assert scene.failed(frame) == set()
+    assert scene.failed(replace(frame, number=1, time_s=0.1)) == set()
+    assert scene.failed(replace(frame, number=2, time_s=0.3)) == {"repeated"}
+    assert scene.failed(scene.shot(number=3, time_s=0.4)) == set()
+    late = scene.shot(number=4, time_s=0.5)
+    assert scene.failed(replace(late, captured_s=late.captured_s - 2)) == {"late"}
+    assert scene.failed(scene.shot(number=90, time_s=0.6)) == {"drops"}
 
 
-def stopping(untouched: np.ndarray, rng: np.random.Generator, *, rows: slice, force_n: float | None) -> list[LiveFrame]:
+def stopping(scene: Scene, *, rows: slice, force_n: float | None) -> list[LiveFrame]:
     """Frames of a picture that deepens, some rows of which stop after the third, by a load that grows meanwhile."""
     frames = []
     for number in range(12):
         depth = np.full((SIDE, 1, 1), number)
         depth[rows] = min(number, 2)
-        time_s = number / 30
-        forces = None
+        frame, forces = scene.shot(scene.untouched - 2.0 * depth, number=number, time_s=number / 30), None
         if force_n is not None:
-            forces = Forces(time_s=np.array([time_s]), force_n=np.array([[0.0, 0.0, force_n * number]]), source="test")
-        frames.append(replace(shot(untouched - 2.0 * depth, rng, number=number, time_s=time_s), forces=forces))
+            force = np.array([[0.0, 0.0, force_n * number]])
+            forces = Forces(time_s=np.array([frame.time_s]), force_n=force, source="test")
+        frames.append(replace(frame, forces=forces))
     return frames
 
 
@@ -156,26 +146,16 @@ def stopping(untouched: np.ndarray, rng: np.random.Generator, *, rows: slice, fo
     ],
 )
 def test_what_shows_noise_alone_while_something_else_changes_is_frozen(
-    *,
-    monitor: HealthMonitor,
-    untouched: np.ndarray,
-    rng: np.random.Generator,
-    rows: slice,
-    force_n: float | None,
-    expected: set[str],
+    scene: Scene, rows: slice, force_n: float | None, expected: set[str]
 ):
-    checks = [monitor.check(frame) for frame in stopping(untouched, rng, rows=rows, force_n=force_n)]
-    assert failed(checks[-1]) & {"halves", "frozen"} == expected
-    assert failed(checks[2]) & {"halves", "frozen"} == set()
+    told = [scene.failed(frame) & {"halves", "frozen"} for frame in stopping(scene, rows=rows, force_n=force_n)]
+    assert (told[2], told[-1]) == (set(), expected)
 
 
-def test_without_a_touch_there_is_nothing_to_tell(
-    monitor: HealthMonitor, untouched: np.ndarray, rng: np.random.Generator
-):
-    bare = np.clip(untouched + rng.normal(0, 2, untouched.shape), 0, 255).astype(np.uint8)
-    checks = monitor.check(LiveFrame(image=bare, number=0, time_s=0.0, captured_s=0.0))
-    assert failed(checks) == {"touch"}
-    assert max(map(severity, checks)) > 1
+def test_without_a_touch_there_is_nothing_to_tell(scene: Scene):
+    checks = scene.check(scene.shot(touches=False))
+    assert {name for name, check in checks.items() if not check.ok} == {"touch"}
+    assert max(map(severity, checks.values())) > 1
 
 
 def test_markers_that_are_hidden_are_counted(trials: dict[str, Recording]):

@@ -76,9 +76,9 @@ def wait_until(condition: Callable[[], object], *, within_s: float = 10.0) -> No
 
 
 def record(folder: Path, frames: list[LiveFrame], recording: Recording) -> Dataset | None:
-    recorder = Recorder(folder, facts=FACTS, source="a camera", reference=recording.reference)
+    recorder = Recorder(folder, facts=FACTS, source="a camera")
     for frame in frames:
-        recorder.add(frame)
+        recorder.add(frame, recording.reference)
     return recorder.close()
 
 
@@ -206,15 +206,15 @@ def room_for(size: int) -> Iterator[None]:
 
 def test_a_full_disk_stops_the_recording_and_keeps_what_is_there(tmp_path: Path, rng: np.random.Generator):
     images = rng.integers(0, 255, (12, 48, 48, 3), dtype=np.uint8)  # 7 kB each, however they are coded
-    recorder = Recorder(tmp_path / "data", reference=images[0])
+    recorder = Recorder(tmp_path / "data")
     with room_for(50_000):
         for number, image in enumerate(images):
-            recorder.add(LiveFrame(image=image, number=number, time_s=float(number), captured_s=0.0))
-        wait_until(lambda: recorder.state.sent + recorder.state.lost == 12)
-    state = recorder.state
+            recorder.add(LiveFrame(image=image, number=number, time_s=float(number), captured_s=0.0), images[0])
+        wait_until(lambda: recorder.outlet.sent + recorder.outlet.lost == 12)
+    state = recorder.outlet
     assert 0 < state.sent < 8
     assert state.lost == 12 - state.sent
-    assert f"stopped after {state.sent} frames" in str(state.trouble)
+    assert f"stopped after {state.sent} were recorded" in str(state.trouble)
     assert "make room, and record again: what is there stays" in str(state.trouble)
     data = recorder.close()
     assert data is not None
@@ -226,10 +226,10 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_is_there(tmp_path: Path,
 
 
 def test_a_disk_that_is_full_at_the_end_keeps_the_journal(recording: Recording, tmp_path: Path):
-    recorder = Recorder(tmp_path / "data", reference=recording.reference)
+    recorder = Recorder(tmp_path / "data")
     for frame in frames_of(recording):
-        recorder.add(frame)
-    wait_until(lambda: recorder.state.sent == 12)
+        recorder.add(frame, recording.reference)
+    wait_until(lambda: recorder.outlet.sent == 12)
     with room_for(5_000), pytest.raises(OSError, match="large"):
         recorder.close()
     data = recover_dataset(tmp_path / "data")
@@ -237,17 +237,14 @@ def test_a_disk_that_is_full_at_the_end_keeps_the_journal(recording: Recording, 
 
 
 def test_a_new_reference_a_clock_that_jumps_and_another_size_begin_a_trial(recording: Recording, tmp_path: Path):
-    recorder = Recorder(tmp_path / "data", facts=FACTS, reference=recording.reference)
+    recorder = Recorder(tmp_path / "data", facts=FACTS)
     frames = frames_of(recording)
     for frame in frames:
-        recorder.add(frame)
+        recorder.add(frame, recording.reference)
     other = recording.reference + np.uint8(1)
-    recorder.set_reference(other)
-    for frame in frames_of(recording, begin_s=50.0):
-        recorder.add(frame)
-    for frame in frames[:3]:  # the clock begins anew
-        recorder.add(frame)
-    recorder.add(LiveFrame(image=np.zeros((24, 24, 3), dtype=np.uint8), number=9, time_s=99.0, captured_s=0.0))
+    for frame in [*frames_of(recording, begin_s=50.0), *frames[:3]]:  # the clock begins anew
+        recorder.add(frame, other)
+    recorder.add(LiveFrame(image=np.zeros((24, 24, 3), dtype=np.uint8), number=9, time_s=99.0, captured_s=0.0), other)
     data = recorder.close()
     assert data is not None
     assert [(info.trial, info.frames) for info in data.trials] == [

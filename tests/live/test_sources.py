@@ -7,11 +7,10 @@ import pytest
 
 import sliplens as sl
 from sliplens.errors import InputError
-from sliplens.live import LiveOptions, ReplaySource, SimulatedSource, open_live
+from sliplens.live import LiveOptions, SimulatedSource, open_live
 from sliplens.mechanics import safety_margin
 from sliplens.recordings import Dataset, Recording
 from sliplens.recordings.sensor import SensorProfile
-from sliplens.recordings.source import open_source
 
 
 def test_a_trial_is_replayed_whole_with_its_labels_and_forces(small_dataset: Dataset):
@@ -36,15 +35,6 @@ def test_no_frame_comes_before_its_time(small_dataset: Dataset, speed: float):
     spans = [(frame.captured_s - frames[0].captured_s) * speed for frame in frames]
     # clocks of the system tick in steps
     assert all(span >= frame.time_s - 1e-3 for span, frame in zip(spans, frames, strict=True))
-
-
-def test_a_repeated_trial_goes_on_counting(recording: Recording):
-    capture = open_source(recording.frames)[0]
-    with ReplaySource(capture, rate_hz=1000.0, repeat=True) as source:
-        frames = [frame for frame, _ in zip(source.frames(), range(30), strict=False)]
-    assert [frame.number for frame in frames] == list(range(30))
-    assert np.all(np.diff([frame.time_s for frame in frames]) > 0)
-    np.testing.assert_array_equal(frames[13].image, recording.frames[1])
 
 
 def test_a_closed_source_ends_soon(recording: Recording):

@@ -17,7 +17,7 @@ import sliplens as sl
 from sliplens.errors import InputError
 from sliplens.images import read_image, write_png
 from sliplens.live import viewer as viewer_process
-from sliplens.recordings import Dataset, Recording
+from sliplens.recordings import Recording
 from sliplens.results.explanation import ExplainedFrame, Explanation, MethodNotes
 from sliplens.simulation import PRESETS, plan_trials, simulate_trial
 
@@ -25,7 +25,6 @@ rerun = pytest.importorskip("rerun")
 chunk = pytest.importorskip("rerun.chunk")
 
 FRAMES = 20  # more than are sent together, and no multiple of them
-LAG_S = 0.05
 
 
 class Rows(NamedTuple):
@@ -63,8 +62,13 @@ def rows(entities: dict[str, list[pa.RecordBatch]], entity: str, component: str)
     )
 
 
-def numbers(entities: dict[str, list[pa.RecordBatch]], entity: str) -> np.ndarray:
-    return np.array(rows(entities, entity, "Scalars:scalars").values, dtype=np.float64).squeeze(-1)
+def shown(entities: dict[str, list[pa.RecordBatch]], entity: str, component: str) -> tuple[list[int], list[Any]]:
+    """Frames with a value of a component, and these values."""
+    if not any(component in batch.schema.names for batch in entities[entity]):
+        return [], []
+    found = rows(entities, entity, component)
+    frames = zip(there(found.frame).tolist(), found.values, strict=True)
+    return [at for at, value in frames if value is not None], [value for value in found.values if value is not None]
 
 
 def pictures(entities: dict[str, list[pa.RecordBatch]], entity: str) -> np.ndarray:
@@ -94,94 +98,49 @@ def simulated(written: Path) -> dict[str, list[pa.RecordBatch]]:
     return read_rrd(written)
 
 
-def test_frames_come_back_pixel_by_pixel(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
+def test_frames_and_margins_come_back_as_they_are(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
     np.testing.assert_array_equal(pictures(simulated, "frame"), trial.frames)
-    np.testing.assert_array_equal(pictures(simulated, "reference"), trial.reference[None])
-    assert rows(simulated, "reference", "EncodedImage:blob").time_ns is None
-
-
-def test_differences_are_those_of_signed_numbers_four_times_as_bright(
-    trial: Recording, simulated: dict[str, list[pa.RecordBatch]]
-):
-    difference = np.abs(trial.frames.astype(int) - trial.reference)
-    np.testing.assert_array_equal(pictures(simulated, "difference"), np.minimum(4 * difference, 255))
-
-
-def test_labels_and_forces_are_those_of_the_recording(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
-    expected = {
-        "force/normal": trial.normal_force_n,
-        "force/tangential": trial.tangential_force_n,
-        "force/limit": trial.friction_coefficient * trial.normal_force_n,
-        "label/margin": trial.safety_margin,
-    }
-    for entity, values in expected.items():
-        np.testing.assert_array_equal(numbers(simulated, entity), values)
-    assert np.isnan(numbers(simulated, "label/margin")).any()  # before the contact there is none
-
-
-def test_truth_lies_over_the_pixels_it_belongs_to(trial: Recording, simulated: dict[str, list[pa.RecordBatch]]):
-    truth = there(trial.truth)
-    buffers = rows(simulated, "frame/zones", "SegmentationImage:buffer").values
-    maps = np.stack([np.array(one, dtype=np.uint8).reshape(trial.reference.shape[:2]) for (one,) in buffers])
-    np.testing.assert_array_equal(maps, truth.contact_map)
-    # a pixel's centre is a whole number here, and a half more in Rerun
-    markers = np.array(rows(simulated, "frame/markers", "Points2D:positions").values, dtype=np.float32)
-    np.testing.assert_allclose(markers, truth.marker_px + 0.5, atol=1e-4)
-
-
-def test_a_trial_without_truth_keeps_its_gaps(trial: Recording, tmp_path: Path):
-    margin, normal = trial.safety_margin.copy(), trial.normal_force_n.copy()
-    margin[8:11], normal[12] = np.nan, np.nan
-    sigma = np.where(np.isnan(margin), np.nan, 0.04)
-    bare = replace(trial, truth=None, safety_margin=margin, normal_force_n=normal, safety_margin_sigma=sigma)
-    data = save_dataset(tmp_path / "data", bare)
-    sl.view(data.folder, out=tmp_path / "a.rrd")
-    found = read_rrd(tmp_path / "a.rrd")
-    np.testing.assert_array_equal(numbers(found, "label/margin"), margin)
-    np.testing.assert_array_equal(numbers(found, "force/normal"), normal)
-    high, low = (numbers(found, f"label/{name}") for name in ("high", "low"))
-    np.testing.assert_allclose((high + low) / 2, margin, rtol=1e-12)
-    np.testing.assert_allclose((high - low) / 2, sigma, rtol=1e-9)
-    np.testing.assert_array_equal(pictures(found, "frame"), trial.frames)
+    frames, margins = shown(simulated, "true", "Scalars:scalars")
+    assert frames == np.flatnonzero(np.isfinite(trial.safety_margin)).tolist()  # before the contact there is none
+    np.testing.assert_array_equal(np.ravel(margins), trial.safety_margin[frames])
+    times_ns = there(rows(simulated, "frame", "EncodedImage:blob").time_ns)
+    np.testing.assert_array_equal(times_ns, np.round(1e9 * trial.time_s).astype(np.int64))
 
 
 def test_what_networks_and_trackers_say_stands_on_the_clock_of_the_frames(trial: Recording, tmp_path: Path):
     data, frames = save_dataset(tmp_path / "data", trial), np.arange(0, FRAMES, 2)
-    rng = np.random.default_rng(3)
-    margin = rng.uniform(0, 1, len(frames))
+    margin = np.random.default_rng(3).uniform(0, 1, len(frames))
     own = {"trial": [trial.trial] * len(frames), "frame": frames, "prediction": margin, "low_90": margin - 0.1}
     # another trial in the same table, and a network that tells no upper end
     others = {**own, "trial": ["other"] * len(frames), "prediction": margin + 1}
     table = pa.concat_tables([pa.table(others), pa.table(own)]).append_column(
         "high_90", pa.array([None] * (2 * len(frames)), pa.float64())
     )
-    pq.write_table(table, tmp_path / "margins.parquet")
-    positions = trial.truth.marker_px[:, :3].copy() if trial.truth is not None else np.empty((0, 3, 2))
+    positions = there(trial.truth).marker_px[:, :3].copy()
     positions[5, 1] = np.nan
-    flat = positions.reshape(-1, 2)
-    place = {"frame": np.repeat(np.arange(FRAMES), 3), "marker": np.tile(np.arange(3), FRAMES)}
-    tracks = pa.table({"trial": [trial.trial] * len(flat), **place, "x_px": flat[:, 0], "y_px": flat[:, 1]})
-    pq.write_table(tracks, tmp_path / "tracks.parquet")
-    maps = explained_of(trial, [3, 4, 9])
+    flat, rest = positions.reshape(-1, 2), np.tile(positions[0], (FRAMES, 1))
+    tracks = pa.table({
+        "trial": [trial.trial] * len(flat), "frame": np.repeat(np.arange(FRAMES), 3),
+        "rest_x_px": rest[:, 0], "rest_y_px": rest[:, 1], "x_px": flat[:, 0], "y_px": flat[:, 1],
+    })  # fmt: skip
     margins, followed = tmp_path / "margins.parquet", tmp_path / "tracks.parquet"
+    pq.write_table(table, margins)
+    pq.write_table(tracks, followed)
+    maps = explained_of(trial, [3, 4, 9])
     sl.view(data.folder, predictions=margins, maps=maps, tracks=followed, out=tmp_path / "a.rrd")
     found = read_rrd(tmp_path / "a.rrd")
-    read = rows(found, "margin", "Scalars:scalars")
-    np.testing.assert_array_equal(read.frame, frames)
-    np.testing.assert_allclose(numbers(found, "margin"), margin)
-    np.testing.assert_allclose(numbers(found, "interval/low"), margin - 0.1)
-    assert not any("Scalars:scalars" in batch.schema.names for batch in found["interval/high"])
-    np.testing.assert_array_equal(read.time_ns, np.round(1e9 * trial.time_s[frames]).astype(np.int64))
-    followed = rows(found, "frame/markers", "Points2D:positions").values
-    moving = [points for points in followed if points is not None]
-    assert [len(points) for points in moving][5] == 2
-    np.testing.assert_allclose(moving[4], positions[4] + 0.5, atol=1e-3)
-    shown = rows(found, "map/poly-cam", "EncodedImage:blob")
-    drawn = zip(there(shown.frame).tolist(), shown.values, strict=True)
-    assert [at for at, blob in drawn if blob is not None] == [3, 4, 9]
-    cleared = rows(found, "map/poly-cam", "Clear:is_recursive")
-    undrawn = zip(there(cleared.frame).tolist(), cleared.values, strict=True)
-    assert [at for at, one in undrawn if one is not None] == [5, 10]
+    for entity, expected in {"margin": margin, "interval/low": margin - 0.1, "interval/high": np.array([])}.items():
+        at, values = shown(found, entity, "Scalars:scalars")
+        assert at == frames.tolist()[: len(expected)]
+        np.testing.assert_allclose(np.ravel(values), expected)
+    _, starts = shown(found, "frame/markers", "Arrows2D:origins")
+    _, ways = shown(found, "frame/markers", "Arrows2D:vectors")
+    assert [len(arrows) for arrows in ways][5] == 2
+    # a pixel's centre is a whole number here, and a half more in Rerun
+    np.testing.assert_allclose(np.array(starts[4]), positions[0] + 0.5, atol=1e-3)
+    np.testing.assert_allclose(np.array(ways[4]), positions[4] - positions[0], atol=1e-3)
+    assert shown(found, "map/poly-cam", "EncodedImage:blob")[0] == [3, 4, 9]
+    assert shown(found, "map/poly-cam", "Clear:is_recursive")[0] == [5, 10]
 
 
 def test_what_is_of_another_trial_is_refused(trial: Recording, tmp_path: Path):
@@ -204,16 +163,13 @@ def test_frames_of_any_source_and_explained_ones_are_viewed_alike(trial: Recordi
     (tmp_path / "images").mkdir()
     for number, image in enumerate(trial.frames):
         write_png(tmp_path / "images" / f"{number:02}.png", image)
-    write_png(tmp_path / "untouched.png", trial.reference)
-    sl.view(tmp_path / "images", reference=tmp_path / "untouched.png", out=tmp_path / "a.rrd")
-    found = read_rrd(tmp_path / "a.rrd")
-    np.testing.assert_array_equal(pictures(found, "frame"), trial.frames)
-    np.testing.assert_array_equal(pictures(found, "reference"), trial.reference[None])
+    sl.view(tmp_path / "images", out=tmp_path / "a.rrd")
+    np.testing.assert_array_equal(pictures(read_rrd(tmp_path / "a.rrd"), "frame"), trial.frames)
     maps = explained_of(trial, [3, 9])
     sl.view(maps, out=tmp_path / "b.rrd")
     found = read_rrd(tmp_path / "b.rrd")
     np.testing.assert_array_equal(pictures(found, "frame"), maps.pictures)
-    np.testing.assert_allclose(numbers(found, "label/margin"), trial.safety_margin[[3, 9]])
+    np.testing.assert_allclose(np.ravel(shown(found, "true", "Scalars:scalars")[1]), trial.safety_margin[[3, 9]])
 
 
 def explained_of(trial: Recording, frames: list[int]) -> Explanation:
@@ -241,15 +197,6 @@ def explained_of(trial: Recording, frames: list[int]) -> Explanation:
         pictures=trial.frames[frames],
         relevance={"poly-cam": relevance},
     )
-
-
-def test_an_interruption_leaves_no_file(small_dataset: Dataset, tmp_path: Path):
-    def interrupt(done: int, total: int) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        sl.view(small_dataset.folder, out=tmp_path / "a.rrd", on_progress=interrupt)
-    assert not list(tmp_path.iterdir())
 
 
 class Begun(NamedTuple):

@@ -36,6 +36,7 @@ _KEEP_ALIVE_S = 1.0  # the page takes a longer silence for a lost connection
 _RATE_S = 2.0
 _LARGEST = {"press_n": 3.0, "pull_n": 2.4, "water_kg": 0.06, "grip_pull_n": 0.6}
 """Ends of the sliders."""
+_STILL = "waiting for a still picture: leave the sensor untouched"
 _Source = TypeVar("_Source", bound=LiveSource)
 
 
@@ -43,7 +44,7 @@ class ClientMessage(msgspec.Struct, forbid_unknown_fields=True):
     """Message of a browser: the answer to a message, or a button, key or slider with its values."""
 
     act: str
-    """`drawn`, a row of `_SHORT` or `_LONG`."""
+    """`drawn`, or a row of `_ACTS`."""
     serial: int = -1
     """Message that was drawn."""
     method: str = RECOMMENDED_METHOD
@@ -118,18 +119,17 @@ class Client:
             self._unanswered.discard(command.serial)
             self.answered += 1
             self._changed.set()
-        elif command.act not in _LONG:
-            await self._act(command)
         elif command.act not in self._running:
             self._running[command.act] = task = asyncio.create_task(self._act(command))
             task.add_done_callback(lambda _: self._running.pop(command.act))
+            if command.act not in _LONG:
+                await task
 
     async def _act(self, command: ClientMessage) -> None:
         try:
-            if command.act in _LONG:
-                await _LONG[command.act](self, command)
-            else:
-                pick(_SHORT, command.act, noun="button")(self, command)
+            done = pick(_ACTS, command.act, noun="button")(self, command)
+            if isinstance(done, Awaitable):
+                await done
         except (SliplensError, OSError) as error:
             self._notices.append(str(error))
         self.wake()
@@ -143,9 +143,10 @@ class Client:
 
     def begin_object(self) -> None:
         """Forget the friction of the object, and show what its slips taught."""
-        lesson = self.feed.reader.lesson
+        learnt = self.feed.reader.learnt
         self.feed.reader.new_object()
-        self._notices.append(lesson or "nothing is known of the friction of the new object")
+        last = "" if learnt is None else f"; the last one's friction was {learnt}"
+        self._notices.append(f"nothing is known of the friction of the new object{last}")
 
     def freeze(self) -> None:
         """Stop at the picture on the screen, or let it run again."""
@@ -190,7 +191,7 @@ class Client:
             "controllers": list(CONTROLLERS),
             "record_into": str(self._record_into),
         }
-        await connection.send(_join({"settings": settings}))
+        await connection.send(msgspec.json.encode({"settings": settings}))
         while True:
             with suppress(TimeoutError):
                 async with asyncio.timeout(_KEEP_ALIVE_S):  # `wait_for` of Python 3.11 may miss that it is cancelled
@@ -202,25 +203,27 @@ class Client:
                 await connection.send(self._message())
 
     def _message(self) -> bytes:
-        """Make a message: length of the header in 4 bytes, the header as JSON, the JPEG and the cells of the map."""
+        """Make a message as JSON, with the JPEG and the cells of the map in base 64."""
         feed, reader, now_s = self.feed, self.feed.reader, time.monotonic()
         picture = self.frozen or feed.picture
         has_margin = feed.reading is not None and feed.reading.margin is not None
         overlay = self.explained if self.frozen is not None else feed.map if has_margin else None
         overlay = overlay if self.shows_map else None
         is_new = picture is not None and (picture is not self._picture or self._sent_arrows is not self.shows_arrows)
-        jpeg = picture.jpeg if picture is not None and is_new else b""
-        cells = overlay.cells if overlay is not None and overlay is not self._map else b""
-        facts = frozen = None
-        if picture is not None and jpeg:
+        drawn = frozen = recording = None
+        if picture is not None and is_new:
             height, width = picture.frame.size
-            facts = {"width": width, "height": height, "arrows": picture.arrows if self.shows_arrows else ()}
+            arrows = picture.arrows if self.shows_arrows else ()
+            drawn = {"width": width, "height": height, "arrows": arrows, "jpeg": picture.jpeg}
         if self.frozen is not None:
             frozen = f"frame {self.frozen.frame.number}, {describe_reading(self.frozen.reading)}"
+        if (recorder := reader.recorder) is not None:
+            outlet = recorder.outlet
+            recording = {"name": outlet.name, "sent": outlet.sent, "lost": outlet.lost}
         points = feed.points_since(self._sent_until_s)
         notices = [self._notices.popleft() for _ in range(len(self._notices))]
         self._serial += 1
-        header = {
+        message = {
             "serial": self._serial,
             "now_s": now_s,  # of the points' clock
             "reading": feed.reading,
@@ -228,24 +231,20 @@ class Client:
             "controls": self._controls(),
             "points": points,  # readings since the message before
             "rate_hz": len(feed.points_since(now_s - _RATE_S)) / _RATE_S,
-            "viewers": len(feed.clients),
-            "waiting": self._waiting or feed.waiting,
+            "waiting": self._waiting or (_STILL if reader.takes_reference else ""),
             "notices": notices,
             "ended": feed.ended,
-            "recording": None if (recorder := reader.recorder) is None else recorder.state,
-            "sinks": [sender.state for sender in reader.senders],
+            "recording": recording,
             "troubles": (*reader.doubts, *reader.troubles),
             "frozen": frozen,
             "has_map": overlay is not None,  # this one, or the one sent before
-            "picture": facts,
-            "picture_bytes": len(jpeg),
-            "map": overlay.facts if overlay is not None and cells else None,
-            "map_bytes": len(cells),
+            "picture": drawn,
+            "map": None if overlay is self._map else overlay,
         }
         self._unanswered.add(self._serial)
         self._picture, self._map, self._sent_arrows = picture, overlay, self.shows_arrows
-        self._sent_until_s = points[-1].at_s if points else self._sent_until_s
-        return _join(header, jpeg, cells)
+        self._sent_until_s = (points[-1]["at_s"] or 0.0) if points else self._sent_until_s
+        return msgspec.json.encode(to_builtins(message))
 
     def _controls(self) -> object:
         """State of the simulated fingertip or gripper: what acts, whoever moved the sliders."""
@@ -260,14 +259,9 @@ class Client:
         return None
 
 
-def _join(header: object, *parts: bytes) -> bytes:
-    encoded = msgspec.json.encode(to_builtins(header))
-    return b"".join([len(encoded).to_bytes(4, "little"), encoded, *parts])
-
-
-_SHORT: dict[str, Callable[[Client, ClientMessage], object]] = {
+_ACTS: dict[str, Callable[[Client, ClientMessage], object]] = {
     "show": lambda client, message: vars(client).update(shows_map=message.map, shows_arrows=message.markers),
-    "reference": lambda client, _: client.feed.take_reference(),
+    "reference": lambda client, _: client.feed.reader.take_reference(),
     "object": lambda client, _: client.begin_object(),
     "freeze": lambda client, _: client.freeze(),
     "load": lambda client, message: client.source(SimulatedSource).load(
@@ -280,9 +274,8 @@ _SHORT: dict[str, Callable[[Client, ClientMessage], object]] = {
     ),
     "hold": lambda client, message: client.source(GripSource).act(wet=message.wet, controller=message.controller),
     "again": lambda client, _: client.source(GripSource).grip_again(),
-}
-"""Functions of the page's buttons, keys and sliders."""
-_LONG: dict[str, Callable[[Client, ClientMessage], Awaitable[None]]] = {
     "explain": Client.explain,
     "record": Client.record,
 }
+"""Functions of the page's buttons, keys and sliders."""
+_LONG = {"explain", "record"}

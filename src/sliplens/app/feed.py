@@ -3,13 +3,12 @@
 import asyncio
 import gc
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from threading import Event, Thread
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 import numpy as np
@@ -43,20 +42,9 @@ least margin at all."""
 _PATIENCE_S = 10.0  # with a thread that is to end
 
 
-class Point(msgspec.Struct, frozen=True, kw_only=True):
-    """A reading on the chart: margins from 0 to 1, forces in newtons, shear in pixels, None where there is none."""
-
-    at_s: float
-    """Time of the reading, as `time.monotonic` counts."""
-    margin: float | None
-    low: float | None
-    high: float | None
-    true_margin: float | None
-    shear_px: float | None
-    force_n: float | None
-    """Grip force, of a simulated gripper alone."""
-    least_force_n: float | None
-    """Least grip force that holds, of the same."""
+Point: TypeAlias = dict[str, float | None]
+"""A reading on the chart: `at_s` as `time.monotonic` counts, margins, shear in pixels, forces of a simulated gripper in
+newtons; None where there is none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,8 +62,8 @@ class PageFrame:
     """Markers: x and y at rest, then now, in pixels of the frame."""
 
 
-class MapFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """Header of a map; margins and relevance in margin units."""
+class Map(msgspec.Struct, frozen=True, kw_only=True):
+    """Relevance of a frame's pixels; margins and relevance in margin units."""
 
     number: int
     """Frame that is explained."""
@@ -87,17 +75,12 @@ class MapFacts(msgspec.Struct, frozen=True, kw_only=True):
     rows: int
     columns: int
     full: float
-    """Relevance of a cell of 127; cells are signed bytes, row by row."""
+    """Relevance of a cell of 127."""
     alike: bool
     """True where both margins are the same but for the network's error, so that there is nothing to explain."""
     warnings: tuple[str, ...]
-
-
-class Map(NamedTuple):
-    """Relevance of a frame's pixels."""
-
-    facts: MapFacts
     cells: bytes
+    """Signed bytes, row by row."""
 
 
 class Feed:
@@ -135,8 +118,6 @@ class Feed:
         self._largest = 0.0
         self._closed = Event()
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._end_subscription: Callable[[], None] = lambda: None
-        self._before: Frame | None = None
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="page-map")
         # explainers hook into the network: a copy, not the one that predicts
         network = reader.network
@@ -159,22 +140,9 @@ class Feed:
         if self._thread.is_alive():  # one that is in OpenCV as the interpreter ends aborts the process
             self._thread.join(_PATIENCE_S)
 
-    @property
-    def waiting(self) -> str:
-        """Instruction while a new reference is taken, else empty."""
-        if self._before is not None and self._before is self.reader.reference:
-            return "waiting for a still picture: leave the sensor untouched"
-        self._before = None
-        return ""
-
     def points_since(self, at_s: float) -> tuple[Point, ...]:
         """Return the points of the chart after a time, as `time.monotonic` counts."""
-        return tuple(point for point in self._points if point.at_s > at_s)
-
-    def take_reference(self) -> None:
-        """Have the reader take a new reference, and show that until it has."""
-        self._before = self.reader.reference
-        self.reader.take_reference()
+        return tuple(point for point in self._points if (point["at_s"] or 0.0) > at_s)
 
     async def explain(self, picture: PageFrame, method: str) -> Map:
         """Explain a picture by any method; one explanation runs at a time.
@@ -193,14 +161,11 @@ class Feed:
         if frame is not None and frame.forces is not None:
             x_n, y_n, normal_n = frame.forces.force_n[-1].tolist()
             self.forces_n = normal_n, float(np.hypot(x_n, y_n))
-        point = Point(
-            at_s=now_s, margin=reading.margin, low=reading.low, high=reading.high, true_margin=reading.true_margin,
-            shear_px=None if reading.markers is None else reading.markers.shear_px,
-            force_n=None if grip is None else grip.force_n,
-            least_force_n=None if grip is None else grip.least_force_n,
-        )  # fmt: skip
+        point = {name: getattr(reading, name) for name in ("margin", "low", "high", "true_margin")}
+        point |= {name: getattr(grip, name, None) for name in ("force_n", "least_force_n")}
+        point |= {"at_s": now_s, "shear_px": getattr(reading.markers, "shear_px", None)}
         # another list, for threads that walk through this one
-        self._points = [*(point for point in self._points if point.at_s >= now_s - CHART_S), point]
+        self._points = [*self.points_since(now_s - CHART_S), point]
         self.reading = reading
         if frame is not None:
             self._note_start(reading, frame)
@@ -289,7 +254,8 @@ class Feed:
         full = full_colour(relevance)
         # where both margins are the same but for the network's error, the strongest of nothing is not shown in colour
         alike = abs(explained.prediction - explained.reference_prediction) < CLOSE
-        facts = MapFacts(
+        cells = np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8)
+        return Map(
             number=frame.number,
             method=method,  # tiles where no markers are found
             baseline=None if start is None else start.number,
@@ -300,6 +266,5 @@ class Feed:
             full=full,
             alike=alike,
             warnings=(*warnings, *(text.partition("): ")[2] for text in explanation.methods[method].warnings)),
+            cells=cells.tobytes(),
         )
-        cells = np.round(127 * (not alike) * np.clip(relevance / full, -1, 1)).astype(np.int8)
-        return Map(facts, cells.tobytes())

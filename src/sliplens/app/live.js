@@ -1,8 +1,8 @@
 // Number, picture, chart and lamps of a running sensor, drawn from messages of a binary websocket.
 //
-// A message is the length of its header in 4 bytes (little end first), the header as JSON (client.py, `_message`), a
-// JPEG and the cells of a map where they are new. The first one holds the settings. What was drawn is answered by its
-// serial number; who does not answer is sent no more than two messages, so that nobody waits for a slow or hidden window.
+// A message is JSON (client.py, `_message`), with a JPEG and the cells of a map in base 64 where they are new. The first
+// one holds the settings. What was drawn is answered by its serial number; who does not answer is sent no more than two
+// messages, so that nobody waits for a slow or hidden window.
 
 const QUIET_MS = 3000; // without a message, after which nothing shown can be believed
 const RETRY_MS = 1000;
@@ -40,20 +40,17 @@ function send(message) {
 }
 
 async function take(data) {
-  const length = new DataView(data).getUint32(0, true);
-  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  const header = JSON.parse(new TextDecoder().decode(data));
   if (header.settings) return begin(header.settings);
   const hadMap = Boolean(map);
-  let at = 4 + length;
   if (header.picture) {
     const before = image;
-    image = await createImageBitmap(new Blob([new Uint8Array(data, at, header.picture_bytes)], { type: "image/jpeg" }));
+    image = await createImageBitmap(new Blob([bytes(header.picture.jpeg)], { type: "image/jpeg" }));
     facts = header.picture;
     before?.close();
-    at += header.picture_bytes;
   }
   if (header.map) {
-    map = paintMap(header.map, new Int8Array(data, at, header.map_bytes));
+    map = paintMap(header.map, new Int8Array(bytes(header.map.cells).buffer));
     mapFacts = header.map;
   } else if (!header.has_map) {
     map = mapFacts = null;
@@ -66,6 +63,10 @@ async function take(data) {
   heardAt = performance.now();
   owed.push({ act: "drawn", serial: header.serial });
   schedule();
+}
+
+function bytes(text) {
+  return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
 }
 
 function begin(told) {
@@ -398,7 +399,7 @@ function tellHealth() {
 }
 
 function tellFacts() {
-  const { reading, words, rate_hz, viewers, recording, ended, sinks, troubles } = update;
+  const { reading, words, rate_hz, recording, ended, troubles } = update;
   const ms = (value) => (value === null || value === undefined ? "–" : `${Math.round(value)} ms`);
   const latency = reading?.latency ?? {};
   const parts = ["decode", "checks", "encode", "network"].map((part) => `${part} ${ms(latency[`${part}_ms`])}`);
@@ -408,8 +409,6 @@ function tellFacts() {
     contact: words?.contact ?? "unknown",
     friction: reading?.friction ? `taken for ${reading.friction}` : "",
     "read in order": reading?.sequence ? "earlier frames of the contact count" : "",
-    viewers: `${viewers}`,
-    sent: sinks.map(({ name, sent, lost }) => `${name} ${sent}, ${lost} lost`).join("; "),
   };
   const shown = Object.entries(rows).filter(([, value]) => value).flat();
   while ($.facts.children.length > shown.length) $.facts.lastChild.remove();
@@ -420,7 +419,7 @@ function tellFacts() {
   $.recording.hidden = !recording;
   if (recording) {
     const lost = recording.lost ? `, ${recording.lost} lost` : "";
-    set($.recording, `● recording ${recording.seconds.toFixed(1)} s, ${recording.sent} frames${lost}: ${recording.name}`);
+    set($.recording, `● recording, ${recording.sent} frames${lost}: ${recording.name}`);
   }
   set($.troubles, troubles.map((trouble) => `▲ ${trouble}`).join("\n"));
 }

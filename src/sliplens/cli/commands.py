@@ -19,6 +19,7 @@ from sliplens.progress import number_of, open_stage, reporting
 
 if TYPE_CHECKING:
     from sliplens.grip.hold import HoldStep
+    from sliplens.live import LiveReader
 
 COMMANDS: dict[str, Command] = {}
 """Commands by name; `sensor new` and the like have two words."""
@@ -63,6 +64,12 @@ class _Log:
             if warning not in self._warnings:
                 self._warnings.add(warning)
                 say(warning, aside=True)
+
+
+def _say_friction(name: str, reader: "LiveReader") -> None:
+    """Print the friction that slips taught, with the option for the next time."""
+    if (friction := reader.learnt) is not None:
+        say(f"{name}: the object slipped; to hold it again, set --friction {friction.text}", aside=True)
 
 
 @command("demo", "demo:run_demo", "sliplens demo runs/demo")
@@ -111,9 +118,9 @@ def call_live(
     Parameters
     ----------
     list_sources
-        List the cameras with their formats, sizes and rates, and the other sources, and end.
+        List the cameras and the other sources, and end.
     sink
-        Where readings go: json (lines on standard output), udp:HOST:PORT, mcap:FILE, foxglove:HOST:PORT, rerun:FILE,
+        Where readings go: json (lines on standard output), udp:HOST:PORT, mcap:FILE (for Foxglove), rerun:FILE,
         zenoh:KEY (to ROS 2). Without one, a line a second is printed.
     page
         Serve a page with buttons to freeze, explain and record.
@@ -151,8 +158,8 @@ def call_live(
         reader.send_to(*sink)
         if record is not None:
             reader.record(record, facts=facts)
-        stack.callback(lambda: [say(str(state), aside=True) for state in reader.outputs])
-        stack.callback(lambda: reader.lesson and say(reader.lesson, aside=True))
+        stack.callback(lambda: [say(str(outlet), aside=True) for outlet in reader.outputs])
+        stack.callback(_say_friction, reader.source.name, reader)
         with suppress(KeyboardInterrupt), reader, ExitStack() as serving:
             if page:
                 from sliplens.app import LivePage
@@ -331,9 +338,10 @@ def call_slip(call: Any) -> None:
     """Print the balanced accuracy of the slip detector and of trivial baselines."""
     with reporting(Terminal()), open_stage("Reading clips"):
         result = call()
-    values = [(score.balanced_accuracy, score.low, score.high) for score in result.scores]
-    rows = [(score.method, *(f"{value:.2f}" for value in of)) for score, of in zip(result.scores, values, strict=True)]
-    print_table(f"Slip of {number_of(len(result.clips), 'clip')}", ("method", "balanced accuracy", "low", "high"), rows)
+    names = ("method", "balanced_accuracy", "low", "high")
+    method, *values = (getattr(result.scores, name) for name in names)
+    rows = [(name, *(f"{value:.2f}" for value in row)) for name, *row in zip(method, *values, strict=True)]
+    print_table(f"Slip of {number_of(len(result.fall), 'clip')}", [name.replace("_", " ") for name in names], rows)
 
 
 @command("compare", "simulation.trials:compare_datasets", "sliplens compare runs/mine/data runs/other/data")
@@ -362,8 +370,8 @@ def call_compare(call: Any) -> None:
 )
 def call_view(call: Any) -> None:
     """Print what is shown."""
-    trial = call()
-    about = f"{trial.trial.trial}, {number_of(len(trial.trial), 'frame')}"
+    viewed = call()
+    about = f"{viewed.trial}, {number_of(viewed.frames, 'frame')}"
     if (out := call.keywords.get("out")) is None:
         say(f"{about}, are in the Rerun viewer")
         say("the viewer reports its use to its makers, not what it shows: see `rerun analytics disable`")
@@ -622,8 +630,7 @@ def call_hold(call: Any, source: str, **options: Unpack[HoldOptions]) -> None:
         result = call(readers=readers, gripper=gripper, on_step=on_step)
     say(result.why, aside=True)
     for name, reader in zip(names, readers, strict=True):
-        if reader.lesson is not None:
-            say(f"{name}: {reader.lesson}" if len(readers) > 1 else reader.lesson, aside=True)
+        _say_friction(name, reader)
     if "out" in arguments:
         print_file(Path(arguments["out"]), number_of(len(result.steps), "command"))
     if result.ended == "failed":

@@ -302,9 +302,8 @@ def print_sources() -> None:
     """Print the cameras and the other live sources."""
     from sliplens.live import SOURCES, list_cameras
 
-    rows = [(str(camera.path), camera.name, each) for camera in list_cameras() for each in camera.formats or ("",)]
-    columns = ("device", "name", "format and sizes")
-    print_table("Cameras", columns, rows) if rows else say("no camera was found")
+    cameras = list(list_cameras().items())
+    print_table("Cameras", ("device", "name"), cameras) if cameras else say("no camera was found")
     for words in ("simulated gripper that holds (grip, or grip:egg)", *(kind.words for kind in SOURCES.values())):
         say(f"  {words}")
 

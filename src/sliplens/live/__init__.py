@@ -3,13 +3,12 @@
 from sliplens.live.contract import LiveOptions, LiveSource, SourceKind
 from sliplens.live.health import HealthMonitor
 from sliplens.live.loop import LiveReader, read_live
-from sliplens.live.mailbox import OutputState
+from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import Check, Latency, LiveFrame, MarkerReading, Reading, SlipState
 from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.slip import SlipDetector
 from sliplens.live.sources import (
     SOURCES,
-    Camera,
     CameraSource,
     FolderSource,
     ReplaySource,
@@ -20,8 +19,8 @@ from sliplens.live.sources import (
 )
 
 __all__ = [
-    "SOURCES", "Camera", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthMonitor",
-    "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "OutputState", "Reading",
+    "SOURCES", "CameraSource", "Check", "FolderSource", "ForceStream", "HealthMonitor",
+    "Latency", "LiveFrame", "LiveOptions", "LiveReader", "LiveSource", "MarkerReading", "Outlet", "Reading",
     "Recorder", "ReplaySource", "SimulatedSource", "SlipDetector", "SlipState", "SourceKind",
     "StreamSource", "list_cameras", "open_live", "read_live",
 ]  # fmt: skip

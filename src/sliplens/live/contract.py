@@ -25,8 +25,6 @@ class LiveOptions:
     """Trial of a data set or bag; the first if None."""
     size: tuple[int, int] | None = None
     """Height and width of the frames, in pixels; larger ones are scaled down. The source's own if None."""
-    pixel_format: str | None = None
-    """Format of a camera, such as MJPG or YUYV; MJPG where the camera has it if None."""
     fit_size: tuple[int, int] | None = None
     """Height and width that a network was trained on, in pixels: used where the source can give it, else ignored."""
 
@@ -133,7 +131,7 @@ class SourceKind:
     """Returns True for the names of this kind, without opening anything."""
     open: Callable[[str, LiveOptions], LiveSource]
     """Nothing runs before the source is entered."""
-    takes: tuple[str, ...] = ("rate_hz", "speed", "trial", "size", "pixel_format")
+    takes: tuple[str, ...] = ("rate_hz", "speed", "trial", "size")
     """Options of `LiveOptions` that apply; others are refused."""
 
 

@@ -4,8 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
-from typing import Protocol, TypedDict, Unpack, runtime_checkable
+from typing import TypedDict, Unpack
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +15,9 @@ from sliplens.friction import FrictionLike, SlipLearner, as_friction
 from sliplens.images import require_rgb, soften
 from sliplens.live.contract import LiveOptions, LiveSource
 from sliplens.live.health import HealthMonitor, check_direction, check_novelty, margin_risk
-from sliplens.live.reading import OFF, Check, Latency, LiveFrame, MarkerReading, Reading, small_factor, small_picture
+from sliplens.live.reading import OFF, Latency, LiveFrame, Reading, small_factor, small_picture
 from sliplens.live.slip import SlipDetector
-from sliplens.markers import Tracker, Tracks
+from sliplens.markers import Tracker
 from sliplens.models.checkpoint import Network
 from sliplens.models.engines import Engine
 from sliplens.models.predictions import LEVEL
@@ -27,24 +26,6 @@ from sliplens.recordings.capture import Frame
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.trial import ContactState, contact_states
 from sliplens.shear import ShearEstimator
-
-
-@runtime_checkable
-class HealthWatch(Protocol):
-    """Checks frames against a reference."""
-
-    def check(self, frame: LiveFrame, markers: Tracks | None, /) -> tuple[Check, ...]:
-        """Check a frame, and its markers where they are tracked; a check that fails withholds its margin."""
-        ...
-
-
-@runtime_checkable
-class SlipWatch(Protocol):
-    """Detects slip from the motion of the markers, frame after frame."""
-
-    def update(self, positions_px: Float[np.ndarray, "markers 2"], time_s: float, /) -> MarkerReading:
-        """Take the markers of a frame, NaN where one is not seen."""
-        ...
 
 
 class ReaderSettings(TypedDict, total=False):
@@ -77,10 +58,10 @@ class ReaderSettings(TypedDict, total=False):
     """Time without a frame after which a reading says so, 1 second by default."""
     forces: Path | str | None
     """File or named pipe into which another program writes the samples of a force sensor (`ForceStream`)."""
-    health: Callable[[Frame], HealthWatch] | None
+    health: Callable[[Frame], HealthMonitor] | None
     """Called with each new reference, returns the checks of frames: `HealthMonitor` by default; None for none, not
     even of the network's novelty."""
-    slip: Callable[[Float[np.ndarray, "markers 2"]], SlipWatch] | None
+    slip: Callable[[Float[np.ndarray, "markers 2"]], SlipDetector] | None
     """Called with the places of the markers in each new reference, returns the slip detector: `SlipDetector` by
     default; None to track no markers."""
 
@@ -94,7 +75,7 @@ _DARK, _BRIGHT = 8.0, 247.0
 _WIDE_PX = 5.0
 
 
-class _ReferenceTaker:
+class ReferenceTaker:
     """Search for a moment in which the picture is still and well exposed."""
 
     def __init__(self) -> None:
@@ -126,8 +107,6 @@ class FrameReader:
         """The sensor untouched, as the next frame is compared with it."""
         self.colour_doubts: tuple[str, ...] = ()
         """Doubts about the colours of the reference for this network."""
-        self.new_reference = Event()
-        """Set to take a new reference as soon as the picture is still."""
         self.markers_px: tuple[np.ndarray, np.ndarray] | None = None
         """Places (x, y) of the markers at rest and in the newest frame, in pixels, NaN where one is not seen.
 
@@ -141,13 +120,13 @@ class FrameReader:
             raise InputError("--sequence needs a network; name one with --network")
         self._follower = network.follow(friction=friction) if network is not None and sequence else None
         self._make_health, self._make_slip = settings.get("health", HealthMonitor), settings.get("slip", SlipDetector)
-        self._health: HealthWatch | None = None
+        self._health: HealthMonitor | None = None
         self._shear: ShearEstimator | None = None
-        self._slip: SlipWatch | None = None
+        self._slip: SlipDetector | None = None
         self._tracker: Tracker | None = None
         self._smaller = 1
-        self._taker: _ReferenceTaker | None = None
-        self._last: LiveFrame | None = None
+        self._taker: ReferenceTaker | None = None
+        self._last: Reading | None = None
         self._dropped = 0
 
     def new_object(self, friction: FrictionLike | None = None, *, same_object: bool | None = None) -> None:
@@ -165,13 +144,12 @@ class FrameReader:
         InputError
             If the friction is none, or the network takes none.
         """
-        network = self.network
         same_object = self.learner.same_object if same_object is None else same_object
         if friction is not None or same_object:
-            if network is None:
+            if self.network is None:
                 option = "--same-object" if friction is None else "--friction"
                 raise InputError(f"{option} needs a network; name one with --network")
-            network.require_ratio()
+            self.network.require_ratio()
         # a new one, not emptied: the reading thread may still teach the one before
         self.learner = SlipLearner(None if friction is None else as_friction(friction), same_object=same_object)
 
@@ -181,7 +159,7 @@ class FrameReader:
         if self._follower is not None and self.source.rate_hz:
             require_frequent(np.arange(2) * self.source.speed / self.source.rate_hz, what=self.source.name)
         if reference is None:
-            self._taker = _ReferenceTaker()
+            self._taker = ReferenceTaker()
             return
         require_rgb(reference, what="levels of the reference")
         if reference.shape[:2] != self._size:
@@ -191,21 +169,25 @@ class FrameReader:
             )
         self._set_reference(reference)
 
+    @property
+    def takes_reference(self) -> bool:
+        """True until a new reference was taken."""
+        return self._taker is not None
+
     def missing(self, why: str) -> Reading:
         """Make the reading of a moment without a frame."""
-        last = self._last
-        return Reading(
-            number=-1 if last is None else last.number,
-            time_s=np.nan if last is None else last.time_s,
-            captured_s=np.nan if last is None else last.captured_s,
-            withheld=why,
-            dropped=self._dropped,
-        )
+        last = self._last or Reading(number=-1, time_s=np.nan, captured_s=np.nan)
+        parts = {"number": last.number, "time_s": last.time_s, "captured_s": last.captured_s}
+        return Reading(**parts, withheld=why, dropped=self._dropped)
 
-    def read(self, frame: LiveFrame) -> Reading:
-        """Read the next frame."""
+    def read(self, frame: LiveFrame, *, early: Callable[[Reading], None] | None = None) -> Reading:
+        """Read the next frame.
+
+        Where the frame before had a margin, `early` is called first with that of this one, if its cheap checks and its
+        novelty pass: that reading is not `complete`.
+        """
         require_rgb(frame.image, what=f"levels of frame {frame.number} of {self.source.name}")
-        last, self._last = self._last, frame
+        last = self._last
         self._dropped += 0 if last is None else max(0, frame.number - last.number - 1)
         begin = Reading(
             number=frame.number,
@@ -215,28 +197,38 @@ class FrameReader:
             true_margin=frame.safety_margin,
             latency=Latency(decode_ms=frame.decode_ms),
         )
-        if (why := self._unready(last, frame)) is not None:
-            return self._withhold(begin, why)
-        if self.network is None or self.engine is None or self.reference is None:
-            return self._withhold(*self._check(begin, frame))
+        why = self._unready(last, frame)
+        self._last = self._read(begin, frame, early) if why is None else _withhold(begin, why)
+        return self._last
+
+    def _read(self, begin: Reading, frame: LiveFrame, early: Callable[[Reading], None] | None) -> Reading:
+        """Read a frame that can be compared with the reference."""
+        last, network = self._last, self.network
+        if network is None or self.engine is None or self.reference is None:
+            return _withhold(*self._check(begin, frame))
+        # the head for several frames predicts each once, after all checks
+        is_early = early is not None and last is not None and last.margin is not None and self._follower is None
         checked, begun = [], time.perf_counter()
-        inputs = self.network.encode(frame.image[None], self.reference)
+        inputs = network.encode(frame.image[None], self.reference)
         encoded = time.perf_counter()
 
         def batches() -> Iterator[Tensor]:
-            yield inputs
-            checked.append(self._check(begin, frame))  # the batch is under way: an engine looks for the next one first
+            yield inputs  # the batch is under way: an engine looks for the next one first
+            checked.append(self._check_now(begin, frame) if is_early else self._check(begin, frame))
 
         [parts] = self.engine.answers(batches())
         [(reading, withheld)] = checked
         network_ms = 1e3 * (time.perf_counter() - encoded) - reading.latency.checks_ms
         latency = replace(reading.latency, encode_ms=1e3 * (encoded - begun), network_ms=network_ms)
         reading = replace(reading, latency=latency)
-        if withheld is not None:
-            return self._withhold(reading, withheld)
-        return self._estimate(reading, frame, self.network, parts)
+        if is_early:
+            first = _withhold(reading, withheld) if withheld else self._estimate(reading, frame, network, parts)
+            if early is not None and first.margin is not None and first.health[-1].name == "novelty":
+                early(first)
+            reading, withheld = self._check(replace(begin, latency=latency), frame)
+        return _withhold(reading, withheld) if withheld else self._estimate(reading, frame, network, parts)
 
-    def _unready(self, last: LiveFrame | None, frame: LiveFrame) -> str | None:
+    def _unready(self, last: Reading | None, frame: LiveFrame) -> str | None:
         """Explain why a frame cannot be compared with a reference, after taking a new one where that is due."""
         name = self.source.name
         if last is not None:
@@ -248,15 +240,24 @@ class FrameReader:
         if frame.size != self._size:
             sizes = f"{_in_pixels(frame.size)} pixels, they were {_in_pixels(self._size)}"
             return f"the frames of {name} are now {sizes}; set the camera as it was, or start again"
-        if self.new_reference.is_set():
-            self.new_reference.clear()
-            self._taker = _ReferenceTaker()
-        if self._taker is not None and self._taker.offer(frame):
+        if (taker := self._taker) is not None and taker.offer(frame):
             self._taker = None
             self._set_reference(frame.image)
         if self.reference is None:
             return "there is no reference frame yet; the picture must be still for a moment: leave the sensor untouched"
         return None
+
+    def _check_now(self, begin: Reading, frame: LiveFrame) -> tuple[Reading, str | None]:
+        """Make the cheap checks of a frame; all else in its reading is of the frame before."""
+        begun, last = time.perf_counter(), self._last
+        health = () if self._health is None else self._health.check_now(frame)
+        if last is not None:
+            age_s = frame.time_s - last.time_s
+            health += tuple(replace(check, age_s=age_s) for check in last.health if check.name == "direction")
+            begin = replace(begin, slip=last.slip, markers=last.markers)
+        latency = replace(begin.latency, checks_ms=1e3 * (time.perf_counter() - begun))
+        withheld = next((check.sentence for check in health if not check.ok), None)
+        return replace(begin, health=health, complete=False, latency=latency), withheld
 
     def _check(self, begin: Reading, frame: LiveFrame) -> tuple[Reading, str | None]:
         """Track the markers of a frame and check its health; returns its reading, and why it has no margin."""
@@ -270,7 +271,8 @@ class FrameReader:
         health = () if self._health is None else self._health.check(frame, tracked)
         if self._shear is not None and self.network is not None and all(check.ok for check in health):
             health = (*health, check_direction(self.network, self._shear.estimate(frame.image)))
-        latency = replace(begin.latency, checks_ms=1e3 * (time.perf_counter() - begun))
+        checks_ms = begin.latency.checks_ms + 1e3 * (time.perf_counter() - begun)
+        latency = replace(begin.latency, checks_ms=checks_ms)
         withheld = next((check.sentence for check in health if not check.ok), None)
         reading = replace(begin, slip=markers and markers.state, markers=markers, health=health, latency=latency)
         untouched = any(check.name == "touch" and not check.ok for check in health)
@@ -284,10 +286,6 @@ class FrameReader:
         self.learner.update(frame.time_s, slipping_s=slipping_s, touches=touches)
         return reading, withheld
 
-    def _withhold(self, reading: Reading, why: str | None) -> Reading:
-        latency = replace(reading.latency, total_ms=_since_ms(reading.captured_s))
-        return replace(reading, withheld=why, latency=latency)
-
     def _estimate(self, reading: Reading, frame: LiveFrame, network: Network, parts: tuple[Tensor, ...]) -> Reading:
         friction = self.learner.friction
         follower = self._follower if friction is None else None  # it takes no friction
@@ -296,11 +294,11 @@ class FrameReader:
         if novelty is not None:
             reading = replace(reading, health=(*reading.health, novelty))
             if not novelty.ok:
-                return self._withhold(reading, novelty.sentence)
+                return _withhold(reading, novelty.sentence)
         if follower is not None:
             estimate = follower.update(estimate, np.array([frame.time_s]), np.array([True]))
         ratio = None if estimate.ratio is None else float(estimate.ratio.mean[0])
-        if ratio is not None and estimate.ratio is not None:
+        if ratio is not None and estimate.ratio is not None and reading.complete:
             self.learner.note(ratio, sigma=float(estimate.ratio.sigma[0]), time_s=frame.time_s)
         interval = estimate.interval(LEVEL)
         values = np.concatenate([estimate.margin] if interval is None else [estimate.margin, *interval]).clip(0, 1)
@@ -332,6 +330,7 @@ class FrameReader:
     def _begin_anew(self) -> None:
         """Forget earlier frames, where frames no longer follow each other."""
         self.learner.release()
+        self._last = None
         if self._follower is not None:
             self._follower.forget()
         self.markers_px = None
@@ -353,6 +352,11 @@ class FrameReader:
 
 def _in_pixels(size: tuple[int, ...]) -> str:
     return f"{size[0]} x {size[1]}"
+
+
+def _withhold(reading: Reading, why: str | None) -> Reading:
+    latency = replace(reading.latency, total_ms=_since_ms(reading.captured_s))
+    return replace(reading, withheld=why, latency=latency)
 
 
 def _since_ms(captured_s: float) -> float:

@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,22 +28,6 @@ _BLOCK_PX = 4
 _CHANGED_SHARE, _NOISE_SHARE, _LEAST_SQUARE = 1.5, 0.2, 0.02
 """Of the noise of block means: share that shows a change, and share to which its square is known; and the mean square
 that rounding makes, in squared grey levels."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _FrameView:
-    """A frame beside the reference, as the checks need it."""
-
-    frame: LiveFrame
-    markers: Tracks | None
-    change: float
-    """Change of the picture against the reference at equal brightness, in grey levels."""
-    gain: float
-    """Power of 2 by which the picture is brighter than the reference."""
-    ratio: np.ndarray
-    """Powers of 2 by which each softened pixel is brighter than the reference."""
-    comparable: np.ndarray
-    """True for pixels that are neither dark nor saturated in either picture."""
 
 
 Measured = tuple[float, str]
@@ -81,52 +65,65 @@ class HealthMonitor:
         self._changed_s = 0.0
         self._numbers: deque[tuple[float, int]] = deque()
         self._last: dict[str, tuple[float, Check]] = {}
+        """Time and result of each check when it was made last."""
+        self._frame: LiveFrame | None = None
+        self._markers: Tracks | None = None
 
     def check(self, frame: LiveFrame, markers: Tracks | None = None, /) -> tuple[Check, ...]:
         """Check a frame of the reference's size, and its markers where they are tracked.
 
         The first check that fails names the cause: faults of the camera come before what they change in the picture.
         """
-        view, checks = self._compare(frame, markers), []
-        self._stillness.update(block_means(_green(frame.small), _BLOCK_PX), frame.forces)
+        if self._frame is not frame:
+            self.check_now(frame)
+        self._markers = markers
         slow = _SLOW if markers is None else _SLOW[:2]  # markers show the camera's motion at once, the border slowly
         age_s = {name: frame.time_s - self._last[name][0] if name in self._last else np.inf for name in slow}
         # too old ones are due, else the oldest; at the same time it may be another frame, of a source without a clock
         due = [name for name in slow if not 0 < age_s[name] < _OLDEST_S] or [max(slow, key=lambda name: age_s[name])]
-        for name, kind in CHECKS.items():
-            if name in slow and name not in due:
-                checks.append(replace(self._last[name][1], age_s=age_s[name]))
-            elif kind.measure is not None and (measured := kind.measure(self, view)) is not None:
-                checks.append(make_check(name, *measured))
-                self._last[name] = frame.time_s, checks[-1]
-        return tuple(checks)
+        return self._make([name for name in _LATER if name not in slow or name in due], frame)
 
-    def _compare(self, frame: LiveFrame, markers: Tracks | None) -> _FrameView:
-        soft = soften(frame.small)
+    def check_now(self, frame: LiveFrame, /) -> tuple[Check, ...]:
+        """Make the checks that take less than a millisecond; the others are those of earlier frames, with their age."""
+        self._frame, soft = frame, soften(frame.small)
+        # pixels that are neither dark nor saturated in either picture
         both = (self._soft > _DIM) & (soft > _DIM) & (self._soft < _WHITE) & (soft < _WHITE)
         ratio = np.log2(np.where(both, soft, 1) / np.where(both, self._soft, 1))
-        gain = float(np.median(ratio[both])) if both.any() else 0.0
-        change = picture_change(soft * 2**-gain, self._soft)
-        return _FrameView(frame=frame, markers=markers, change=change, gain=gain, ratio=ratio, comparable=both)
+        self._gain = float(np.median(ratio[both])) if both.any() else 0.0
+        # those that cannot be compared sort behind all others
+        self._brighter = np.where(both, ratio - self._gain, np.inf)
+        self._change = picture_change(soft * 2**-self._gain, self._soft)
+        self._stillness.update(block_means(_green(frame.small), _BLOCK_PX), frame.forces)
+        return self._make([name for name in CHECKS if name not in _LATER], frame)
 
-    def _repeated(self, view: _FrameView) -> Measured:
-        frame = view.frame
+    def _make(self, names: Sequence[str], frame: LiveFrame) -> tuple[Check, ...]:
+        """Make some checks; returns the newest of each."""
+        for name in names:
+            measure = CHECKS[name].measure
+            if measure is None or (measured := measure(self, frame)) is None:
+                self._last.pop(name, None)
+            else:
+                self._last[name] = frame.time_s, make_check(name, *measured)
+        made = [self._last[name] for name in CHECKS if name in self._last]
+        return tuple(replace(check, age_s=frame.time_s - then_s) for then_s, check in made)
+
+    def _repeated(self, frame: LiveFrame) -> Measured:
         if self._before is None or not np.array_equal(frame.small, self._before):
             self._before, self._changed_s = frame.small.copy(), frame.time_s
         value = max(0.0, frame.time_s - self._changed_s)  # a camera's noise never repeats
         return value, f"the picture has not changed by a single pixel for {value:.2g} s"
 
-    def _halves(self, _: _FrameView) -> Measured:
+    def _halves(self, _: LiveFrame) -> Measured:
         ratio = self._stillness.ratio
         return ratio, f"one half of the picture changes {ratio:.2g} times as much as the other"
 
-    def _frozen(self, _: _FrameView) -> Measured | None:
+    def _frozen(self, _: LiveFrame) -> Measured | None:
         if (change_n := self._stillness.force_change_n) is None:
             return None
         return change_n, f"the force changed by {change_n:.2g} N while the picture showed nothing but noise"
 
-    def _drops(self, view: _FrameView) -> Measured:
-        frame, numbers = view.frame, self._numbers
+    def _drops(self, frame: LiveFrame) -> Measured:
+        numbers = self._numbers
         numbers.append((frame.time_s, frame.number))
         while frame.time_s - numbers[0][0] > _DROPS_OVER_S or frame.number < numbers[0][1]:
             numbers.popleft()
@@ -134,35 +131,62 @@ class HealthMonitor:
         value = max(0.0, 1 - (len(numbers) - 1) / span) if span > 0 else 0.0
         return value, f"{value:.0%} of the frames of the last second were lost"
 
-    def _late(self, view: _FrameView) -> Measured:
-        captured_s = view.frame.captured_s
+    def _late(self, frame: LiveFrame) -> Measured:
+        captured_s = frame.captured_s
         value = max(0.0, time.monotonic() - captured_s) if captured_s > 0 else 0.0
         return value, f"the frame is {value:.2g} s old"
 
-    def _exposure(self, view: _FrameView) -> Measured:
-        return abs(view.gain), f"the picture is {2**view.gain:.2g} times as bright as the reference"
+    def _exposure(self, _: LiveFrame) -> Measured:
+        return abs(self._gain), f"the picture is {2**self._gain:.2g} times as bright as the reference"
 
-    def _touch(self, view: _FrameView) -> Measured:
-        change = f"the picture differs by {view.change:.2g} grey levels from the untouched sensor"
-        return view.change, "nothing touches the sensor" if view.change < LEAST_TOUCH else change
+    def _touch(self, _: LiveFrame) -> Measured:
+        change = f"the picture differs by {self._change:.2g} grey levels from the untouched sensor"
+        return self._change, "nothing touches the sensor" if self._change < LEAST_TOUCH else change
 
-    def _saturation(self, view: _FrameView) -> Measured:
-        value = max(0.0, _saturated_share(view.frame.small) - self._saturated)
+    def _saturation(self, frame: LiveFrame) -> Measured:
+        value = max(0.0, _saturated_share(frame.small) - self._saturated)
         return value, f"{value:.0%} of the picture have turned black or white"
 
-    def _focus(self, view: _FrameView) -> Measured:
-        share = _sharpness(_green(view.frame.small)) / 2**view.gain / max(self._sharpness, 1e-3)
+    def _focus(self, frame: LiveFrame) -> Measured:
+        share = _sharpness(_green(frame.small)) / 2**self._gain / max(self._sharpness, 1e-3)
         return max(0.0, 1 - share), f"edges are {share:.0%} as sharp as in the reference"
 
-    def _camera_motion(self, view: _FrameView) -> Measured:
-        touches = view.change >= LEAST_TOUCH
-        motion = self._camera.update(view.frame.small, view.markers, touches=touches)
+    def _camera_motion(self, frame: LiveFrame) -> Measured:
+        touches = self._change >= LEAST_TOUCH
+        motion = self._camera.update(frame.small, self._markers, touches=touches)
         if motion is None:
             return 0.0, "the border of the picture shows too little to measure a motion of the camera"
         return motion.excess_px, (
             f"since the reference the picture was shifted by {motion.shift_px:.1f} px, turned by "
             f"{motion.turn_deg:+.1f} degrees and zoomed by {100 * motion.zoom:+.1f} %"
         )
+
+    def _light(self, _: LiveFrame) -> Measured:
+        """Measure how much brighter or darker than the rest one side of the border is, in powers of 2."""
+        height, width = (side // _TILES for side in self._brighter.shape[:2])
+        tiles = self._brighter[: _TILES * height, : _TILES * width]
+        tiles = tiles.reshape(_TILES, height, _TILES, width, 3).transpose(0, 2, 4, 1, 3)
+        values = np.sort(tiles.reshape(_TILES, _TILES, 3, -1), axis=-1)
+        # inside the border, contact may brighten or shade
+        border = np.pad(np.zeros((_TILES - 2, _TILES - 2), dtype=bool), 1, constant_values=True)
+        values = values[border].reshape(-1, height * width)
+        count = np.isfinite(values).sum(axis=1)
+        values, count = values[count > 3], count[count > 3]
+        # the median: markers that moved are few
+        middle = [np.take_along_axis(values, at[:, None], axis=1) for at in ((count - 1) // 2, count // 2)]
+        worst = float(np.abs(np.add(*middle) / 2).max(initial=0.0))
+        return worst, f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference"
+
+    def _absent_markers(self, _: LiveFrame) -> Measured | None:
+        """Measure the share of the reference's markers that are not where they should be."""
+        if self._markers is None:
+            return None
+        status = self._markers.status
+        if (status == MarkerStatus.LOST).any():
+            return 1.0, "the pattern of the markers has jumped, and none can be told from the next"
+        absent = np.isin(status, (MarkerStatus.MISSING, MarkerStatus.BROKEN))
+        value = float(absent.sum() / max(1, (absent | (status == MarkerStatus.FOLLOWED)).sum()))
+        return value, f"{value:.0%} of the markers are not seen where they should be"
 
 
 def make_check(name: str, value: float, sentence: str, *, cure: str | None = None) -> Check:
@@ -174,41 +198,11 @@ def make_check(name: str, value: float, sentence: str, *, cure: str | None = Non
     return Check(name=name, value=value, limit=limit, ok=ok, sentence=sentence if ok else f"{sentence}; {cure}")
 
 
-def _light(_: HealthMonitor, view: _FrameView) -> Measured:
-    """Measure how much brighter or darker than the rest one side of the border is, in powers of 2."""
-    height, width = (side // _TILES for side in view.ratio.shape[:2])
-    # pixels that cannot be compared sort behind all others
-    tiles = np.where(view.comparable, view.ratio - view.gain, np.inf)[: _TILES * height, : _TILES * width]
-    tiles = tiles.reshape(_TILES, height, _TILES, width, 3).transpose(0, 2, 4, 1, 3)
-    values = np.sort(tiles.reshape(_TILES, _TILES, 3, -1), axis=-1)
-    # inside the border, contact may brighten or shade
-    border = np.pad(np.zeros((_TILES - 2, _TILES - 2), dtype=bool), 1, constant_values=True)
-    values = values[border].reshape(-1, height * width)
-    count = np.isfinite(values).sum(axis=1)
-    values, count = values[count > 3], count[count > 3]
-    # the median: markers that moved are few
-    middle = [np.take_along_axis(values, at[:, None], axis=1) for at in ((count - 1) // 2, count // 2)]
-    worst = float(np.abs(np.add(*middle) / 2).max(initial=0.0))
-    return worst, f"one side of the picture is {2**worst:.2g} times brighter or darker than in the reference"
-
-
-def _absent_markers(_: HealthMonitor, view: _FrameView) -> Measured | None:
-    """Measure the share of the reference's markers that are not where they should be."""
-    if view.markers is None:
-        return None
-    status = view.markers.status
-    if (status == MarkerStatus.LOST).any():
-        return 1.0, "the pattern of the markers has jumped, and none can be told from the next"
-    absent = np.isin(status, (MarkerStatus.MISSING, MarkerStatus.BROKEN))
-    value = float(absent.sum() / max(1, (absent | (status == MarkerStatus.FOLLOWED)).sum()))
-    return value, f"{value:.0%} of the markers are not seen where they should be"
-
-
 @dataclass(frozen=True, kw_only=True)
 class CheckKind:
     """Row of `CHECKS`: what one check measures, its limit and its cure."""
 
-    measure: Callable[[HealthMonitor, _FrameView], Measured | None] | None = None
+    measure: Callable[[HealthMonitor, LiveFrame], Measured | None] | None = None
     """Measures a frame; returns None where there is nothing to measure. None of a check of the network."""
     limit: float
     """Bound of healthy values, in the unit of `unit`: seconds, newtons, pixels, grey levels, or a ratio."""
@@ -244,14 +238,14 @@ CHECKS = {
         cure="clean or focus the lens, and take a new reference",
     ),
     "light": CheckKind(
-        measure=_light, limit=0.2, unit="powers of 2", cure="look after the lamps, or take a new reference",
-        harm=(0.28, 0.11),
+        measure=HealthMonitor._light, limit=0.2, unit="powers of 2", harm=(0.28, 0.11),
+        cure="look after the lamps, or take a new reference",
     ),
     "camera": CheckKind(
         measure=HealthMonitor._camera_motion, limit=CAMERA_LIMIT_PX, unit="px", cure=CAMERA_CURE, harm=(0.56, 0.38)
     ),
     "markers": CheckKind(
-        measure=_absent_markers, limit=0.15, unit="share", harm=(0.33, 1.18),
+        measure=HealthMonitor._absent_markers, limit=0.15, unit="share", harm=(0.33, 1.18),
         cure="clean the skin and the lens, let go, and take a new reference",
     ),
     "touch": CheckKind(
@@ -273,6 +267,8 @@ time are chosen by hand. `harm` was fitted by `benchmarks/health.py --choose --t
 show no touch, whose growth is of an earlier fit to twice as many trials.
 """
 _SLOW = "focus", "light", "camera"
+_LATER = *_SLOW, "markers"
+"""Checks that `check_now` leaves out."""
 
 
 class _Stillness:

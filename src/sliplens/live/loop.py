@@ -4,8 +4,9 @@ import gc
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Condition, Event, Lock, Thread
 from typing import TypeAlias, Unpack
@@ -19,8 +20,8 @@ from sliplens.extras import import_cv2, missing_packages
 from sliplens.friction import Friction
 from sliplens.images import read_image
 from sliplens.live.contract import LiveOptions, LiveSource
-from sliplens.live.frame_reader import FrameReader, HealthWatch, ReaderSettings, SlipWatch
-from sliplens.live.mailbox import Mailbox, OutputState
+from sliplens.live.frame_reader import FrameReader, ReaderSettings, ReferenceTaker
+from sliplens.live.mailbox import Mailbox, Outlet
 from sliplens.live.reading import LiveFrame, Reading
 from sliplens.live.recorder import ForceStream, Recorder
 from sliplens.live.sinks import Sender
@@ -28,7 +29,6 @@ from sliplens.live.sources import Images, open_live
 from sliplens.models.checkpoint import Network
 from sliplens.models.engines import make_engine
 from sliplens.models.wrapping import open_run
-from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture
 from sliplens.recordings.dataset import Dataset, save_profile
 from sliplens.recordings.sensor import load_profile
@@ -44,42 +44,41 @@ _SWITCH_S = 5e-4
 _FLUSH_S = 5.0
 
 
-_cores_lock, _readers = Lock(), list[object]()
+_lock, _entered = Lock(), list["LiveReader"]()
 _limits = ExitStack()
 """Thread limits of the process while a reader is entered; the last one that leaves undoes them."""
 
 
-@contextmanager
-def _share_cores() -> Iterator[None]:
+def _limit_threads(reader: "LiveReader") -> None:
     """Limit the threads of the whole process while any reader is entered.
 
     Threads that share one step wait for each other: a matrix of markers takes ten times as long by two as by one.
     """
-    reader = object()
-    with _cores_lock:
-        if not _readers:
-            restore, threads = _limits.callback, torch.get_num_threads()
-            restore(threadpool_limits(1, user_api="blas").restore_original_limits)
-            restore(torch.set_num_threads, threads)
-            torch.set_num_threads(max(1, threads - 1))  # the checks have a core
-            # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
-            restore(sys.setswitchinterval, sys.getswitchinterval())
-            sys.setswitchinterval(_SWITCH_S)
-            # existing objects stay: to search all of them for garbage takes as long as half a frame
-            restore(gc.unfreeze)
-            gc.freeze()
-            if not missing_packages("cv2", extra="markers"):
-                cv2 = import_cv2()
-                restore(cv2.setNumThreads, cv2.getNumThreads())
-                cv2.setNumThreads(1)
-        _readers.append(reader)
-    try:
-        yield
-    finally:
-        with _cores_lock:
-            _readers.remove(reader)
-            if not _readers:
-                _limits.close()
+    with _lock:
+        _entered.append(reader)
+        if len(_entered) > 1:
+            return
+        restore, threads = _limits.callback, torch.get_num_threads()
+        restore(threadpool_limits(1, user_api="blas").restore_original_limits)
+        restore(torch.set_num_threads, threads)
+        torch.set_num_threads(max(1, threads - 1))  # the checks have a core
+        # a thread that has waited for a core waits for Python too, and the usual 5 ms are a third of a frame
+        restore(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(_SWITCH_S)
+        # existing objects stay: to search all of them for garbage takes as long as half a frame
+        restore(gc.unfreeze)
+        gc.freeze()
+        if not missing_packages("cv2", extra="markers"):
+            cv2 = import_cv2()
+            restore(cv2.setNumThreads, cv2.getNumThreads())
+            cv2.setNumThreads(1)
+
+
+def _free_threads(reader: "LiveReader") -> None:
+    with _lock:
+        _entered.remove(reader)
+        if not _entered:
+            _limits.close()
 
 
 LiveInput: TypeAlias = "str | Path | Images | Capture | LiveSource"
@@ -157,7 +156,8 @@ class LiveReader(FrameReader):
         self._news = Condition()
         self._newest: Reading | None = None
         self._published = 0
-        self._subscribers: list[Subscriber] = []
+        self._subscribers: dict[Subscriber, bool] = {}
+        """Callbacks, and whether they take early margins."""
         self._stopped, self._over = Event(), Event()
         self._error: BaseException | None = None
         self._trouble: str | None = None
@@ -165,10 +165,10 @@ class LiveReader(FrameReader):
         self._stack = ExitStack()
 
     @property
-    def outputs(self) -> tuple[OutputState, ...]:
-        """Progress of the newest recording and of each sink."""
+    def outputs(self) -> "tuple[Outlet, ...]":
+        """Newest recording, and each sink, with what they have sent."""
         recorder = self._last_recorder
-        return (*(() if recorder is None else (recorder.state,)), *(sender.state for sender in self.senders))
+        return (*(() if recorder is None else (recorder.outlet,)), *self.senders)
 
     @property
     def doubts(self) -> tuple[str, ...]:
@@ -185,7 +185,7 @@ class LiveReader(FrameReader):
     @property
     def troubles(self) -> tuple[str, ...]:
         """Why the recording, a sink or the forces have ended, with the cure."""
-        troubles = [state.trouble for state in self.outputs] + [self._forces.trouble if self._forces else None]
+        troubles = [outlet.trouble for outlet in self.outputs] + [self._forces.trouble if self._forces else None]
         return tuple(trouble for trouble in troubles if trouble is not None)
 
     @property
@@ -198,9 +198,8 @@ class LiveReader(FrameReader):
         """Why no more readings come; None while they may."""
         if not self._over.is_set():
             return None
-        return (
-            f"{self.source.name} has ended" if self._error is None else str(self._error) or type(self._error).__name__
-        )
+        error = self._error
+        return f"{self.source.name} has ended" if error is None else str(error) or type(error).__name__
 
     @property
     def failed(self) -> bool:
@@ -211,7 +210,8 @@ class LiveReader(FrameReader):
         if self._threads:
             raise InputError("a reader reads once; make another one of the same source")
         with ExitStack() as stack:
-            stack.enter_context(_share_cores())
+            _limit_threads(self)
+            stack.callback(_free_threads, self)
             stack.callback(self._end_outputs)
             stack.enter_context(self.source)
             if self._forces is not None:
@@ -277,39 +277,24 @@ class LiveReader(FrameReader):
         if self._error is not None:
             raise self._error
 
-    def subscribe(self, callback: Subscriber) -> Callable[[], None]:
+    def subscribe(self, callback: Subscriber, *, early: bool = False) -> Callable[[], object]:
         """Call back with every reading and its frame; returns a function that ends it.
 
-        The callback runs in the thread that reads, which waits for it: do long work elsewhere.
+        With `early`, a margin comes some milliseconds before the complete reading of its frame, in one more reading
+        (`Reading.complete`): it may still be withheld, so never loosen a grip by it. The callback runs in the thread
+        that reads, which waits for it: do long work elsewhere.
         """
-        self._subscribers.append(callback)
-
-        def end() -> None:
-            with suppress(ValueError):
-                self._subscribers.remove(callback)
-
-        return end
+        self._subscribers[callback] = early
+        return lambda: self._subscribers.pop(callback, None)
 
     @property
     def learnt(self) -> Friction | None:
         """Friction of the object that slipped last, for a later grasp; None before any slip."""
         return self.learner.learnt
 
-    @property
-    def lesson(self) -> str | None:
-        """That friction in a sentence, with the option for the next time; None before any slip."""
-        learner = self.learner
-        if learner.learnt is None:
-            return None
-        slips = number_of(learner.slips, "slip")
-        return (
-            f"the object that slipped: friction {learner.learnt.mean:.2f} +- {learner.learnt.sigma:.2f}, from {slips}; "
-            f"set it when you hold the same again, with --friction {learner.learnt.text}"
-        )
-
     def take_reference(self) -> None:
         """Take a new reference as soon as the picture is still; the old one holds until then."""
-        self.new_reference.set()
+        self._taker = ReferenceTaker()
 
     def send_to(self, *sinks: str) -> None:
         """Send every reading and its frame to other programs from now on, until it is closed.
@@ -323,9 +308,8 @@ class LiveReader(FrameReader):
             If there is no such sink, or it cannot be opened.
         """
         for name in sinks:
-            sender = Sender(name)
-            self.senders.append(sender)
-            self.subscribe(sender.take)
+            self.senders.append(sender := Sender(name))
+            self.subscribe(sender.add)
 
     def record(self, folder: Path | str, *, facts: TrialFacts | None = None) -> Recorder:
         """Record every frame from now on, read or not, into a data set, a new one or one that is there.
@@ -339,18 +323,15 @@ class LiveReader(FrameReader):
         """
         if self.recorder is not None:
             raise RecordingError(f"{self.recorder.folder} is being recorded; stop that first")
-        facts = facts or TrialFacts(trial="live")
-        if self._profile is not None:
-            facts = replace(facts, sensor=self._profile.name)
-        if self.network is not None and not facts.sensor:
-            facts = replace(facts, sensor=self.network.manifest.sensor)
+        facts, profile = facts or TrialFacts(trial="live"), self._profile
+        trained = "" if self.network is None else self.network.manifest.sensor
+        facts = replace(facts, sensor=facts.sensor or trained if profile is None else profile.name)
         recorder = Recorder(folder, facts=facts, source=self.source.name, simulated=self.source.simulated)
-        if self._profile is not None:
-            try:
-                save_profile(Path(folder), self._profile)
-            except BaseException:
-                recorder.close()
-                raise
+        with ExitStack() as stack:
+            stack.callback(recorder.close)
+            if profile is not None:
+                save_profile(Path(folder), profile)
+            stack.pop_all()
         self.recorder = self._last_recorder = recorder
         return recorder
 
@@ -360,9 +341,9 @@ class LiveReader(FrameReader):
         return None if recorder is None else recorder.close()
 
     def _end_outputs(self) -> None:
-        for sender in self.senders:
-            if not sender.close(_FLUSH_S):
-                sender.discard()
+        for outlet in self.senders:
+            if not outlet.finish(_FLUSH_S):
+                outlet.close(discard=True)
         self.stop_recording()
 
     def _end(self) -> None:
@@ -404,8 +385,7 @@ class LiveReader(FrameReader):
             frame = self._forces.attach(frame)
         # other threads may end the recording, or take a new reference, at any time
         if (recorder := self.recorder) is not None and (reference := self.reference) is not None:
-            recorder.set_reference(reference)
-            recorder.add(frame)
+            recorder.add(frame, reference)
         self._frames.put(frame)
 
     def _reconnect(self) -> None:
@@ -426,7 +406,8 @@ class LiveReader(FrameReader):
         while (left_s := ends_s - time.monotonic()) > 0:
             frame = self._frames.take(min(self._stall_s, left_s))
             if frame is not None:
-                self._publish(self.read(frame), frame)
+                early = partial(self._call_back, frame) if any(self._subscribers.values()) else None
+                self._publish(self.read(frame, early=early), frame)
             elif self._frames.closed:
                 break
             elif time.monotonic() < ends_s:
@@ -443,8 +424,12 @@ class LiveReader(FrameReader):
         with self._news:
             self._newest, self._published = reading, self._published + 1
             self._news.notify_all()
-        for callback in tuple(self._subscribers):
-            callback(reading, frame)
+        self._call_back(frame, reading)
+
+    def _call_back(self, frame: LiveFrame | None, reading: Reading) -> None:
+        for callback, early in tuple(self._subscribers.items()):
+            if early or reading.complete:
+                callback(reading, frame)
 
 
 def read_live(
@@ -476,4 +461,4 @@ def read_live(
         yield from reader.readings()
 
 
-__all__ = ["HealthWatch", "LiveReader", "ReaderSettings", "SlipWatch", "Subscriber", "read_live"]
+__all__ = ["LiveReader", "ReaderSettings", "Subscriber", "read_live"]

@@ -2,32 +2,29 @@
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from threading import Condition, Thread
 from typing import Generic, TypeVar
-
-from sliplens.progress import number_of
 
 Item = TypeVar("Item")
 
 
 class Mailbox(Generic[Item]):
-    """Queue between two threads; where too many items wait, the oldest is lost and counted."""
+    """Queue between two threads; where more wait than `most_bytes` holds, the oldest is lost and counted."""
 
-    def __init__(self) -> None:
-        self._changed, self._items = Condition(), deque[Item]()
+    def __init__(self, *, most_bytes: int = 1) -> None:
+        self._changed, self._items, self._most_bytes = Condition(), deque[Item](), most_bytes
         self.closed = False
         """True once no more items come; those that wait can still be taken."""
         self.lost = 0
         """Items that were left here and never taken."""
 
-    def put(self, item: Item, *, most: int = 1) -> None:
-        """Leave an item, in place of the oldest where so many wait; into a closed one it is lost."""
+    def put(self, item: Item, *, size_bytes: int = 1) -> None:
+        """Leave an item, in place of the oldest where too many wait; into a closed one it is lost."""
         with self._changed:
             if self.closed:
                 self.lost += 1
                 return
-            while len(self._items) >= most:
+            while len(self._items) >= max(1, self._most_bytes // size_bytes):
                 self._items.popleft()
                 self.lost += 1
             self._items.append(item)
@@ -49,37 +46,13 @@ class Mailbox(Generic[Item]):
             return self._items.popleft() if self._items else None
 
 
-@dataclass(frozen=True, kw_only=True)
-class OutputState:
-    """Progress of a recording or a sink."""
-
-    name: str
-    """Folder of the recording, or name of the sink."""
-    sent: int
-    """Frames that are on disk, or readings that the sink took."""
-    lost: int
-    """Frames or readings for which it was too slow, or that came after it failed."""
-    seconds: float | None = None
-    """Time that recorded frames span, in seconds; None of a sink."""
-    trouble: str | None
-    """Why it failed, with the cure; None while it works."""
-
-    def __str__(self) -> str:
-        sent = number_of(self.sent, "reading") + " sent"
-        if self.seconds is not None:
-            sent = f"{number_of(self.sent, 'frame')} in {self.seconds:.1f} s"
-        lost = f", {self.lost:,} lost" if self.lost else ""
-        trouble = f"; {self.trouble}" if self.trouble else ""
-        return f"{self.name}: {sent}{lost}{trouble}"
-
-
-class Outlet(Generic[Item]):
-    """Thread that hands items on, one after another, so that their producer never waits.
+class Outlet(Mailbox[Item]):
+    """Thread that hands frames or readings on, one after another, so that their producer never waits.
 
     Parameters
     ----------
     name
-        What it feeds, in messages.
+        Folder of the recording, or name of the sink.
     send
         Called with each item; after an exception nothing more is sent, and `error` is set.
     end
@@ -88,55 +61,56 @@ class Outlet(Generic[Item]):
         Size of the items that may wait; of more, the oldest is lost.
     cure
         Cure where it fails.
+    verb
+        What it does with an item.
     """
 
     def __init__(
-        self, name: str, send: Callable[[Item], None], end: Callable[[], None], *, most_bytes: int, cure: str
+        self,
+        name: str,
+        send: Callable[[Item], None],
+        end: Callable[[], None],
+        *,
+        most_bytes: int,
+        cure: str,
+        verb: str = "sent",
     ) -> None:
-        self.name, self._send, self._end, self._most_bytes, self._cure = name, send, end, most_bytes, cure
-        self.seconds: float | None = None
-        """Time that recorded frames span, in seconds; None of a sink."""
-        self._box: Mailbox[Item] = Mailbox()
+        super().__init__(most_bytes=most_bytes)
+        self.name, self._send, self._end, self._cure, self._verb = name, send, end, cure, verb
         self.sent = 0
-        """Items that were handed on."""
+        """Frames that are on disk, or readings that the sink took."""
         self.error: Exception | None = None
         """Exception that ended it before it was closed."""
         self._thread = Thread(target=self._run, daemon=True)
         self._thread.start()
 
+    def __str__(self) -> str:
+        lost = f", {self.lost:,} lost" if self.lost else ""
+        return f"{self.name}: {self.sent:,} {self._verb}{lost}{f'; {self.trouble}' if self.trouble else ''}"
+
     @property
-    def state(self) -> OutputState:
-        """Current progress."""
-        trouble, error = None, self.error
-        if error is not None:
-            reason = (error.strerror if isinstance(error, OSError) else None) or error
-            items = number_of(self.sent, "reading" if self.seconds is None else "frame")
-            trouble = f"{self.name} stopped after {items} ({reason}); {self._cure}"
-        return OutputState(name=self.name, sent=self.sent, lost=self._box.lost, seconds=self.seconds, trouble=trouble)
+    def trouble(self) -> str | None:
+        """Why it failed, with the cure; None while it works."""
+        if self.error is None:
+            return None
+        reason = (self.error.strerror if isinstance(self.error, OSError) else None) or self.error
+        return f"{self.name} stopped after {self.sent:,} were {self._verb} ({reason}); {self._cure}"
 
-    def put(self, item: Item, *, size_bytes: int) -> None:
-        """Take an item, without waiting."""
-        self._box.put(item, most=max(1, self._most_bytes // size_bytes))
-
-    def close(self, patience_s: float) -> bool:
+    def finish(self, patience_s: float) -> bool:
         """Take no more, and wait until all are handed on; False where that takes longer."""
-        self._box.close()
+        self.close()
         self._thread.join(patience_s)
         return not self._thread.is_alive()
 
-    def discard(self) -> None:
-        """Hand on nothing more."""
-        self._box.close(discard=True)
-
     def _run(self) -> None:
         try:
-            while (item := self._box.take()) is not None:
+            while (item := self.take()) is not None:
                 self._send(item)
                 self.sent += 1
         except Exception as error:  # any: the producer reports it
             self.error = error
-            self._box.lost += 1
-            self.discard()
+            self.lost += 1
+            self.close(discard=True)
         try:
             self._end()
         except Exception as error:

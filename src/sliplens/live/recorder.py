@@ -1,17 +1,19 @@
 """Recording a running source into a data set, frame by frame, and force samples that come as lines of text."""
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
-from threading import Event, Lock, Thread
+from threading import Event, Thread
 from typing import TextIO
 
 import numpy as np
 
 from sliplens.errors import RecordingError
-from sliplens.live.mailbox import Outlet, OutputState
+from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Forces, Frame
 from sliplens.recordings.dataset import Dataset, begin_recording, finish_recording, load_dataset
@@ -45,8 +47,6 @@ class Recorder:
         Name of the camera, stream or file.
     simulated
         True where no real sensor is behind it.
-    reference
-        The sensor untouched, where there is an image.
 
     Raises
     ------
@@ -61,37 +61,29 @@ class Recorder:
         facts: TrialFacts | None = None,
         source: str = "frames in memory",
         simulated: bool = False,
-        reference: Frame | None = None,
     ) -> None:
         self.folder = Path(folder)
         self._facts = facts or TrialFacts(trial="live")
         require_trial_name(self._facts.trial)
-        self._source, self._reference = source, reference
-        self._lock, taken = begin_recording(self.folder, simulated=simulated)
-        self._taken = set(taken)
+        self._source, (lock, taken) = source, begin_recording(self.folder, simulated=simulated)
+        self._finish, self._taken = cache(lambda: finish_recording(self.folder, lock)), set(taken)
         self._journal: Journal | None = None
         self._last: LiveFrame | None = None
         self._first_s = 0.0
-        self._trial_reference: Frame | None = None
-        self._closed = False
-        cure = "make room, and record again: what is there stays"
-        self._outlet = Outlet(
-            str(self.folder), self._append, self._end_trial, most_bytes=_MOST_WAITING_BYTES, cure=cure
+        self._reference: Frame | None = None
+        self.outlet = Outlet(
+            str(self.folder),
+            self._append,
+            self._end_trial,
+            most_bytes=_MOST_WAITING_BYTES,
+            cure="make room, and record again: what is there stays",
+            verb="recorded",
         )
-        self._outlet.seconds = 0.0
+        """Thread that writes frames, with their number."""
 
-    @property
-    def state(self) -> OutputState:
-        """Current progress."""
-        return self._outlet.state
-
-    def set_reference(self, image: Frame) -> None:
-        """Begin a new trial with the next frame, with this image of the untouched sensor."""
-        self._reference = image
-
-    def add(self, frame: LiveFrame) -> None:
-        """Take a frame; another thread writes it, or loses it where that is far behind."""
-        self._outlet.put((frame, self._reference), size_bytes=frame.image.nbytes)
+    def add(self, frame: LiveFrame, reference: Frame | None = None) -> None:
+        """Take a frame, and the sensor untouched; another thread writes it, or loses it where that is far behind."""
+        self.outlet.put((frame, reference), size_bytes=frame.image.nbytes)
 
     def close(self) -> Dataset | None:
         """Write the waiting frames and make trials; None where there is no frame at all.
@@ -103,24 +95,23 @@ class Recorder:
         OSError
             If there is no room; the same holds.
         """
-        outlet, written = self._outlet, -1
-        while not outlet.close(_STUCK_S):
+        outlet, written = self.outlet, -1
+        while not outlet.finish(_STUCK_S):
             if outlet.sent == written:
-                outlet.discard()
+                outlet.close(discard=True)
                 raise RecordingError(
                     f"{self.folder} takes no more frames, {outlet.sent} were written; end this program and look after "
                     f"the disk, then run `sliplens recover {self.folder}`"
                 )
             written = outlet.sent
-        closed, self._closed = self._closed, True
-        if not closed:
-            finish_recording(self.folder, self._lock)
+        self._finish()
         return load_dataset(self.folder) if outlet.sent else None
 
     def _append(self, item: tuple[LiveFrame, Frame | None]) -> None:
         (frame, reference), last = item, self._last
         goes_on = last is not None and frame.size == last.size and frame.time_s > last.time_s
-        if self._journal is None or not goes_on or reference is not self._trial_reference:
+        is_same = reference is self._reference or np.array_equal(np.asarray(reference), np.asarray(self._reference))
+        if self._journal is None or not goes_on or not is_same:
             self._begin_trial(frame, reference)
         assert self._journal is not None
         forces = frame.forces
@@ -128,8 +119,6 @@ class Recorder:
             forces = replace(forces, time_s=forces.time_s - self._first_s)
         time_s = frame.time_s - self._first_s
         self._journal.append(frame.image, time_s=time_s, safety_margin=frame.safety_margin, forces=forces)
-        if last is not None and time_s > 0:
-            self._outlet.seconds = (self._outlet.seconds or 0.0) + frame.time_s - last.time_s
         self._last = frame
 
     def _end_trial(self) -> None:
@@ -142,16 +131,12 @@ class Recorder:
         while f"{self._facts.trial}-{number}" in self._taken:
             number += 1
         facts = replace(self._facts, trial=f"{self._facts.trial}-{number}")
-        header = JournalHeader(
-            facts=facts,
-            source=self._source,
-            size=frame.size,
-            forces=None if frame.forces is None else frame.forces.source,
-        )
+        forces = None if frame.forces is None else frame.forces.source
+        header = JournalHeader(facts=facts, source=self._source, size=frame.size, forces=forces)
         fits = reference is not None and reference.shape == frame.image.shape
         self._journal = Journal(self.folder, header, reference=reference if fits else None)
         self._taken.add(facts.trial)
-        self._first_s, self._trial_reference = frame.time_s, reference
+        self._first_s, self._reference = frame.time_s, reference
 
 
 _TAIL_S = 0.01
@@ -172,9 +157,9 @@ class ForceStream:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self._lock, self._closed = Lock(), Event()
-        self._samples: list[tuple[float, float, tuple[float, float, float]]] = []
-        self._delay_s = np.inf
+        self._closed, self._delay_s = Event(), np.inf
+        self._samples = deque[tuple[float, ...]]()
+        """Time on the sensor's clock, time of arrival, and force of each."""
         self.trouble: str | None = None
         """Why no more samples come, with the cure; None while they may."""
 
@@ -190,16 +175,10 @@ class ForceStream:
 
     def attach(self, frame: LiveFrame) -> LiveFrame:
         """Add to a frame the samples that came since the one before."""
-        with self._lock:
-            samples, self._samples = self._samples, []
-            delay_s = self._delay_s
-        if not samples:
-            return frame
+        samples = np.array([self._samples.popleft() for _ in range(len(self._samples))]).reshape(-1, 5)
+        stamps_s, arrived_s, force_n = samples[:, 0], samples[:, 1], samples[:, 2:]
         # from the sensor's clock to that of this machine, and on to that of the frames
-        shift_s = frame.time_s - frame.captured_s
-        stamps_s, arrived_s = np.array([sample[:2] for sample in samples]).T
-        time_s: np.ndarray = np.where(np.isnan(stamps_s), arrived_s, stamps_s + delay_s) + shift_s
-        force_n = np.array([force for *_, force in samples])
+        time_s = np.where(np.isnan(stamps_s), arrived_s, stamps_s + self._delay_s) + frame.time_s - frame.captured_s
         # samples that dropped out, and those that come after a later one
         good = np.isfinite(force_n).all(axis=1) & (time_s > np.maximum.accumulate(np.append(-np.inf, time_s))[:-1])
         if not good.any():
@@ -216,9 +195,8 @@ class ForceStream:
                 for line in lines:
                     stamp_s, force_n = parse(line)
                     arrived_s = time.monotonic()
-                    with self._lock:
-                        self._samples.append((stamp_s, arrived_s, force_n))
-                        self._delay_s = min(self._delay_s, arrived_s - stamp_s)  # as it is, where that is NaN
+                    self._delay_s = min(self._delay_s, arrived_s - stamp_s)  # as it is, where that is NaN
+                    self._samples.append((stamp_s, arrived_s, *force_n))
         except (RecordingError, OSError, ValueError) as error:
             self.trouble = f"{error}; the forces of {self.path} end here"
 
@@ -235,7 +213,7 @@ class ForceStream:
             text = ""
 
 
-def _line_parser(path: Path, header: str) -> Callable[[str], tuple[float, tuple[float, float, float]]]:
+def _line_parser(path: Path, header: str) -> Callable[[str], tuple[float, list[float]]]:
     """Return the function that reads a line of a table of forces, by the names of its columns."""
     separator = next((mark for mark in ("\t", ";", ",") if mark in header), ",")
     names = tuple(name.strip() for name in header.split(separator))
@@ -247,14 +225,14 @@ def _line_parser(path: Path, header: str) -> Callable[[str], tuple[float, tuple[
     with suppress(RecordingError):
         stamp = column(guess_time_column(names, path=path), "time", "s")
 
-    def parse(line: str) -> tuple[float, tuple[float, float, float]]:
+    def parse(line: str) -> tuple[float, list[float]]:
         fields = line.split(separator)
         if len(fields) < len(names):
             raise RecordingError(f"{path} has a line of {len(fields)} columns, {len(names)} are named")
         force = [float(fields[at]) * scale for at, scale in forces]
         if len(force) == 2:  # normal and tangential, as `import` lays them along z and x
             force = [force[1], 0.0, force[0]]
-        return float(fields[stamp[0]]) * stamp[1] if stamp else np.nan, (force[0], force[1], force[2])
+        return float(fields[stamp[0]]) * stamp[1] if stamp else np.nan, force
 
     return parse
 

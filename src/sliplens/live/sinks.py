@@ -1,4 +1,4 @@
-"""Sinks of readings: JSON lines, datagrams, MCAP and Foxglove, Rerun, ROS 2 over Zenoh."""
+"""Sinks of readings: JSON lines, datagrams, MCAP, Rerun, ROS 2 over Zenoh."""
 
 import errno
 import itertools
@@ -9,8 +9,7 @@ import secrets
 import socket
 import sys
 import time
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,10 +52,11 @@ _QUALITY = 90
 _FRAME_ID = "fingertip"
 
 
-def _stamp(reading: Reading) -> tuple[int, int]:
-    """Compute the time of a capture since 1970, in whole seconds and nanoseconds."""
+def _stamp(reading: Reading) -> tuple[int, tuple[int, int]]:
+    """Compute the time of a capture since 1970, in nanoseconds, and in whole seconds and the rest."""
     captured_s = reading.captured_s if np.isfinite(reading.captured_s) else time.monotonic()
-    return divmod(round(1e9 * (captured_s + _EPOCH_S)), 10**9)
+    at_ns = round(1e9 * (captured_s + _EPOCH_S))
+    return at_ns, divmod(at_ns, 10**9)
 
 
 def _open_json(address: str) -> Sink:
@@ -76,18 +76,13 @@ _TRANSIENT = (
 """Errors at which a datagram is lost and the next, newer one is sent: no listener, a full buffer, no network."""
 
 
-def _split_address(address: str, *, kind: str) -> tuple[str, int]:
-    """Split HOST:PORT or :PORT; this machine where no host is named."""
-    host, _, number = address.rpartition(":")
-    if not number.isdecimal() or not 0 < int(number) <= 65535:
-        raise InputError(f"--sink {kind}:{address} names no port; give {kind}:HOST:PORT, as {kind}:127.0.0.1:9870")
-    return host.strip("[]") or "127.0.0.1", int(number)
-
-
 def _open_udp(address: str) -> Sink:
-    host, port = _split_address(address, kind="udp")
+    host, _, port = address.rpartition(":")
+    host = host.strip("[]") or "127.0.0.1"
+    if not port.isdecimal() or not 0 < int(port) <= 65535:
+        raise InputError(f"--sink udp:{address} names no port; give udp:HOST:PORT, as udp:127.0.0.1:9870")
     try:
-        [(family, kind, protocol, _, target), *_] = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        [(family, kind, protocol, _, target), *_] = socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)
     except socket.gaierror as error:
         raise InputError(f"--sink udp: {host} is not known ({error.strerror}); give an address") from None
     outgoing = socket.socket(family, kind, protocol)
@@ -104,46 +99,51 @@ def _open_udp(address: str) -> Sink:
 
 
 READING_TOPIC, IMAGE_TOPIC = "/sliplens/reading", "/sliplens/image"
-"""Topics of Foxglove and MCAP: readings as JSON, frames as `foxglove.CompressedImage`."""
-_BACKLOG = 8  # messages that wait for a slow viewer: old readings help nobody
+"""Topics of MCAP files: readings and frames (`foxglove.CompressedImage`), both as JSON."""
+_FIELDS = {"frame_id": {"type": "string"}, "format": {"type": "string"}}
+_FIELDS |= {
+    "timestamp": {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}},
+    "data": {"type": "string", "contentEncoding": "base64"},
+}
 
 
-def _open_foxglove(address: str, *, is_file: bool = False) -> Sink:
-    """Send readings and frames on two topics of Foxglove, of a server or in an MCAP file."""
-    kind = "mcap" if is_file else "foxglove"
-    path = _new_file(address, kind=kind) if is_file else None
-    host, port = ("", 0) if is_file else _split_address(address or ":8765", kind=kind)
-    require_packages("foxglove", extra="sinks", purpose=f"--sink {kind}")
-    import foxglove  # noqa: PLC0415 (an extra)
-    from foxglove.channels import CompressedImageChannel  # noqa: PLC0415
-    from foxglove.messages import CompressedImage, Timestamp  # noqa: PLC0415
+def _open_mcap(address: str) -> Sink:
+    """Write readings and frames into an MCAP file, which Foxglove opens."""
+    path = _new_file(address, kind="mcap", suffix=".mcap")
+    require_packages("mcap", extra="sinks", purpose="--sink mcap")
+    from mcap.writer import Writer  # noqa: PLC0415 (an extra)
 
-    context = foxglove.Context()
-    readings = foxglove.Channel(READING_TOPIC, schema=msgspec.json.decode(reading_schema()), context=context)
-    frames = CompressedImageChannel(IMAGE_TOPIC, context=context)
     try:
-        if path is not None:
-            close = foxglove.open_mcap(str(path), context=context).close
-        else:
-            server = {"host": host, "port": port, "message_backlog_size": _BACKLOG}
-            close = foxglove.start_server(name="sliplens", context=context, **server).stop
-    except (OSError, RuntimeError) as error:
-        raise InputError(f"{path or f'{host}:{port}'} cannot be opened ({error}); name another with --sink") from None
+        file = path.open("xb")
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}); name another file") from None
+    writer = Writer(file)
+    writer.start()
+
+    def add_topic(topic: str, name: str, schema: bytes) -> int:
+        return writer.register_channel(topic, "json", writer.register_schema(name, "jsonschema", schema))
+
+    readings = add_topic(READING_TOPIC, "Reading", reading_schema())
+    image_schema = msgspec.json.encode({"type": "object", "properties": _FIELDS})
+    images = add_topic(IMAGE_TOPIC, "foxglove.CompressedImage", image_schema)
 
     def send(reading: Reading, image: Frame | None) -> None:
-        seconds, nanoseconds = _stamp(reading)
-        at_ns = seconds * 10**9 + nanoseconds
-        readings.log(encode_reading(reading), log_time=at_ns)
+        at_ns, (seconds, nanoseconds) = _stamp(reading)
+        writer.add_message(readings, at_ns, encode_reading(reading), at_ns)
         if image is not None:
-            stamp, data = Timestamp(sec=seconds, nsec=nanoseconds), encode_jpeg(image, _QUALITY)
-            frames.log(CompressedImage(timestamp=stamp, frame_id=_FRAME_ID, data=data, format="jpeg"), log_time=at_ns)
+            stamp, data = {"sec": seconds, "nsec": nanoseconds}, encode_jpeg(image, _QUALITY)
+            picture = {"timestamp": stamp, "frame_id": _FRAME_ID, "format": "jpeg", "data": data}
+            writer.add_message(images, at_ns, msgspec.json.encode(picture), at_ns)
 
-    # a context that is collected closes its channels
-    return Sink(send, lambda _=context: close())
+    def close() -> None:
+        with file:
+            writer.finish()
+
+    return Sink(send, close)
 
 
-def _new_file(address: str, *, kind: str) -> Path:
-    path, suffix = Path(address), {"rerun": ".rrd"}.get(kind, f".{kind}")
+def _new_file(address: str, *, kind: str, suffix: str) -> Path:
+    path = Path(address)
     if path.suffix != suffix:
         raise InputError(f"--sink {kind} writes a file that ends in {suffix}; give {kind}:grip{suffix}")
     if path.exists():
@@ -153,10 +153,20 @@ def _new_file(address: str, *, kind: str) -> Path:
     return path
 
 
+_LINES = {
+    "margin": ("predicted margin", (213, 94, 0)),
+    "interval/low": ("its 90 % interval, low", (230, 159, 0)),
+    "interval/high": ("its 90 % interval, high", (230, 159, 0)),
+    "true": ("true margin", (86, 180, 233)),
+}
+"""Names and colours (Okabe and Ito) of the numbers of a frame, by entity; read on a dark ground and on a light one."""
+
+
 class RerunSink:
     """Readings and frames for the Rerun viewer, by the stream that is connected to a file or a viewer.
 
-    Its entities are `margin`, `interval/low`, `interval/high`, `words` and `frame`; with `lossless`, images are PNG.
+    Its entities are `margin`, `interval/low`, `interval/high`, `true`, `words` and `frame`; with `lossless`, images are
+    PNG.
     """
 
     def __init__(self, *, lossless: bool = False) -> None:
@@ -167,32 +177,40 @@ class RerunSink:
         if not self.stream.is_enabled():
             raise InputError("the environment variable RERUN switches Rerun off; unset it")
 
-    @staticmethod
-    def in_ns(time_s: Any) -> Any:
-        """Convert seconds to what Rerun takes as a duration; it would cut off what is less than a nanosecond."""
-        return np.round(1e9 * np.asarray(time_s)).astype("timedelta64[ns]")
+    def send_layout(self, maps: Iterable[str] = ()) -> None:
+        """Lay out the views: the frame with what lies over it, maps by method, and the margins over time."""
+        from rerun import blueprint  # noqa: PLC0415 (an extra, and large)
 
-    def set_frame(self, number: int, time_s: float) -> None:
-        """Set number and time of the frame that is logged next."""
-        self.stream.set_time("time", duration=self.in_ns(time_s))
-        self.stream.set_time("frame", sequence=number)
+        for entity, (name, colour) in _LINES.items():
+            self.stream.log(entity, self.rerun.SeriesLines(names=name, colors=[colour]), static=True)
+        pictures = [blueprint.Spatial2DView(origin="frame")]
+        pictures += [blueprint.Spatial2DView(origin=f"map/{name}") for name in maps]
+        margins = blueprint.TimeSeriesView(
+            contents=list(_LINES),
+            name="safety margin (1 sticks, 0 slips)",
+            axis_y=blueprint.ScalarAxis(range=(-0.05, 1.05)),
+        )
+        layout = blueprint.Horizontal(blueprint.Vertical(*pictures), margins)
+        self.stream.send_blueprint(blueprint.Blueprint(layout, collapse_panels=True))
 
-    def log_image(self, entity: str, image: Frame, *, static: bool = False) -> None:
+    def log_image(self, entity: str, image: Frame) -> None:
         """Log an image."""
         data, kind = (encode_png(image), "png") if self._lossless else (encode_jpeg(image, _QUALITY), "jpeg")
-        self.stream.log(entity, self.rerun.EncodedImage(contents=data, media_type=f"image/{kind}"), static=static)
+        self.stream.log(entity, self.rerun.EncodedImage(contents=data, media_type=f"image/{kind}"))
 
     def send(self, reading: Reading, image: Frame | None, /) -> None:
         """Log a reading on the clock of the source; one without a time is left out."""
         if not np.isfinite(reading.time_s):
             return
-        self.set_frame(reading.number, reading.time_s)
-        ends = ("margin", reading.margin), ("interval/low", reading.low), ("interval/high", reading.high)
-        for entity, value in ends:
+        # it would cut off what is less than a nanosecond
+        self.stream.set_time("time", duration=np.timedelta64(round(1e9 * reading.time_s), "ns"))
+        self.stream.set_time("frame", sequence=reading.number)
+        for entity, value in zip(_LINES, (reading.margin, reading.low, reading.high, reading.true_margin), strict=True):
             # a withheld margin ends the line, and is no longer shown as the newest
             scalar = self.rerun.Clear(recursive=False) if value is None else self.rerun.Scalars(value)
             self.stream.log(entity, scalar)
-        self.stream.log("words", self.rerun.TextLog(str(describe_reading(reading))))
+        if reading.margin is not None or reading.withheld or reading.slip:
+            self.stream.log("words", self.rerun.TextLog(str(describe_reading(reading))))
         if image is not None:
             self.log_image("frame", image)
 
@@ -203,8 +221,9 @@ class RerunSink:
 
 
 def _open_rerun(address: str) -> Sink:
-    path, sink = _new_file(address, kind="rerun"), RerunSink()
+    path, sink = _new_file(address, kind="rerun", suffix=".rrd"), RerunSink()
     sink.stream.save(path)
+    sink.send_layout()
     return Sink(sink.send, sink.close)
 
 
@@ -330,8 +349,7 @@ def _open_zenoh(address: str) -> Sink:
     publish = {name: ros.publisher(f"{key}/{name}", kind) for name, kind in ROS_TOPICS.items()}
 
     def send(reading: Reading, image: Frame | None) -> None:
-        seconds, nanoseconds = _stamp(reading)
-        at_ns = seconds * 10**9 + nanoseconds
+        at_ns, (seconds, nanoseconds) = _stamp(reading)
         publish["reading"]([encode_reading(reading).decode()], at_ns)
         if reading.margin is not None:
             publish["margin"]([reading.margin], at_ns)
@@ -349,8 +367,7 @@ SINKS = Table[Callable[[str], Sink]](
     {
         "json": _open_json,
         "udp": _open_udp,
-        "mcap": partial(_open_foxglove, is_file=True),
-        "foxglove": _open_foxglove,
+        "mcap": _open_mcap,
         "rerun": _open_rerun,
         "zenoh": _open_zenoh,
     },
@@ -375,20 +392,14 @@ _READING_BYTES = 4096
 
 
 class Sender(Outlet[tuple[Reading, Frame | None]]):
-    """Sends readings to a sink in a thread of its own: a slow sink loses readings, and delays none.
-
-    Parameters
-    ----------
-    name
-        As `open_sink` takes it.
-    """
+    """Outlet of readings to a sink, by its name: a slow one loses readings, and delays none."""
 
     def __init__(self, name: str) -> None:
         sink = open_sink(name)
         most_bytes, cure = _MOST_WAITING_BYTES, "begin it anew"
         super().__init__(name, lambda item: sink.send(*item), sink.close, most_bytes=most_bytes, cure=cure)
 
-    def take(self, reading: Reading, frame: LiveFrame | None) -> None:
+    def add(self, reading: Reading, frame: LiveFrame | None) -> None:
         """Take a reading and its frame, without waiting."""
         image = None if frame is None else frame.image
         self.put((reading, image), size_bytes=_READING_BYTES + (0 if image is None else image.nbytes))

@@ -1,9 +1,8 @@
 """Gross slip from the motion of the markers alone: no network, thresholds from the noise of the still sensor."""
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -15,6 +14,8 @@ from sliplens.markers.estimators import INNER_SHARE, rank_from_centre, stick_sha
 Field = Float[np.ndarray, "markers 2"]
 Fields: TypeAlias = np.ndarray
 """Fields by row, coordinate and marker: not checked in tests, for these helpers run some 20 times a frame."""
+Rows: TypeAlias = Int[np.ndarray, " rows"]
+Contacts: TypeAlias = Float[np.ndarray, " contacts"]
 
 _FEWEST = 6
 """Least number of markers that shows the motion of a contact."""
@@ -61,16 +62,15 @@ class ContactStates:
     slip: Bool[np.ndarray, " contacts"]
     unknown: Bool[np.ndarray, " contacts"]
     """True where neither slip nor sticking is certain."""
-    shear_px: Float[np.ndarray, " contacts"]
+    shear_px: Contacts
     """Mean motion of the contact's middle since it was pressed, in pixels."""
-    slipping_s: Float[np.ndarray, " contacts"]
+    slipping_s: Contacts
     """Time since the slip began; NaN where nothing slips."""
-    slipped_s: Float[np.ndarray, " contacts"]
+    slipped_s: Contacts
     """Time since a slip began that is confirmed in this frame; NaN elsewhere."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Recoil:
+class _Recoil(NamedTuple):
     """A contact as its skin began to spring back."""
 
     time_s: float
@@ -80,12 +80,11 @@ class _Recoil:
     shear_px: Float[np.ndarray, "2"]
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Frame:
+class _Frame(NamedTuple):
     """Markers of one frame: motion since they were untouched, 0 where one is not seen."""
 
     time_s: float
-    spread: Float[np.ndarray, " contacts"]
+    spread: Contacts
     moved: Float[np.ndarray, "contacts 2 markers"]
     visible: Bool[np.ndarray, "contacts markers"]
 
@@ -101,9 +100,7 @@ class SlipBatch:
         self._rest = np.ascontiguousarray(rest_px.swapaxes(1, 2), dtype=np.float64)
         self._reach_px = np.linalg.norm(_from_middle(self._rest), axis=1).mean(axis=1)
         self._still: list[tuple[float, Fields]] = []
-        """Times and motions (NaN where a marker is not seen) of the frames in which noise is measured."""
-        self._still_s, self._still_frames = np.full(contacts, np.inf), np.zeros(contacts, dtype=int)
-        """Time of the first of these frames that counts for each contact, and their number."""
+        """Times and motions (NaN where a marker is not seen) of the still frames."""
         self._visible = np.ones((contacts, markers), dtype=bool)
         self._fit = _affine_weights(self._rest, self._visible)
         self._noise_px = np.full(contacts, np.nan)
@@ -130,11 +127,9 @@ class SlipBatch:
         moved = np.ascontiguousarray(positions_px.swapaxes(1, 2)) - self._rest
         visible = np.isfinite(moved[:, 0])
         moved, count = np.where(visible[:, None], moved, 0), np.count_nonzero(visible, axis=1)
-        learns = np.isnan(self._noise_px)
-        if learns.any():
-            still = learns & (count >= _FEWEST)
-            self._learn_noise(still, np.where((still[:, None] & visible)[:, None], moved, np.nan), time_s)
-        ready = ~learns & (count >= _FEWEST)
+        ready = (count >= _FEWEST) & np.isfinite(self._noise_px)
+        if np.isnan(self._noise_px[0]) and (count >= _FEWEST).all():
+            self._learn_noise(np.where(visible[:, None], moved, np.nan), time_s)
         if not np.array_equal(visible, self._visible):
             self._visible, self._fit = visible, _affine_weights(self._rest, visible)
         spread = np.einsum("ckm,ckm->c", self._fit[:, 1:], moved)
@@ -152,18 +147,9 @@ class SlipBatch:
             self._begin(begins, moved[begins], spread[begins], time_s)
             shear_px[begins] = 0.0
         self._window = np.where(contact, self._window + 1, 0)
-        self._frames.append(_Frame(time_s=time_s, spread=spread, moved=moved, visible=visible))
+        self._frames.append(_Frame(time_s, spread, moved, visible))
         self._shorten_windows(time_s)
-        return self._states(self._recoils(), shear_px, ready, contact, time_s)
-
-    def _states(
-        self,
-        began_s: Float[np.ndarray, " contacts"],
-        shear_px: Float[np.ndarray, " contacts"],
-        ready: Bool[np.ndarray, " contacts"],
-        contact: Bool[np.ndarray, " contacts"],
-        time_s: float,
-    ) -> ContactStates:
+        began_s = self._recoils()
         springs = np.isfinite(began_s)
         self._slip_s = np.where(springs & np.isnan(self._slip_s), began_s, self._slip_s)
         self._recoil_s = np.where(springs, time_s, self._recoil_s)
@@ -172,19 +158,18 @@ class SlipBatch:
         # pulled on, and it follows: it sticks again
         sticks = ~slip & (shear_px > self._least_px + _RECOIL * self._middle_noise_px())
         self._slip_s = np.where(sticks, np.nan, self._slip_s)
-        # after a slip, and until the press is over, neither is certain
-        unknown = np.isfinite(self._slip_s) | (time_s - self._hold_s < _WINDOW_S)
         return ContactStates(
             ready=ready,
             contact=contact,
             slip=slip,
-            unknown=unknown,
+            # after a slip, and until the press is over, neither is certain
+            unknown=np.isfinite(self._slip_s) | (time_s - self._hold_s < _WINDOW_S),
             shear_px=shear_px,
             slipping_s=np.where(slip, time_s - self._slip_s, np.nan),
             slipped_s=self._confirm(springs, time_s),
         )
 
-    def _confirm(self, springs: Bool[np.ndarray, " contacts"], time_s: float) -> Float[np.ndarray, " contacts"]:
+    def _confirm(self, springs: Bool[np.ndarray, " contacts"], time_s: float) -> Contacts:
         """Compute the time since the slips that are confirmed now: the load is still there some time after the recoil.
 
         A contact that slides carries what kinetic friction holds, and one that is tightened takes the load up again; a
@@ -195,13 +180,9 @@ class SlipBatch:
             if row not in self._recoils_at and self._slip_s[row] != self._judged_s[row]:
                 first = self._frames[-int(self._window[row])]
                 middle = self._inner[row] & first.visible[row]
-                self._recoils_at[row] = _Recoil(
-                    time_s=float(self._slip_s[row]),
-                    spread=float(first.spread[row]),
-                    hold=self._hold[row].copy(),
-                    inner=middle,
-                    shear_px=(first.moved[row] - self._hold[row])[:, middle].mean(axis=1),
-                )
+                hold, began_s, spread = self._hold[row].copy(), float(self._slip_s[row]), float(first.spread[row])
+                shear_px = (first.moved[row] - hold)[:, middle].mean(axis=1)
+                self._recoils_at[row] = _Recoil(began_s, spread, hold, middle, shear_px)
         for row, recoil in list(self._recoils_at.items()):
             if not self._pressed[row] or time_s - recoil.time_s > 2 * _CONFIRMED_S:
                 del self._recoils_at[row]
@@ -216,32 +197,27 @@ class SlipBatch:
                     confirmed_s[row] = time_s - recoil.time_s
         return confirmed_s
 
-    def _learn_noise(self, rows: Bool[np.ndarray, " contacts"], moved: Fields, time_s: float) -> None:
-        """Take a still frame for some contacts; measure the noise of those that have enough of them."""
+    def _learn_noise(self, moved: Fields, time_s: float) -> None:
+        """Take a still frame; measure the noise once there are enough of them."""
         self._still.append((time_s, moved))
-        self._still_s[rows] = np.minimum(self._still_s[rows], time_s)
-        self._still_frames[rows] += 1
-        enough = rows & (time_s - self._still_s >= _STILL_S) & (self._still_frames >= _STILL_FRAMES)
-        for first_s in np.unique(self._still_s[enough]).tolist():
-            at = np.flatnonzero(enough & (self._still_s == first_s))
-            fields = np.stack([field[at] for then_s, field in self._still if then_s >= first_s], axis=1)
-            steps = np.diff(fields, axis=1)
-            valid = np.isfinite(steps)
-            median, count = np.median if valid.all() else np.nanmedian, valid.sum(axis=3)
-            mean = np.where(count, np.where(valid, steps, 0).sum(axis=3) / np.maximum(count, 1), np.nan)
-            mean *= np.sqrt(np.isfinite(moved[at, 0]).sum(axis=1))[:, None, None]
-            # of differences, and their median: creep and a touch that begins count little
-            single, together = (
-                np.maximum(median(np.abs(part).reshape(len(at), -1), axis=1) / 0.6745 / np.sqrt(2), _LEAST_NOISE_PX)
-                for part in (steps, mean)
+        if time_s - self._still[0][0] < _STILL_S or len(self._still) < _STILL_FRAMES:
+            return
+        steps = np.diff(np.stack([field for _, field in self._still], axis=1), axis=1)
+        valid = np.isfinite(steps)
+        count = valid.sum(axis=3)
+        mean = np.where(count, np.where(valid, steps, 0).sum(axis=3) / np.maximum(count, 1), np.nan)
+        mean *= np.sqrt(np.isfinite(moved[:, 0]).sum(axis=1))[:, None, None]
+        # of differences, and their median: creep and a touch that begins count little
+        single, together = (
+            np.maximum(
+                np.nanmedian(np.abs(part).reshape(len(moved), -1), axis=1) / 0.6745 / np.sqrt(2), _LEAST_NOISE_PX
             )
-            self._noise_px[at], self._together_px[at] = single, np.maximum(single, together)
-        if not np.isnan(self._noise_px).any():
-            self._still.clear()
+            for part in (steps, mean)
+        )
+        self._noise_px, self._together_px = single, np.maximum(single, together)
+        self._still.clear()
 
-    def _begin(
-        self, rows: Int[np.ndarray, " begins"], moved: Fields, spread: Float[np.ndarray, " begins"], time_s: float
-    ) -> None:
+    def _begin(self, rows: Rows, moved: Fields, spread: Float[np.ndarray, " begins"], time_s: float) -> None:
         """Begin some contacts, or begin them anew."""
         visible = self._visible[rows]
         self._hold[rows] = np.where(visible[:, None], moved, np.nan)
@@ -252,7 +228,7 @@ class SlipBatch:
         inner = (rank < INNER_SHARE) & visible
         self._inner[rows] = np.where((inner.sum(axis=1) >= 2)[:, None], inner, visible)
 
-    def _end(self, rows: Int[np.ndarray, " ended"]) -> None:
+    def _end(self, rows: Rows) -> None:
         self._hold[rows] = self._pattern[rows] = self._slip_s[rows] = np.nan
         self._pressed[rows] = self._hold_s[rows] = self._recoil_s[rows] = 0.0
         self._inner[rows], self._least_px[rows] = False, np.inf
@@ -272,13 +248,11 @@ class SlipBatch:
         together_px = float(np.linalg.norm(moved.mean(axis=1))) if moved.size else np.inf
         return bool(frame.spread[row] / 2 * self._reach_px[row] > together_px)
 
-    def _middle_noise_px(self) -> Float[np.ndarray, " contacts"]:
+    def _middle_noise_px(self) -> Contacts:
         """Compute the noise of a difference of two means over the contact's middle."""
         return self._noise_px * np.sqrt(2 / np.maximum(self._inner.sum(axis=1), 1))
 
-    def _shear(
-        self, moved: Float[np.ndarray, "contacts 2 markers"], visible: Bool[np.ndarray, "contacts markers"]
-    ) -> Float[np.ndarray, "contacts 2"]:
+    def _shear(self, moved: Fields, visible: Bool[np.ndarray, "contacts markers"]) -> Float[np.ndarray, "contacts 2"]:
         """Compute the mean motion of the contact's middle since it was pressed; NaN without a contact."""
         middle = self._inner & visible & np.isfinite(self._hold[:, 0])
         count = np.count_nonzero(middle, axis=1)[:, None]
@@ -306,55 +280,52 @@ class SlipBatch:
         for _ in range(len(frames) - max(1, int(self._window.max()))):
             frames.popleft()
 
-    def _recoils(self) -> Float[np.ndarray, " contacts"]:
+    def _recoils(self) -> Contacts:
         """Find the times at which the skin began to spring back by a slip; NaN where it did not."""
-        began_s = np.full(len(self._rest), np.nan)
-        searched = (self._window > 1) & np.isfinite(self._pattern[:, 0]).any(axis=1)
-        for count in np.unique(self._window[searched]).tolist():
-            rows = np.flatnonzero(searched & (self._window == count))
-            began_s[rows] = self._recoils_of(rows, [self._frames[at] for at in range(-count, 0)])
-        return began_s
-
-    def _recoils_of(self, rows: Int[np.ndarray, " rows"], frames: Sequence[_Frame]) -> Float[np.ndarray, " rows"]:
-        """Find these times for contacts whose windows are some frames."""
-        began_s = np.full(len(rows), np.nan)
-        picks = slice(None) if len(rows) == len(self._rest) else rows
-        rest, pattern, hold = (values[picks] for values in (self._rest, self._pattern, self._hold))
+        began_s, frames = np.full(len(self._rest), np.nan), tuple(self._frames)
+        rows = np.flatnonzero((self._window > 1) & np.isfinite(self._pattern[:, 0]).any(axis=1))
+        if not len(rows):
+            return began_s
+        inside = np.arange(len(frames))[:, None] >= len(frames) - self._window[rows]
+        rest, pattern, hold = (values[rows] for values in (self._rest, self._pattern, self._hold))
         valid = np.isfinite(pattern[:, 0]) & np.isfinite(hold[:, 0])
-        for frame in frames:
-            valid &= frame.visible[picks]
-        if not valid.all():
-            rest, pattern, hold = (np.where(valid[:, None], values, 0) for values in (rest, pattern, hold))
-        count = np.maximum(valid.sum(axis=1), 1)[:, None, None]
-        arm = (rest - rest.sum(axis=2, keepdims=True) / count) * valid[:, None]
+        for frame, counts in zip(frames, inside, strict=True):
+            valid &= frame.visible[rows] | ~counts[:, None]
+        rest, pattern, hold = (np.where(valid[:, None], values, 0) for values in (rest, pattern, hold))
+        arm = (rest - rest.sum(axis=2, keepdims=True) / np.maximum(valid.sum(axis=1), 1)[:, None, None]) * valid[
+            :, None
+        ]
         # a grip that is tightened or loosened moves the markers as its press did, or from the middle
         press = _unit(hold)
         pattern = _without(pattern, press, _unit(_without(arm, press)))
         length = np.sqrt(np.einsum("rkm,rkm->r", pattern, pattern))
         # of little shear the pattern is noise
         enough = (length >= 2 * _RECOIL * self._together_px[rows]) & (valid.sum(axis=1) >= _FEWEST)
-        if not enough.any():
+        rows, valid, pattern, arm, length = (values[enough] for values in (rows, valid, pattern, arm, length))
+        if not len(rows):
             return began_s
-        if not enough.all():
-            rows, valid, pattern, arm, length = (values[enough] for values in (rows, valid, pattern, arm, length))
         pattern /= length[:, None, None]
-        old = np.arange(1, len(frames))
-        spread = np.sqrt(1 / old + 1 / (len(frames) - old))
+        inside = inside[:, enough].T
+        old = np.cumsum(inside, axis=1)[:, :-1]
+        new, old, is_cut = self._window[rows, None] - old, np.maximum(old, 1), old > 0
+        wide = np.sqrt(1 / old + 1 / new)
 
         def drops(ways: Fields, of: slice | np.ndarray) -> Float[np.ndarray, "rows cuts"]:
             """Compute the fall of the mean motion along a field from before each cut to after it."""
-            picks = slice(None) if len(ways) == len(self._rest) else rows[of]  # a view of all costs no copy
-            heights = np.stack([np.einsum("rkm,rkm->r", frame.moved[picks], ways) for frame in frames], axis=-1)
-            total = np.cumsum(heights, axis=-1)
-            return total[:, :-1] / old - (total[:, -1:] - total[:, :-1]) / (len(frames) - old)
+            heights = [np.einsum("rkm,rkm->r", frame.moved[rows[of]], ways) for frame in frames]
+            total = np.cumsum(np.stack(heights, axis=-1) * inside[of], axis=-1)
+            return total[:, :-1] / old[of] - (total[:, -1:] - total[:, :-1]) / new[of]
+
+        def at_cut(values: np.ndarray) -> np.ndarray:
+            return np.take_along_axis(values, cut[:, None], axis=-1)[:, 0]
 
         # the press is no part of the pattern, so that it need not be subtracted
         drops_px = drops(pattern, slice(None))
-        cut = (drops_px / spread).argmax(axis=-1)
-        drop, wide = np.take_along_axis(drops_px, cut[:, None], axis=-1)[:, 0], spread[cut]
+        cut = np.where(is_cut, drops_px / wide, -np.inf).argmax(axis=-1)
+        drop, wide = at_cut(drops_px), at_cut(wide)
         whole = drop / wide / self._together_px[rows]
-        springs = (drop >= _FALL * length) & (whole >= _RECOIL)
-        if not springs.any():
+        springs = np.flatnonzero((drop >= _FALL * length) & (whole >= _RECOIL))
+        if not len(springs):
             return began_s
         shifts = [_unit(valid[springs, None] * np.array(way)) for way in ([[1.0], [0.0]], [[0.0], [1.0]])]
         turn = _unit(arm[springs][:, ::-1] * np.array([[-1.0], [1.0]]))
@@ -363,78 +334,25 @@ class SlipBatch:
         bending = np.take_along_axis(drops(_unit(bent), springs), cut[springs, None], axis=-1)[:, 0]
         bending = bending / wide[springs] / self._noise_px[rows[springs]]
         # a large motion must show more than noise that happens to bend
-        bends = springs.copy()
-        bends[springs] = bending >= np.maximum(_EVIDENCE, _BENT_SHARE * residual * whole[springs])
-        bends[bends] = ~self._handled(rows[bends], frames, cut[bends] + 1, valid[bends], drop[bends])
-        began_s[enough] = np.where(bends, np.array([frame.time_s for frame in frames])[cut], np.nan)
+        bends = springs[bending >= np.maximum(_EVIDENCE, _BENT_SHARE * residual * whole[springs])]
+        bends = bends[~self._handled(rows[bends], cut[bends], inside[bends].T, valid[bends], drop[bends])]
+        began_s[rows[bends]] = np.array([frame.time_s for frame in frames])[cut[bends]]
         return began_s
 
-    def _handled(
-        self,
-        rows: Int[np.ndarray, " rows"],
-        frames: Sequence[_Frame],
-        cut: Int[np.ndarray, " rows"],
-        valid: Bool[np.ndarray, "rows markers"],
-        drop: Float[np.ndarray, " rows"],
-    ) -> Bool[np.ndarray, " rows"]:
-        """True where a contact was let go, pressed or pulled further from a frame of the window on."""
-        old = np.arange(len(frames))[:, None] < cut
-        shares = [old / cut, ~old / (len(frames) - cut)]  # weights of the means before the cut and from it on
-        spread = np.stack([frame.spread[rows] for frame in frames])
+    def _handled(self, rows: Rows, cut: Rows, inside: Fields, valid: Fields, drop: Contacts) -> Fields:
+        """True where a contact was let go, pressed or pulled further after a frame of the window."""
+        old = np.arange(len(inside))[:, None] <= cut
+        # weights of the means before the cut and after it
+        shares = [some / np.maximum(some.sum(axis=0), 1) for some in (old & inside, ~old & inside)]
+        spread = np.stack([frame.spread[rows] for frame in self._frames])
         pressed = np.abs((spread * (shares[0] - shares[1])).sum(axis=0))
         inner = valid & self._inner[rows]
         markers = np.expand_dims(np.where(inner.any(axis=1, keepdims=True), inner, valid), 1)
-        count = np.count_nonzero(markers, axis=2)
-        hold = np.where(markers, self._hold[rows], 0)
-        middle = np.stack([(np.where(markers, frame.moved[rows], 0) - hold).sum(axis=2) / count for frame in frames])
-        before, after = (np.linalg.norm((middle * share[..., None]).sum(axis=0), axis=1) for share in shares)
+        hold, count = np.where(markers, self._hold[rows], 0), np.count_nonzero(markers, axis=2)
+        sums = [(np.where(markers, frame.moved[rows], 0) - hold).sum(axis=2) / count for frame in self._frames]
+        before, after = (np.linalg.norm((np.stack(sums) * share[..., None]).sum(axis=0), axis=1) for share in shares)
         pulled = after > before + _RECOIL * self._middle_noise_px()[rows]
         return pulled | (pressed / 2 * self._reach_px[rows] > drop / np.sqrt(valid.sum(axis=1)))
-
-
-class ShearFall:
-    """Fall of the mean shear from its largest value so far: slip of a grasp that begins pressed, at any frame rate.
-
-    A contact that holds carries its load, so that the shear grows or stays; one that slips loses part of it. The fall
-    is a share of the largest shear, beyond the noise of the mean, which the stiller frames so far show. Neither an
-    untouched frame nor a still phase is needed. It cannot distinguish a slip from a load that is taken away.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sliplens.live.slip import ShearFall
-    >>> start_px = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), axis=-1).reshape(-1, 2) * 20
-    >>> fall = ShearFall(start_px)
-    >>> [fall.update(start_px + [shear_px, 0]) for shear_px in (0.0, 4.0, 4.0, 2.0)]
-    [None, None, 0.0, 0.496]
-    """
-
-    def __init__(self, start_px: Field) -> None:
-        self._start_px, self._before = start_px, np.full((2, *start_px.shape), np.nan)
-        self._noises_px: deque[float] = deque(maxlen=_NOISE_FRAMES)
-        self._largest_px = 0.0
-
-    def update(self, positions_px: Field) -> float | None:
-        """Take the markers of a frame, and return the fall as a share; None before any shear, or without markers."""
-        moved = positions_px - self._start_px
-        visible = np.isfinite(moved[:, 0])
-        if visible.sum() < _FEWEST:
-            return None
-        mean = moved[visible].mean(axis=0)
-        # second differences: skin that moves on evenly is no noise
-        bends = moved - mean - 2 * self._before[1] + self._before[0]
-        self._before = np.stack([self._before[1], moved - mean])
-        bends = bends[np.isfinite(bends[:, 0])]
-        if len(bends) >= _FEWEST:
-            self._noises_px.append(float(np.median(np.abs(bends))) / 0.6745 / np.sqrt(6))
-        shear_px = float(np.linalg.norm(mean))
-        self._largest_px = max(self._largest_px, shear_px)
-        if not self._noises_px:
-            return None
-        noise_px = max(float(np.quantile(self._noises_px, 0.25)), _LEAST_NOISE_PX) / np.sqrt(visible.sum())
-        if self._largest_px <= _LEAST_SHEAR * noise_px:
-            return None
-        return float(max(0.0, self._largest_px - shear_px - _UNCERTAIN * noise_px) / self._largest_px)
 
 
 class SlipDetector:
@@ -453,7 +371,8 @@ class SlipDetector:
     skin springs back passes for a slip.
 
     All this needs an untouched frame and 0.4 s of stillness. Until a press was seen, as in a grasp that begins pressed,
-    the state is that of `ShearFall`.
+    the mean shear is watched: a contact that holds carries its load, so that the shear grows or stays; one that slips
+    loses part of it, a share of the largest shear beyond the noise of the mean.
 
     Parameters
     ----------
@@ -480,38 +399,59 @@ class SlipDetector:
     """
 
     def __init__(self, rest_px: Field) -> None:
-        self._batch, self._fall = SlipBatch(rest_px[None]), ShearFall(rest_px)
-        self._press_seen = False
+        self._batch, self._rest_px, self._before = (
+            SlipBatch(rest_px[None]),
+            rest_px,
+            np.full((2, *rest_px.shape), np.nan),
+        )
+        self._noises_px: deque[float] = deque(maxlen=_NOISE_FRAMES)
+        self._largest_px, self._press_seen = 0.0, False
 
     def update(self, positions_px: Field, time_s: float, /) -> MarkerReading:
         """Take the markers of a frame, in the order of `rest_px`, NaN where one is not seen; times must rise."""
         batch = self._batch
         states = batch.update(positions_px[None], time_s)
-        fall, contact = self._fall.update(positions_px), bool(states.contact[0])
+        fall, contact, slips = self._shear_fall(positions_px), bool(states.contact[0]), bool(states.slip[0])
+        free = False if states.ready[0] else None
         self._press_seen |= contact and batch.spreads(0)
-        if self._press_seen and not contact:
-            return MarkerReading(state=SlipState.CANNOT_TELL, contact=False if states.ready[0] else None)
         if not self._press_seen:
-            slips = bool(states.slip[0]) or (fall is not None and fall >= SLIP_FALL)
-            holds = fall is not None and fall <= HOLD_FALL
-            return MarkerReading(
-                state=SlipState.SLIP if slips else SlipState.STICKING if holds else SlipState.CANNOT_TELL,
-                contact=True if contact or fall is not None else False if states.ready[0] else None,
-                fall=fall,
-            )
-        state = SlipState.CANNOT_TELL if states.unknown[0] else SlipState.STICKING
+            slips |= fall is not None and fall >= SLIP_FALL
+            holds, touches = fall is not None and fall <= HOLD_FALL, contact or fall is not None
+            return MarkerReading(state=_state(slips, holds), contact=True if touches else free, fall=fall)
+        if not contact:
+            return MarkerReading(state=SlipState.CANNOT_TELL, contact=free)
         shear_px, share, slipping_s, slipped_s = (
             float(value) if np.isfinite(value) else None
             for value in (states.shear_px[0], batch.stick_share(0), states.slipping_s[0], states.slipped_s[0])
         )
-        return MarkerReading(
-            state=SlipState.SLIP if states.slip[0] else state,
-            contact=True,
-            shear_px=shear_px,
-            stick_share=share,
-            slipping_s=slipping_s,
-            slipped_s=slipped_s,
-        )
+        state, times = _state(slips, not states.unknown[0]), {"slipping_s": slipping_s, "slipped_s": slipped_s}
+        return MarkerReading(state=state, contact=True, shear_px=shear_px, stick_share=share, **times)
+
+    def _shear_fall(self, positions_px: Field) -> float | None:
+        """Compute the fall of the mean shear as a share; None before any shear, or without markers."""
+        moved = positions_px - self._rest_px
+        visible = np.isfinite(moved[:, 0])
+        if visible.sum() < _FEWEST:
+            return None
+        mean = moved[visible].mean(axis=0)
+        # second differences: skin that moves on evenly is no noise
+        bends = moved - mean - 2 * self._before[1] + self._before[0]
+        self._before = np.stack([self._before[1], moved - mean])
+        bends = bends[np.isfinite(bends[:, 0])]
+        if len(bends) >= _FEWEST:
+            self._noises_px.append(float(np.median(np.abs(bends))) / 0.6745 / np.sqrt(6))
+        shear_px = float(np.linalg.norm(mean))
+        self._largest_px = max(self._largest_px, shear_px)
+        if not self._noises_px:
+            return None
+        noise_px = max(float(np.quantile(self._noises_px, 0.25)), _LEAST_NOISE_PX) / np.sqrt(visible.sum())
+        if self._largest_px <= _LEAST_SHEAR * noise_px:
+            return None
+        return float(max(0.0, self._largest_px - shear_px - _UNCERTAIN * noise_px) / self._largest_px)
+
+
+def _state(slips: bool, holds: bool) -> SlipState:
+    return SlipState.SLIP if slips else SlipState.STICKING if holds else SlipState.CANNOT_TELL
 
 
 def _from_middle(places_px: Fields) -> Fields:
@@ -539,4 +479,4 @@ def _without(fields: Fields, *ways: Fields) -> Fields:
     return fields
 
 
-__all__ = ["HOLD_FALL", "SLIP_FALL", "ContactStates", "ShearFall", "SlipBatch", "SlipDetector"]
+__all__ = ["HOLD_FALL", "SLIP_FALL", "ContactStates", "SlipBatch", "SlipDetector"]

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from sliplens.codec import Result
+from sliplens.codec import Columns, Result
 from sliplens.errors import ImageError, InputError
 from sliplens.live.reading import SlipState
 from sliplens.live.slip import SlipDetector
@@ -25,35 +25,27 @@ _DRAWS = 2000
 
 
 @dataclass(frozen=True, kw_only=True)
-class SlipScore:
-    """Balanced accuracy of a method: mean of the shares of slipping and of holding clips that it classifies rightly."""
+class SlipScores(Columns):
+    """Balanced accuracy of methods: mean of the shares of slipping and of holding clips that are classified rightly."""
 
-    method: str
-    balanced_accuracy: float
-    low: float
-    high: float
+    method: Shaped[np.ndarray, " methods"]
+    balanced_accuracy: Float[np.ndarray, " methods"]
+    low: Float[np.ndarray, " methods"]
+    high: Float[np.ndarray, " methods"]
     """Ends of the 95 % interval, from drawing objects again, as shares."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClipReading:
-    """Slip of one clip as the markers show it."""
-
-    detected: bool
-    """True where a frame up to the decision was read as slip."""
-    fall: float
-    """Largest fall of the mean shear, as a share; 0 where no shear was seen."""
-    displacement_px: float
-    """Largest mean displacement of the markers, in pixels."""
-    frames: int
-
-
-@dataclass(frozen=True, kw_only=True)
 class SlipEvaluation(Result):
-    """Scores of the detector and of baselines on labelled clips, and the reading of each clip."""
+    """Scores of the detector and of baselines on labelled clips, and what the markers show in each clip."""
 
-    scores: tuple[SlipScore, ...]
-    clips: tuple[ClipReading, ...]
+    scores: SlipScores
+    detected: Flags
+    """True for clips in which a frame up to the decision was read as slip."""
+    fall: Float[np.ndarray, " clips"]
+    """Largest fall of the mean shear, as a share; 0 where no shear was seen."""
+    displacement_px: Float[np.ndarray, " clips"]
+    """Largest mean displacement of the markers, in pixels."""
 
 
 def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str = "auto") -> SlipEvaluation:
@@ -97,22 +89,20 @@ def evaluate_slip(table: Path | str, *, after: int | None = None, markers: str =
     if slips.all() or not slips.any():
         raise InputError(f"the clips of {table} are all labelled alike; add clips that slip and clips that hold")
     objects = np.array([row.get("object") or row["file"] for row in rows])
-    clips = []
+    clips = np.empty((len(rows), 4))
     for number, row in enumerate(rows):
         chosen = slice(start[number], None if after is None else start[number] + after + 1)
-        clips.append(_read_clip(Path(table).parent / row["file"], chosen, markers))
+        clips[number] = _read_clip(Path(table).parent / row["file"], chosen, markers)
         report_progress(number + 1, len(rows))
-    values = {
-        "fall of the mean shear": np.array([clip.fall for clip in clips]),
-        "largest displacement": np.array([clip.displacement_px for clip in clips]),
-        "frame count": np.array([float(clip.frames) for clip in clips]),
-    }
+    detected, fall, displacement_px, frames = clips.T
+    values = {"fall of the mean shear": fall, "largest displacement": displacement_px, "frame count": frames}
     if "width" in numbers:
         values["gripper width"] = numbers["width"]
-    guesses = {"detector": np.array([clip.detected for clip in clips])}
+    guesses = {"detector": detected > 0}
     guesses |= {name: threshold_left_out(value, slips, objects) for name, value in values.items()}
-    scores = tuple(score_guesses(name, guess, slips, objects) for name, guess in guesses.items())
-    return SlipEvaluation(scores=scores, clips=tuple(clips))
+    accuracy, low, high = np.array([score_guesses(guess, slips, objects) for guess in guesses.values()]).T
+    scores = SlipScores(method=np.array(list(guesses)), balanced_accuracy=accuracy, low=low, high=high)
+    return SlipEvaluation(scores=scores, detected=guesses["detector"], fall=fall, displacement_px=displacement_px)
 
 
 def _numbers(rows: list[dict[str, str]], column: str, table: Path | str) -> Float[np.ndarray, " rows"]:
@@ -125,7 +115,8 @@ def _numbers(rows: list[dict[str, str]], column: str, table: Path | str) -> Floa
     return values
 
 
-def _read_clip(path: Path, chosen: slice, markers: str) -> ClipReading:
+def _read_clip(path: Path, chosen: slice, markers: str) -> tuple[bool, float, float, int]:
+    """Return whether a slip was detected, the largest fall and displacement, and the number of frames."""
     capture = open_source(path)[0]
     frames = list(islice(capture.read_frames(), chosen.start, chosen.stop))
     if not frames:
@@ -134,18 +125,14 @@ def _read_clip(path: Path, chosen: slice, markers: str) -> ClipReading:
         tracks = track_markers(frames, frames[0], markers)
     except ImageError as error:
         add_note(f"{path.name} counts as not slipping: {error}")
-        return ClipReading(detected=False, fall=0.0, displacement_px=0.0, frames=len(capture))
+        return False, 0.0, 0.0, len(capture)
     detector = SlipDetector(tracks.rest_px)
     readings = [
         detector.update(place_px, number / capture.frame_rate_hz) for number, place_px in enumerate(tracks.position_px)
     ]
     moved = np.ma.masked_invalid(tracks.displacement_px).mean(axis=1).filled(0)
-    return ClipReading(
-        detected=SlipState.SLIP in [reading.state for reading in readings],
-        fall=max(reading.fall or 0.0 for reading in readings),
-        displacement_px=float(np.linalg.norm(moved, axis=1).max()),
-        frames=len(capture),
-    )
+    detected, fall = SlipState.SLIP in [reading.state for reading in readings], max(it.fall or 0.0 for it in readings)
+    return detected, fall, float(np.linalg.norm(moved, axis=1).max()), len(capture)
 
 
 def threshold_left_out(values: Float[np.ndarray, " clips"], labels: Flags, groups: Groups) -> Flags:
@@ -161,13 +148,13 @@ def threshold_left_out(values: Float[np.ndarray, " clips"], labels: Flags, group
     return guess
 
 
-def score_guesses(method: str, guess: Flags, labels: Flags, groups: Groups) -> SlipScore:
-    """Compute the balanced accuracy of a method with its interval over groups."""
+def score_guesses(guess: Flags, labels: Flags, groups: Groups) -> tuple[float, float, float]:
+    """Compute the balanced accuracy of a method, and the ends of its interval over groups."""
     rng, rows = np.random.default_rng(0), [np.flatnonzero(groups == name) for name in np.unique(groups)]
     drawn = [np.concatenate([rows[at] for at in rng.integers(0, len(rows), len(rows))]) for _ in range(_DRAWS)]
     draws = [_balanced(guess[some], labels[some]) for some in drawn if 0 < labels[some].mean() < 1]
     low, high = np.quantile(draws or [0.0, 1.0], [0.025, 0.975]).tolist()
-    return SlipScore(method=method, balanced_accuracy=_balanced(guess, labels), low=low, high=high)
+    return _balanced(guess, labels), low, high
 
 
 def _balanced(guess: Flags, labels: Flags) -> float:

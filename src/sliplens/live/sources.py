@@ -1,19 +1,17 @@
 """Running sources: cameras, network streams, growing folders, replays, and a simulated fingertip."""
 
 import errno
-import re
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import av
-import av.logging
 import numpy as np
 from av.container import InputContainer
-from av.error import ExitError, FFmpegError, InvalidDataError
+from av.error import FFmpegError, InvalidDataError
 from av.video.reformatter import VideoReformatter
 from jaxtyping import UInt8
 
@@ -26,7 +24,6 @@ from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Capture, Forces
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.video import upright
-from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.source import open_source
 from sliplens.simulation.filming import prepare_film
 from sliplens.simulation.loading import load_at_margins
@@ -36,11 +33,11 @@ from sliplens.simulation.sensor import SENSORS
 _CURES = {
     errno.EBUSY: "is taken by another program; close that one",
     errno.EACCES: "may not be opened; add yourself to the group video and log in again",
-    errno.ENOENT: "is not there; plug it in, and see `sliplens live --list`",
+    errno.ENOENT: "is not there; plug it in, and see `sliplens live --list-sources`",
     errno.ENODEV: "was unplugged; plug it in again",
     errno.ENXIO: "was unplugged; plug it in again",
-    errno.ENOTTY: "is no camera; see `sliplens live --list`",
-    errno.EINVAL: "does not take these settings; see `sliplens live --list`",
+    errno.ENOTTY: "is no camera; see `sliplens live --list-sources`",
+    errno.EINVAL: "does not take these settings; see `sliplens live --list-sources`",
 }
 _NETWORK = ("rtsp", "rtp", "udp", "tcp", "http", "https", "rtmp", "srt")
 _OPEN_S, _READ_S = 5.0, 2.0
@@ -52,7 +49,6 @@ _QUICK = {
     "flags": "low_delay",
     "analyzeduration": "500000",
 }
-_FFMPEG_NAMES = {"MJPG": "mjpeg", "YUYV": "yuyv422", "GREY": "gray"}
 _CLOCKS_S = 10.0  # stamps of a camera that differ from the monotonic clock by more are of another one
 
 
@@ -66,8 +62,11 @@ class StreamSource(LiveSource):
 
     def open(self, stack: ExitStack, /) -> None:
         """Connect, and look for pictures."""
+        self._start(stack, self._connect(options=_QUICK, timeout=(_OPEN_S, _READ_S)))
+
+    def _connect(self, **settings: Any) -> InputContainer:
         try:
-            self._start(stack, av.open(self._address, options=_QUICK, timeout=(_OPEN_S, _READ_S)))
+            return av.open(self._address, **settings)
         except (FFmpegError, OSError, ValueError) as error:
             raise self._explained(error) from None
 
@@ -103,9 +102,9 @@ class StreamSource(LiveSource):
                     steps += 1
                     continue
                 time_s = arrived_s if frame.time is None else float(frame.time)
-                number += self._count(steps, time_s - last_s)
-                steps, last_s = 1, time_s
-                height, width = self._wanted if self._wanted else (frame.height, frame.width)
+                steps, captured_s = self._place(steps, time_s, last_s, arrived_s)
+                number, steps, last_s = number + steps, 1, time_s
+                height, width = self._wanted or (frame.height, frame.width)
                 if self._wanted and frame.rotation % 180:
                     height, width = width, height
                 pixels = to_rgb.reformat(frame, width=width, height=height, format="rgb24", interpolation="AREA")
@@ -113,15 +112,13 @@ class StreamSource(LiveSource):
                     image=upright(frame, pixels.to_ndarray(), where=self.name),
                     number=number,
                     time_s=time_s,
-                    captured_s=self._captured_s(time_s, arrived_s),
+                    captured_s=captured_s,
                     decode_ms=1e3 * (time.monotonic() - arrived_s),
                 )
 
-    def _count(self, steps: int, _passed_s: float) -> int:
-        return steps
-
-    def _captured_s(self, _time_s: float, arrived_s: float) -> float:
-        return arrived_s
+    def _place(self, steps: int, _time_s: float, _last_s: float, arrived_s: float) -> tuple[int, float]:
+        """Return the number of frames since the last one, and the time of the capture."""
+        return steps, arrived_s
 
     def _explained(self, error: Exception) -> SourceError:
         reason = getattr(error, "strerror", None) or str(error)
@@ -139,7 +136,7 @@ class CameraSource(StreamSource):
     path
         Device file.
     options
-        Rate, size and pixel format; the camera's own where None.
+        Rate and size; the camera's own where None.
     """
 
     def __init__(self, path: Path, options: LiveOptions) -> None:
@@ -148,77 +145,38 @@ class CameraSource(StreamSource):
 
     def open(self, stack: ExitStack, /) -> None:
         """Open the device in the mode that suits the options, and start it."""
-        options, chosen = self._options, self._options.pixel_format or "MJPG"
-        size = options.size or options.fit_size
+        rate_hz, size = self._options.rate_hz, self._options.size or self._options.fit_size
+        settings = {"video_size": size and f"{size[1]}x{size[0]}", "framerate": rate_hz and f"{rate_hz:g}"}
+        settings = {name: str(value) for name, value in settings.items() if value}
         try:  # compressed first: what is not compressed fills the cable, and the rate falls
-            container = self._open_as(_FFMPEG_NAMES.get(chosen, chosen.lower()), size)
+            container = self._connect(format="v4l2", options={"input_format": "mjpeg"} | settings)
         except SourceError:
-            if options.pixel_format is not None:
-                raise
-            container = self._open_as(None, size)
+            container = self._connect(format="v4l2", options=settings)
         self._wanted = None
         self._start(stack, container)
         self._video.codec_context.options = {"err_detect": "explode"}
         actual = self.size
         if size is not None and actual[0] * size[1] == actual[1] * size[0] and actual[0] >= size[0]:
             self.size = self._wanted = size
-        elif size is not None and options.size is not None:  # a network that needs another size says so itself
+        elif self._options.size is not None:  # a network that needs another size says so itself
             raise SourceError(
-                f"{self.name} gives {actual[1]}x{actual[0]} and not {size[1]}x{size[0]}; choose a --size of the same "
-                "shape and no larger, see `sliplens live --list`"
+                f"{self.name} gives {actual[1]}x{actual[0]} and not {self._options.size[1]}x{self._options.size[0]}; "
+                "choose a --size of the same shape and no larger"
             )
 
-    def _open_as(self, pixel_format: str | None, size: tuple[int, int] | None) -> InputContainer:
-        settings = {
-            "input_format": pixel_format,
-            "video_size": size and f"{size[1]}x{size[0]}",
-            "framerate": self._options.rate_hz and f"{self._options.rate_hz:g}",
-        }
-        try:
-            return av.open(self._address, format="v4l2", options={name: str(it) for name, it in settings.items() if it})
-        except (FFmpegError, OSError) as error:
-            raise self._explained(error) from None
-
-    def _count(self, steps: int, passed_s: float) -> int:
-        return max(steps, round(np.nan_to_num(passed_s) * (self.rate_hz or 0)))
-
-    def _captured_s(self, time_s: float, arrived_s: float) -> float:
-        return time_s if abs(arrived_s - time_s) < _CLOCKS_S else arrived_s
+    def _place(self, steps: int, time_s: float, last_s: float, arrived_s: float) -> tuple[int, float]:
+        steps = max(steps, round(np.nan_to_num(time_s - last_s) * (self.rate_hz or 0)))
+        return steps, time_s if abs(arrived_s - time_s) < _CLOCKS_S else arrived_s
 
     def _explained(self, error: Exception) -> SourceError:
         cure = _CURES.get(getattr(error, "errno", None) or 0, f"cannot be read ({error}); plug it in again")
         return SourceError(f"{self.name} {cure}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Camera:
-    """Camera of this machine: its device file, the name of its driver, and its formats with their sizes."""
-
-    path: Path
-    name: str
-    formats: tuple[str, ...] = ()
-    """Format and sizes (width x height) of each, such as `mjpeg 640x480 320x240`."""
-
-
-def list_cameras(folder: Path = Path("/dev")) -> tuple[Camera, ...]:
-    """List the cameras of this machine, with their formats and sizes."""
-    cameras, level = [], av.logging.get_level()
-    for path in sorted(folder.glob("video*"), key=lambda path: natural_key(path.name)):
-        names = Path("/sys/class/video4linux", path.name, "name")
-        name = names.read_text(encoding="utf-8").strip() if names.exists() else path.name
-        av.logging.set_level(av.logging.INFO)  # FFmpeg lists formats in its log only
-        with av.logging.Capture() as log:
-            try:
-                av.open(str(path), format="v4l2", options={"list_formats": "all"}).close()
-            except ExitError:
-                lines = "".join(text for *_, text in log).splitlines()
-                matches = [re.match(r"(?:Raw|Compressed)\s*:\s*(\w+)\s*:[^:]*:(.*)", line) for line in lines]
-                cameras.append(Camera(path=path, name=name, formats=tuple(f"{m[1]}{m[2]}" for m in matches if m)))
-            except (FFmpegError, OSError) as error:
-                if error.errno not in {errno.ENOTTY, errno.ENODEV}:
-                    cameras.append(Camera(path=path, name=f"cannot be opened ({error.strerror})"))
-        av.logging.set_level(level)
-    return tuple(cameras)
+def list_cameras(folder: Path = Path("/sys/class/video4linux")) -> dict[str, str]:
+    """List the cameras of this machine: the name of each by its device file."""
+    paths = sorted(folder.glob("video*/name"), key=lambda path: natural_key(path.parent.name))
+    return {f"/dev/{path.parent.name}": path.read_text(encoding="utf-8").strip() for path in paths}
 
 
 _FOLDER_S = 0.02
@@ -246,8 +204,9 @@ class FolderSource(LiveSource):
 
     def frames(self) -> Iterator[LiveFrame]:
         """Iterate over images in the natural order of their names; a damaged one is missing in the numbers."""
-        number, last_s, broken_s = 0, -np.inf, np.inf
-        while not self.closed.is_set():
+        last_s, broken_s = -np.inf, np.inf
+        begun = len(self._taken)
+        while not self.closed.wait(_FOLDER_S):
             try:
                 new = [path for path in self._folder.iterdir() if path.name not in self._taken and is_image(path)]
             except OSError as error:
@@ -265,21 +224,19 @@ class FolderSource(LiveSource):
                     written_s, image = 0.0, None
                 broken_s = np.inf
                 self._taken.add(path.name)
-                number += 1
                 if image is not None:
                     last_s, now_s = max(written_s, last_s + 1e-6), time.monotonic()
                     yield LiveFrame(
                         image=image,
-                        number=number - 1,
+                        number=len(self._taken) - begun - 1,
                         time_s=last_s,
                         captured_s=now_s - max(0.0, time.time() - written_s),
                         decode_ms=1e3 * (now_s - before),
                     )
-            self.closed.wait(_FOLDER_S)
 
 
 class ReplaySource(LiveSource):
-    """Trial of a data set, video or bag replayed at its own pace, once or over and over.
+    """Trial of a data set, video or bag replayed at its own pace.
 
     Parameters
     ----------
@@ -289,59 +246,49 @@ class ReplaySource(LiveSource):
         Ratio of the recorded time to that of the replay: 2 is twice as fast.
     rate_hz
         Frames a second in place of the recorded times.
-    repeat
-        If True, begin anew at the end; times and numbers go on.
     """
 
-    def __init__(
-        self, capture: Capture, *, speed: float = 1.0, rate_hz: float | None = None, repeat: bool = False
-    ) -> None:
-        self._capture, self._repeat = capture, repeat
+    def __init__(self, capture: Capture, *, speed: float = 1.0, rate_hz: float | None = None) -> None:
+        self._capture, self.count = capture, len(capture)
         self.name, self.simulated = f"{capture.name} of {capture.opened}", capture.simulated
-        self.size, self.count = capture.frame_size, None if repeat else len(capture)
-        self._step_s = 1 / (rate_hz or capture.frame_rate_hz)
-        recorded_s = capture.time_s if rate_hz is None else None
-        self._time_s = np.arange(len(capture)) * self._step_s if recorded_s is None else recorded_s - recorded_s[0]
-        self.speed, self.rate_hz = speed, speed / self._step_s
+        self.size, self.speed = capture.frame_size, speed
+        self.rate_hz = speed * (rate_hz or capture.frame_rate_hz)
+        self._time_s, self._first_s = np.arange(len(capture)) * speed / self.rate_hz, 0.0
+        if capture.time_s is not None:
+            self._first_s = float(capture.time_s[0])
+            self._time_s = self._time_s if rate_hz else capture.time_s - self._first_s
         self.reference = None if capture.read_reference is None else capture.read_reference()
 
     def frames(self) -> Iterator[LiveFrame]:
-        """Iterate over frames at their times, of the first pass and of those after it."""
-        pace, number, begun_s, capture = Pace(self.closed), 0, 0.0, self._capture
-        first_s = 0.0 if capture.time_s is None else float(capture.time_s[0])
+        """Iterate over frames at their times."""
+        pace, capture, last_s, before = Pace(self.closed), self._capture, -np.inf, time.perf_counter()
         margins = np.full(len(capture), np.nan) if capture.safety_margin is None else capture.safety_margin
-        while True:
-            images, forces_s = capture.read_frames(), -np.inf
-            for offset_s, margin in zip(self._time_s.tolist(), margins.tolist(), strict=True):
-                before = time.perf_counter()
-                image = next(images, None)
-                if image is None:  # a video whose header promised more
-                    break
-                decode_ms = 1e3 * (time.perf_counter() - before)
-                if not pace.wait((begun_s + offset_s) / self.speed):
-                    return
-                yield LiveFrame(
-                    image=image,
-                    number=number,
-                    time_s=begun_s + offset_s,
-                    captured_s=time.monotonic(),
-                    decode_ms=decode_ms,
-                    forces=self._forces_between(forces_s, offset_s + first_s, shift_s=begun_s - first_s),
-                    safety_margin=None if np.isnan(margin) else margin,
-                )
-                number, forces_s = number + 1, offset_s + first_s
-            if not self._repeat:
+        rows = zip(self._time_s.tolist(), margins.tolist(), capture.read_frames(), strict=False)
+        for number, (time_s, margin, image) in enumerate(rows):  # a video whose header promised more ends before
+            decode_ms = 1e3 * (time.perf_counter() - before)
+            if not pace.wait(time_s / self.speed):
                 return
-            begun_s += float(self._time_s[-1]) + self._step_s
+            yield LiveFrame(
+                image=image,
+                number=number,
+                time_s=time_s,
+                captured_s=time.monotonic(),
+                decode_ms=decode_ms,
+                forces=self._forces_between(last_s, time_s),
+                safety_margin=None if np.isnan(margin) else margin,
+            )
+            last_s, before = time_s, time.perf_counter()
 
-    def _forces_between(self, after_s: float, until_s: float, *, shift_s: float) -> Forces | None:
-        """Return the samples of the force sensor between two times, shifted."""
+    def _forces_between(self, after_s: float, until_s: float) -> Forces | None:
+        """Return the samples of the force sensor between two times."""
         forces = self._capture.forces
         if forces is None:
             return None
-        first, last = np.searchsorted(forces.time_s, (after_s, until_s), side="right")
-        time_s, force_n = forces.time_s[first:last] + shift_s, forces.force_n[first:last]
-        return Forces(time_s=time_s, force_n=force_n, source=forces.source) if first < last else None
+        all_s = forces.time_s - self._first_s
+        first, last = np.searchsorted(all_s, (after_s, until_s), side="right")
+        if first == last:
+            return None
+        return Forces(time_s=all_s[first:last], force_n=forces.force_n[first:last], source=forces.source)
 
 
 _GRIP_N = 1.5
@@ -442,8 +389,11 @@ class SimulatedSource(LiveSource):
         return _GRIP_N * press, pull * self._grasp.friction * _GRIP_N
 
 
-def _open_replay(name: str, options: LiveOptions) -> LiveSource:
-    capture, *_ = open_source(Path(name), trial=options.trial, options=ReadOptions(), whole=True)
+Images: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
+
+
+def _replay(source: Path | Images | Capture, options: LiveOptions) -> LiveSource:
+    capture = source if isinstance(source, Capture) else open_source(source, trial=options.trial, whole=True)[0]
     return ReplaySource(capture, speed=options.speed or 1.0, rate_hz=options.rate_hz)
 
 
@@ -460,7 +410,7 @@ _ROWS = {
         words="camera by its number or device file (0, or /dev/video0)",
         recognises=lambda name: name.isdecimal() or name.startswith("/dev/"),
         open=lambda name, options: CameraSource(Path(f"/dev/video{int(name)}" if name.isdecimal() else name), options),
-        takes=("rate_hz", "size", "pixel_format"),
+        takes=("rate_hz", "size"),
     ),
     "stream": SourceKind(
         words="network stream by its address (rtsp://, http://, udp://)",
@@ -477,14 +427,12 @@ _ROWS = {
     "replay": SourceKind(
         words="video, bag or trial of a data set, replayed",
         recognises=lambda name: Path(name).exists(),
-        open=_open_replay,
+        open=lambda name, options: _replay(Path(name), options),
         takes=("rate_hz", "speed", "trial"),
     ),
 }
 SOURCES = Table("source", "sliplens.sources", _ROWS)
 """Running sources by kind; an installed package adds its own by the entry point `sliplens.sources`."""
-
-Images: TypeAlias = UInt8[np.ndarray, "frames height width 3"]
 
 
 def open_live(
@@ -517,20 +465,18 @@ def open_live(
         return source
     if isinstance(source, Capture | np.ndarray):
         options.require_only("rate_hz", "speed", what="a replay")
-        capture = source if isinstance(source, Capture) else open_source(source)[0]
-        return ReplaySource(capture, speed=options.speed or 1.0, rate_hz=options.rate_hz)
+        return _replay(source, options)
     name = str(source)
-    added = [row for row in SOURCES if row not in _ROWS]
-    for row in (*added, *_ROWS):
-        if SOURCES[row].recognises(name):
-            opened = SOURCES[row].open(name, options)
-            options.require_only(*SOURCES[row].takes, what=opened.name)
+    for kind in sorted(SOURCES.values(), key=list(_ROWS.values()).__contains__):  # those that were added go first
+        if kind.recognises(name):
+            opened = kind.open(name, options)
+            options.require_only(*kind.takes, what=opened.name)
             return opened
-    kinds = "; ".join(SOURCES[row].words for row in SOURCES)
+    kinds = "; ".join(kind.words for kind in SOURCES.values())
     raise InputError(f"{name} is no source that is known, nor a path that exists; name a {kinds}")
 
 
 __all__ = [
-    "SOURCES", "Camera", "CameraSource", "FolderSource", "ReplaySource", "SimulatedSource", "StreamSource",
+    "SOURCES", "CameraSource", "FolderSource", "ReplaySource", "SimulatedSource", "StreamSource",
     "list_cameras", "open_live",
 ]  # fmt: skip
