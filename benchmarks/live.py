@@ -8,10 +8,10 @@
 `p50_ms` and `p99_ms` are from the moment a replayed frame is due to its margin, over the frames that have one, while a
 headless Chromium beside it draws the page (`--page browser`); `p50_first_ms` and `p99_first_ms` are to its first event,
 before markers, slip, focus, light, camera and direction are checked; `p99_ms_with_maps` is the same while the page
-shows maps, twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process holds at
-the end than after the first 10 seconds (or a tenth of a shorter run), `page_ms_a_second` the processor time of the
-page's threads. `of_it_ms` is the mean time of each part over the slowest hundredth of the frames: `network` is what a
-frame waits for that after its checks, `waiting` what none of them took.
+shows maps, twice a second. `drops` are frames that were never read, `memory_growth_mb` how much more memory the process
+holds at the end than after the first 10 seconds (or a tenth of a shorter run), `page_ms_a_second` the processor time of
+the page's threads. `of_it_ms` is the mean time of each part over the slowest hundredth of the frames: `network` is what
+a frame waits for that after its checks, `waiting` what none of them took.
 
 `--ratios` compares ways to read, without a page: readers take turns, frame by frame, so that whatever else the machine
 does hits all alike. `p50_ratios` and `p99_ratios` are of `chromatouch-pair` over `chromatouch-difference`, as they come
