@@ -19,9 +19,9 @@ import argparse
 import json
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # must be set before torch is imported
@@ -38,7 +38,10 @@ from sliplens.errors import SliplensError
 from sliplens.extras import import_cv2
 from sliplens.markers import MarkerStatus, track_markers
 from sliplens.markers.estimators import affine_parts
-from sliplens.recordings.formats.gelsight import list_gelsight_clips, read_gelsight_clip
+from sliplens.recordings.capture import Capture
+from sliplens.recordings.formats.tables import open_text_table
+from sliplens.recordings.formats.video import read_video
+from sliplens.recordings.options import ReadOptions
 
 FRAMES, STRIDE = 24, 12
 SMALL = (48, 64)
@@ -85,23 +88,98 @@ class Clip:
         return float(np.median(distance.min(axis=1)))
 
 
-def follow(path: Path) -> Clip:
+@dataclass(frozen=True, kw_only=True)
+class RecordedClip:
+    """A clip without the dark and frozen frames at its start."""
+
+    path: Path
+    grasped: str
+    slipped: bool
+    stale: int
+    capture: Capture
+    reference: int
+    """Frame with the least relief, for no untouched one was recorded."""
+
+
+_HEAD = 13  # frames at the start that may be stale
+_HORIZON = 500  # frames that the head is compared with; a longer video is read no further
+_BLOCKS = 24, 32
+_LEAST_LEAP = 1.5  # grey levels, mean over the image: several times what noise and coding change
+_FROZEN = 0.75  # grey levels: no more than noise and coding change
+_WAKES = 1.015  # a camera that adapts its exposure when it is started grows brighter by more
+
+
+def small_copies(frames: Iterable[np.ndarray]) -> np.ndarray:
+    """Reduce frames to the means of blocks, enough to tell scenes apart and small enough to keep."""
+    copies = []
+    for frame in islice(frames, _HORIZON):
+        rows, columns = (min(most, size) for most, size in zip(_BLOCKS, frame.shape[:2], strict=True))
+        height, width = frame.shape[0] // rows, frame.shape[1] // columns
+        whole = frame[: rows * height, : columns * width]
+        # rows first, which lie in one piece: several times faster than both at once
+        lines = whole.reshape(rows, height, -1).sum(axis=1, dtype=np.uint32)
+        copies.append((lines.reshape(rows, columns, width, 3).sum(axis=2) / (height * width)).astype(np.float32))
+    return np.stack(copies) if copies else np.empty((0, *_BLOCKS, 3), dtype=np.float32)
+
+
+def count_stale(copies: np.ndarray) -> int:
+    """Count the frames at the start of `small_copies` that belong to another scene.
+
+    A camera that was just started hands out dark frames, then frozen frames of an earlier moment from its buffers, the
+    last of them unlike every frame that follows. Of an object that slides all frames leap, or none does. (Where the
+    camera ran already, an object that is pressed all at once within the first 13 frames and never released looks like
+    a frozen start; do not count there.)
+    """
+    head = min(_HEAD, len(copies) // 3)  # enough frames must follow to compare with
+    if not head:
+        return 0
+    flat = copies.reshape(len(copies), -1)
+    leap = np.array([np.abs(flat[at + 1 :] - flat[at]).mean(axis=1).min() for at in range(head)])
+    brightness = flat[: head + 1].mean(axis=1)
+    wakes = bool(np.any(brightness[1:] > _WAKES * brightness[:-1]))
+    frozen = np.append(False, leap[:-1] < np.minimum(leap[1:] / 4, _FROZEN))
+    # where all frames move, none of them leaps
+    stale = (leap > max(_LEAST_LEAP, 4 * float(np.median(leap)))) & (frozen | wakes)
+    return int(np.flatnonzero(stale)[-1]) + 1 if stale.any() else 0
+
+
+def list_clips(folder: Path) -> dict[Path, dict[str, str]]:
+    """List the clips in `labels.csv` that exist, with their rows: their names repeat in every folder."""
+    table = open_text_table(folder / "labels.csv")
+    rows = [dict(zip(table.header, cells, strict=True)) for _, cells in table.rows]
+    return {folder / row["file"]: row for row in rows if (folder / row["file"]).is_file()}
+
+
+def read_clip(path: Path, row: dict[str, str]) -> RecordedClip:
+    """Open a clip at 8 frames a second: its file says 25, its author that 10 to 13 s of video are 37 s of motion."""
+    copies = small_copies(read_video(path, ReadOptions()).read_frames())
+    stale = count_stale(copies)
+    colour = copies[stale:, ..., [0, 2]] - copies[stale:, ..., [1]]
+    padded = np.pad(colour, ((0, 0), (2, 2), (2, 2), (0, 0)), mode="edge")
+    smooth = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(1, 2)).mean(axis=(-2, -1))
+    return RecordedClip(
+        path=path,
+        grasped=row["object"],
+        slipped=row["slip_label"] == "1",
+        stale=stale,
+        capture=read_video(path, ReadOptions(frame_rate=8.0, skip_frames=stale)),
+        reference=int(np.argmin(np.abs(colour - smooth).mean(axis=(1, 2, 3)))),
+    )
+
+
+def follow(recorded: RecordedClip) -> Clip:
     """Follow the dots of a clip from its frame with least contact."""
-    capture = read_gelsight_clip(path)
-    known_clip, reference = capture.clip, capture.reference_index
-    assert known_clip is not None
-    assert reference is not None
-    frames = list(capture.read_frames())
-    tracks = track_markers(frames, frames[reference], "gelsight-mini")
+    path, frames = recorded.path, list(recorded.capture.read_frames())
+    tracks = track_markers(frames, frames[recorded.reference], "gelsight-mini")
     return Clip(
         grasp="/".join(path.parts[-3:-1]),
-        grasped=capture.object,
-        slipped=known_clip.slips,
+        grasped=recorded.grasped,
+        slipped=recorded.slipped,
         rest_px=tracks.rest_px,
         position_px=np.where(tracks.followed[..., None], tracks.position_px, np.nan),
         status=tracks.status,
         picture=np.stack([shrink(frame) for frame in frames]),
-        key_change=measure_key_change(path, frames, skipped=known_clip.stale_frames),
+        key_change=measure_key_change(path, frames, skipped=recorded.stale),
     )
 
 
@@ -124,14 +202,14 @@ def measure_key_change(path: Path, frames: list[np.ndarray], *, skipped: int) ->
 def follow_all(folder: Path, keep: Path | None) -> tuple[list[Clip], list[str]]:
     """Follow every clip, or read what was followed before from `keep`; gives the clips, and what failed."""
     clips, failed = [], []
-    for path in track(list_gelsight_clips(folder), console=_SHOWN, description="Following dots"):
+    for path, row in track(list_clips(folder).items(), console=_SHOWN, description="Following dots"):
         saved = None if keep is None else keep / ("__".join(path.parts[-3:]) + ".npz")
         if saved is not None and saved.is_file():
             with np.load(saved) as data:
                 clips.append(Clip(**{name: value if value.ndim else value.item() for name, value in data.items()}))
             continue
         try:
-            clip = follow(path)
+            clip = follow(read_clip(path, row))
         except SliplensError as error:
             failed.append(f"{path.parent.name}/{path.name}: {error}")
             continue

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gelsight import list_clips, read_clip
 from sliplens.errors import SliplensError
 from sliplens.live import SlipDetector, SlipState
 from sliplens.markers import Tracker
-from sliplens.recordings.formats.gelsight import list_gelsight_clips, read_gelsight_clip
 from sliplens.simulation import make_recipe, plan_trials
 from sliplens.simulation.intervention import NOISE_PX
 from sliplens.simulation.plan import TrialPlan
@@ -101,15 +101,13 @@ def run_clips(folder: Path) -> dict[str, float | int]:
     """Share of the real clips in which a slip was told, of those that slip and of those that hold."""
     told: dict[bool, list[bool]] = {True: [], False: []}
     failed = 0
-    for path in list_gelsight_clips(folder):
+    for path, row in list_clips(folder).items():
         try:
-            capture = read_gelsight_clip(path)
-            frames = list(capture.read_frames())
-            assert capture.clip is not None
-            assert capture.reference_index is not None
-            tracker = Tracker(frames[capture.reference_index], "gelsight-mini")
+            clip = read_clip(path, row)
+            frames = list(clip.capture.read_frames())
+            tracker = Tracker(frames[clip.reference], "gelsight-mini")
             detector = SlipDetector(tracker.rest.centre_px)
-            rate_hz = capture.frame_rate_hz
+            rate_hz = clip.capture.frame_rate_hz
             states = [
                 detector.update(tracker.update(frame).position_px, at / rate_hz).state
                 for at, frame in enumerate(frames)
@@ -117,7 +115,7 @@ def run_clips(folder: Path) -> dict[str, float | int]:
         except SliplensError:
             failed += 1
             continue
-        told[capture.clip.slips].append(SlipState.SLIP in states)
+        told[clip.slipped].append(SlipState.SLIP in states)
     return {
         "slip_clips": len(told[True]), "told_in_slip_clips": float(np.mean(told[True] or [np.nan])),
         "holding_clips": len(told[False]), "told_in_holding_clips": float(np.mean(told[False] or [np.nan])),

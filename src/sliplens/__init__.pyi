@@ -23,14 +23,11 @@ from .recordings.corrections import draft_corrections as draft_corrections
 from .recordings.corrections import label_dataset as label_dataset
 from .recordings.dataset import load_dataset as load_dataset
 from .recordings.dataset import recover_dataset as recover_dataset
-from .recordings.exporting import export_lerobot as export_lerobot
-from .recordings.exporting import export_mcap as export_mcap
 from .recordings.importing import import_recordings as import_recordings
 from .recordings.splits import split_dataset as split_dataset
 from .report.page import write_report as write_report
 from .results.study import StudyConfig as StudyConfig
 from .runner import read_status as read_status
-from .simulation.trials import compare_datasets as compare_datasets
 from .simulation.trials import simulate as simulate
 from .study.explaining import explain as explain
 from .study.run import run_study as run_study

@@ -38,7 +38,6 @@ def test_a_damaged_page_is_told_by_every_command(
     commands = (
         ("train", damaged, "-o", tmp_path / "run", "--image-size", "32", "--batch-size", "4"),
         ("evaluate", difference_run, damaged, "-o", tmp_path / "scores"),
-        ("export", "mcap", damaged, "-o", tmp_path / "bags"),
         ("view", damaged, "--trial", trial, "-o", tmp_path / "trial.rrd"),
     )
     for words in commands:

@@ -97,7 +97,7 @@ def test_an_interrupted_import_goes_on_where_it_stopped(
             written.append(path)
 
     with monkeypatch.context() as patch:
-        patch.setattr("sliplens.recordings.trial_writer.write_trial", write)
+        patch.setattr("sliplens.recordings.importing.write_trial", write)
         assert run(*broken) == 130
     assert not (tmp_path / "b").exists()
     [kept] = (tmp_path / ".b.partial" / "parts").glob("trial=*/0*/trials/*.parquet")

@@ -2,7 +2,6 @@
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,9 +11,8 @@ from own_recording import write_forces, write_video
 from small import make_recording
 from there import there
 
-from sliplens.recordings import Recording, load_dataset, trial_writer
-from sliplens.recordings.capture import Capture
-from sliplens.recordings.trial_writer import import_trial
+from sliplens.recordings import Recording, importing, load_dataset
+from sliplens.recordings.importing import TrialJob, import_trial
 
 PROFILE = 'name = "mine"\ncamera_size_px = [112, 112]\nrotate_deg = 90\nnormal_axis = "z"\nnormal_sign = -1\n'
 
@@ -95,13 +93,13 @@ def test_a_trial_that_fails_is_left_out_until_it_is_added(tmp_path: Path, monkey
         save_dataset(tmp_path / name, make_recording(name, frames=8, seed=seed))
     tries = []
 
-    def import_but_one(capture: Capture, *given: Any, **named: Any) -> None:
-        if capture.trial == "jar":
-            tries.append(capture.trial)
+    def import_but_one(job: TrialJob, path: Path) -> None:
+        if job.capture.trial == "jar":
+            tries.append(path)
             raise RuntimeError("out of luck")
-        import_trial(capture, *given, **named)
+        import_trial(job, path)
 
-    monkeypatch.setattr(trial_writer, "import_trial", import_but_one)
+    monkeypatch.setattr(importing, "import_trial", import_but_one)
     with pytest.raises(SystemExit, match="1"):
         run("import", manifest, "-o", data, "--no-audit")
     assert len(tries) == 1

@@ -14,30 +14,31 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import chdir
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from io import BytesIO
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from lerobot_data import HEIGHT, LENGTHS, WIDTH, write_dataset
 from made_up import write_workspace
 from own_recording import write_video
 from PIL import Image
+from ros_bags import CAMERA, FORCE, frame_ns, raw_image, wrench, wrench_ns, write_bag
 from small import make_recording, save_untrained
 
 from sliplens.errors import SliplensError
 from sliplens.files import hash_file, scratch_folder
 from sliplens.images import write_png
 from sliplens.models import predict
-from sliplens.recordings import Dataset, import_recordings, label_dataset, load_dataset
+from sliplens.recordings import import_recordings, label_dataset, load_dataset
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.check import check_dataset
 from sliplens.recordings.corrections import read_corrections
 from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table
-from sliplens.recordings.exporting import export_lerobot, export_mcap
-from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.labelling import Reason
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import load_profile
@@ -280,7 +281,8 @@ def _read_data_set(folder: Path) -> object:
     told = check_dataset(data)
     if told:
         raise _FoundError(told[0].what)
-    return [(one.trial, one.safety_margin, [*one.read_frames()], one.frame_time_s) for one in read_stored(folder)]
+    trials = map(data.open, data.trials)
+    return [(one.trial, one.safety_margin, [*one.read_frames()], one.frame_time_s) for one in trials]
 
 
 class _FoundError(Exception):
@@ -423,37 +425,18 @@ def _video(folder: Path) -> None:
     write_video(make_recording("cup", frames=20), folder / "cup.mkv")
 
 
-def _exported(export: Callable[[Dataset, Path], object], name: str) -> Callable[[Path], object]:
-    """Maker of an exported data set."""
-
-    def make(folder: Path) -> None:
-        _data_set(folder / "data")
-        export(load_dataset(folder / "data"), folder / name)
-
-    return make
+def _bag(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 256, (20, 12, 16, 3), dtype=np.uint8)
+    frames = [(CAMERA, raw_image(each, frame_ns(at)), frame_ns(at)) for at, each in enumerate(pixels)]
+    samples = [(FORCE, wrench((0.0, 0.0, float(at)), wrench_ns(at)), wrench_ns(at)) for at in range(60)]
+    write_bag(folder / "bag", sorted([*frames, *samples], key=itemgetter(2)))
 
 
-_lerobot = _exported(export_lerobot, "robot")
-
-
-def _robot(folder: Path) -> None:
-    """A data set of LeRobot with frames in videos."""
-    _lerobot(folder)
-    robot = folder / "robot"
-    info = json.loads((robot / "meta" / "info.json").read_text())
-    info["features"]["observation.images.tactile"]["dtype"] = "video"
-    info["video_path"] = "{video_key}-{file_index}.mkv"
-    (robot / "meta" / "info.json").write_text(json.dumps(info))
-    (path,) = robot.glob("meta/episodes/*/*.parquet")
-    table = pq.read_table(path, columns=["episode_index", "length", "data/chunk_index", "data/file_index"])
-    for name, values in (("chunk_index", [0, 0]), ("file_index", [0, 1]), ("from_timestamp", [0.0, 0.0])):
-        table = table.append_column(f"videos/observation.images.tactile/{name}", pa.array(values))
-    pq.write_table(table, path)
-    for path in robot.glob("data/*/*.parquet"):
-        pq.write_table(pq.read_table(path, columns=["timestamp", "episode_index", "observation.force"]), path)
-    for index in range(2):
-        trial = make_recording(f"trial-{index}", seed=index)
-        write_video(trial, robot / f"observation.images.tactile-{index}.mkv")
+def _robot(folder: Path, *, images: bool) -> None:
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (sum(LENGTHS), HEIGHT, WIDTH, 3), dtype=np.uint8)
+    write_dataset(folder / "robot", frames, rng.normal(size=(len(frames), 6)).astype(np.float32), images=images)
 
 
 def _read_workspace(folder: Path) -> object:
@@ -568,6 +551,7 @@ def _frames_of(name: str, **options: Any) -> Callable[[Path], object]:
     return lambda folder: _read_frames(folder / name, **options)
 
 
+_images = partial(_robot, images=True)
 _ROBOT = ("robot/data/*/*.parquet", "robot/meta/episodes/*/*.parquet")
 _WEIGHTS = {**ANY, "header": _tensors, "not finite": _not_finite}
 FORMATS = {
@@ -592,11 +576,11 @@ FORMATS = {
     "manifest": Format(_own, ("many.csv",), MANY, lambda folder: _import(folder, "many.csv")),
     "images": Format(_own, ("cup/0*.png",), PICTURE, _frames_of("cup", frame_rate=30.0)),
     "video": Format(_video, ("cup.mkv",), ANY, _frames_of("cup.mkv")),
-    "bag": Format(_exported(export_mcap, "bags"), ("bags/trial-0.mcap",), ANY, _frames_of("bags/trial-0.mcap")),
-    "lerobot": Format(_lerobot, ("robot/meta/info.json",), {**ANY, **JSON}, _frames_of("robot")),
-    "lerobot tables": Format(_lerobot, _ROBOT, TABLES, _frames_of("robot")),
+    "bag": Format(_bag, ("bag/bag.mcap",), ANY, _frames_of("bag/bag.mcap")),
+    "lerobot": Format(_images, ("robot/meta/info.json",), {**ANY, **JSON}, _frames_of("robot")),
+    "lerobot tables": Format(_images, _ROBOT, TABLES, _frames_of("robot")),
     "toml": Format(_text("tip.toml"), ("*.toml",), TOML, _read_toml),
-    "robot": Format(_robot, _ROBOT, TABLES, _frames_of("robot")),
+    "robot": Format(partial(_robot, images=False), _ROBOT, TABLES, _frames_of("robot")),
 }
 """Every kind of input."""
 

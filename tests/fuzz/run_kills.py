@@ -51,8 +51,12 @@ import sliplens.study.run as study  # noqa: E402
 from sliplens.cli import main as command  # noqa: E402
 from sliplens.cli.console import say  # noqa: E402
 from sliplens.recordings import load_dataset  # noqa: E402
-from sliplens.recordings.dataset import trial_info, trial_path, write_dataset_table  # noqa: E402
-from sliplens.recordings.journal import JOURNAL_FOLDER  # noqa: E402
+from sliplens.recordings.dataset import (  # noqa: E402
+    JOURNAL_FOLDER,
+    trial_info,
+    trial_path,
+    write_dataset_table,
+)
 from sliplens.recordings.store import save_recording  # noqa: E402
 from sliplens.results.study import StudyConfig  # noqa: E402
 
@@ -94,8 +98,6 @@ CASES = {
     "study": Case(("study", "@/drawn", "-o", "out", "--network", "@/of-drawn", *_QUICK)),
     "track": Case(("track", "@/drawn", "-o", "out.parquet")),
     "export onnx": Case(("export", "onnx", "@/run", "-o", "out.onnx")),
-    "export lerobot": Case(("export", "lerobot", "@/data", "-o", "out")),
-    "export mcap": Case(("export", "mcap", "@/data", "-o", "out")),
     "live": Case(("live", "@/data", "--speed", "2", "--no-page", "--record", "out"), grows=True),
     "grip": Case(("grip", "-o", "out", "--controller", "margin", "--episodes", "12")),
 }  # fmt: skip

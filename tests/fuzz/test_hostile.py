@@ -2,7 +2,6 @@
 
 import json
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +21,7 @@ from sliplens.progress import visible
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import FrictionEstimate
 from sliplens.recordings.labels.axes import middles
-from sliplens.recordings.options import LIMITS, Budget, ReadOptions
 from sliplens.recordings.sensor import SensorProfile
-from sliplens.recordings.source import open_source
 from sliplens.recordings.store import save_recording, stream_frames
 from sliplens.recordings.trial import Recording
 
@@ -164,23 +161,6 @@ def test_no_picture_is_opened_that_no_camera_takes(tmp_path: Path):
     claim_size(tmp_path / "x.png", (10_001, 10_000))
     with pytest.raises(ImageError, match="10001 x 10000 pixels are more than any camera has"):
         read_image(tmp_path / "x.png")
-
-
-@pytest.mark.parametrize("name", LIMITS)
-def test_a_recording_beyond_a_limit_is_told_and_let_in_by_name(name: Budget, tmp_path: Path, monkeypatch):
-    (tmp_path / "cup").mkdir()
-    for index in range(3):
-        write_png(tmp_path / "cup" / f"{index}.png", np.zeros((4, 5, 3), dtype=np.uint8))
-    lines = [f"{0.5 * row},0,0,{row}" for row in range(4)]
-    (tmp_path / "forces.csv").write_text("\n".join(["time_s,fx,fy,fz", *lines]))
-    options = ReadOptions(frame_rate=1.0, forces=tmp_path / "forces.csv")
-    least = {"frames": 3, "pixels": 20, "samples": 4, "span": 2}[name]
-    monkeypatch.setitem(LIMITS, name, least)
-    assert open_source(tmp_path / "cup", options=options)
-    monkeypatch.setitem(LIMITS, name, least - 1)
-    with pytest.raises(RecordingError, match=rf"more than the {least - 1} that are usual.*--allow-large {name}"):
-        open_source(tmp_path / "cup", options=options)
-    assert open_source(tmp_path / "cup", options=replace(options, allow_large=(name,)))
 
 
 def test_windows_over_a_gap_are_as_many_as_samples_fill():

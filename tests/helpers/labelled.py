@@ -1,6 +1,6 @@
 """How labels were made, with all that can be told and numbers that no rounding keeps."""
 
-from sliplens.recordings.labelling import Clip, ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
+from sliplens.recordings.labelling import ForceAxes, Found, LabelBasis, Labelling, Lag, ReferenceChoice
 from sliplens.recordings.labels import FrictionEstimate
 
 LABELLING = Labelling(
@@ -8,7 +8,6 @@ LABELLING = Labelling(
     forces=None,
     notes=("Grüße\u2028",),
     reference=ReferenceChoice(index=4, method="named", contact_energy=0.1 + 0.2),
-    clip=Clip(slips=True, grasp="cup 1", stale_frames=3),
     basis=LabelBasis(
         axes=ForceAxes(
             normal="z",
@@ -28,6 +27,5 @@ LABELLING = Labelling(
         contact_threshold_n=0.1,
         window_s=0.04,
         gap_s=0.01,
-        force_range_n=None,
     ),
 )

@@ -48,7 +48,9 @@ def write_frames(
 ) -> Path:
     """Frames at a rate, or at milliseconds as they are given; `reordered` B-frames in a row."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
+    # the table of an MP4 first, so that a file that is cut off has it
+    faststart = {"movflags": "faststart"} if path.suffix == ".mp4" else {}
+    with av.open(str(path), "w", options=faststart) as container:
         container.metadata["title"] = title
         stream = container.add_stream(codec, rate=rate, options=options or {})
         assert isinstance(stream, av.VideoStream)

@@ -22,8 +22,15 @@ from sliplens.errors import RecordingError, SliplensError
 from sliplens.live import ForceStream, LiveFrame, LiveOptions, Recorder, open_live
 from sliplens.recordings import Dataset, Recording, TrialFacts, load_dataset
 from sliplens.recordings.capture import Forces
-from sliplens.recordings.dataset import begin_recording, finish_recording, recover_dataset
-from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, Journal, JournalHeader
+from sliplens.recordings.dataset import (
+    JOURNAL_FOLDER,
+    LOCK_FILE,
+    Journal,
+    JournalHeader,
+    begin_recording,
+    finish_recording,
+    recover_dataset,
+)
 from sliplens.recordings.store import forces_path, load_forces
 
 FACTS = TrialFacts(trial="cup", sensor="tip", object="a cup", condition="wet", day=3)
@@ -125,7 +132,7 @@ from pathlib import Path
 from typing import Any
 import numpy as np
 from sliplens.recordings.dataset import begin_recording
-from sliplens.recordings.journal import Journal, JournalHeader
+from sliplens.recordings.dataset import Journal, JournalHeader
 from sliplens.recordings.trial import TrialFacts
 lock, _ = begin_recording(Path(sys.argv[1]), simulated=False)
 header = JournalHeader(facts=TrialFacts(trial="a"), source="", size=(48, 48))

@@ -61,3 +61,10 @@ def test_a_gel_that_fills_the_frame_is_kept_whole_and_one_without_markers_has_no
 def test_black_frames_are_refused():
     with pytest.raises(ImageError, match="black"):
         propose_profile(np.zeros((3, 40, 40, 3), dtype=np.uint8), name="tip")
+
+
+def test_dark_frames_of_a_starting_camera_are_not_taken_for_the_untouched_sensor():
+    gel = draw_dots(make_grid(columns=6, rows=6, pitch=24.0, at=(28.0, 28.0)), size=(176, 176))
+    frames = np.repeat(camera(gel, at=(90, 30)), 5, axis=0)
+    frames[:4] //= 3
+    assert propose_profile(frames, name="tip").profile.reference_frame == 4

@@ -1,8 +1,11 @@
+from itertools import islice
+
 import numpy as np
 import pytest
 
 from sliplens.errors import ImageError, RecordingError
 from sliplens.markers import MarkerStatus, Tracker, detect_markers, track_markers, tracker
+from sliplens.recordings.source import open_source
 
 KIND = {"chromatouch": "chromatouch", "flat-gel": "gelsight-mini"}
 
@@ -161,13 +164,11 @@ def test_what_cannot_be_followed_is_refused_in_one_sentence(dots, grid):
 
 @pytest.mark.real
 def test_dots_of_a_real_gel_stay_where_they_are_while_nothing_moves(reference_folder):
-    from sliplens.recordings.formats.gelsight import read_gelsight_clip  # noqa: PLC0415 (decoding comes with it)
-
     path = reference_folder / "gelsight_mini_slip" / "noslip" / "tennis_ball__exp_num_6" / "camera_0.avi"
     if not path.is_file():
         pytest.skip(f"the real clip is not at {path}")
-    clip = read_gelsight_clip(path)
-    frames = [frame for _, frame in zip(range(12), clip.read_frames(), strict=False)]
+    (clip,) = open_source(path)
+    frames = list(islice(clip.read_frames(), 12))
     tracks = track_markers(frames[1:], frames[0], "gelsight-mini")
     assert len(tracks.rest_px) > 50
     assert tracks.followed.mean() > 0.99

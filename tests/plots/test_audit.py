@@ -77,7 +77,6 @@ def make_labelling(
         contact_threshold_n=0.061,
         window_s=0.04,
         gap_s=0.008,
-        force_range_n=17.5,
     )
     return Labelling(
         source=source,
@@ -129,7 +128,6 @@ def test_words_hold_what_the_labels_rest_on():
         "15.0 ± 9.0 ms",
         "0.061 N",
         "40.0 ms",
-        "17.5 N",
         "0.42 grey",
     )
     names = (

@@ -17,15 +17,16 @@ def touch(folder: Path, *names: str) -> Path:
 
 def test_recordings_and_tables_are_paired_by_name(tmp_path: Path):
     touch(tmp_path, "cup.mp4", "cup.csv", "jar.MKV", "jar_forces.csv", "mug.avi", "notes.txt", "tip.toml", ".x.mp4")
-    rows = {row.trial: (row.video.name, row.forces and row.forces.name) for row in pair_recordings(tmp_path)}
-    assert rows == {"cup": ("cup.mp4", "cup.csv"), "jar": ("jar.MKV", "jar_forces.csv"), "mug": ("mug.avi", None)}
-    assert find_rows(tmp_path) == pair_recordings(tmp_path)
+    rows = pair_recordings(tmp_path)
+    assert find_rows(tmp_path) == rows
+    pairs = {row.trial: (row.video.name, row.reading.forces and row.reading.forces.name) for row in rows}
+    assert pairs == {"cup": ("cup.mp4", "cup.csv"), "jar": ("jar.MKV", "jar_forces.csv"), "mug": ("mug.avi", None)}
 
 
 def test_recordings_that_end_like_tables_and_names_of_any_script_find_theirs(tmp_path: Path):
     touch(tmp_path, "left.mp4", "left.csv", "lift_ft.mp4", "lift_ft.csv", "\u676f\u5b50.mp4", "\u676f\u5b50.csv")
     touch(tmp_path, "pru\u0308fung.mp4", "pr\u00fcfung_forces.csv")
-    rows = {row.trial: row.forces and row.forces.name for row in pair_recordings(tmp_path)}
+    rows = {row.trial: row.reading.forces and row.reading.forces.name for row in pair_recordings(tmp_path)}
     assert rows == {
         "left": "left.csv",
         "lift_ft": "lift_ft.csv",
@@ -51,11 +52,12 @@ def test_a_folder_that_leaves_a_choice_is_refused(tmp_path: Path, names, words):
 def test_a_column_named_as_an_option_of_reading_sets_it_for_its_trial(tmp_path: Path):
     path = tmp_path / "trials.csv"
     path.write_text(
-        "video;forces;time_unit;force_columns;start_s;skip_stale\na.mp4;a.csv;ms;Fz Ft;1.5;yes\nb.mp4;b.csv;;;;\n"
+        "video;forces;time_unit;force_columns;start_s;skip_frames\na.mp4;a.csv;ms;Fz Ft;1.5;3\nb.mp4;b.csv;;;;\n"
     )
     first, second = read_rows(path)
-    assert first.reading == ReadOptions(time_unit="ms", force_columns=("Fz", "Ft"), start_s=1.5, skip_stale=True)
-    assert (first.forces, second.reading) == (tmp_path / "a.csv", ReadOptions())
+    options = {"time_unit": "ms", "force_columns": ("Fz", "Ft"), "start_s": 1.5, "skip_frames": 3}
+    assert first.reading == ReadOptions(forces=tmp_path / "a.csv", **options)
+    assert second.reading == ReadOptions(forces=tmp_path / "b.csv")
 
 
 def test_a_manifest_says_all_of_a_trial(tmp_path: Path):
@@ -69,8 +71,8 @@ def test_a_manifest_says_all_of_a_trial(tmp_path: Path):
     one, two = read_rows(path)
     profile = str(tmp_path / "tip.toml")
     assert one == ManifestRow(
-        trial="one", video=tmp_path / "a.mp4", forces=tmp_path / "a.csv", sensor=profile, day=2, object="cup",
-        condition="wet", mu=0.7, reference=12,
+        trial="one", video=tmp_path / "a.mp4", sensor=profile, day=2, object="cup",
+        condition="wet", mu=0.7, reference=12, reading=ReadOptions(forces=tmp_path / "a.csv"),
     )  # fmt: skip
     assert two == ManifestRow(trial="b", video=tmp_path / "b.mp4", sensor="digit", reference=tmp_path / "still.png")
     assert find_rows(path) == (one, two)

@@ -25,7 +25,7 @@ def test_a_folder_and_an_array_give_the_same_frames(folder):
     path, frames = folder
     for source in (path, str(path), frames):
         (trial,) = open_source(source, reference_frame=1)
-        assert (trial.frames, trial.frame_size) == (3, (24, 32))
+        assert (len(trial), trial.frame_size) == (3, (24, 32))
         for _ in range(2):  # reading begins anew
             np.testing.assert_array_equal(np.stack(list(trial.read_frames())), frames)
         np.testing.assert_array_equal(there(trial.read_reference)(), frames[1])
@@ -41,14 +41,14 @@ def test_images_and_frames_in_memory_have_times_where_their_rate_is_told(folder)
 
 def test_a_data_set_brings_references_times_and_trusted_labels(small_dataset: Dataset):
     trials = open_source(small_dataset, split="test")
-    assert [trial.name for trial in trials] == [info.trial for info in small_dataset.select(split="test")]
+    assert [trial.trial for trial in trials] == [info.trial for info in small_dataset.select(split="test")]
     recording = small_dataset.load(small_dataset.select(split="test")[0])
     np.testing.assert_array_equal(there(trials[0].read_reference)(), recording.reference)
     np.testing.assert_array_equal(next(trials[0].read_frames()), recording.frames[0])
     np.testing.assert_array_equal(there(trials[0].time_s), recording.time_s)
     np.testing.assert_array_equal(np.isfinite(there(trials[0].safety_margin)), recording.labelled)
-    (one,) = open_source(small_dataset.folder, trial=trials[-1].name)
-    assert one.name == trials[-1].name
+    (one,) = open_source(small_dataset.folder, trial=trials[-1].trial)
+    assert one.trial == trials[-1].trial
 
 
 def test_what_does_not_fit_is_told(folder, small_dataset: Dataset):

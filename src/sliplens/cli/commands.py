@@ -312,11 +312,14 @@ def call_split(call: Any) -> None:
 @command("check", "recordings.check:check_dataset", "sliplens check runs/mine/data")
 def call_check(call: Any) -> None:
     """Print the findings; exit code 2 if there are any."""
-    from sliplens.recordings.dataset import load_dataset, trial_path
+    from sliplens.recordings.dataset import DATASET_FILE, load_dataset, trial_path
     from sliplens.recordings.store import read_header
 
-    data = load_dataset(call.keywords["data"])
-    findings = call(data=data)
+    data, other = load_dataset(call.keywords["data"]), call.keywords.get("against")
+    if other is not None and not (Path(other) / DATASET_FILE).is_file():
+        output.print_known_trials(data, Path(other))
+        other = None
+    findings = call(data=data, against=other)
     if findings:
         print_table("Findings", ("where", "what"), [(finding.where, finding.what) for finding in findings])
         count = number_of(len(findings), "error")
@@ -342,25 +345,6 @@ def call_slip(call: Any) -> None:
     method, *values = (getattr(result.scores, name) for name in names)
     rows = [(name, *(f"{value:.2f}" for value in row)) for name, *row in zip(method, *values, strict=True)]
     print_table(f"Slip of {number_of(len(result.fall), 'clip')}", [name.replace("_", " ") for name in names], rows)
-
-
-@command("compare", "simulation.trials:compare_datasets", "sliplens compare runs/mine/data runs/other/data")
-def call_compare(call: Any) -> None:
-    """Print what two data sets share, or which trials of a data set trained a network."""
-    from sliplens.recordings.dataset import DATASET_FILE
-
-    first, second = Path(call.keywords["first"]), Path(call.keywords["second"])
-    if not (second / DATASET_FILE).is_file():
-        output.print_known_trials(first, second)
-        return
-    shared = call()
-    pairs = {"trial": shared.trials, "day": shared.days, "sensor": shared.sensors}
-    for noun, names in pairs.items():
-        if names:
-            print_table(f"Shared {noun}s", (str(first), str(second)), list(names))
-    counts = ", ".join(number_of(len(names), noun) for noun, names in pairs.items())
-    basis = "seeds and frames" if shared.by_seeds else "names and frames"
-    say(f"{first} and {second} share {counts} (compared by {basis})")
 
 
 @command(
@@ -479,13 +463,6 @@ def call_export_onnx(call: Any) -> None:
     with OUT.status("Exporting; the file appears once ONNX Runtime predicts the same as the network"):
         path = call()
     print_file(path, "predicts as the network does")
-
-
-@command("export lerobot", "recordings.exporting:export_lerobot", "sliplens export lerobot runs/mine/data -o lerobot")
-@command("export mcap", "recordings.exporting:export_mcap", "sliplens export mcap runs/mine/data -o mcap")
-def call_export_dataset(call: Any) -> None:
-    """Write the data set."""
-    call()
 
 
 @command(

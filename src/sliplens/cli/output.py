@@ -189,16 +189,14 @@ def _names(names: Iterable[str]) -> str:
     return ", ".join(ordered if rest < 2 else [*ordered[:_MOST_NAMES], f"{rest} more"]) or "-"
 
 
-def print_known_trials(folder: Path, network: Path) -> None:
+def print_known_trials(data: "Dataset", network: Path) -> None:
     """Print how many trials of each split trained a network."""
     from sliplens.models.checkpoint import load
-    from sliplens.recordings.dataset import load_dataset
     from sliplens.training.evaluation import find_training_trials
 
-    trials = load_dataset(folder).trials
-    trained = Counter(trial.split for trial in find_training_trials(trials, load(network)))
-    for split, count in Counter(trial.split for trial in trials).items():
-        say(f"{network} was trained on {trained[split]} of the {count} {split} trials of {folder}")
+    trained = Counter(trial.split for trial in find_training_trials(data.trials, load(network)))
+    for split, count in Counter(trial.split for trial in data.trials).items():
+        say(f"{network} was trained on {trained[split]} of the {count} {split} trials of {data.folder}")
 
 
 def print_scores(evaluation: "Evaluation") -> None:

@@ -213,7 +213,7 @@ def frames_from_dataset(
     rows: list[tuple[str, int]] = []
     for info in data.select(split=selection.split, condition=selection.condition)[: selection.trials]:
         (opened,) = open_source(data, trial=info.trial)
-        margin = require_labels(opened.name, opened.safety_margin)
+        margin = require_labels(opened.trial, opened.safety_margin)
         rows += [(info.trial, nearest_frame(margin, level)) for level in selection.levels]
     return frames_at(network, data, rows, baseline=baseline)
 
@@ -270,10 +270,10 @@ def frames_from_folder(
     """
     parts, captures = [], open_source(folder, reference=reference, sensor=sensor)
     for opened in captures:
-        default = "stick" if opened.files is None and opened.frames > 1 else "untouched"
+        default = "stick" if opened.files is None and len(opened) > 1 else "untouched"
         chosen = default if baseline is None else baseline
-        part = _take(network, opened, range(opened.frames), source="real", baseline=chosen)
-        part = replace(part, trial=(folder.name if opened.files else opened.name,) * len(part.ids))
+        part = _take(network, opened, range(len(opened)), source="real", baseline=chosen)
+        part = replace(part, trial=(folder.name if opened.files else opened.trial,) * len(part.ids))
         if labels_in_names:
             margin = np.array([_label(folder / name) for name in opened.files or part.ids], dtype=np.float32)
             part = replace(part, safety_margin=margin)
@@ -290,13 +290,13 @@ def frames_from_folder(
 def _take(
     network: Network, opened: Capture, numbers: Sequence[int], *, source: str, baseline: Baseline
 ) -> ChosenFrames:
-    names = opened.files or [f"{opened.name}-f{number:04d}" for number in range(opened.frames)]
+    names = opened.files or [f"{opened.trial}-f{number:04d}" for number in range(len(opened))]
     network.require_frame_size(opened.frame_size, what=f"frames such as {names[numbers[0]]}")
     untouched = None if opened.read_reference is None else opened.read_reference()
     stick, warnings = None, ()
     if isinstance(baseline, str) and baseline == "stick":
         baseline = "untouched"
-        stick, warnings = try_stick_frame(opened.name, opened.read_frames(), untouched, opened.safety_margin)
+        stick, warnings = try_stick_frame(opened.trial, opened.read_frames(), untouched, opened.safety_margin)
     wanted = {*numbers} if stick is None else {*numbers, stick}
     frames = {
         number: frame for number, frame in enumerate(islice(opened.read_frames(), max(wanted) + 1)) if number in wanted
@@ -305,7 +305,7 @@ def _take(
         network.require_kind(frames[numbers[0]], what=names[numbers[0]])
     taken = np.stack([frames[number] for number in numbers])
     chosen = frames_from_arrays(network, taken, untouched, baseline=baseline if stick is None else frames[stick])
-    margin = np.full(opened.frames, np.nan) if opened.safety_margin is None else opened.safety_margin
+    margin = np.full(len(opened), np.nan) if opened.safety_margin is None else opened.safety_margin
     return replace(
         chosen,
         ids=tuple(Path(names[number]).stem if opened.files else names[number] for number in numbers),

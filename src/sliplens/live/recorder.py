@@ -16,7 +16,7 @@ from sliplens.errors import RecordingError
 from sliplens.live.mailbox import Outlet
 from sliplens.live.reading import LiveFrame
 from sliplens.recordings.capture import Forces, Frame
-from sliplens.recordings.dataset import Dataset, begin_recording, finish_recording, load_dataset
+from sliplens.recordings.dataset import Dataset, Journal, JournalHeader, begin_recording, finish_recording, load_dataset
 from sliplens.recordings.formats.tables import (
     UNITS,
     guess_force_columns,
@@ -24,7 +24,6 @@ from sliplens.recordings.formats.tables import (
     require_trial_name,
     unit_of,
 )
-from sliplens.recordings.journal import Journal, JournalHeader
 from sliplens.recordings.trial import TrialFacts
 
 _MOST_WAITING_BYTES = 256 * 2**20

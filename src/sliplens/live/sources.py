@@ -250,7 +250,7 @@ class ReplaySource(LiveSource):
 
     def __init__(self, capture: Capture, *, speed: float = 1.0, rate_hz: float | None = None) -> None:
         self._capture, self.count = capture, len(capture)
-        self.name, self.simulated = f"{capture.name} of {capture.opened}", capture.simulated
+        self.name, self.simulated = f"{capture.trial} of {capture.opened}", capture.simulated
         self.size, self.speed = capture.frame_size, speed
         self.rate_hz = speed * (rate_hz or capture.frame_rate_hz)
         self._time_s, self._first_s = np.arange(len(capture)) * speed / self.rate_hz, 0.0

@@ -13,12 +13,12 @@ from sliplens.errors import ImageError, InputError
 from sliplens.extras import import_cv2
 from sliplens.markers.detect import FEWEST, Appearance, MarkerKind, detect_markers
 from sliplens.recordings.capture import Frame
-from sliplens.recordings.formats.video import count_stale, small_copies
 from sliplens.recordings.sensor import SensorProfile
 from sliplens.recordings.source import Frames, open_source
 
 _FIRST_FRAMES = 300  # that are searched for the untouched sensor
 _EVERY = 10
+_STARTING, _LIT_SHARE = 30, 0.9  # frames of a starting camera; share of their median brightness that is no dark one
 _BRIGHTER = 2.0  # a lit gel against what surrounds it
 _SURROUND = 0.03, 0.9  # shares of the frame that may be dark around a gel
 _REACH = 0.75  # of the markers' spacing, by which the gel extends beyond the outermost of them
@@ -72,8 +72,9 @@ def propose_profile(
     (12, 4, 40, 40)
     """
     capture, *others = open_source(Path(source) if isinstance(source, str) else source)
-    # a camera that was just started hands out frames of another moment
-    untouched = count_stale(small_copies(islice(capture.read_frames(), _FIRST_FRAMES)))
+    # a camera that was just started hands out dark frames
+    levels = np.array([frame.mean() for frame in islice(capture.read_frames(), _STARTING)])
+    untouched = int(np.argmax(levels >= _LIT_SHARE * np.median(levels)))
     first = islice(capture.read_frames(), untouched, untouched + _FIRST_FRAMES, _EVERY)
     frames, (height, width) = np.stack(list(first)), capture.frame_size
     frame = frames[0]

@@ -150,12 +150,12 @@ def track(
         for trial in trials.kinds:
             if trial.read_reference is not None:
                 continue
-            if trial.frames == 1:
+            if len(trial) == 1:
                 raise InputError(
-                    f"{trial.name} has one frame and no reference to measure displacements from; name the untouched "
+                    f"{trial.trial} has one frame and no reference to measure displacements from; name the untouched "
                     "sensor with --reference IMAGE"
                 )
-            add_note(f"{trial.name}: no untouched frame was named, so displacements count from the first frame.")
+            add_note(f"{trial.trial}: no untouched frame was named, so displacements count from the first frame.")
         _, rows = run_table(
             _Following(trials=trials, markers=markers, schema=schema),
             # a marker is followed from the first frame on: a trial is not cut
@@ -197,7 +197,7 @@ class _Following(Work):
             places = tracked.position_px, tracked.rest_px, tracked.displacement_px
             numbers = np.column_stack([*places, tracked.radius_px, tracked.deviation_px]).astype(np.float32)
             columns: dict[str, pa.Array] = {
-                "trial": pa.array([trial.name] * count),
+                "trial": pa.array([trial.trial] * count),
                 "frame": pa.array(np.full(count, number, dtype=np.int32)),
                 "time_s": pa.array([time_s] * count, pa.float64()),
                 "marker": pa.array(np.arange(count, dtype=np.int32)),
@@ -205,7 +205,7 @@ class _Following(Work):
                 **{name: pa.array(numbers[:, at], from_pandas=True) for at, name in enumerate(_NUMBERS)},
             }
             yield pa.table(columns, schema=pa.schema(_COLUMNS))
-            report_progress(number + 1, trial.frames)
+            report_progress(number + 1, len(trial))
 
 
 def _outcome(rows: pa.Table) -> TrialTracking:

@@ -282,7 +282,7 @@ def _list_notes(
     notes: list[str] = []
     for capture in captures:
         if sequence:
-            require_frequent(capture.time_s, what=capture.name)
+            require_frequent(capture.time_s, what=capture.trial)
         notes += [*capture.notes, *_require_comparable(network, capture)]
     notes += network.doubts(profile=profile)
     if friction is not None:
@@ -306,7 +306,7 @@ def _assume_reference(network: Network, trial: Capture) -> Capture:
     if trial.read_reference is not None or not _is_recorded(trial) or not network.encoding.compares:
         return trial
     words = (
-        f"{trial.name}: its first frame was taken for the untouched sensor; if that touches, name another with "
+        f"{trial.trial}: its first frame was taken for the untouched sensor; if that touches, name another with "
         "--reference-frame N, or an image with --reference"
     )
     return replace(trial, reference_index=0, notes=(*trial.notes, words))
@@ -330,17 +330,17 @@ def _require_comparable(network: Network, trial: Capture) -> Iterator[str]:
     if not encoding.compares:
         if network.directions != FULL_CIRCLE:
             yield (
-                f"{trial.name}: no reference was given, so neither the direction of the pull nor a motion of the "
+                f"{trial.trial}: no reference was given, so neither the direction of the pull nor a motion of the "
                 f"camera is checked; the network was trained on {range_words(network.directions)} (90 is down)."
             )
     elif encoding.empty_is_black:
         yield (
-            f"{trial.name}: no reference was given, so its images were taken for difference images, which hide the "
+            f"{trial.trial}: no reference was given, so its images were taken for difference images, which hide the "
             "pull."
         )
     else:
         raise InputError(
-            f"a network on {encoding.name} images compares the frames of {trial.name} with the untouched sensor; "
+            f"a network on {encoding.name} images compares the frames of {trial.trial} with the untouched sensor; "
             "name its image with --reference IMAGE, or a frame of it with --reference-frame N"
         )
 
@@ -390,7 +390,7 @@ class _Prediction(Work):
         capture = _assume_reference(self.network, capture)
         network, follower = self.network, self.network.follow() if self.sequence else None
         if self.sequence:
-            require_frequent(capture.time_s, what=capture.name)  # `_list_notes` saw one trial of each sensor
+            require_frequent(capture.time_s, what=capture.trial)  # `_list_notes` saw one trial of each sensor
         reference = None if capture.read_reference is None else capture.read_reference()
         check, size = _make_check(network, capture, reference), tuple(network.manifest.frame_size)
         encode = partial(network.encoding.encode, reference=reference, image_size=network.manifest.image_size)
@@ -473,7 +473,7 @@ def _columns(
     recorded = {"time_s": trial.time_s, "safety_margin": trial.safety_margin}
     recorded |= {name: labels and getattr(labels, name) for name in _FORCES}
     return {
-        "trial": [trial.name] * len(believed),
+        "trial": [trial.trial] * len(believed),
         "frame": np.arange(here.start, here.stop),
         "file": trial.files and trial.files[here],
         "known": estimate.known,

@@ -84,15 +84,8 @@ def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
     if basis is None:
         came, none = ["They came with the recording."], ("No frame has one.",)
         facts.append(Fact("Labels", came) if valid else Fact("Labels", [], none))
-        if (clip := labelling.clip) is not None:
-            about = [
-                f"slips: {'yes' if clip.slips else 'no'}",
-                f"grasp: {clip.grasp}",
-                f"stale frames: {clip.stale_frames}",
-            ]
-            facts.append(Fact("Known of the whole clip", about))
     else:
-        axes, limit = basis.axes, basis.force_range_n
+        axes = basis.axes
         if basis.flags:
             facts.append(Fact("Flags", [], tuple(f"• {flag}" for flag in basis.flags), indent="   "))
         turned = f", turned by {axes.tilt_deg:.1f} degrees" if axes.direction else ""
@@ -109,7 +102,6 @@ def audit_facts(recording: Recording, labelling: Labelling) -> list[Fact]:
         forces = [
             f"contact from {basis.contact_threshold_n:.3f} N",
             f"means over {_milli(basis.window_s)} ms; gaps over {_milli(basis.gap_s)} ms count as missing",
-            "range of the sensor unknown" if limit is None else f"range of the sensor ± {limit:g} N",
         ]
         facts += [
             Fact("Axes", [f"normal force is {sign}{axes.normal}{turned} {origins}"], unsure),

@@ -8,9 +8,6 @@ from .dataset import Dataset as Dataset
 from .dataset import TrialInfo as TrialInfo
 from .dataset import load_dataset as load_dataset
 from .dataset import recover_dataset as recover_dataset
-from .exporting import Export as Export
-from .exporting import export_lerobot as export_lerobot
-from .exporting import export_mcap as export_mcap
 from .importing import import_recordings as import_recordings
 from .labelling import Corrections as Corrections
 from .labelling import Labelling as Labelling

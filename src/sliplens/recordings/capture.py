@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images import require_rgb
-from sliplens.recordings.labelling import Clip, ReferenceChoice
+from sliplens.recordings.labelling import ReferenceChoice
 from sliplens.recordings.trial import Labels, TrialFacts, require_rising
 
 Frame: TypeAlias = UInt8[np.ndarray, "height width 3"]  #: RGB image of the camera.
@@ -52,7 +52,6 @@ class Capture(TrialFacts):
     reference_index: int | None = None  #: Number of the untouched frame, by the source or its reader.
     reference_choice: ReferenceChoice | None = None
     """How the image of the untouched sensor was chosen; None where unknown."""
-    clip: Clip | None = None  #: Facts about the whole recording.
     split: str = ""  #: Split in the source; empty where it has none.
     simulated: bool = False
     files: tuple[str, ...] | None = None  #: Names of the images of a folder.
@@ -72,16 +71,6 @@ class Capture(TrialFacts):
 
     def __len__(self) -> int:
         return len(self.frame_time_s)
-
-    @property
-    def name(self) -> str:
-        """Name of the trial."""
-        return self.trial
-
-    @property
-    def frames(self) -> int:
-        """Number of frames."""
-        return len(self)
 
     @property
     def time_s(self) -> Float[np.ndarray, " frames"] | None:

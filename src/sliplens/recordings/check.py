@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from sliplens.errors import SliplensError
-from sliplens.files import hash_file
-from sliplens.progress import OnProgress, report_each, reporting
-from sliplens.recordings.dataset import Dataset, TrialInfo, load_dataset, report_flags, trial_path
-from sliplens.recordings.journal import JOURNAL_FOLDER
-from sliplens.recordings.store import forces_path, load_recording, read_header, stream_frames
+from sliplens.errors import InputError, SliplensError
+from sliplens.files import RUN_FILE, hash_file, read_json
+from sliplens.progress import OnProgress, add_note, report_each, reporting
+from sliplens.recordings.dataset import JOURNAL_FOLDER, Dataset, TrialInfo, load_dataset, report_flags, trial_path
+from sliplens.recordings.store import forces_path, hash_frames, load_recording, read_header, stream_frames
 from sliplens.recordings.trial import SIGNALS, ContactState, Recording
 
 # margins are stored in double precision; labels made in single precision may differ by this much from their forces
@@ -31,13 +30,27 @@ class Violation:
     what: str  #: Error, and the frame it is at.
 
 
-def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None = None) -> tuple[Violation, ...]:
-    """Read every trial of a data set and list its errors.
+def check_dataset(
+    data: Dataset | Path | str,
+    *,
+    against: Dataset | Path | str | None = None,
+    on_progress: OnProgress | None = None,
+) -> tuple[Violation, ...]:
+    """Read every trial of a data set and list its errors, and those of its trials that another data set holds too.
 
     For each trial: its file exists, has the hash and the facts of the table, and every image can be decoded; margin,
     forces and contact states agree, and F_t / F_n stays within the friction by 3 sigma, before a slip and after it. For
     the data set: no trial is listed twice, no file is unlisted, and no recording was cut off. Flags on labels, such as
     faults of the force sensor, are notes: frames at a fault are not valid.
+
+    Parameters
+    ----------
+    data
+        Data set, or its folder.
+    against
+        Data set whose trials must be others, as those of a test; on the command line also a network, to count the
+        trials that trained it. Trials are known by their frames, simulated ones by their seeds too. Days and sensors
+        of both are notes.
 
     See Also
     --------
@@ -47,8 +60,9 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
     Examples
     --------
     >>> import sliplens as sl
-    >>> sl.check_dataset(sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20))
-    ()
+    >>> data = sl.simulate(dry_trials=3, wet_trials=0, days=2, frames_per_trial=20)
+    >>> sl.check_dataset(data), len(sl.check_dataset(data, against=data))
+    ((), 3)
     """
     data = load_dataset(data)
     folder, violations, labellings = data.folder, [], []
@@ -72,7 +86,35 @@ def check_dataset(data: Dataset | Path | str, *, on_progress: OnProgress | None 
             with suppress(SliplensError):  # an unreadable file is among the violations
                 labellings.append((info.trial, read_header(trial_path(folder, info.trial)).labelling))
         report_flags(labellings)
+        violations += [] if against is None else _find_shared(data, load_dataset(against))
     return tuple(violations)
+
+
+def _find_shared(data: Dataset, other: Dataset) -> list[Violation]:
+    """List the trials that are in another data set too, and note the days and sensors of both."""
+    seeds = [_read_seed(each) for each in (data, other)]
+    seeds = seeds if all(seeds) else [(), ()]
+    trials, circumstances = ([{}, {}] for _ in range(2))
+    for place, each in enumerate((data, other)):
+        for info in each.trials:
+            # a simulated trial of the same seed is of the same touch, also where its frames are others
+            names = [hash_frames(trial_path(each.folder, info.trial)), *([(*seeds[place], info.trial)] * any(seeds))]
+            trials[place] |= dict.fromkeys(names, info.trial)
+            if info.sensor:
+                for fact in (f"the sensor {info.sensor}", f"day {info.day} of {info.sensor}"):
+                    circumstances[place][*seeds[place], fact] = fact
+    if both := [fact for key, fact in circumstances[0].items() if key in circumstances[1]]:
+        add_note(f"{other.folder} has, too: {', '.join(both)}")
+    shared = {name: trials[1][key] for key, name in trials[0].items() if key in trials[1]}
+    return [Violation(where=name, what=f"is {same} of {other.folder}") for name, same in shared.items()]
+
+
+def _read_seed(data: Dataset) -> tuple[object, ...]:
+    """Return what the draws of a simulated data set follow from; nothing for others, or where its recipe is unknown."""
+    with suppress(InputError, KeyError, TypeError):
+        recipe = read_json(data.folder / RUN_FILE)["config"]["recipe"] if data.simulated else {}
+        return recipe["seed"], recipe["series"]
+    return ()
 
 
 def _check_trial(folder: Path, info: TrialInfo) -> Iterator[str]:

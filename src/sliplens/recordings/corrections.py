@@ -3,7 +3,7 @@
 import csv
 import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -12,26 +12,18 @@ import numpy as np
 from sliplens.errors import InputError, RecordingError
 from sliplens.files import MOST_TEXT, output_folder, remove, require_file, whole_file
 from sliplens.progress import OnProgress, add_note, number_of, reporting
-from sliplens.recordings.dataset import (
-    Dataset,
-    copy_profiles,
-    load_dataset,
-    report_dataset,
-    trial_path,
-    write_dataset_table,
-)
-from sliplens.recordings.formats.stored import read_stored_trial
+from sliplens.recordings import dataset
+from sliplens.recordings.dataset import Dataset, load_dataset, trial_path
+from sliplens.recordings.importing import PARTS, TrialJob, TrialWork, write_trials
 from sliplens.recordings.labelling import Corrections
 from sliplens.recordings.labels import require_inside
-from sliplens.recordings.manifest import read_csv
+from sliplens.recordings.manifest import Column, parse_cells, read_csv
 from sliplens.recordings.options import LabelSettings, TrialSettings
 from sliplens.recordings.store import read_first_reference, read_header
 from sliplens.recordings.trial import ContactState, Recording
-from sliplens.recordings.trial_writer import PARTS, TrialJob, TrialWork, write_trials
 
 _SETTINGS = ("exclude", *(field.name for field in fields(TrialSettings)))
 _CURRENT = ("reference_frame", "contact_s", "slip_s", "tare", "normal_sign", "mu")
-_COLUMNS = ("trial", *_SETTINGS, *(f"current_{name}" for name in _CURRENT), "valid_frames", "frames", "flags")
 _WORDS = {**dict.fromkeys(("yes", "true", "1", "x"), True), **dict.fromkeys(("no", "false", "0"), False)}
 
 
@@ -45,7 +37,8 @@ def _parse_span(text: str) -> tuple[int, int]:
     return int(first), int(last or first)
 
 
-_PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
+_COLUMNS: dict[str, Column] = {
+    "trial": (str, ""),
     "exclude": (lambda text: _WORDS[text.lower()], "write yes or no"),
     "reference_frame": (int, "write a whole number"),
     "normal_sign": (lambda text: {1: 1, -1: -1}[int(text)], "write 1 or -1"),
@@ -55,8 +48,8 @@ _PARSERS: dict[str, tuple[Callable[[str], object], str]] = {
         lambda text: tuple(map(_parse_span, re.split(r"[\s;]+", text))),
         "write spans of frames, such as 10..19 34",
     ),
+    **dict.fromkeys((*(f"current_{name}" for name in _CURRENT), "valid_frames", "frames", "flags"), (str, "")),
 }
-"""Function that parses the cells of a column, and the cure where it cannot."""
 
 
 def read_corrections(path: Path | str) -> dict[str, Corrections]:
@@ -68,20 +61,12 @@ def read_corrections(path: Path | str) -> dict[str, Corrections]:
     path = Path(path)
     require_file(path, most=MOST_TEXT, missing="write one with `sliplens label DATA --draft corrections.csv`")
     corrections: dict[str, Corrections] = {}
-    for where, cells in read_csv(path, _COLUMNS, what="a table of corrections"):
-        if "trial" not in cells:
-            raise RecordingError(f"{where}: the column trial is empty; name the trial that the row corrects")
+    for where, cells in read_csv(path, _COLUMNS, what="a table of corrections", needed="trial"):
         if cells["trial"] in corrections:
             raise RecordingError(f"{where}: {cells['trial']} has a row already; write one row a trial")
-        values = {}
-        for name in cells.keys() & _PARSERS.keys():
-            parse, cure = _PARSERS[name]
-            try:
-                values[name] = parse(cells[name])
-            except (ValueError, KeyError):
-                raise RecordingError(f"{where}: {name} is {cells[name][:40]!r}; {cure}") from None
+        settings = dict(parse_cells({name: text for name, text in cells.items() if name in _SETTINGS}, _COLUMNS, where))
         try:
-            corrections[cells["trial"]] = Corrections(**values)
+            corrections[cells["trial"]] = Corrections(**settings)
         except RecordingError as error:
             raise RecordingError(f"{where}: {error}") from None
     return {trial: row for trial, row in corrections.items() if row != Corrections()}
@@ -204,15 +189,15 @@ def label_dataset(
                 items = [(number, info.trial, info.frames) for number, info in enumerate(data.trials)]
                 rows, _ = write_trials(work, items, folder, title="Labelling frames", on=on)
                 table = [replace(row, split=info.split) for row, info in zip(rows, data.trials, strict=True)]
-                write_dataset_table(folder, table, simulated=data.simulated, left_out=data.left_out)
-                copy_profiles(data.folder, folder)
+                dataset.write_dataset_table(folder, table, simulated=data.simulated, left_out=data.left_out)
+                dataset.copy_profiles(data.folder, folder)
                 remove(folder / PARTS)
         if corrections:
             add_note(f"corrections of {number_of(len(corrections), 'trial')} applied")
         if removed := sorted(before.keys() - corrections.keys()):
             add_note(f"corrections of {number_of(len(removed), 'trial')} removed, such as {removed[0]}")
         labelled = load_dataset(out)
-        report_dataset(labelled, existed=output.complete)
+        dataset.report_dataset(labelled, existed=output.complete)
     return labelled
 
 
@@ -226,7 +211,7 @@ class _Relabelling(TrialWork):
 
     def open(self, item: int) -> TrialJob:
         info, folder = self.data.trials[item], self.data.folder
-        capture = read_stored_trial(self.data, info)
+        capture = self.data.open(info)
         if capture.forces is None:
             no_forces = f"{info.trial} of {folder} has no forces, and without them there is no label"
             raise InputError(f"{no_forces}; import it again with its table of forces")

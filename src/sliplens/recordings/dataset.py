@@ -4,22 +4,39 @@ import shlex
 import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
-from filelock import FileLock
+import msgspec
+import numpy as np
+import pyarrow as pa
+from filelock import FileLock, Timeout
 
-from sliplens.codec import Result, from_builtins
+from sliplens.codec import Result, from_builtins, one_line, to_builtins
 from sliplens.errors import RecordingError
-from sliplens.files import hash_file, hash_json, read_json, require_folder, whole_file, write_json
+from sliplens.files import (
+    hash_file,
+    hash_json,
+    parse_json,
+    read_json,
+    require_file,
+    require_folder,
+    whole_file,
+    write_json,
+)
+from sliplens.images import encode_png, read_image
 from sliplens.progress import OnProgress, add_note, fold_equal, number_of, report_file, reporting
-from sliplens.recordings.journal import JOURNAL_FOLDER, LOCK_FILE, finish_journal, lock_journals
-from sliplens.recordings.labelling import Labelling
+from sliplens.recordings import store
+from sliplens.recordings.capture import Capture, Forces, Frame
+from sliplens.recordings.labelling import Labelling, ReferenceChoice
 from sliplens.recordings.sensor import SENSORS_FOLDER, SensorProfile, load_profile, profile_text
 from sliplens.recordings.store import SCHEMA_VERSION, StoredFacts, forces_path, load_recording, read_header
-from sliplens.recordings.trial import Recording
+from sliplens.recordings.trial import Recording, TrialFacts, labels_of_margins
 
 DATASET_FILE = "dataset.json"
+JOURNAL_FOLDER = "recording"  #: Folder of a data set with the journals of recordings that run or were cut off.
+LOCK_FILE = "lock"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +110,30 @@ class Dataset(Result):
     def read_labels(self, info: TrialInfo) -> Recording:
         """Read the labels of one trial, with its reference and without its frames."""
         return load_recording(trial_path(self.folder, info.trial), pixels=False)
+
+    def open(self, info: TrialInfo, *, samples: bool = True) -> Capture:
+        """Open one trial as a recording, with or without the samples of its forces; no frame is read yet."""
+        stored, forces = self.read_labels(info), None
+        force_n = np.stack([stored.tangential_force_n, np.zeros(len(stored)), stored.normal_force_n], axis=-1)
+        measured = np.isfinite(force_n).all(axis=1)
+        if samples and info.forces_sha256:
+            forces = store.load_forces(forces_path(self.folder, info.trial))
+        elif samples and measured.any():
+            source = f"the frames of {info.trial}"
+            forces = Forces(time_s=stored.time_s[measured], force_n=force_n[measured], source=source)
+        return Capture(
+            **{field.name: getattr(info, field.name) for field in fields(TrialFacts)},
+            source=f"{info.trial} of {self.folder}",
+            frame_time_s=stored.time_s,
+            frame_size=(info.height, info.width),
+            read_frames=partial(store.stream_frames, trial_path(self.folder, info.trial)),
+            forces=forces,
+            labels=stored,
+            reference=stored.reference,
+            split=info.split,
+            simulated=self.simulated,
+            opened=str(self.folder),
+        )
 
 
 _RECORDED_SPLIT = "test"  # nothing was trained on it
@@ -253,3 +294,124 @@ def write_dataset_table(
     """Write `dataset.json`, the last file of a data set."""
     table = {"schema_version": SCHEMA_VERSION, "simulated": simulated, "trials": [*trials], "left_out": [*left_out]}
     write_json(folder / DATASET_FILE, table)
+
+
+_HEADER, _REFERENCE = b"sliplens", b"reference"
+_NUMBER = pa.float64()
+_NUMBERS = {
+    **dict.fromkeys(("time_s", "safety_margin"), _NUMBER),
+    **dict.fromkeys(("force_time_s", "force_n"), pa.list_(_NUMBER)),
+}
+_SCHEMA = pa.schema(_NUMBERS | {"image": pa.binary()})
+
+
+@dataclass(frozen=True, kw_only=True)
+class JournalHeader:
+    """Facts of a trial before its first frame."""
+
+    facts: TrialFacts
+    source: str  #: Camera, stream or file.
+    size: tuple[int, int]  #: Height and width of the frames, in pixels.
+    forces: str | None = None  #: Source of the forces; None where there is none.
+
+
+class Journal:
+    """Journal of one trial of a data set; frames are appended one by one, with rising times."""
+
+    def __init__(self, data: Path, header: JournalHeader, *, reference: Frame | None) -> None:
+        metadata = {_HEADER: msgspec.json.encode(to_builtins(header))}
+        if reference is not None:
+            metadata[_REFERENCE] = encode_png(reference)
+        self.path = data / JOURNAL_FOLDER / f"{header.facts.trial}.arrow"
+        self._file = self.path.open("xb")
+        self._writer = pa.ipc.new_stream(pa.PythonFile(self._file, mode="w"), _SCHEMA.with_metadata(metadata))
+
+    def append(
+        self, image: Frame, *, time_s: float, safety_margin: float | None = None, forces: Forces | None = None
+    ) -> None:
+        """Append a frame, completely when this returns; an `OSError` where there is no room."""
+        samples = ([], []) if forces is None else (forces.time_s.tolist(), forces.force_n.ravel().tolist())
+        row = [[value] for value in (time_s, safety_margin, *samples, store.encode_pixels(image))]
+        self._writer.write_batch(pa.record_batch(row, schema=_SCHEMA))
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file; its content stays."""
+        with suppress(OSError):  # of a frame for which there was no room
+            self._file.close()
+
+
+def lock_journals(data: Path) -> FileLock:
+    """Lock a data set for recording into it; the system releases the lock when the process ends, even killed."""
+    folder = data / JOURNAL_FOLDER
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK_FILE, blocking=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise RecordingError(f"{data} is being recorded; stop the recording first, or choose another folder") from None
+    return lock
+
+
+def finish_journal(journal: Path, trial: Path) -> bool:
+    """Make a trial, and the file of its force samples, of a journal; False where it holds no complete frame."""
+    require_file(journal, missing="move it away")
+    try:
+        with pa.memory_map(str(journal)) as file:  # images are read from the disk when they are written
+            rows, metadata = _rows(file)
+            if not rows:
+                return False
+            where = "the header of a journal"
+            values = parse_json(metadata.get(_HEADER, b""), where=where, cure="move it away")
+            header = from_builtins(values, JournalHeader, where=where, command="sliplens live")
+            numbers = {name: pa.chunked_array([row[name] for row in rows]).combine_chunks() for name in _NUMBERS}
+            if (picture := metadata.get(_REFERENCE)) is None:
+                first = rows[0]["image"][0].as_py()
+                reference = store.decode_pixels(first, size=(*header.size, 3), where=f"the first frame of {journal}")
+                notes = ("No picture of the untouched sensor was taken: the first frame stands for it.",)
+                choice = ReferenceChoice(index=0, method="assumed")
+            else:
+                reference, notes = read_image(picture, where=f"the reference frame of {journal}"), ()
+                choice = ReferenceChoice(method="recorded apart from the frames")
+            labelling = Labelling(source=header.source, forces=header.forces, notes=notes, reference=choice)
+            samples_s, samples_n = (numbers[name].flatten().to_numpy() for name in ("force_time_s", "force_n"))
+            # a sensor slower than the camera repeats its samples
+            rising = samples_s > np.maximum.accumulate(np.append(-np.inf, samples_s))[:-1]
+            if rising.any():
+                source, force_n = header.forces or "the force sensor", samples_n.reshape(-1, 3)[rising]
+                forces = Forces(time_s=samples_s[rising], force_n=force_n, source=source)
+                store.save_forces(forces, forces_path(trial.parent.parent, trial.stem))
+            margin = numbers["safety_margin"].to_numpy(zero_copy_only=False)
+            store.write_trial(
+                trial,
+                (row["image"][0].as_py() for row in rows),
+                facts=header.facts,
+                time_s=numbers["time_s"].to_numpy(),
+                labels=replace(labels_of_margins(margin), labelling=labelling),
+                reference=reference,
+            )
+    except pa.ArrowException as error:
+        raise RecordingError(f"{journal} is damaged ({one_line(error)}); move it away") from None
+    return True
+
+
+def _rows(file: pa.NativeFile) -> tuple[list[pa.RecordBatch], dict[bytes, bytes]]:
+    """Read the complete frames of a journal, and its metadata; none where it ends before its header does."""
+    rows: list[pa.RecordBatch] = []
+    try:
+        reader = pa.ipc.open_stream(file)
+    except pa.ArrowInvalid:
+        return rows, {}
+    except OSError as error:  # of no disk: the file is mapped
+        raise pa.ArrowInvalid(str(error)) from None
+    if not reader.schema.equals(_SCHEMA):
+        raise pa.ArrowInvalid("it has other columns than a recording")
+    with suppress(StopIteration, pa.ArrowInvalid, OSError):  # the frame that was being written
+        while True:
+            rows.append(reader.read_next_batch())
+    for row in rows:
+        row.validate(full=True)
+        gaps = any(row[name].null_count for name in _SCHEMA.names if name != "safety_margin")
+        if len(row) != 1 or gaps or len(row["force_n"][0]) != 3 * len(row["force_time_s"][0]):
+            raise pa.ArrowInvalid("a row is no frame")
+    return rows, reader.schema.metadata or {}

@@ -1,34 +1,220 @@
-"""Recordings imported as a labelled data set, one frame at a time."""
+"""Recordings imported as a labelled data set, one frame at a time; each trial is complete or absent."""
 
 import os
 import shutil
+import tempfile
+from abc import abstractmethod
+from array import array
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias, TypedDict, Unpack
+from typing import IO, Any, TypeAlias, TypedDict, Unpack
 
-from sliplens.errors import InputError, RecordingError, SliplensError
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from sliplens.codec import RESULT_FILE, load_record, save_record
+from sliplens.errors import InputError, PartError, RecordingError, SliplensError
 from sliplens.files import output_folder, remove, whole_file
-from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, reporting
-from sliplens.recordings.capture import Capture
-from sliplens.recordings.dataset import (
-    Dataset,
-    LeftOut,
-    TrialInfo,
-    copy_profiles,
-    load_dataset,
-    report_dataset,
-    save_profile,
-    write_dataset_table,
-)
+from sliplens.images import Soft, require_rgb, soften
+from sliplens.progress import OnProgress, add_note, number_of, open_stage, report_each, report_progress, reporting
+from sliplens.recordings import dataset
+from sliplens.recordings.capture import Capture, Frame
+from sliplens.recordings.dataset import Dataset, LeftOut, TrialInfo, load_dataset, trial_path
+from sliplens.recordings.labelling import Corrections, Labelling, ReferenceChoice
+from sliplens.recordings.labels import Reason, choose_reference, describe_repeats, label_trial, measure_motion
 from sliplens.recordings.manifest import ManifestRow, find_rows
 from sliplens.recordings.options import LabelSettings, ReadOptions
 from sliplens.recordings.sensor import SensorProfile, is_profile, load_profile
 from sliplens.recordings.source import open_source
 from sliplens.recordings.splits import Group, SplitResult, assign_splits, deal_splits, load_splits
-from sliplens.recordings.trial_writer import PARTS, TrialJob, TrialWork, require_forces, write_trials
-from sliplens.runner import require_executor
+from sliplens.recordings.store import decode_pixels, encode_pixels, forces_path, in_turn, save_forces, write_trial
+from sliplens.recordings.trial import label_by_friction, labels_of_margins
+from sliplens.runner import MakePart, Work, part, require_executor, run_parts
+
+PARTS = "parts"  #: Folder of a data set in the making, with a data set of each trial; the caller removes it.
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrialJob:
+    """Trial to be labelled and written."""
+
+    capture: Capture
+    settings: LabelSettings
+    corrections: Corrections | None = None  #: Corrections by hand, which `settings` follow already.
+    cure: str = ""  #: End of an error message, where corrections may be the cause.
+    profile: SensorProfile | None = None  #: Profile that its frames go through.
+
+
+class TrialWork(Work):
+    """Work on whole trials: each becomes a data set of its own, which is moved into the common one."""
+
+    in_threads = True  # decoding, arrays and compression release the interpreter's lock
+
+    @abstractmethod
+    def open(self, item: Any) -> TrialJob:
+        """Open the trial of a part."""
+
+    def begin(self) -> MakePart:
+        """Make data sets of one trial."""
+        # matrix products are small here: idle threads would spin on all cores
+        threadpool_limits(1, user_api="blas")
+
+        def make(item: Any, folder: Path) -> None:
+            job = self.open(item)
+            import_trial(job, path := trial_path(folder, job.capture.trial))
+            save_record(dataset.trial_info(path, split=""), folder / RESULT_FILE)
+
+        return make
+
+
+def write_trials(
+    work: TrialWork,
+    trials: Sequence[tuple[Any, str, int]],
+    folder: Path,
+    *,
+    title: str,
+    on: str,
+    optional: Mapping[str, str] | None = None,
+) -> tuple[list[TrialInfo], list[LeftOut]]:
+    """Write trials (item, name, number of frames) into the folder of a data set; return their rows.
+
+    Those of `optional`, names and sources, are left out where they fail; without any other the error is raised.
+    """
+    # the folder is of these recordings and settings alone (`files.output_folder`)
+    every = [part(item, trial=name, frames=frames, recipe="trial", content=name) for item, name, frames in trials]
+    left_out: list[LeftOut] = []
+    with threadpool_limits(1, user_api="blas"), open_stage(title):
+        try:
+            run_parts(work, every, folder / PARTS, title=title, on=on)
+        except PartError as error:
+            if not error.errors.keys() <= (optional or {}).keys():
+                raise
+            for name, failure in error.errors.items():
+                why = f"{failure}; the same command with --add tries it again"
+                left_out.append(LeftOut(trial=name, source=(optional or {})[name], why=why))
+    if len(left_out) == len(trials):
+        remove(folder / PARTS)
+        raise RecordingError(f"no trial could be imported; the first: {left_out[0].why}")
+    rows: list[TrialInfo] = []
+    failed = {trial.trial for trial in left_out}
+    for made in (folder / PARTS / each.path for each in every if each.name not in failed):
+        rows.append(load_record(made / RESULT_FILE, TrialInfo, command="the interrupted command"))
+        for path in (trial_path(made, rows[-1].trial), forces_path(made, rows[-1].trial)):
+            if path.exists():  # else there are none, or they were moved before an interruption
+                target = folder / path.relative_to(made)
+                target.parent.mkdir(exist_ok=True)
+                path.replace(target)
+    return rows, left_out
+
+
+def require_forces(capture: Capture) -> None:
+    """Refuse a recording that has neither labels nor forces to make them from."""
+    if capture.labels is None and capture.forces is None:
+        cure = "give the table of the force sensor with --forces FILE, or under the name of the recording"
+        raise RecordingError(f"{capture.source} has no forces, and without them there is no label; {cure}")
+
+
+def import_trial(job: TrialJob, path: Path) -> None:
+    """Write a recording as a trial of a data set, with its own or automatic labels; complete or not at all."""
+    capture, settings, corrections = job.capture, job.settings, job.corrections
+    require_forces(capture)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=path.parent) as file:
+        footage = _Footage(capture, file)
+        motion = measure_motion(footage.soften())
+        labels, untouched, basis = capture.labels, None, None
+        try:
+            if labels is None and corrections is not None and corrections.exclude:
+                labels = labels_of_margins(np.full(len(capture), np.nan))
+                labels = replace(labels, reason=(Reason.EXCLUDED,) * len(capture))
+            elif labels is None:
+                assert capture.forces is not None
+                # random numbers that do not depend on the other trials
+                rng = np.random.default_rng((0, *capture.trial.encode()))
+                labels = label_trial(capture.frame_time_s, motion, capture.forces, settings=settings, rng=rng)
+                basis, untouched = labels.basis, np.array([reason is Reason.NO_CONTACT for reason in labels.reason])
+                if (doubt := describe_repeats(motion, capture.frame_time_s)) is not None:
+                    basis = replace(basis, doubts=(*basis.doubts, doubt))
+            elif settings.mu is not None and not labels.labelled.any():
+                labels = label_by_friction(labels, settings.mu)
+            index = capture.reference_index if settings.reference_frame is None else settings.reference_frame
+            if capture.reference is not None and index is None:
+                method = "came with the recording" if untouched is None else "recorded apart from the frames"
+                reference, choice = capture.reference, capture.reference_choice or ReferenceChoice(method=method)
+            else:
+                of_forces = np.zeros(len(capture), dtype=np.bool_) if untouched is None else untouched
+                choice = choose_reference(footage.read, of_forces, index=index)
+                choice = choice if untouched is not None else replace(choice, contact_energy=None)
+                (reference,) = footage.read([choice.index or 0])
+        except RecordingError as error:
+            raise RecordingError(f"{capture.source}: {error}{job.cure}") from None
+        first = None
+        if capture.reference is not None and corrections is not None and corrections.reference_frame is not None:
+            # for who takes the correction back
+            first = capture.reference_choice or ReferenceChoice(method="came with the recording")
+        labelling = labels.labelling or Labelling(
+            source=capture.source,
+            forces=capture.forces.source if capture.forces else None,
+            notes=capture.notes,
+            reference=choice,
+            basis=basis,
+            corrections=corrections,
+            first_reference=first,
+        )
+        # before the trial, whose file means that all of it is there
+        if capture.forces is not None:
+            save_forces(capture.forces, forces_path(path.parent.parent, path.stem))
+        write_trial(
+            path,
+            footage.images(),
+            facts=capture,
+            time_s=capture.frame_time_s,
+            labels=replace(labels, labelling=labelling),
+            reference=reference,
+            first_reference=capture.reference if labelling.first_reference is not None else None,
+        )
+
+
+class _Footage:
+    """Frames of a recording, decoded once and spooled to a temporary file, to be read again in any order."""
+
+    def __init__(self, capture: Capture, file: IO[bytes]) -> None:
+        self.capture, self._file, self._ends = capture, file, array("q", [0])
+
+    def soften(self) -> Iterator[Soft]:
+        """Decode, check and spool the frames; yields them softened."""
+        capture = self.capture
+
+        def encode(item: tuple[int, Frame]) -> tuple[bytes, Soft]:
+            number, frame = item
+            require_rgb(frame, what=f"levels of frame {number} of {capture.source}")
+            if frame.shape[:2] != capture.frame_size:
+                raise RecordingError(f"frame {number} of {capture.source} is of another size; cut the recording there")
+            return encode_pixels(frame), soften(frame)
+
+        for image, soft in in_turn(encode, enumerate(capture.read_frames())):
+            self._file.write(image)
+            self._ends.append(self._file.tell())
+            yield soft
+            report_progress(len(self._ends) - 1, len(capture))
+        if (count := len(self._ends) - 1) != len(capture):
+            raise RecordingError(f"{capture.source} promised {len(capture)} frames but gave {count}; copy it again")
+
+    def _image(self, place: int) -> bytes:
+        self._file.seek(self._ends[place])
+        return self._file.read(self._ends[place + 1] - self._ends[place])
+
+    def read(self, places: Sequence[int]) -> Iterator[Frame]:
+        """Read some frames."""
+        for place in places:
+            where = f"frame {place} of {self.capture.source}"
+            yield decode_pixels(self._image(place), size=(*self.capture.frame_size, 3), where=where)
+
+    def images(self) -> Iterator[bytes]:
+        """Yield the encoded frames."""
+        return map(self._image, range(len(self.capture)))
 
 
 class ImportOptions(TypedDict, total=False):
@@ -130,7 +316,7 @@ def import_recordings(
             count = number_of(len(existing), "trial")
             add_note(f"already in {out}, and left as it is: {count}, such as {existing[0]}")
         if before is not None and not jobs:
-            report_dataset(before, existed=True)
+            dataset.report_dataset(before, existed=True)
             return replace(before, left_out=tuple(lost))
         captures = [job.capture for job in jobs.values()]
         _require_names(captures, lost)
@@ -157,18 +343,18 @@ def import_recordings(
                 written = [job for job in jobs.values() if job.capture.trial in names]
                 dealt = _deal(old, [job.capture for job in written], plan, last)
                 for used in {job.profile.name: job.profile for job in written if job.profile}.values():
-                    save_profile(folder, used)
+                    dataset.save_profile(folder, used)
                 table = [replace(info, split=split) for info, split in zip([*old, *new], dealt.splits, strict=True)]
                 # trials left out before stay listed
                 missing = {trial.trial: trial for trial in (*(before.left_out if before else ()), *lost, *failed)}
                 missing = [trial for name, trial in missing.items() if name not in {info.trial for info in table}]
                 simulated = all(job.capture.simulated for job in written) and (before is None or before.simulated)
-                write_dataset_table(folder, table, simulated=simulated, left_out=missing)
+                dataset.write_dataset_table(folder, table, simulated=simulated, left_out=missing)
                 remove(folder / PARTS)
         for message in dealt.notes:
             add_note(message)
         data = load_dataset(out)
-        report_dataset(data, existed=output.complete)
+        dataset.report_dataset(data, existed=output.complete)
         return data
 
 
@@ -183,31 +369,28 @@ def _prepare_work(
     """List the recordings, each with the facts that its manifest or else the call gives."""
     if reading.forces is not None and len(paths) > 1:
         raise InputError("one table of forces goes with one recording; name what belongs together in a manifest (CSV)")
-    reference = options.get("reference")
+    reference, format = options.get("reference"), options.get("format")
     if reference is not None and labelling.reference_frame is not None:
         raise InputError("the untouched sensor is named twice; give --reference or --reference-frame, not both")
-    profile = load_profile(sensor) if sensor is not None and is_profile(sensor) else None
     defaults = ManifestRow(
         trial="",
         video=Path(),
-        forces=reading.forces,
-        sensor=None if profile is not None or sensor is None else str(sensor),
+        sensor=load_profile(sensor) if sensor is not None and is_profile(sensor) else sensor and str(sensor),
         day=options.get("day"),
         object=options.get("object"),
         condition=options.get("condition"),
         mu=labelling.mu,
         reference=labelling.reference_frame if reference is None else Path(reference),
     )
-    single = options.get("format") is not None or reading.forces is not None
-    rows = [
-        replace(defaults, **{name: value for name, value in vars(row).items() if value is not None})
-        for path in paths
+    rows = []
+    for path in paths:
         # a path that is one recording becomes a row without a name
-        for row in (None if single else find_rows(path)) or (replace(defaults, video=path),)
-    ]
-    return _ImportWork(
-        rows=tuple(rows), reading=reading, labelling=labelling, profile=profile, format=options.get("format")
-    )
+        single = format is not None or reading.forces is not None
+        for row in (None if single else find_rows(path)) or (replace(defaults, video=path),):
+            listed = {name: value for name, value in vars(row).items() if value is not None}
+            options_of_row = {name: getattr(row.reading, name) for name in row.reading.given()}
+            rows.append(replace(defaults, **listed | {"reading": replace(reading, **options_of_row)}))
+    return _ImportWork(rows=tuple(rows), labelling=labelling, format=format)
 
 
 _Item: TypeAlias = tuple[int, int]  #: Number of a row, and of a trial in it.
@@ -218,9 +401,7 @@ class _ImportWork(TrialWork):
     """Work on recordings, which every process opens again by their paths."""
 
     rows: tuple[ManifestRow, ...]  # recordings; those without a name of their own must not be left out
-    reading: ReadOptions
     labelling: LabelSettings
-    profile: SensorProfile | None
     format: str | None
     jobs: dict[_Item, TrialJob] = field(default_factory=dict)
 
@@ -246,33 +427,32 @@ class _ImportWork(TrialWork):
         return self.jobs[item]
 
     def _open_row(self, number: int) -> None:
-        row, profile = self.rows[number], self.profile
-        if row.sensor is not None:
-            profile = load_profile(row.sensor) if is_profile(row.sensor) else None
+        row = self.rows[number]
+        profile = load_profile(row.sensor) if row.sensor is not None and is_profile(row.sensor) else None
         index, image = (row.reference, None) if isinstance(row.reference, int) else (None, row.reference)
-        settings = replace(self.labelling, reference_frame=index, mu=row.mu)
-        facts = {"sensor": profile.name if profile else row.sensor, "day": row.day}
-        facts |= {"object": row.object, "condition": row.condition}
-        facts = {name: fact for name, fact in facts.items() if fact is not None}
-        listed = {name: getattr(row.reading, name) for name in row.reading.given()}
-        options = replace(self.reading, **listed, forces=row.forces)
         opened = open_source(
-            row.video, reference=image, format=self.format, options=options, sensor=profile, whole=True
+            row.video, reference=image, format=self.format, options=row.reading, sensor=profile, whole=True
         )
+        facts = {"day": row.day, "object": row.object, "condition": row.condition}
+        facts |= {} if profile else {"sensor": row.sensor}  # a profile names it itself
+        facts |= {"trial": row.trial} if row.trial and len(opened) == 1 else {}
+        facts = {name: fact for name, fact in facts.items() if fact is not None}
         captures = [replace(capture, **facts) for capture in opened]
         if row.trial:
-            captures = [replace(captures[0], trial=row.trial)] if len(captures) == 1 else captures
             _require_names(captures)
             for capture in captures:
                 require_forces(capture)
+        settings = replace(self.labelling, reference_frame=index, mu=row.mu)
         settings = settings if profile is None else profile.settings(settings)
-        for index, capture in enumerate(captures):
-            self.jobs[number, index] = TrialJob(capture=capture, settings=settings, profile=profile)
+        for place, capture in enumerate(captures):
+            self.jobs[number, place] = TrialJob(capture=capture, settings=settings, profile=profile)
 
     def recipe(self) -> dict:
         """Return all that shapes the trials; a change of a file beside them changes nothing."""
 
         def describe(value: object) -> object:
+            if isinstance(value, ManifestRow | ReadOptions):
+                return {name: describe(each) for name, each in vars(value).items()}
             if not isinstance(value, Path):
                 return value
             files = [value] if value.is_file() else [file for file in value.rglob("*") if file.is_file()]
@@ -280,12 +460,7 @@ class _ImportWork(TrialWork):
             changed = max((each.st_mtime_ns for each in stats), default=0)
             return str(value.resolve()), sum(each.st_size for each in stats), changed
 
-        settings = {name: value for name, value in vars(self).items() if name not in {"rows", "reading", "jobs"}}
-        rows, (reading,) = (
-            [{name: describe(value) for name, value in vars(record).items()} for record in records]
-            for records in (self.rows, [self.reading])
-        )
-        return settings | {"rows": rows, "reading": reading}
+        return {"rows": [*map(describe, self.rows)], "labelling": self.labelling, "format": self.format}
 
 
 def _link_trials(source: Path, folder: Path) -> None:
@@ -302,7 +477,7 @@ def _link_trials(source: Path, folder: Path) -> None:
     for name in ("trials", "forces", "audit"):
         if (source / name).is_dir():
             shutil.copytree(source / name, folder / name, copy_function=link, dirs_exist_ok=True)
-    copy_profiles(source, folder)
+    dataset.copy_profiles(source, folder)
 
 
 def _require_names(captures: Sequence[Capture], left_out: Sequence[LeftOut] = ()) -> None:

@@ -119,15 +119,6 @@ class ReferenceChoice:
     """Mean absolute high-pass difference from the median untouched frame, in grey levels; None where not measured."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Clip:
-    """Facts of a whole recording that label no single frame."""
-
-    slips: bool
-    grasp: str  #: Name of the grasp; its fingers belong into one split.
-    stale_frames: int  #: Frames left out at the start.
-
-
 class Reason(StrEnum):
     """Reason why a frame has no valid label; empty where it has one."""
 
@@ -140,7 +131,6 @@ class Reason(StrEnum):
     MARKED = "marked by hand"
     EXCLUDED = "excluded by hand"
     MISSING_SAMPLES = "missing samples"
-    OUT_OF_RANGE = "outside the force sensor's range"
     NO_CONTACT = "no contact"
     AFTER_GROSS_SLIP = "after gross slip"
     TOO_UNCERTAIN = "too uncertain"
@@ -169,7 +159,6 @@ class LabelBasis:
     contact_threshold_n: float
     window_s: float  #: Time over which the forces of a frame were averaged.
     gap_s: float  #: Time beyond which samples count as missing between two others.
-    force_range_n: float | None  #: Largest force that each axis can measure; None where it is unknown.
     faults: tuple[ForceFault, ...] = ()  #: Samples that were left out, in the order of time.
     doubts: tuple[str, ...] = ()  #: Other implausible findings, a sentence each.
 
@@ -231,7 +220,6 @@ class Labelling:
     forces: str | None  #: Topic, file or columns of the forces; None where none were recorded.
     notes: tuple[str, ...]  #: Assumptions made on import, a sentence each.
     reference: ReferenceChoice
-    clip: Clip | None = None
     basis: LabelBasis | None = None  #: None where the labels came with the frames.
     corrections: Corrections | None = None  #: Settings that were corrected by hand; None where none were.
     first_reference: ReferenceChoice | None = None  #: Choice before a correction named another; None where none did.

@@ -4,21 +4,24 @@ import csv
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.formats import recognise
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.options import ReadOptions
+from sliplens.recordings.sensor import SensorProfile
 
 _VIDEOS = frozenset({".mp4", ".m4v", ".mkv", ".mov", ".avi", ".webm", ".mpg", ".mpeg"})
 _TABLES = frozenset({".csv", ".tsv", ".txt"})
 _FORCE_SUFFIX = re.compile(r"[-_. ](forces?|wrench|ft)$", re.IGNORECASE)
 _LONGEST_NAME = 255  # characters, of a file or a folder
 _LONGEST_HEADER = 100_000  # characters
+
+Column: TypeAlias = tuple[Callable[[str], Any], str]  #: Parser of the cells of a column, and the cure where it fails.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,8 +30,7 @@ class ManifestRow:
 
     trial: str  #: Name of the trial.
     video: Path  #: Video, folder of images or bag.
-    forces: Path | None = None  #: Table of forces beside it.
-    sensor: str | None = None  #: Name of the sensor, or its profile.
+    sensor: SensorProfile | str | None = None  #: Name of the sensor, or its profile.
     day: int | None = None  #: Counted from 1.
     object: str | None = None  #: Name of the object in the grasp.
     condition: str | None = None  #: State of the surface, such as dry or wet.
@@ -74,7 +76,7 @@ def pair_recordings(folder: Path) -> tuple[ManifestRow, ...]:
                 several = f"{folder} has several {kind} named {stem} ({names})"
                 raise RecordingError(f"{several}; rename all but one, or list them in a manifest (CSV)")
     rows = tuple(
-        ManifestRow(trial=trial_name(stem), video=path, forces=tables.get(stem, [None])[0])
+        ManifestRow(trial=trial_name(stem), video=path, reading=ReadOptions(forces=tables.get(stem, [None])[0]))
         for stem, (path,) in recordings.items()
     )
     return _require_unique(rows, folder)
@@ -86,12 +88,28 @@ def read_rows(path: Path) -> tuple[ManifestRow, ...]:
     Paths are relative to the manifest; `reference` is an image or the number of a frame. A column named as an option of
     `ReadOptions`, such as `time_unit` or `force_columns` (separated by spaces), sets it for its trial.
     """
-    columns = dict.fromkeys(item.name for kind in (ManifestRow, ReadOptions) for item in fields(kind))
-    del columns["reading"], columns["allow_large"]
-    rows = tuple(_parse_row(cells, path.parent, where) for where, cells in read_csv(path, columns, what="a manifest"))
+    folder = path.parent
+    columns: dict[str, Column] = dict.fromkeys((item.name for item in fields(ManifestRow)), (str, ""))
+    columns |= dict.fromkeys((item.name for item in fields(ReadOptions)), (str, ""))
+    columns |= dict.fromkeys(("day", "skip_frames"), (int, "write a whole number"))
+    columns |= dict.fromkeys(("mu", "frame_rate", "start_s"), (float, "write a number with a decimal point"))
+    columns |= dict.fromkeys(("video", "forces", "times", "image_root"), (folder.joinpath, ""))
+    columns["sensor"] = (lambda text: str(folder / text) if text.endswith(".toml") else text, "")
+    columns["reference"] = (lambda text: int(text) if text.isdecimal() else folder / text, "name an image or a frame")
+    columns["force_columns"] = (lambda text: tuple(text.split()), "")
+    del columns["reading"]
+    rows = []
+    for where, cells in read_csv(path, columns, what="a manifest", needed="video"):
+        for name, text in cells.items():
+            if max(map(len, re.split(r"[/\\]", text))) > _LONGEST_NAME:
+                raise RecordingError(f"{where}: {name} has {len(text):,} characters, which no name has; correct it")
+        facts = dict(parse_cells(cells, columns, where))
+        facts["trial"] = trial_name(facts.get("trial") or facts["video"].stem)
+        options = {name: facts.pop(name) for name in vars(ReadOptions()).keys() & facts.keys()}
+        rows.append(ManifestRow(**facts, reading=ReadOptions(**options)))
     if not rows:
         raise RecordingError(f"{path} lists no trial; write a row for each below the header")
-    return _require_unique(rows, path)
+    return _require_unique(tuple(rows), path)
 
 
 def _require_unique(rows: tuple[ManifestRow, ...], where: Path) -> tuple[ManifestRow, ...]:
@@ -112,7 +130,7 @@ def _read_header(path: Path) -> tuple[list[str], str]:
     return [name.strip().strip('"').lower() for name in line.strip("\r\n").split(delimiter)], delimiter
 
 
-def read_csv(path: Path, columns: Collection[str], *, what: str) -> Iterator[tuple[str, dict[str, str]]]:
+def read_csv(path: Path, columns: Collection[str], *, what: str, needed: str) -> Iterator[tuple[str, dict[str, str]]]:
     """Read a table that a person wrote; yields the place of each row and its cells that are not empty, by column."""
     names, delimiter = _read_header(path)
     if unknown := [name for name in names if name not in columns]:
@@ -123,39 +141,22 @@ def read_csv(path: Path, columns: Collection[str], *, what: str) -> Iterator[tup
             next(reader)
             for cells in reader:
                 where = f"{path}, line {reader.line_num}"
-                if not any(cell.strip() for cell in cells):
-                    continue
                 if len(cells) > len(names):
                     raise RecordingError(f"{where}: {len(cells)} cells but {len(names)} columns; correct the row")
                 filled = {name: cell.strip() for name, cell in zip(names, cells, strict=False) if cell.strip()}
-                yield where, filled
+                if filled and needed not in filled:
+                    raise RecordingError(f"{where}: the column {needed} is empty; write one row a trial and name it")
+                if filled:
+                    yield where, filled
     except (UnicodeDecodeError, csv.Error, StopIteration) as error:
         raise RecordingError(f"{path} cannot be read as CSV ({error}); export it again as UTF-8") from None
 
 
-def _parse_row(cells: dict[str, str], folder: Path, where: str) -> ManifestRow:
-    if "video" not in cells:
-        raise RecordingError(f"{where}: the column video is empty; name the recording of the trial")
+def parse_cells(cells: Mapping[str, str], columns: Mapping[str, Column], where: str) -> Iterator[tuple[str, Any]]:
+    """Parse the cells of a row by their columns; yields names and values."""
     for name, text in cells.items():
-        if max(map(len, re.split(r"[/\\]", text))) > _LONGEST_NAME:
-            raise RecordingError(f"{where}: {name} has {len(text):,} characters, which no name has; correct it")
-    kinds: dict[str, Callable[[str], object]] = {
-        **dict.fromkeys(("video", "forces"), folder.joinpath),
-        "sensor": lambda text: str(folder / text) if text.endswith(".toml") else text,
-        "reference": lambda text: int(text) if text.isdecimal() else folder / text,
-        **dict.fromkeys(("day", "skip_frames"), int),
-        **dict.fromkeys(("mu", "frame_rate", "start_s"), float),
-        **dict.fromkeys(("times", "image_root"), folder.joinpath),
-        "force_columns": lambda text: tuple(text.split()),
-        "skip_stale": lambda text: {"yes": True, "no": False}[text.lower()],
-    }
-    facts: dict[str, Any] = {"trial": Path(cells["video"]).stem}
-    for name, text in cells.items():
+        parse, cure = columns[name]
         try:
-            facts[name] = kinds.get(name, str)(text)
+            yield name, parse(text)
         except (ValueError, KeyError):
-            kind = "yes or no" if name == "skip_stale" else "a number"
-            raise RecordingError(f"{where}: {name} is {text!r}, not {kind}; correct it") from None
-    facts["trial"] = trial_name(facts["trial"])
-    options = {name: facts.pop(name) for name in vars(ReadOptions()).keys() & facts.keys() - {"forces"}}
-    return ManifestRow(**facts, reading=ReadOptions(**options))
+            raise RecordingError(f"{where}: {name} is {text[:40]!r}; {cure}") from None

@@ -3,12 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
-
-Budget: TypeAlias = Literal["frames", "pixels", "samples", "span"]
-LIMITS: dict[Budget, int] = {"frames": 1_000_000, "pixels": 2**25, "samples": 20_000_000, "span": 86_400}
-"""Most frames, pixels of a frame, samples of forces and seconds of a recording, unless `allow_large` names them: those
-of nine hours of video, of an 8K camera, of five hours at 1 kHz, and of a day."""
+from typing import Literal
 
 
 def option_flags(names: Iterable[str]) -> str:
@@ -39,8 +34,6 @@ class ReadOptions:
     """Unit (s, ms, us, ns) of the last number in the names of images, which is then their time."""
     skip_frames: int | None = None
     """Number of frames to leave out at the start of a video."""
-    skip_stale: bool = False
-    """Leave out the dark or frozen frames that a camera hands out when it was just started."""
     start_s: float | None = None
     """When the first frame was taken, in seconds on the clock of the forces."""
     image_topic: str | None = None
@@ -53,14 +46,10 @@ class ReadOptions:
     """Feature of a LeRobot data set with the forces."""
     image_root: Path | None = None
     """Folder that now holds the images whose old paths a list of the thesis names."""
-    margin_unit: Literal["fraction", "percent"] | None = None
-    """Unit of the safety margins in a list of the thesis; guessed from their size if not given."""
-    allow_large: tuple[Budget, ...] = ()
-    """Limits that do not hold, where a recording really is so large: frames, pixels, samples or span."""
 
     def given(self) -> tuple[str, ...]:
         """Return the names of the options that are set, of those that a reader must support."""
-        return tuple(name for name, value in vars(self).items() if value not in (None, False) and name != "allow_large")
+        return tuple(name for name, value in vars(self).items() if value is not None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,9 +88,3 @@ class LabelSettings(TrialSettings):
     """Shift the forces by the estimated lag between camera and force sensor; it is always shown."""
     normal_axis: Literal["x", "y", "z"] | None = None
     """Axis of the force sensor that presses; estimated if not given."""
-    contact_threshold: float | None = None
-    """Least normal force of a contact, in newtons; chosen from the noise if not given."""
-    force_range: float | None = None
-    """Range of each axis of the force sensor, in newtons; frames beyond are not valid."""
-    seed: int = 0
-    """Seed of the random draws behind the uncertainties."""

@@ -18,9 +18,8 @@ from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.dataset import DATASET_FILE, Dataset, load_dataset
 from sliplens.recordings.formats import open_captures
-from sliplens.recordings.formats.stored import read_stored_trial
 from sliplens.recordings.formats.tables import evenly_spaced, trial_name
-from sliplens.recordings.options import LIMITS, Budget, ReadOptions, option_flags
+from sliplens.recordings.options import ReadOptions, option_flags
 from sliplens.recordings.sensor import SensorProfile, load_profile
 from sliplens.runner import LONGEST, Part, part
 
@@ -78,7 +77,7 @@ def open_source(
     >>> import numpy as np
     >>> from sliplens.recordings.source import open_source
     >>> (trial,) = open_source(np.zeros((5, 8, 6, 3), dtype=np.uint8), reference_frame=0)
-    >>> trial.frames, trial.frame_size
+    >>> len(trial), trial.frame_size
     (5, (8, 6))
     """
     if reference is not None and reference_frame is not None:
@@ -95,21 +94,16 @@ def open_source(
             raise InputError(f"{opened.folder} is a data set, which went through its profile; leave out --sensor")
         infos = opened.select(split=split)
         places = _choose_trial([info.trial for info in infos], trial, str(opened.folder))
-        stored = (read_stored_trial(opened, infos[place], samples=whole) for place in places)
-        return tuple(replace(capture, opened=str(opened.folder)) for capture in stored)
+        return tuple(opened.open(infos[place], samples=whole) for place in places)
     name = str(opened) if isinstance(opened, Path) else Capture.opened
     if split is not None:
         raise InputError(f"{name} is no data set of sliplens and has no splits; leave out --split")
-    if profile is not None and profile.frame_rate_hz is not None and options.frame_rate is None:
+    if profile is not None and options.frame_rate is None:
         options = replace(options, frame_rate=profile.frame_rate_hz)
-    captures = [
-        replace(_with_reference(capture, reference, reference_frame), opened=name)
-        for capture in _read_captures(opened, format, options, whole=whole)
-    ]
-    for capture in captures if isinstance(opened, Path) else ():
-        _require_usual(capture, options.allow_large)
+    read = _read_captures(opened, format, options, whole=whole)
+    captures = [replace(_with_reference(each, reference, reference_frame), opened=name) for each in read]
     captures = captures if profile is None else [profile.prepare(capture) for capture in captures]
-    return tuple(captures[place] for place in _choose_trial([capture.name for capture in captures], trial, name))
+    return tuple(captures[place] for place in _choose_trial([capture.trial for capture in captures], trial, name))
 
 
 def _open_dataset(source: Path | str | Other, format: str | None) -> Path | Dataset | Other:
@@ -168,12 +162,12 @@ class Trials:
         """Return a function that opens a part: its trial, and its frames with their numbers."""
         source, options = self.source, self.options
         opened = open_source(source, **options) if isinstance(source, Path) else source
-        by_name = {} if isinstance(opened, Dataset) else {capture.name: capture for capture in opened}
+        by_name = {} if isinstance(opened, Dataset) else {capture.trial: capture for capture in opened}
         # the next part of a trial goes on where this one ended: frames before it are not decoded again
         following: dict[tuple[str, int], Iterator[tuple[int, Frame]]] = {}
 
         def read_part(capture: Capture, first: int, count: int) -> Iterator[tuple[int, Frame]]:
-            frames = following.pop((capture.name, first), None)
+            frames = following.pop((capture.trial, first), None)
             following.clear()
             if frames is None:
                 frames = islice(enumerate(capture.read_frames()), first, None)
@@ -184,7 +178,7 @@ class Trials:
             if number + 1 < first + count:
                 ends = f"ends after {number + 1} of its {first + count} frames"
                 raise RecordingError(f"{capture.source} {ends}; make or copy it again")
-            following[capture.name, first + count] = frames
+            following[capture.trial, first + count] = frames
 
         def read(trial: str, first: int, count: int) -> tuple[Capture, Iterator[tuple[int, Frame]]]:
             if isinstance(source, Dataset):
@@ -219,37 +213,35 @@ def open_trials(
         captures = tuple(source)
     else:
         captures = open_source(source, **options)
-    if len({capture.name for capture in captures}) < len(captures):
+    if len({capture.trial for capture in captures}) < len(captures):
         raise InputError("two of the trials have the same name; give each its own")
     sha256 = hash_tree(source) if resumable and isinstance(source, Path) else ""
     return Trials(
         source=source if isinstance(source, Path) else captures,
         options=options,
         kinds=captures,
-        rows=tuple((capture.name, capture.frames, sha256) for capture in captures),
+        rows=tuple((capture.trial, len(capture), sha256) for capture in captures),
     )
 
 
 def _read_captures(
     source: Path | Images, format: str | None, options: ReadOptions, *, whole: bool
 ) -> Sequence[Capture]:
-    name, where, files = "frames", Capture.opened, None
+    name, where, what, files, rate = "frames", Capture.opened, "frames", None, options.frame_rate
     if isinstance(source, Path):
-        suffix = source.suffix.lower()
-        if whole or format is not None or suffix not in {*_ARRAYS, *IMAGE_SUFFIXES} or not source.is_file():
+        is_array = source.suffix.lower() in _ARRAYS
+        single = is_array or source.suffix.lower() in IMAGE_SUFFIXES
+        if whole or format is not None or not single or not source.is_file():
             captures = open_captures(source, format=format, options=options)
             # unlike on import, the times of images may stay unknown
             if whole and any(capture.time_s is None for capture in captures):
                 cure = "give one of --times, --frame-rate, --name-unit"
                 raise RecordingError(f"the frames of {source} have no times; {cure}")
             return captures
-        name, where = trial_name(source.stem), str(source)
-        files = None if suffix in _ARRAYS else (source.name,)
-        source = _load_array(source) if suffix in _ARRAYS else read_image(source)
-    frames, rate = (
-        as_frames(source, what="frames" if where == Capture.opened else f"frames of {where}"),
-        options.frame_rate,
-    )
+        name, where, what = trial_name(source.stem), str(source), f"frames of {source}"
+        files = None if is_array else (source.name,)
+        source = _load_array(source) if is_array else read_image(source)
+    frames = as_frames(source, what=what)
     if not len(frames):
         raise InputError("there is no frame; give one or more")
     if strange := [option for option in options.given() if option != "frame_rate"]:
@@ -278,22 +270,6 @@ def _load_array(path: Path) -> np.ndarray:
     raise RecordingError(f"{path} holds {number_of(count, 'array')}; name that of the frames 'frames'")
 
 
-def _require_usual(capture: Capture, allowed: Sequence[Budget]) -> None:
-    """Refuse a recording that is larger than any usual one, before memory of its size is allocated."""
-    height, width = capture.frame_size
-    clocks = [time for time in (capture.time_s, capture.forces and capture.forces.time_s) if time is not None]
-    sizes: dict[Budget, tuple[float, str]] = {
-        "frames": (len(capture), number_of(len(capture), "frame")),
-        "pixels": (height * width, f"frames of {height} x {width} pixels"),
-        "samples": (samples := len(capture.forces.time_s) if capture.forces else 0, f"{samples:,} samples of forces"),
-        "span": max(((span := float(np.ptp(time)), f"times over {span:.6g} s") for time in clocks), default=(0.0, "")),
-    }
-    for name, (size, text) in sizes.items():
-        if size > LIMITS[name] and name not in allowed:
-            usual = f"more than the {LIMITS[name]:,} that are usual; cut or mend it"
-            raise RecordingError(f"{capture.source} has {text}, {usual}, or say --allow-large {name} if it is right")
-
-
 def _choose_trial(names: Sequence[str], trial: str | None, source: str) -> Sequence[int]:
     """Return the place of a trial, or of all if None."""
     if trial is None:
@@ -308,19 +284,18 @@ def _with_reference(trial: Capture, image: Path | str | Images | None, number: i
     if image is None and number is None and trial.reference is None:
         number = trial.reference_index
     if number is not None:
-        if not 0 <= number < trial.frames:
-            raise InputError(f"{trial.name} has no frame {number}; name one from 0 to {trial.frames - 1}")
+        if not 0 <= number < len(trial):
+            raise InputError(f"{trial.trial} has no frame {number}; name one from 0 to {len(trial) - 1}")
         return replace(trial, reference=None, reference_index=number)
     if image is None:
         return trial
-    frames = as_frames(
-        read_image(Path(image)) if isinstance(image, str | Path) else image, what="levels of the reference"
-    )
+    image = read_image(Path(image)) if isinstance(image, str | Path) else image
+    frames = as_frames(image, what="levels of the reference")
     if len(frames) != 1:
         raise ImageError(f"the reference is {len(frames)} images; give one of the untouched sensor")
     (pixels,) = frames
     if pixels.shape[:2] != trial.frame_size:
         height, width = trial.frame_size
-        sizes = f"{pixels.shape[0]} x {pixels.shape[1]} pixels but the frames of {trial.name} are {height} x {width}"
+        sizes = f"{pixels.shape[0]} x {pixels.shape[1]} pixels but the frames of {trial.trial} are {height} x {width}"
         raise ImageError(f"the reference is {sizes}; record both with the same camera settings")
     return replace(trial, reference=pixels)

@@ -3,7 +3,6 @@
 import hashlib
 import math
 import re
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -40,15 +39,13 @@ def read_split_table(path: Path) -> dict[str, str]:
     cure = "name trial, object or day, or write a table with the columns trial and split (CSV)"
     require_file(path, missing=cure, most=MOST_TEXT)
     table: dict[str, str] = {}
-    for where, cells in read_csv(path, ("trial", "split"), what="a table of splits"):
-        for name in ("trial", "split"):
-            if name not in cells:
-                raise RecordingError(f"{where}: the column {name} is empty; write a trial and its split")
-        if cells["trial"] in table:
-            raise RecordingError(f"{where}: {cells['trial']} has a row already; write one row a trial")
-        if not _SPLIT_NAME.fullmatch(cells["split"]):
-            raise RecordingError(f"{where}: split is {cells['split']!r}; use a lower-case word such as train or test")
-        table[cells["trial"]] = cells["split"]
+    for where, cells in read_csv(path, ("trial", "split"), what="a table of splits", needed="trial"):
+        trial, split = cells["trial"], cells.get("split", "")
+        if trial in table:
+            raise RecordingError(f"{where}: {trial} has a row already; write one row a trial")
+        if not _SPLIT_NAME.fullmatch(split):
+            raise RecordingError(f"{where}: split is {split!r}; use a lower-case word such as train or test")
+        table[trial] = split
     if not table:
         raise RecordingError(f"{path} lists no trial; write a row for each below the header")
     return table
@@ -64,7 +61,7 @@ def assign_splits(trials: Sequence[TrialFacts], table: Mapping[str, str]) -> Spl
     >>> assign_splits(trials, {"mug-2": "validation", "mug-*": "train", "*": "test"}).splits
     ('train', 'validation', 'test')
     """
-    names = _unique_names(trials)
+    names = [trial.trial for trial in trials]
     rows = [next((row for row in table if row == name or fnmatchcase(name, row)), "") for name in names]
     if unmatched := [name for name, row in zip(names, rows, strict=True) if not row]:
         raise InputError(f"no row of the table of splits matches {_list(unmatched)}; add rows, or a last row for *")
@@ -91,7 +88,7 @@ def deal_splits(
     >>> splits[::2] == splits[1::2], sorted(splits[::2])
     (True, ['test', 'train', 'validation'])
     """
-    names = _unique_names(trials)
+    names = [trial.trial for trial in trials]
     if by not in get_args(Group):
         raise InputError(f"trials cannot be dealt by {by!r}; choose {', '.join(get_args(Group))}")
     if any(not (math.isfinite(share) and share >= 0) for share in shares) or abs(sum(shares) - 1) > _SUM_TOLERANCE:
@@ -168,13 +165,6 @@ def split_dataset(
         trials = [replace(info, split=split) for info, split in zip(data.trials, result.splits, strict=True)]
         write_dataset_table(data.folder, trials, simulated=data.simulated, left_out=data.left_out)
     return result
-
-
-def _unique_names(trials: Sequence[TrialFacts]) -> list[str]:
-    names = [trial.trial for trial in trials]
-    if repeated := [name for name, count in Counter(names).items() if count > 1]:
-        raise InputError(f"listed more than once: {_list(repeated)}; a trial belongs to one split, list it once")
-    return names
 
 
 def _remarks(trials: Sequence[TrialFacts], splits: Sequence[str]) -> list[str]:

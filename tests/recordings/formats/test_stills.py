@@ -62,7 +62,7 @@ def test_each_image_has_the_forces_of_its_row(tmp_path: Path, frames: np.ndarray
         labels = there(trial.labels)
         np.testing.assert_allclose(labels.normal_force_n, expected[:, 2])
         np.testing.assert_allclose(labels.tangential_force_n, np.hypot(expected[:, 0], expected[:, 1]))
-        assert (trial.name, trial.reference_index) == ("dome", 1)  # the row without a force
+        assert (trial.trial, trial.reference_index) == ("dome", 1)  # the row without a force
 
 
 def test_margins_are_those_of_the_given_friction_and_none_without_it(tmp_path: Path, frames: np.ndarray):

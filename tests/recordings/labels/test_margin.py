@@ -16,7 +16,7 @@ from sliplens.recordings.labels import (
     label_frames,
 )
 
-from .conftest import NORMAL_N, PULL_S, SLIP_S, STATIC, TOUCH_S, Trial, ratio
+from .conftest import PULL_S, SLIP_S, STATIC, TOUCH_S, Trial, ratio
 
 FRICTION = FrictionEstimate(mu=STATIC, low=STATIC, high=STATIC, onset_s=SLIP_S)
 LAG = Lag(lag_s=0.04, sigma_s=0.003, correlation=0.9)
@@ -114,15 +114,6 @@ def test_frames_without_samples_have_no_label(trial: Trial):
     np.testing.assert_array_equal(missing, ((time > 2.998) & (time < 3.202)) | (time > 5.298))
     assert np.all(np.isnan(labels.safety_margin[missing]))
     assert np.all(np.isnan(labels.normal_force_n[missing]))
-
-
-def test_forces_outside_the_range_have_no_label(trial: Trial):
-    some, everything = (
-        label_frames(trial.frame_time_s, trial.contact(), friction=FRICTION, settings=LabelSettings(force_range=limit))
-        for limit in (NORMAL_N - 0.1, NORMAL_N + 0.1)
-    )
-    assert Reason.OUT_OF_RANGE in reasons(some) - reasons(everything)
-    assert np.nanmax(some.normal_force_n[some.valid]) < NORMAL_N - 0.1
 
 
 def test_a_lag_is_applied_only_when_asked(trial: Trial):

@@ -35,11 +35,10 @@ def test_the_lag_is_reported_and_not_applied_unless_asked(trial: Trial):
 
 def test_what_is_declared_is_used(trial_without_slip: Trial):
     settings = {"normal_axis": "x", "normal_sign": 1, "tare": (0.0,) * 3, "mu": STATIC, "lag_ms": 10.0}
-    labels = trial_without_slip.label(trial_without_slip.forces(), **settings, contact_threshold=0.3)
+    labels = trial_without_slip.label(trial_without_slip.forces(), **settings)
     basis = labels.basis
     assert (basis.axes.tare_found, basis.lag, basis.lag_applied) == (Found.DECLARED, Lag(lag_s=0.01, sigma_s=0.0), True)
-    assert (basis.friction, basis.contact_threshold_n) == (FrictionEstimate(mu=STATIC, low=STATIC, high=STATIC), 0.3)
-    assert labels.normal_force_n[labels.valid].min() >= 0.3
+    assert basis.friction == FrictionEstimate(mu=STATIC, low=STATIC, high=STATIC)
 
 
 @pytest.mark.parametrize("mu", [None, STATIC])

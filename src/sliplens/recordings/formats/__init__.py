@@ -12,13 +12,10 @@ from sliplens.errors import InputError
 from sliplens.extras import Table
 from sliplens.images import IMAGE_SUFFIXES
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.dataset import DATASET_FILE
-from sliplens.recordings.formats.gelsight import is_gelsight, read_gelsight
-from sliplens.recordings.formats.images import read_image_folder
+from sliplens.recordings.dataset import DATASET_FILE, load_dataset
+from sliplens.recordings.formats.images import find_states, read_image_folder, read_stills
 from sliplens.recordings.formats.lerobot import read_lerobot
 from sliplens.recordings.formats.rosbag import read_rosbag
-from sliplens.recordings.formats.stills import find_states, read_stills
-from sliplens.recordings.formats.stored import read_stored
 from sliplens.recordings.formats.thesis import is_thesis_list, read_thesis
 from sliplens.recordings.formats.video import read_video
 from sliplens.recordings.options import ReadOptions, option_flags
@@ -42,7 +39,7 @@ _ROWS = {
         words="data set of sliplens, simulated or imported, with its labels",
         recognises=lambda path: (path / DATASET_FILE).is_file(),
         takes=(),
-        read=lambda path, _: read_stored(path),
+        read=lambda path, _: list(map((data := load_dataset(path)).open, data.trials)),
     ),
     "rosbag": Reader(
         words="ROS 2 bag (MCAP or sqlite3)",
@@ -59,14 +56,8 @@ _ROWS = {
     "thesis": Reader(
         words="lists of the thesis (*_images_L.txt), with their margins",
         recognises=is_thesis_list,
-        takes=("image_root", "margin_unit", "frame_rate"),
+        takes=("image_root", "frame_rate"),
         read=read_thesis,
-    ),
-    "gelsight": Reader(
-        words="GelSight Mini clips of the data set behind 'Incipient Slip Detection', without a label of any frame",
-        recognises=is_gelsight,
-        takes=("frame_rate",),
-        read=read_gelsight,
     ),
     "stills": Reader(
         words="table of labelled stills: a column of files, and forces",
@@ -83,7 +74,7 @@ _ROWS = {
     "video": Reader(
         words="video, with a table of forces",
         recognises=lambda path: path.is_file(),
-        takes=(*_FORCE_TABLE, "skip_frames", "skip_stale"),
+        takes=(*_FORCE_TABLE, "skip_frames"),
         read=read_video,
     ),
 }

@@ -1,8 +1,7 @@
 """LeRobot v3 data sets of a tactile camera and a force sensor."""
 
-import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from math import floor, prod
@@ -27,7 +26,7 @@ from sliplens.recordings.options import ReadOptions
 
 _COPY = "copy the data set again"
 _LATEST_S = 1e7  # of a stamp in a video: four months
-_FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([1-9])d)?\}")
+_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"  # of every data set of v3.0
 _TACTILE = re.compile(r"tactile|touch|gel|digit|tactip|fingertip|skin", re.IGNORECASE)
 _FORCE = re.compile(r"force|wrench|(?<![a-z])f_?t(?![a-z])", re.IGNORECASE)
 _TORQUE = re.compile(r"torque|moment|(?<![a-z])[tm]_?[xyz](?![a-z])", re.IGNORECASE)
@@ -41,13 +40,12 @@ class Feature:
     shape: tuple[int, ...]
     names: Any = None
     info: Any = None
-    video_info: Any = None
 
     @property
     def is_camera(self) -> bool:
         """True for colour images or videos."""
-        details = [each for each in (self.info, self.video_info) if isinstance(each, dict)]
-        depth = any(each.get("is_depth_map") or each.get("video.is_depth_map") for each in details)
+        info = self.info if isinstance(self.info, dict) else {}
+        depth = info.get("is_depth_map") or info.get("video.is_depth_map")
         return self.dtype in {"video", "image"} and not depth
 
 
@@ -58,17 +56,6 @@ class Layout:
     folder: Path
     fps: Annotated[float, msgspec.Meta(gt=0)]
     features: dict[str, Feature]
-    data_path: str
-    video_path: str | None = None
-
-    def file(self, template: str, values: Mapping[str, int | str]) -> Path:
-        """Fill in a template; not by `str.format`, which lets a hostile file reach attributes."""
-        name = _FIELD.sub(lambda field: f"{values.get(field[1], '{}')}".rjust(int(field[2] or 0), "0"), template)
-        path, root = (Path(os.path.normpath(each)) for each in (self.folder / name, self.folder))
-        if path == root or not path.is_relative_to(root) or re.search(r"[{}\0]", name):
-            leads = f"names files by {template!r}, which leads out of the data set or cannot be filled in"
-            raise RecordingError(f"meta/info.json of {self.folder} {leads}; copy one you trust")
-        return path
 
 
 def read_layout(folder: Path) -> Layout:
@@ -132,14 +119,12 @@ def image_frames(path: Path, key: str, *, episode: int, frame_size: tuple[int, i
     index = 0
     columns = {"episode_index": "whole numbers", key: "values"}
     damage = parquet_errors(path, cure=_COPY, error=RecordingError)
-    with open_parquet(path, columns, cure=_COPY, error=RecordingError) as file, damage:
-        # without this, each episode would cost all that share its file
+    with open_parquet(path, columns, cure=_COPY, error=RecordingError), damage:
         import pyarrow.dataset as ds  # noqa: PLC0415 (takes a second, and other formats are read without)
 
-        (fragment,) = ds.dataset(path).get_fragments()
-        groups = [group.id for group in fragment.subset(pc.field("episode_index") == episode).row_groups]
-        for batch in file.iter_batches(batch_size=16, row_groups=groups, columns=list(columns)):
-            for cell in batch.filter(pc.field("episode_index") == episode).column(key).to_pylist():
+        of_episode, ahead = pc.field("episode_index") == episode, {"batch_readahead": 1, "fragment_readahead": 1}
+        for batch in ds.dataset(path).to_batches(columns=[key], filter=of_episode, batch_size=16, **ahead):
+            for cell in batch.column(key).to_pylist():
                 where = f"frame {index} of {key}, episode {episode} of {path},"
                 data = cell.get("bytes") if isinstance(cell, dict) else None
                 if not isinstance(data, bytes) or not data:
@@ -156,7 +141,9 @@ def image_frames(path: Path, key: str, *, episode: int, frame_size: tuple[int, i
 def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
     """Read a data set, one trial an episode."""
     layout = read_layout(folder)
-    camera = _choose_camera(layout, options.camera_key)
+    cameras = [key for key, feature in layout.features.items() if feature.is_camera]
+    tactile = [key for key in cameras if _TACTILE.search(key)]
+    camera = _choose(layout, cameras, tactile or cameras, name=options.camera_key, kind="camera")
     force = _choose_force(layout, options.force_key)
     notes = [] if force else ["There are no forces: no feature of 3 or 6 numbers is named like one."]
     kinds = {"episode_index": "whole numbers", "timestamp": "numbers", **({force: "values"} if force else {})}
@@ -168,12 +155,15 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
         with open_video(path) as (_, stream):
             return first_frame_size(path), loss_note(stream, name=path.name)
 
+    if trial_name(camera) != camera:
+        raise RecordingError(f"the camera {camera[:40]!r} of {layout.folder} cannot name a folder; copy one you trust")
     video = f"videos/{camera}/" if layout.features[camera].dtype == "video" else ""
     captures = []
     for row in _read_episodes(layout, video=video):
         episode, loss, forces = int(row["episode_index"]), (), None
         places = {name: int(row[f"data/{name}"]) for name in ("chunk_index", "file_index")}
-        path, source = layout.file(layout.data_path, places), f"episode {episode} of {layout.folder}"
+        path = layout.folder / "data" / f"{_FILE.format(**places)}.parquet"
+        source = f"episode {episode} of {layout.folder}"
         table = read_table(path).filter(pc.field("episode_index") == episode)
         if table.num_rows != row["length"] or not table.num_rows:
             count = f"{path} has {table.num_rows} frames of episode {episode}, its metadata say {row['length']}"
@@ -189,7 +179,7 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
             forces = Forces(time_s=time_s, force_n=force_n, source=f"{force} of {source}")
         if video:
             places = {name: int(row[f"{video}{name}"]) for name in ("chunk_index", "file_index")}
-            file = layout.file(layout.video_path or "", {"video_key": camera, **places})
+            file = layout.folder / video / f"{_FILE.format(**places)}.mp4"
             size, loss = read_header(file)
             stamps_s, tolerance_s = row[f"{video}from_timestamp"] + time_s, 0.5 / layout.fps
             read_frames = partial(video_frames, file, stamps_s, tolerance_s=tolerance_s, frame_size=size)
@@ -211,8 +201,9 @@ def read_lerobot(folder: Path, options: ReadOptions) -> list[Capture]:
     return captures
 
 
-def _choose(layout: Layout, fitting: Sequence[str], chosen: Sequence[str], *, name: str | None, kind: str) -> str:
-    """Return the only feature that was chosen; `name` is that of the option, where one is given."""
+def _choose(layout: Layout, fitting: Sequence[str], likely: Sequence[str], *, name: str | None, kind: str) -> str:
+    """Return the feature that an option names, or the only one that is likely."""
+    chosen = likely if name is None else [key for key in fitting if key == name]
     if len(chosen) == 1:
         return chosen[0]
     wanted = f"{len(chosen) or 'no'} {kind}s" if name is None else f"no {kind} {name}"
@@ -220,22 +211,15 @@ def _choose(layout: Layout, fitting: Sequence[str], chosen: Sequence[str], *, na
     raise RecordingError(f"{layout.folder} has {wanted} among {some}; name one with --{kind}-key")
 
 
-def _choose_camera(layout: Layout, name: str | None) -> str:
-    cameras = [key for key, feature in layout.features.items() if feature.is_camera]
-    chosen = [key for key in cameras if key == name] if name else [key for key in cameras if _TACTILE.search(key)]
-    return _choose(layout, cameras, chosen or (cameras if name is None else []), name=name, kind="camera")
-
-
 def _choose_force(layout: Layout, name: str | None) -> str | None:
     fitting = [
         key for key, each in layout.features.items() if each.dtype.startswith("float") and each.shape in ((3,), (6,))
     ]
     # what was commanded is not what was felt
-    forces = [key for key in fitting if _FORCE.search(key) and not key.startswith("action")]
-    forces = forces if name is None else [key for key in fitting if key == name]
-    if not forces and name is None:
+    likely = [key for key in fitting if _FORCE.search(key) and not key.startswith("action")]
+    if not likely and name is None:
         return None
-    force = _choose(layout, fitting, forces, name=name, kind="force")
+    force = _choose(layout, fitting, likely, name=name, kind="force")
     # names of the numbers are a list, or lists by group
     names = layout.features[force].names
     groups = names.values() if isinstance(names, dict) else [names]

@@ -1,16 +1,10 @@
 """ROS 2 bags (MCAP or sqlite3) of a tactile camera and a force-torque sensor."""
 
-import io
-import os
 from array import array
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache, partial
-from importlib import import_module
-from importlib.util import find_spec, module_from_spec
-from itertools import accumulate
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import av
@@ -21,15 +15,14 @@ from sliplens.extras import require_packages
 from sliplens.files import require_file
 from sliplens.images import image_size, read_image
 from sliplens.recordings.capture import Capture, Forces, Frame
-from sliplens.recordings.formats.mcap import IMAGE, TOPICS, WRENCH, trial_types
 from sliplens.recordings.formats.tables import trial_name
 from sliplens.recordings.options import ReadOptions
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
 
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
-_TYPES = {"image": ("sensor_msgs/msg/Image", COMPRESSED), "wrench": (TOPICS[WRENCH], "geometry_msgs/msg/Wrench")}
+COMPRESSED, WRENCH = "sensor_msgs/msg/CompressedImage", "geometry_msgs/msg/WrenchStamped"
+_TYPES = {"image": ("sensor_msgs/msg/Image", COMPRESSED), "wrench": (WRENCH, "geometry_msgs/msg/Wrench")}
 _ENCODINGS = {
     "rgb8": (3, "rgb24"),
     **dict.fromkeys(("bgr8", "8UC3"), (3, "bgr24")),
@@ -64,83 +57,13 @@ def _message_size(message: Any, *, where: str) -> tuple[int, int]:
     return height, width
 
 
-MOST_BYTES = 256 * 2**20
-"""In memory at a time: of a chunk, of all chunks that cover one moment, or of a message. Chunks are of some 1 MB."""
-MOST_TIMES = 100  #: A file that is compressed as a whole expands on disk, so far that its size may be multiplied.
-
-
-class ExpandsTooFarError(Exception):
-    """Data that expand to more bytes than they may."""
-
-
-def _require_below(size: int, most: int) -> None:
-    if size > most:
-        raise ExpandsTooFarError(f"{most:,} bytes")
-
-
-@cache
-def bounded_reader() -> "type[Reader]":
-    """Return `rosbags.rosbag2.Reader`, changed to raise `ExpandsTooFarError` before memory or disk are filled."""
-    mcap, reader = _load_copy("rosbags.rosbag2.storage_mcap"), _load_copy("rosbags.rosbag2.reader")
-    sqlite = import_module("rosbags.rosbag2.storage_sqlite3")
-    zstd, lz4 = mcap.zstd, import_module("lz4.frame")
-
-    class Mcap(mcap.McapReader):
-        def _open(self) -> None:
-            super()._open()
-            # chunks that cover one moment are all expanded at once; what begins then counts before what ends
-            times = [
-                (chunk.message_start_time, chunk.message_end_time, chunk.uncompressed_size) for chunk in self.chunks
-            ]
-            steps = [(begin, 0, size) for begin, _, size in times] + [(max(span), 1, -size) for *span, size in times]
-            _require_below(max(accumulate(size for *_, size in sorted(steps)), default=0), MOST_BYTES)
-
-    class Sqlite(sqlite.Sqlite3Reader):
-        def _open(self) -> None:
-            # a tiny database may compute a message of any size
-            self.dbconn.limit(sqlite.apsw.SQLITE_LIMIT_LENGTH, MOST_BYTES)
-            super()._open()
-
-    class File(zstd.ZstdFile):
-        def __init__(self, file: Any, mode: str) -> None:
-            super().__init__(file, mode)
-            self._most = max(MOST_BYTES, MOST_TIMES * os.fstat(file.fileno()).st_size)
-
-        def read(self, size: int = -1) -> bytes:
-            data = super().read(size)
-            _require_below(self.tell(), self._most)
-            return data
-
-    def expand(open_stream: Any, data: bytes, most: int) -> bytes:
-        _require_below(most, MOST_BYTES)
-        with open_stream(io.BytesIO(data)) as stream:
-            expanded = stream.read(most + 1)
-        _require_below(len(expanded), most)
-        return expanded
-
-    # each gets the bytes and the size that is claimed for them, which rosbags compares with what comes out
-    packers = {"lz4": partial(expand, lz4.open), "zstd": partial(expand, zstd.open)}
-    mcap.DECOMPRESSORS = {"": lambda data, _: data, **packers}
-    reader.zstd = SimpleNamespace(decompress=lambda data: expand(zstd.open, data, MOST_BYTES), open=File)
-    reader.DirectoryReader.STORAGE_PLUGINS = {"mcap": Mcap, "sqlite3": Sqlite}
-    reader.Reader.STORAGE_PLUGINS = {"dir": reader.DirectoryReader, ".mcap": Mcap, ".db3": Sqlite}
-    return reader.Reader
-
-
-def _load_copy(name: str) -> Any:
-    """Load a module a second time, so that its changes stay here."""
-    spec = find_spec(name)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{name} is not there")
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def bag_messages(path: Path, topics: Mapping[str, str]) -> Iterator[tuple[str, int, Any]]:
     """Iterate over topic, time of arrival in nanoseconds and content of messages, in the order of recording."""
     with open_bag(path) as bag:
-        types = trial_types()
+        from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415 (an extra)
+
+        # never the types that a file defines: `rosbags` turns definitions into code
+        types = get_typestore(Stores.LATEST)
         chosen = [each for each in bag.connections if topics.get(each.topic) == each.msgtype]
         if not chosen:  # to rosbags none means all
             return
@@ -151,7 +74,9 @@ def bag_messages(path: Path, topics: Mapping[str, str]) -> Iterator[tuple[str, i
 @contextmanager
 def open_bag(path: Path) -> Iterator["Reader"]:
     """Open a bag; whatever its readers raise inside becomes a `RecordingError`."""
-    require_packages("mcap", "rosbags", extra="ros", purpose="a ROS 2 bag")
+    require_packages("rosbags", extra="ros", purpose="a ROS 2 bag")
+    from rosbags.rosbag2 import Reader  # noqa: PLC0415 (an extra)
+
     if path.suffix == ".bag":
         raise RecordingError(f"{path} is a ROS 1 bag; convert it with `rosbags-convert --src BAG --dst FOLDER`")
     files = sorted(file for file in path.iterdir() if file.suffix in _STORAGE) if path.is_dir() else [path]
@@ -167,12 +92,10 @@ def open_bag(path: Path) -> Iterator["Reader"]:
         if head.startswith(b"SQLite format 3\0") and file.stat().st_size % (65536 if page == 1 else page or 1):
             raise RecordingError(f"{file} is cut off; copy it again")  # sqlite would read zeros there
     try:
-        with bounded_reader()(path) as bag:
+        with Reader(path) as bag:
             yield bag
     except SliplensError:
         raise
-    except ExpandsTooFarError as error:
-        raise RecordingError(f"{path} expands to more than {error} in one piece; expand it beforehand") from None
     # a damaged byte may lead rosbags, sqlite or YAML into any error there is, from KeyError to MemoryError
     except Exception as error:
         text = " ".join(f"{type(error).__name__}: {error}".split())[:200]
@@ -213,7 +136,7 @@ def read_rosbag(path: Path, options: ReadOptions) -> Capture:
     if size is None:
         raise RecordingError(f"{images} of {path} has no frame; leave it out or record it again")
     if not forces_n and options.wrench_topic is None:
-        notes.append(f"There are no forces: {wrenches or 'the bag'} has no message of {TOPICS[WRENCH]}.")
+        notes.append(f"There are no forces: {wrenches or 'the bag'} has no message of {WRENCH}.")
         wrenches = None
     clock, why = _choose_clock({name: stamps for name, stamps in stamps_ns.items() if stamps["bag"]})
     zero = min(stamps[clock][0] for stamps in stamps_ns.values() if stamps[clock])
@@ -252,12 +175,10 @@ def _read_frames(path: Path, images: str, kind: str) -> Iterator[Frame]:
 
 
 def _choose(topics: Mapping[str, str], name: str | None, *, what: str, path: Path) -> str | None:
-    """Return the topic `name`, or the only one of the fitting types, or that which `export_mcap` writes."""
+    """Return the topic `name`, or the only one of the fitting types."""
     fitting = {topic: kind for topic, kind in topics.items() if kind in _TYPES[what]}
     if name is not None and name not in fitting:
         raise RecordingError(f"{path} has no {what} topic {name}; it has {_list_topics(topics)}")
-    if name is None and IMAGE in fitting:
-        return IMAGE
     if name is None and len(fitting) > 1:
         several = f"{len(fitting)} {what} topics, {_list_topics(fitting)}"
         raise RecordingError(f"{path} has {several}; name one of them with --{what}-topic")

@@ -98,7 +98,7 @@ def open_text_table(path: Path) -> TextTable:
         raise RecordingError(f"{path} is empty; name a table with a header and a row a sample")
     separator, width = _find_layout(path, plain)
     rows = _split_lines(path, chain(plain, lines), separator, width)
-    _, header = next(rows)
+    _, header = first = next(rows)
     if not _WORD.search("".join(header)):
         # `rostopic echo -p` and NumPy write the header as a comment
         above = [_split(path, line, text.lstrip("#% \t"), separator) for line, text in head if line < plain[0][0]]
@@ -108,8 +108,7 @@ def open_text_table(path: Path) -> TextTable:
             if _WORD.search(plain[0][1]):
                 deque(_split_lines(path, plain, separator, len(_split(path, *plain[0], separator))), maxlen=0)
             raise RecordingError(f"{path} begins with numbers, not names of columns; begin with time_s,fx,fy,fz")
-        rows = _split_lines(path, chain(plain, lines), separator, width)
-        header = commented[-1]
+        rows, header = chain([first], rows), commented[-1]
     first = next(rows, None)
     if first is not None:
         units = [cell.strip("[]()") for cell in first[1]]
@@ -168,9 +167,10 @@ def _split_lines(
 
 def find_column(table: TextTable, name: str, *, option: str) -> str:
     """Find a column that the user named, in any case, and return its name in the file."""
-    forms = (lambda text: text), (lambda text: text.strip().lower()), (lambda text: re.sub(r" \[.*", "", text.lower()))
-    matches = ([column for column in table.header if form(column) == form(name)] for form in forms)
-    same = next(filter(None, matches), [])
+    # as it is written, in any case, or without its unit
+    for form in (str, str.lower, lambda text: re.sub(r" \[.*", "", text.lower())):
+        if same := [column for column in table.header if form(column) == form(name.strip())]:
+            break
     if len(same) != 1:
         count = f"{len(same)} columns" if same else "no column"
         raise RecordingError(f"{table.path} has {count} {name!r}, it has {_quote(table.header)}; name it with {option}")

@@ -1,15 +1,14 @@
 """The lists of the thesis: paths of frames, paths of their reference frames, and their safety margins."""
 
-import os
 from functools import partial
-from pathlib import Path, PureWindowsPath
+from pathlib import Path
 
 import numpy as np
 
 from sliplens.errors import RecordingError
 from sliplens.images import natural_key, read_image
 from sliplens.recordings.capture import Capture
-from sliplens.recordings.formats.images import common_size
+from sliplens.recordings.formats.images import common_size, find_image
 from sliplens.recordings.formats.tables import evenly_spaced, text_lines, trial_name
 from sliplens.recordings.options import ReadOptions
 from sliplens.recordings.trial import labels_of_margins, require_possible
@@ -41,7 +40,7 @@ def read_thesis(path: Path, options: ReadOptions) -> list[Capture]:
     stem = frames_list.name.removesuffix(FRAMES)
     references_list, margins_list = (frames_list.with_name(stem + ending) for ending in (REFERENCES, MARGINS))
     frames, references = _read_lines(frames_list), _read_lines(references_list)
-    margins, note = _read_margins(margins_list, unit=options.margin_unit)
+    margins, note = _read_margins(margins_list)
     if not len(frames) == len(references) == len(margins):
         counts = f"{len(references)} references and {margins_list.name} {len(margins)} margins"
         raise RecordingError(f"{frames_list} has {len(frames)} frames, {references_list.name} {counts}; give as many")
@@ -83,33 +82,7 @@ def _read_lines(path: Path) -> list[tuple[int, str]]:
     raise RecordingError(f"{path} is empty; list one entry a line")
 
 
-def find_image(listed: str, where: str, *, folder: Path, root: Path) -> Path:
-    """Find the file of a list at its path, which must stay in the root, or under the root by its last parts."""
-    if Path(listed).is_absolute() and _is_file(Path(listed)):
-        return Path(listed)
-    foreign = PureWindowsPath(listed)  # reads slashes and backslashes
-    parts = foreign.parts[1:] if foreign.anchor else foreign.parts
-    inside = Path(os.path.normpath(folder.absolute().joinpath(*parts)))
-    within = inside.is_relative_to(os.path.normpath(root.absolute()))
-    if ".." in parts and not within:
-        raise RecordingError(f"{where}: {listed!r} leads out of {root}; give the folder of all with --image-root")
-    if within and _is_file(inside):
-        return inside
-    parts = tuple(part for part in parts if part != "..")
-    moved = (root.joinpath(*parts[dropped:]) for dropped in range(len(parts)))
-    if image := next(filter(_is_file, moved), None):
-        return image
-    raise RecordingError(f"{where}: {listed[:200]!r} is not there, nor under {root}; name its folder with --image-root")
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except OSError:  # a line that is too long for a name
-        return False
-
-
-def _read_margins(path: Path, *, unit: str | None) -> tuple[np.ndarray, str]:
+def _read_margins(path: Path) -> tuple[np.ndarray, str]:
     values = []
     for number, line in _read_lines(path):
         try:
@@ -122,8 +95,7 @@ def _read_margins(path: Path, *, unit: str | None) -> tuple[np.ndarray, str]:
     if not np.isfinite(margins).any():
         raise RecordingError(f"{path} holds no safety margin; give one a line")
     # no margin as a fraction comes near 2, percents all do
-    percent, how = unit == "percent", "by their size" if unit is None else "declared"
-    percent |= unit is None and bool(np.nanmax(margins) > 2)
+    percent = bool(np.nanmax(margins) > 2)
     margins = margins / 100 if percent else margins
     require_possible(margins, name="safety_margin", where=path.name)
-    return margins, f"{path.name}: safety margins were read as {'percent' if percent else 'fractions'} ({how})."
+    return margins, f"{path.name}: safety margins were read as {'percent' if percent else 'fractions'}, by their size."

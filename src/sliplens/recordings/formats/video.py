@@ -1,8 +1,8 @@
 """Frames of a video file, with the presentation stamps of its container."""
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from av.error import FFmpegError
 from av.stream import Disposition
 from av.video.reformatter import VideoReformatter
 from av.video.stream import VideoStream
-from jaxtyping import Float, Float32, Int64, UInt8
+from jaxtyping import Float, Int64, UInt8
 
 from sliplens.errors import RecordingError
 from sliplens.images import MOST_PIXELS, is_image
@@ -22,56 +22,6 @@ from sliplens.progress import number_of
 from sliplens.recordings.capture import Capture, Frame
 from sliplens.recordings.formats.tables import evenly_spaced, place_on_clock, trial_name
 from sliplens.recordings.options import ReadOptions
-
-_HEAD = 13  # frames at the start that may be stale
-_HORIZON = 500  # frames that the head is compared with; a longer video is read no further
-_BLOCKS = 24, 32
-_LEAST_LEAP = 1.5  # grey levels, mean over the image: several times what noise and coding change
-_FROZEN = 0.75  # grey levels: no more than noise and coding change
-_WAKES = 1.015  # a camera that adapts its exposure when it is started grows brighter by more
-
-
-def small_copies(frames: Iterable[Frame]) -> Float32[np.ndarray, "frames rows columns 3"]:
-    """Reduce frames to the means of blocks, enough to tell scenes apart and small enough to keep."""
-    copies = []
-    for frame in islice(frames, _HORIZON):
-        rows, columns = (min(most, size) for most, size in zip(_BLOCKS, frame.shape[:2], strict=True))
-        height, width = frame.shape[0] // rows, frame.shape[1] // columns
-        whole = frame[: rows * height, : columns * width]
-        # rows first, which lie in one piece: several times faster than both at once
-        lines = whole.reshape(rows, height, -1).sum(axis=1, dtype=np.uint32)
-        copies.append((lines.reshape(rows, columns, width, 3).sum(axis=2) / (height * width)).astype(np.float32))
-    return np.stack(copies) if copies else np.empty((0, *_BLOCKS, 3), dtype=np.float32)
-
-
-def count_stale(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
-    """Count the frames at the start of `small_copies` that belong to another scene.
-
-    A camera that was just started hands out dark frames, then frozen frames of an earlier moment from its buffers, the
-    last of them unlike every frame that follows. Of an object that slides all frames leap, or none does. (Where the
-    camera ran already, an object that is pressed all at once within the first 13 frames and never released looks like
-    a frozen start; do not count there.)
-    """
-    head = min(_HEAD, len(copies) // 3)  # enough frames must follow to compare with
-    if not head:
-        return 0
-    flat = copies.reshape(len(copies), -1)
-    leap = np.array([np.abs(flat[at + 1 :] - flat[at]).mean(axis=1).min() for at in range(head)])
-    brightness = flat[: head + 1].mean(axis=1)
-    wakes = bool(np.any(brightness[1:] > _WAKES * brightness[:-1]))
-    frozen = np.append(False, leap[:-1] < np.minimum(leap[1:] / 4, _FROZEN))
-    # where all frames move, none of them leaps
-    stale = (leap > max(_LEAST_LEAP, 4 * float(np.median(leap)))) & (frozen | wakes)
-    return int(np.flatnonzero(stale)[-1]) + 1 if stale.any() else 0
-
-
-def least_contact(copies: Float32[np.ndarray, "frames rows columns 3"]) -> int:
-    """Find the frame with the least relief: the candidate for a reference where none was recorded."""
-    colour = copies[..., [0, 2]] - copies[..., [1]]
-    padded = np.pad(colour, ((0, 0), (2, 2), (2, 2), (0, 0)), mode="edge")
-    smooth = np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(1, 2)).mean(axis=(-2, -1))
-    return int(np.argmin(np.abs(colour - smooth).mean(axis=(1, 2, 3))))
-
 
 # FFmpeg also plays text files and play lists, and would follow these to other files and hosts
 _OPTIONS = {
@@ -149,21 +99,55 @@ def loss_note(video: VideoStream, *, name: str) -> tuple[str, ...]:
     return (f"{loss}; record losslessly (FFV1, PNG) where you can.",) if codec.lossy else ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class _VideoFile:
-    """Facts about the frames of a video from its container."""
+def _ends_early(
+    container: InputContainer, video: VideoStream, frames: int, time_s: Float[np.ndarray, " frames"] | None
+) -> bool:
+    if video.frames:  # AVI and MP4 say how many frames they hold
+        return frames < video.frames
+    # Matroska says how long it lasts, which may be the length of a sound stream
+    if not (container.format.name.startswith("matroska") and container.duration and len(container.streams) == 1):
+        return False
+    steps = [] if time_s is None else np.diff(time_s).tolist()
+    if video.average_rate:
+        steps.append(float(1 / video.average_rate))
+    if time_s is None or not steps:
+        return False
+    return float(time_s[-1]) + 1.5 * max(steps) < container.duration / av.time_base
 
-    frames: int
-    stamps: Int64[np.ndarray, " frames"] | None
-    """Stamps in units of the stream, in the order of display; None where there are none."""
-    time_s: Float[np.ndarray, " frames"] | None
-    counted: bool  #: True where the container counts frames and holds no presentation stamps.
-    frame_size: tuple[int, int]  #: Height and width of the upright frames, in pixels.
-    notes: tuple[str, ...]
+
+def _decode(
+    path: Path, *, frames: int, stamps: Int64[np.ndarray, " frames"] | None, size: tuple[int, int]
+) -> Iterator[Frame]:
+    """Decode the frames in the order they are shown, upright; stamps are None where the container counts frames."""
+    count = 0
+    to_rgb = VideoReformatter()  # one for all: preparing it costs as much as a frame
+    with open_video(path) as (container, video):
+        try:
+            for frame in container.decode(video):
+                if frame.is_corrupt:
+                    raise RecordingError(_damaged(path, count, "it is incomplete"))
+                if count == frames or not (stamps is None or frame.pts in {None, stamps[count]}):
+                    raise RecordingError(_damaged(path, count, "its stamp is not among those of the file"))
+                pixels = upright(frame, to_rgb.reformat(frame, format="rgb24").to_ndarray(), where=path)
+                if pixels.shape[:2] != size:
+                    raise RecordingError(_damaged(path, count, "it is of another size than the first"))
+                count += 1
+                yield pixels
+        except FFmpegError as error:
+            raise RecordingError(_damaged(path, count, error.strerror)) from None
+    if count < frames:
+        raise RecordingError(_damaged(path, count, f"the file has stamps of {number_of(frames, 'frame')}"))
 
 
-def _inspect(path: Path) -> _VideoFile:
-    """Read the stamps of all frames, and decode the first for its size."""
+def _damaged(path: Path, frame: int, reason: str | None) -> str:
+    return f"frame {frame} of {path} cannot be decoded ({reason}); the file is damaged, copy or export it again"
+
+
+def read_video(path: Path, options: ReadOptions) -> Capture:
+    """Open a video at its presentation stamps, which keep a variable rate, and a table of forces recorded beside it.
+
+    Of a video that was cut off, the frames up to the cut are kept.
+    """
     packets: list[int | None] = []
     cut, stamps, time_s = False, None, None
     with open_video(path) as (container, video):
@@ -182,90 +166,39 @@ def _inspect(path: Path) -> _VideoFile:
             # the clock of a transport stream starts anywhere
             zero = stamps[0] if container.format.name in {"mpegts", "mpeg"} else 0
             time_s = (stamps - zero) * float(video.time_base)
-        if cut or _ends_early(container, video, len(packets), time_s):
-            raise RecordingError(f"{path} is truncated or damaged: it ends before frame {len(packets)}; copy it again")
+        cut |= _ends_early(container, video, len(packets), time_s)
         notes = list(loss_note(video, name=path.name))
         if (streams := len(_moving(container))) > 1:
             notes.append(f"{path.name}: the first of {streams} video streams was read.")
         pixels = video.codec_context.format
         if pixels is not None and max(part.bits for part in pixels.components) > 8:
             notes.append(f"{path.name}: frames have more than 8 bits a channel and were reduced to 8.")
-    return _VideoFile(
-        frames=len(packets),
-        stamps=stamps,
-        time_s=time_s,
-        counted=counted,
-        frame_size=first_frame_size(path),
-        notes=tuple(notes),
-    )
-
-
-def _ends_early(
-    container: InputContainer, video: VideoStream, frames: int, time_s: Float[np.ndarray, " frames"] | None
-) -> bool:
-    if video.frames:  # AVI and MP4 say how many frames they hold
-        return frames < video.frames
-    # Matroska says how long it lasts, which may be the length of a sound stream
-    if not (container.format.name.startswith("matroska") and container.duration and len(container.streams) == 1):
-        return False
-    steps = [] if time_s is None else np.diff(time_s).tolist()
-    if video.average_rate:
-        steps.append(float(1 / video.average_rate))
-    if time_s is None or not steps:
-        return False
-    return float(time_s[-1]) + 1.5 * max(steps) < container.duration / av.time_base
-
-
-def _decode(path: Path, file: _VideoFile) -> Iterator[Frame]:
-    """Decode the frames in the order they are shown, upright."""
-    count = 0
-    to_rgb = VideoReformatter()  # one for all: preparing it costs as much as a frame
-    with open_video(path) as (container, video):
-        try:
-            for frame in container.decode(video):
-                if frame.is_corrupt:
-                    raise RecordingError(_damaged(path, count, "it is incomplete"))
-                if count == file.frames or not (
-                    file.stamps is None or file.counted or frame.pts in {None, file.stamps[count]}
-                ):
-                    raise RecordingError(_damaged(path, count, "its stamp is not among those of the file"))
-                pixels = upright(frame, to_rgb.reformat(frame, format="rgb24").to_ndarray(), where=path)
-                if pixels.shape[:2] != file.frame_size:
-                    raise RecordingError(_damaged(path, count, "it is of another size than the first"))
-                count += 1
-                yield pixels
-        except FFmpegError as error:
-            raise RecordingError(_damaged(path, count, error.strerror)) from None
-    if count < file.frames:
-        raise RecordingError(_damaged(path, count, f"the file has stamps of {number_of(file.frames, 'frame')}"))
-
-
-def _damaged(path: Path, frame: int, reason: str | None) -> str:
-    return f"frame {frame} of {path} cannot be decoded ({reason}); the file is damaged, copy or export it again"
-
-
-def read_video(path: Path, options: ReadOptions) -> Capture:
-    """Open a video at its presentation stamps, which keep a variable rate, and a table of forces recorded beside it."""
-    file, frame_rate, skipped = _inspect(path), options.frame_rate, options.skip_frames or 0
-    notes, time_s = list(file.notes), file.time_s
-    if frame_rate is not None:
-        time_s = evenly_spaced(file.frames, frame_rate=frame_rate)
-        notes.append(f"{path.name}: frames were declared to be taken {frame_rate:g} times a second.")
+    size, frames = first_frame_size(path), len(packets)
+    decode = partial(_decode, path, frames=frames, stamps=None if counted else stamps, size=size)
+    if cut:
+        frames, decoded = 0, decode()
+        with suppress(RecordingError):
+            while next(decoded, None) is not None:
+                frames += 1
+        whole = f"{number_of(frames, 'frame')} before the cut were kept"
+        notes.append(f"{path.name}: the file is cut off: {whole}; copy it again if it was longer.")
+    if options.frame_rate is not None:
+        time_s = evenly_spaced(frames, frame_rate=options.frame_rate)
+        notes.append(f"{path.name}: frames were declared to be taken {options.frame_rate:g} times a second.")
     if time_s is None:
         raise RecordingError(f"{path} has no presentation stamps; declare its rate with --frame-rate")
-    time_s, samples, more = place_on_clock(time_s, options, source=path.name)
-    if options.skip_stale:
-        skipped = max(skipped, count_stale(small_copies(_decode(path, file))))
-    if not 0 <= skipped < file.frames:
-        raise RecordingError(f"{skipped} of {number_of(file.frames, 'frame')} of {path} cannot be skipped; skip fewer")
+    time_s, samples, more = place_on_clock(time_s[:frames], options, source=path.name)
+    skipped = options.skip_frames or 0
+    if not 0 <= skipped < frames:
+        raise RecordingError(f"{skipped} of {number_of(frames, 'frame')} of {path} cannot be skipped; skip fewer")
     if skipped:
-        more = (*more, f"{path.name}: the first {skipped} of {file.frames} frames were left out.")
+        more = (*more, f"{path.name}: the first {skipped} of {frames} frames were left out.")
     return Capture(
         trial=trial_name(path.stem),
         source=str(path),
         frame_time_s=time_s[skipped:],
-        frame_size=file.frame_size,
-        read_frames=lambda: islice(_decode(path, file), skipped, None),
+        frame_size=size,
+        read_frames=lambda: islice(decode(), skipped, frames if cut else None),
         forces=samples,
         notes=(*notes, *more),
     )

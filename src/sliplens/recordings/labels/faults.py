@@ -11,14 +11,7 @@ from jaxtyping import Float, Int
 from sliplens.errors import RecordingError
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import ForceFault, Lag, Reason
-from sliplens.recordings.labels.axes import (
-    infer_axes,
-    mean_force,
-    noise_sigma,
-    robust_spread,
-    turn_matrix,
-    typical_step,
-)
+from sliplens.recordings.labels import axes
 from sliplens.recordings.labels.lag import estimate_lag, force_changes
 from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import MOST_FORCE_N
@@ -79,7 +72,7 @@ class Screened:
             )
             for start, end in pairwise(ends.tolist()) if codes[start]
         ]  # fmt: skip
-        gaps = np.flatnonzero(np.diff(time) > GAP_STEPS * typical_step(time))
+        gaps = np.flatnonzero(np.diff(time) > GAP_STEPS * axes.typical_step(time))
         faults += [
             ForceFault(kind=Reason.MISSING_SAMPLES, start_s=float(time[at]), end_s=float(time[at + 1]))
             for at in gaps.tolist()
@@ -90,7 +83,7 @@ class Screened:
         """Return the index in `FAULTS` of the fault within a window about given times; 0 for none."""
         flags = (self.codes[:, None] == np.arange(len(FAULTS))).astype(np.float64)
         flags[:, 0] = 0
-        means = mean_force(self.recorded.time_s, flags, time_s, window_s=window_s)
+        means = axes.mean_force(self.recorded.time_s, flags, time_s, window_s=window_s)
         return np.where(means.max(axis=1) > _ROUNDING, np.argmax(means, axis=1), 0)
 
 
@@ -230,7 +223,7 @@ def _noise(force_n: Samples) -> Axis:
         # coarse or repeated values change seldom: the median of all changes would be 0, and neighbours are alike
         if len(changes := changes[changes > 0]):
             run = min(len(values) / len(changes), _FIT_SAMPLES[1])
-            sigma[axis] = max(float(noise_sigma(values)), np.median(changes) * (run > _COARSE)) * np.sqrt(run)
+            sigma[axis] = max(float(axes.noise_sigma(values)), np.median(changes) * (run > _COARSE)) * np.sqrt(run)
     return sigma
 
 
@@ -241,14 +234,14 @@ def _load(force_n: Samples) -> float:
 
 def _fit_count(forces: Forces) -> int:
     """Number of samples on either side of a jump that a line is fitted to."""
-    return int(np.clip(round(_FIT_S / typical_step(forces.time_s)), *_FIT_SAMPLES))
+    return int(np.clip(round(_FIT_S / axes.typical_step(forces.time_s)), *_FIT_SAMPLES))
 
 
 def _find_jumps(forces: Forces) -> list[tuple[int, float]]:
     """Find the samples before which the force jumps, and the size of the jump, in newtons."""
-    if not 0 < typical_step(forces.time_s) <= _SLOW_S:
+    if not 0 < axes.typical_step(forces.time_s) <= _SLOW_S:
         return []
-    force, step, load_n = forces.force_n, typical_step(forces.time_s), _load(forces.force_n)
+    force, step, load_n = forces.force_n, axes.typical_step(forces.time_s), _load(forces.force_n)
     sigma, count = _noise(force), _fit_count(forces)
     change = np.diff(force, axis=0, prepend=force[:1])
     apart = np.diff(forces.time_s, prepend=forces.time_s[0]) > 2 * _FIT_SAMPLES[0] * step
@@ -301,7 +294,7 @@ def _near(forces: Forces) -> Axis:
 
 def _cut(forces: Forces, spans: Sequence[tuple[int, int]]) -> list[_Part]:
     """Cut the samples into parts, and extend a line through the samples at either end of each by half a step."""
-    count, half, parts = _fit_count(forces), typical_step(forces.time_s) / 2, []
+    count, half, parts = _fit_count(forces), axes.typical_step(forces.time_s) / 2, []
     for start, end in spans:
         time, force = forces.time_s[start:end], forces.force_n[start:end]
         levels = [
@@ -367,15 +360,15 @@ def _classify_jumps(forces: Forces, *, image_moves: ImageMotionTest) -> tuple[li
     if not resting:
         return [], []
     try:
-        axes = infer_axes(forces)
+        sensor = axes.infer_axes(forces)
     except RecordingError:
         return resting, []  # nothing is ever loaded
-    time, force = forces.time_s, forces.force_n - axes.tare_n
+    time, force = forces.time_s, forces.force_n - sensor.tare_n
     at = np.array([at for at, _ in jumps])
     groups = [group.tolist() for group in np.split(at, np.flatnonzero(np.diff(time[at]) > _RELEASE_S) + 1)]
     starts, ends = [0, *(group[-1] for group in groups)], [*(group[0] for group in groups), len(time)]
     parts, returns = _cut(forces, list(zip(starts, ends, strict=True))), _make_return_test(forces)
-    normal = axes.sign * turn_matrix(axes)[axes.normal_index]
+    normal = sensor.sign * axes.turn_matrix(sensor)[sensor.normal_index]
     slips_s: list[float] = []
     harmless: set[int] = set()
     faulty: list[int] = []  # groups that are neither slip nor release
@@ -423,7 +416,7 @@ def _make_motion_test(frame_time_s: Times, image_motion: Times, forces: Forces, 
     """Make the test whether the image moves at a jump, about as much as at other changes of the force in the trial."""
     if len(image_motion) < _BESIDE:
         return lambda _t, _n: True  # without frames the force is believed
-    lag_s, step = 0.0 if lag.doubt else lag.lag_s, typical_step(frame_time_s)
+    lag_s, step = 0.0 if lag.doubt else lag.lag_s, axes.typical_step(frame_time_s)
     change_n = np.append(0.0, np.nan_to_num(force_changes(frame_time_s - lag_s, forces)))
     reach_s = _LONGEST_LAG_S if lag.doubt else 2 * lag.sigma_s + 1.5 * step
     motion, base = image_motion[1:], float(np.quantile(image_motion[1:], 0.1))
@@ -437,7 +430,7 @@ def _make_motion_test(frame_time_s: Times, image_motion: Times, forces: Forces, 
         beside = ~near & (apart_s <= reach_s + _QUIET_S)
         if not near.any() or beside.sum() < _BESIDE:
             return True
-        quiet, spread = robust_spread(motion[beside])
+        quiet, spread = axes.robust_spread(motion[beside])
         return bool(motion[near].max() - quiet > max(_MOVES_SHARE * per_newton * size_n, _MOVES_SIGMAS * spread))
 
     return image_moves

@@ -9,16 +9,8 @@ from jaxtyping import Bool, Float, Int
 
 from sliplens.errors import RecordingError
 from sliplens.recordings.labelling import Found, FrictionEstimate
-from sliplens.recordings.labels.axes import (
-    ContactForces,
-    Samples,
-    Times,
-    find_spans,
-    magnitude,
-    mean_force,
-    robust_spread,
-    typical_step,
-)
+from sliplens.recordings.labels import axes
+from sliplens.recordings.labels.axes import ContactForces, Samples, Times
 
 _REACH_S, _TRIES = 0.08, 41  # how far the break may lie from the rough guess, and breaks tried over that reach
 # lengths of the fall that are tried, from a sudden drop to that of a soft fingertip
@@ -69,7 +61,7 @@ def fit_break(
 def _bracket_break(time_s: Samples, values: Samples, *, about_s: float, rng: np.random.Generator, draws: int) -> Break:
     """Extend the line through the last samples before a break to anywhere before the next sample."""
     # the break itself is rough: a sample half a step beyond may still be before it
-    near = np.flatnonzero(time_s <= about_s + typical_step(time_s) / 2)
+    near = np.flatnonzero(time_s <= about_s + axes.typical_step(time_s) / 2)
     before = near[max(0, len(near) - _LEAST_BEFORE) : np.argmax(values[near]) + 1] if len(near) else near
     if len(before) < _LEAST_LINE or before[-1] + 1 == len(time_s):
         few = (
@@ -169,8 +161,8 @@ class _MeanRatio(NamedTuple):
 def find_contacts(forces: ContactForces, *, contact_threshold_n: float) -> tuple[tuple[float, float], ...]:
     """Find the contacts: spans of time, in seconds, each from a touch to its release; light or short ones are none."""
     time = forces.time_s
-    normal = mean_force(time, forces.normal_n, time, window_s=_STEP_S)
-    spans, least = find_spans(time, normal > contact_threshold_n, apart_s=_APART_S), _PRESSED_SHARE * normal.max()
+    normal = axes.mean_force(time, forces.normal_n, time, window_s=_STEP_S)
+    spans, least = axes.find_spans(time, normal > contact_threshold_n, apart_s=_APART_S), _PRESSED_SHARE * normal.max()
     return tuple((float(time[start]), float(time[end - 1])) for start, end in spans if normal[start:end].max() >= least)
 
 
@@ -311,7 +303,7 @@ def _fit_slip(
     draws: int,
 ) -> _Slip:
     """Fit the break of the ratio about the rough time of a slip."""
-    step = typical_step(forces.time_s)
+    step = axes.typical_step(forces.time_s)
 
     def fit_near(before_s: float) -> tuple[Break, float]:
         near = forces.time_s >= rough_s - max(before_s, _BEFORE_STEPS * step)
@@ -342,9 +334,9 @@ def _fit_slip(
 
 def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: float) -> _MeanRatio:
     time = forces.time_s
-    normal = mean_force(time, forces.normal_n, time, window_s=window_s)
+    normal = axes.mean_force(time, forces.normal_n, time, window_s=window_s)
     normal_noise, noise = forces.noise_of_means_n(window_s)
-    tangential = magnitude(mean_force(time, forces.tangential_n, time, window_s=window_s), sigma_n=noise)
+    tangential = axes.magnitude(axes.mean_force(time, forces.tangential_n, time, window_s=window_s), sigma_n=noise)
     pressed = normal > max(contact_threshold_n, _PRESSED_SHARE * normal.max())
     # the window shrinks at the ends, where a single sample's noise is no fall
     pressed &= (time - time[0] >= window_s / 2) & (time[-1] - time >= window_s / 2)
@@ -361,7 +353,7 @@ def _mean_ratio(forces: ContactForces, *, window_s: float, contact_threshold_n: 
 
 def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_change: float) -> list[float]:
     """Rough times at which the ratio of a contact suddenly falls from a height that it exceeds nowhere."""
-    time, step = means.time_s, max(typical_step(means.time_s), 1e-9)
+    time, step = means.time_s, max(axes.typical_step(means.time_s), 1e-9)
     span = (time >= start_s) & (time <= end_s)
     inside, pressed = span & means.pulled, span & means.pressed
     if not inside.any():
@@ -379,7 +371,7 @@ def _find_falls(means: _MeanRatio, *, start_s: float, end_s: float, friction_cha
     reach_s = max(_STEP_S, step)
 
     def mean(values: Samples, at_s: Times) -> Times:
-        return mean_force(time, values, at_s, window_s=reach_s)
+        return axes.mean_force(time, values, at_s, window_s=reach_s)
 
     # the moments at which the ratio falls most steeply, up to the time of a slip after it is seen to fall
     steep = mean(ratio, time - reach_s / 2) - mean(ratio, time + reach_s)
@@ -413,11 +405,11 @@ def _image_sigmas(image: ImageMotion | None, onset_s: float) -> float | None:
     if image is None:
         return None
     # the motion of a frame happens between it and the one before; a lag may be uncertain by a frame
-    step = typical_step(image.time_s)
+    step = axes.typical_step(image.time_s)
     after = image.time_s - onset_s
     quiet = image.motion[1:][(after[1:] < -3 * step) & (after[1:] > -_QUIET_S - 3 * step)]
     burst = image.motion[1:][(after[1:] >= -2 * step) & (after[1:] <= 3 * step)]
     if len(quiet) < 3 or len(burst) == 0:
         return None
-    middle, spread = robust_spread(quiet)
+    middle, spread = axes.robust_spread(quiet)
     return float((burst.max() - middle) / max(spread, 1e-9))

@@ -12,16 +12,8 @@ from sliplens.errors import RecordingError
 from sliplens.mechanics import safety_margin, stick_ratio
 from sliplens.recordings.capture import Forces
 from sliplens.recordings.labelling import Found, FrictionEstimate, LabelBasis, Lag, Reason, describe_faults
-from sliplens.recordings.labels.axes import (
-    ContactForces,
-    Samples,
-    apply_axes,
-    half_window,
-    infer_axes,
-    magnitude,
-    mean_force,
-    typical_step,
-)
+from sliplens.recordings.labels import axes
+from sliplens.recordings.labels.axes import ContactForces, Samples
 from sliplens.recordings.labels.faults import FAULTS, GAP_STEPS, MARKED, Screened, screen_trial
 from sliplens.recordings.labels.friction import ImageMotion, estimate_friction, find_contacts
 from sliplens.recordings.labels.lag import doubt_agreement
@@ -29,7 +21,6 @@ from sliplens.recordings.options import LabelSettings
 from sliplens.recordings.trial import ContactState, Labels
 
 Frames: TypeAlias = Float[np.ndarray, " frames"]
-_NO_FLAG = 1e-6  # rounding of a mean of flags that are all 0
 
 
 class FrameForces(NamedTuple):
@@ -40,21 +31,20 @@ class FrameForces(NamedTuple):
     normal_sigma_n: Frames
     tangential_sigma_n: Frames
     missing: Bool[np.ndarray, " frames"]  # the neighbouring samples are too far apart, or missing on one side
-    out_of_range: Bool[np.ndarray, " frames"]  # a sample in the window reaches the end of the sensor's range
 
 
 def interpolate_forces(
-    forces: ContactForces, time_s: Frames, *, window_s: float, gap_s: float, until_s: float, force_range_n: float | None
+    forces: ContactForces, time_s: Frames, *, window_s: float, gap_s: float, until_s: float
 ) -> FrameForces:
     """Interpolate the forces onto given times: the mean, over a window about each, of the line through the samples."""
     samples = forces.time_s
     normal, tangential = (
-        mean_force(samples, values, time_s, window_s=window_s, until_s=until_s)
+        axes.mean_force(samples, values, time_s, window_s=window_s, until_s=until_s)
         for values in (forces.normal_n, forces.tangential_n)
     )
     noise, sample_noise = forces.noise_of_means_n(window_s), forces.noise_n
     # a shorter window averages less noise away, at worst none
-    length = 2 * half_window(samples, np.clip(time_s, samples[0], samples[-1]), window_s=window_s, until_s=until_s)
+    length = 2 * axes.half_window(samples, np.clip(time_s, samples[0], samples[-1]), window_s=window_s, until_s=until_s)
     more = np.sqrt(window_s / np.maximum(length, 1e-9))
     normal_noise, tangential_noise = (
         np.minimum(mean * more, max(sample, mean)) for mean, sample in zip(noise, sample_noise, strict=True)
@@ -63,16 +53,12 @@ def interpolate_forces(
     # the neighbours of a time on a sample are both that sample
     before = samples[np.maximum(np.searchsorted(samples, time_s, side="right") - 1, 0)]
     after = samples[np.minimum(np.searchsorted(samples, time_s), len(samples) - 1)]
-    # with the tare; the slip's onset hides no sample here: a window more is a frame less, a window less a wrong label
-    limit = np.inf if force_range_n is None else force_range_n
-    full = np.any(np.abs(forces.recorded.force_n) >= limit, axis=1, keepdims=True).astype(np.float64)
     return FrameForces(
         normal_n=normal,
-        tangential_n=magnitude(tangential, sigma_n=tangential_noise),
+        tangential_n=axes.magnitude(tangential, sigma_n=tangential_noise),
         normal_sigma_n=np.hypot(normal_noise, normal_tare),
         tangential_sigma_n=np.hypot(tangential_noise, tangential_tare),
         missing=(time_s < samples[0]) | (time_s > samples[-1]) | (after - before > gap_s),
-        out_of_range=mean_force(samples, full, time_s, window_s=window_s)[:, 0] > _NO_FLAG,
     )
 
 
@@ -106,11 +92,9 @@ class FoundLabels(Labels):
     basis: LabelBasis
 
 
-def contact_threshold(forces: ContactForces, settings: LabelSettings, *, window_s: float) -> float:
-    """Return the least normal force of a contact: as set, or well above the noise, and a share of the largest force."""
-    if settings.contact_threshold is not None:
-        return settings.contact_threshold
-    smooth = mean_force(forces.time_s, forces.normal_n, forces.time_s, window_s=window_s)
+def contact_threshold(forces: ContactForces, *, window_s: float) -> float:
+    """Return the least normal force of a contact, well above the noise, and a share of the largest force."""
+    smooth = axes.mean_force(forces.time_s, forces.normal_n, forces.time_s, window_s=window_s)
     return float(max(_CONTACT_SIGMAS * forces.noise_of_means_n(window_s)[0], _CONTACT_SHARE * smooth.max(), 1e-9))
 
 
@@ -134,11 +118,10 @@ def label_frames(
     if apply_lag and (lag is None or lag.doubt):
         cause = "it is not estimated" if lag is None else lag.doubt
         raise RecordingError(f"the lag cannot be applied: {cause}; give the lag by hand or leave it out")
-    window, gap = typical_step(frame_time_s), GAP_STEPS * typical_step(forces.time_s)
-    threshold = contact_threshold(forces, settings, window_s=window)
+    window, gap = axes.typical_step(frame_time_s), GAP_STEPS * axes.typical_step(forces.time_s)
+    threshold = contact_threshold(forces, window_s=window)
     onset = np.inf if friction.onset_s is None else friction.onset_s
-    limits = {"window_s": window, "gap_s": gap, "until_s": onset, "force_range_n": settings.force_range}
-    forces_at = partial(interpolate_forces, forces, **limits)
+    forces_at = partial(interpolate_forces, forces, window_s=window, gap_s=gap, until_s=onset)
     shift = lag.lag_s if lag is not None and apply_lag else 0.0
     unsure = 0.0 if lag is None else lag.sigma_s if apply_lag else float(np.hypot(lag.lag_s, lag.sigma_s))
     time = frame_time_s - shift
@@ -146,7 +129,7 @@ def label_frames(
     contact = (at.normal_n >= threshold) & (time >= (-np.inf if settings.contact_s is None else settings.contact_s))
     used = _used(at, friction, threshold)
     # a chord as short as the lag's uncertainty would count the noise of its ends, which `variance` counts already
-    reach = max(unsure, _RATE_STEPS * typical_step(frame_time_s), 1e-9)
+    reach = max(unsure, _RATE_STEPS * axes.typical_step(frame_time_s), 1e-9)
     # up to the slip only: beyond it there is no margin to be wrong about, and a window at it would shrink to a sample
     end = np.where(time < onset, np.minimum(time + reach, onset - window / 2), time + reach)
     early, late = (_used(forces_at(moment), friction, threshold) for moment in (end - 2 * reach, end))
@@ -166,7 +149,7 @@ def label_frames(
     fault = np.zeros(len(time), dtype=np.int64) if screened is None else screened.codes_at(time, window_s=window)
     for first, last in settings.bad_frames:
         fault[first : last + 1] = MARKED
-    reliable = contact & ~at.missing & ~at.out_of_range & (fault == 0)
+    reliable = contact & ~at.missing & (fault == 0)
     slip_s = friction.onset_s
     if slip_s is None and np.any(outside := reliable & (used > 1 + sigma)):
         slip_s = float(time[np.argmax(outside)])
@@ -177,7 +160,7 @@ def label_frames(
         anew_s = next((start_s for start_s, _ in touches if start_s > onset_s), np.inf)
         slipped |= (time >= onset_s) & (time < anew_s)
     margin = safety_margin(np.where(contact, at.normal_n, 0.0), at.tangential_n, friction.mu)
-    margin = np.where(at.missing | at.out_of_range | (fault > 0), np.nan, np.where(slipped & contact, 0.0, margin))
+    margin = np.where(at.missing | (fault > 0), np.nan, np.where(slipped & contact, 0.0, margin))
     valid = reliable & ~slipped & (sigma <= LARGEST_SIGMA)
     holds = np.where(slipped & contact & (at.tangential_n > 0), used * friction.mu, friction.mu)
     return FoundLabels(
@@ -195,7 +178,6 @@ def label_frames(
             _REASONS,
             *(fault == kind for kind in range(1, len(FAULTS))),
             at.missing,
-            at.out_of_range,
             ~contact,
             slipped,
             ~valid & bool(friction.notes),
@@ -210,7 +192,6 @@ def label_frames(
             contact_threshold_n=threshold,
             window_s=window,
             gap_s=gap,
-            force_range_n=settings.force_range,
             faults=() if screened is None else screened.faults,
         ),
     )
@@ -224,7 +205,7 @@ def _used(at: FrameForces, friction: FrictionEstimate, threshold_n: float) -> Fr
 _STATES = (ContactState.NO_CONTACT, ContactState.FULL_SLIP, ContactState.CONTACT, ContactState.INCIPIENT_SLIP)
 _REASONS = (
     *FAULTS[1:],
-    Reason.MISSING_SAMPLES, Reason.OUT_OF_RANGE, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.CONTRADICTED,
+    Reason.MISSING_SAMPLES, Reason.NO_CONTACT, Reason.AFTER_GROSS_SLIP, Reason.CONTRADICTED,
     Reason.TOO_UNCERTAIN, Reason.NONE,
 )  # fmt: skip
 _Word = TypeVar("_Word", ContactState, Reason)
@@ -245,10 +226,10 @@ def label_trial(
     require_inside(settings, frames=len(frame_time_s), time_s=forces.time_s)
     screened, lag = screen_trial(frame_time_s, image_motion, forces, settings=settings, rng=rng)
     try:
-        contact = apply_axes(screened.forces, infer_axes(screened.forces, settings, moved_s=screened.moved_s))
+        contact = axes.apply_axes(screened.forces, axes.infer_axes(screened.forces, settings, moved_s=screened.moved_s))
         friction = estimate_friction(
             contact,
-            contact_threshold_n=contact_threshold(contact, settings, window_s=typical_step(frame_time_s)),
+            contact_threshold_n=contact_threshold(contact, window_s=axes.typical_step(frame_time_s)),
             rng=rng,
             image=ImageMotion(time_s=frame_time_s - (0.0 if lag.doubt else lag.lag_s), motion=image_motion),
             slip_s=settings.slip_s,
